@@ -1,0 +1,169 @@
+"""Every error that a user can act on: one root, exceptions that carry data and say what to do.
+
+The command line prints ``what``, ``where`` and ``mend`` as one line and exits with ``exit_code``.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import ClassVar
+
+
+def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:
+    """Return the known names closest to ``name``, best first; the first few known ones if none is close."""
+    names = list(known)
+    folded = {n.casefold(): n for n in names}
+    close = [folded[c] for c in difflib.get_close_matches(name.casefold(), folded, n=count, cutoff=0.5)]
+    inside = [n for n in names if name.casefold() in n.casefold() and n not in close]
+    return (close + inside)[:count] or names[:count]
+
+
+class ImpactPostureError(Exception):
+    """Root of all errors of this package.
+
+    Args:
+        what: What is wrong, without a full stop.
+        where: Which file, option, joint or frame is meant.
+        mend: What the user can do about it.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+    def __init__(self, what: str, *, where: str = "", mend: str = "") -> None:
+        self.what = " ".join(what.split())
+        self.where = " ".join(where.split())
+        self.mend = " ".join(mend.split())
+        super().__init__(self.line)
+
+    @property
+    def line(self) -> str:
+        """The whole message on one line."""
+        text = f"{self.where}: {self.what}" if self.where else self.what
+        return f"{text}; {self.mend}" if self.mend else text
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Subclasses take other arguments, yet worker processes must be able to send them home.
+        return (_rebuild, (type(self), self.__dict__.copy(), self.line))
+
+
+def _rebuild(cls: type[ImpactPostureError], state: dict[str, object], line: str) -> ImpactPostureError:
+    error = cls.__new__(cls)
+    Exception.__init__(error, line)
+    error.__dict__.update(state)
+    return error
+
+
+class InputError(ImpactPostureError):
+    """A value that the user gave is wrong."""
+
+
+class NameNotFound(InputError):
+    """A name that does not exist; carries the nearest valid names."""
+
+    kind: ClassVar[str] = "name"
+
+    def __init__(self, name: str, known: Iterable[str], *, where: str = "", mend: str = "") -> None:
+        self.name = name
+        self.nearest = nearest(name, known)
+        hint = f"did you mean {', '.join(self.nearest)}?" if self.nearest else "there are none"
+        super().__init__(f"no {self.kind} '{name}'", where=where, mend=f"{hint} {mend}".strip())
+
+
+class RobotNotFound(NameNotFound):
+    """No robot of that name is known."""
+
+    kind = "robot"
+
+
+class FrameNotFound(NameNotFound):
+    """The robot has no frame of that name."""
+
+    kind = "frame"
+
+
+class JointNotFound(NameNotFound):
+    """The robot has no joint of that name."""
+
+    kind = "joint"
+
+
+class PostureNotFound(NameNotFound):
+    """The robot has no named posture, and there is no such file."""
+
+    kind = "posture"
+
+
+class PackageNotFound(NameNotFound):
+    """A ``package://`` or ``example-robot-data:`` path leads nowhere."""
+
+    kind = "path"
+
+
+class UrdfError(InputError):
+    """The URDF or SRDF cannot be read or makes no robot."""
+
+
+class InertiaError(UrdfError):
+    """A link's mass or rotational inertia is physically impossible."""
+
+
+class SpecError(InputError):
+    """A robot.toml, problem.toml or other file of ours has a wrong key or value."""
+
+
+class PostureError(InputError):
+    """A posture has the wrong length, a swapped or non-unit quaternion, or leaves the limits."""
+
+
+class NotWithinLimits(PostureError):
+    """A joint lies outside its position limits."""
+
+    def __init__(self, joint: str, value: float, lower: float, upper: float, *, where: str = "posture") -> None:
+        self.joint, self.value, self.lower, self.upper = joint, value, lower, upper
+        super().__init__(
+            f"joint '{joint}' is at {value:.6g}, outside its limits [{lower:.6g}, {upper:.6g}]",
+            where=where,
+            mend="choose a posture within the limits or correct them in robot.toml [limits.position]",
+        )
+
+
+class ContactError(InputError):
+    """A contact is degenerate: a zero normal, or a frame that nothing massive carries."""
+
+
+class MetricError(InputError):
+    """A metric or objective that cannot be computed for this robot or contact."""
+
+
+class UnsupportedJoint(InputError):
+    """A joint type that the symbolic dynamics does not know."""
+
+
+class OutputError(InputError):
+    """An output folder exists, or cannot be written."""
+
+
+class CompilerError(InputError):
+    """The C compiler is missing or failed; carries its words and the command."""
+
+
+class Infeasible(ImpactPostureError):
+    """No posture satisfies the constraints; carries the conflicting ones."""
+
+    exit_code = 3
+
+    def __init__(self, conflicts: dict[str, float], *, where: str = "problem", mend: str = "") -> None:
+        self.conflicts = dict(conflicts)
+        named = ", ".join(f"{name} (off by {value:.3g})" for name, value in self.conflicts.items())
+        super().__init__(
+            f"the constraints conflict: {named}",
+            where=where,
+            mend=mend or "relax one of them, move the target, or start from another --posture",
+        )
+
+
+class SolverFailed(ImpactPostureError):
+    """The solver did not converge from any start, or its answer failed the certificate."""
+
+    exit_code = 4

@@ -1,0 +1,1 @@
+"""What a robot is: its model, named postures, limits, armature and actuation."""
