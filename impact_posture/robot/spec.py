@@ -32,6 +32,8 @@ class ModelSpec(_Strict):
     root: Root = "fixed"
     package_dirs: tuple[str, ...] = ()
     lock: tuple[str, ...] = ()
+    # Some published URDFs carry links that no rigid body can be; their owner may insist.
+    accept_inertias: bool = False
 
 
 class PostureSpec(_Strict):

@@ -1,0 +1,1 @@
+"""The same model twice: symbolic (CasADi, from a ``pin.Model``) and numeric (Pinocchio, the oracle)."""

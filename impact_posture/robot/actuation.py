@@ -1,0 +1,305 @@
+"""What a robot's rotors and motors can do: allocation, hover, and lateral force.
+
+Notation is that of the whole package: ``ν = [base linear, base angular, joint rates]`` with the base twist in the
+base frame.  The equation of motion of an aerial robot with arm is ``M(q) ν̇ + h(q, ν) = G u`` with
+``u = [rotor thrusts (N), joint torques (N·m)]``.  Generalised forces are dual to ``ν``, hence ``G`` is constant:
+its rotor columns are wrenches on the base, in the base frame at its origin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linprog, lsq_linear
+
+from impact_posture.errors import FrameNotFound, PostureError, SpecError
+from impact_posture.robot.spec import PropulsionSpec
+
+Array = NDArray[np.float64]
+
+_RESIDUAL = 1e-6
+"""Largest unbalanced base force or moment (N, N·m) that still counts as equilibrium."""
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """How rotor thrusts make a wrench on the base.
+
+    Attributes:
+        matrix: 6 × n: base wrench ``[force (N); moment (N·m)]`` per unit thrust (N), base frame, base origin.
+        rank: 6 for a fully actuated robot.
+        condition: Largest over smallest singular value (mixes N and N·m; infinite below rank 6).
+    """
+
+    matrix: Array
+    rank: int
+    condition: float
+
+
+@dataclass(frozen=True)
+class Hover:
+    """Static equilibrium ``h(q, 0) = G u`` at one posture.
+
+    Attributes:
+        thrusts: Rotor thrusts, N.
+        speeds: Rotor speeds in the unit of ``speed_max``; zero where the thrust would be negative.
+        joint_torques: Torques of all joints behind the base, N·m (N for a prismatic joint).
+        thrust_margin: Least distance of a thrust to its limits over the width of its range: at most 0.5, negative
+            outside the limits.
+        torque_margin: Least ``1 - |τ|/τ_max`` over the joints; 1 where there are none.
+        residual: Largest base force or moment (N, N·m) that the rotors leave unbalanced.
+        violations: What stands against hovering here, in words; empty if nothing does.
+    """
+
+    thrusts: Array
+    speeds: Array
+    joint_torques: Array
+    thrust_margin: float
+    torque_margin: float
+    residual: float
+    violations: tuple[str, ...]
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the robot can hover in this posture."""
+        return not self.violations
+
+
+@dataclass(frozen=True)
+class LateralForce:
+    """Largest net horizontal force without tilting or turning, each way, N (zero or above; NaN without hover).
+
+    The force acts through the centre of mass of the robot with its arm held still.  Forward and left are the base's
+    x and y axes made horizontal.
+    """
+
+    forward: float
+    backward: float
+    left: float
+    right: float
+    mass: float
+
+    @property
+    def least(self) -> float:
+        """The smallest of the four, N."""
+        return float(np.min([self.forward, self.backward, self.left, self.right]))
+
+    @property
+    def least_acceleration(self) -> float:
+        """The smallest of the four per mass, m/s²."""
+        return self.least / self.mass
+
+
+def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
+    """Return the smallest and the largest thrust of a rotor, N: ``c_f ω²`` at the speed limits."""
+    if propulsion.speed_min >= propulsion.speed_max:
+        raise SpecError(
+            f"speed_min {propulsion.speed_min:g} is not below speed_max {propulsion.speed_max:g}",
+            where="propulsion",
+            mend="correct the rotor speed limits",
+        )
+    c = propulsion.thrust_coefficient
+    return c * propulsion.speed_min**2, c * propulsion.speed_max**2
+
+
+def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
+    """Map rotor thrusts (N) to the base wrench ``[force; moment]``, in the base frame at its origin.
+
+    A rotor at ``p`` with unit thrust direction ``d``, spin ``s`` and drag ratio ``κ`` contributes per unit thrust
+    ``[d; p × d - s κ d]``, first in the propulsion frame, then carried to the base (root joint) frame.
+
+    Args:
+        model: Free-flying model; the propulsion frame must sit on its base body.
+        propulsion: Rotor geometry and coefficients.
+
+    Returns:
+        6 × n_rotors.
+    """
+    _require_free_flyer(model)
+    if not model.existFrame(propulsion.frame):
+        raise FrameNotFound(propulsion.frame, (f.name for f in model.frames), where="propulsion.frame")
+    frame = model.frames[model.getFrameId(propulsion.frame)]
+    if frame.parentJoint != 1:
+        raise SpecError(
+            f"frame '{propulsion.frame}' is not on the base body",
+            where="propulsion.frame",
+            mend="name a frame that is fixed to the floating base",
+        )
+    if not propulsion.rotors:
+        raise SpecError("there are no rotors", where="propulsion.rotors", mend="list them, or leave propulsion out")
+    columns = []
+    for rotor in propulsion.rotors:
+        direction = np.asarray(rotor.direction, dtype=float)
+        length = float(np.linalg.norm(direction))
+        if not np.isfinite(length) or abs(length - 1.0) > 1e-3:
+            raise SpecError(
+                f"direction of length {length:.4g}",
+                where=f"propulsion.rotors '{rotor.name}'",
+                mend="give a unit vector",
+            )
+        force = direction / length
+        moment = np.cross(rotor.position, force) - rotor.spin * propulsion.drag_ratio * force
+        columns.append(frame.placement.act(pin.Force(force, moment)).vector)
+    return np.column_stack(columns)
+
+
+def allocation(model: pin.Model, propulsion: PropulsionSpec) -> Allocation:
+    """Return the allocation matrix with its rank and condition number."""
+    matrix = allocation_matrix(model, propulsion)
+    values = np.linalg.svd(matrix, compute_uv=False)
+    rank = int(np.count_nonzero(values > 1e-9 * values[0]))
+    condition = float(values[0] / values[-1]) if rank == 6 else float("inf")
+    return Allocation(matrix, rank, condition)
+
+
+def actuation_matrix(model: pin.Model, propulsion: PropulsionSpec | None = None) -> Array:
+    """Return the constant ``G`` of ``M ν̇ + h = G u``, ``u = [thrusts (N); joint torques (N·m)]``.
+
+    Without ``propulsion`` the base of a free-flying robot is not actuated; a fixed-base robot has ``G = I``.
+
+    Returns:
+        nv × (n_rotors + n_joints), joints in the order of ``ν``.
+    """
+    base = 6 if _is_free_flyer(model) else 0
+    rotors = np.zeros((base, 0)) if propulsion is None else allocation_matrix(model, propulsion)
+    joints = model.nv - base
+    matrix = np.zeros((model.nv, rotors.shape[1] + joints))
+    matrix[:base, : rotors.shape[1]] = rotors
+    matrix[base:, rotors.shape[1] :] = np.eye(joints)
+    return matrix
+
+
+def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
+    """Find the thrusts and torques that hold posture ``q`` at rest: ``h(q, 0) = G u``.
+
+    The rows of the base fix the thrusts (six independent rotors: uniquely; more: those farthest from their limits;
+    where the rotors cannot make the wrench, the nearest one within the limits).  The other rows are the torques.
+
+    Args:
+        model: Free-flying model with effort limits.
+        propulsion: Rotor geometry, coefficients and limits.
+        q: Configuration, nq numbers.
+    """
+    matrix = allocation_matrix(model, propulsion)
+    low, high = thrust_limits(propulsion)
+    q = _configuration(model, q)
+    load = np.asarray(pin.computeGeneralizedGravity(model, model.createData(), q))
+    thrusts = _centred_thrusts(matrix, load[:6], low, high)
+    residual = float(np.max(np.abs(matrix @ thrusts - load[:6])))
+    torques = load[6:].copy()
+    limits = np.asarray(model.effortLimit)[6:]
+    width = high - low
+    thrust_margin = float(np.min(np.minimum(thrusts - low, high - thrusts)) / width)
+    used = np.divide(np.abs(torques), limits, out=np.full(torques.shape, np.inf), where=limits > 0)
+    violations = []
+    if residual > _RESIDUAL:
+        violations.append(f"the rotors leave {residual:.3g} (N or N·m) of the weight unbalanced")
+    for rotor, thrust in zip(propulsion.rotors, thrusts, strict=True):
+        if not low - 1e-9 * width <= thrust <= high + 1e-9 * width:
+            violations.append(f"{rotor.name} would need {thrust:.3g} N, outside [{low:.3g}, {high:.3g}]")
+    for name, torque, share in zip(_velocity_names(model)[6:], torques, used, strict=True):
+        if share > 1.0:
+            violations.append(f"{name} would need {torque:.3g} N·m, above its limit")
+    return Hover(
+        thrusts=thrusts,
+        speeds=np.sqrt(np.maximum(thrusts, 0.0) / propulsion.thrust_coefficient),
+        joint_torques=torques,
+        thrust_margin=thrust_margin,
+        torque_margin=float(1.0 - np.max(used, initial=0.0)),
+        residual=residual,
+        violations=tuple(violations),
+    )
+
+
+def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> LateralForce:
+    """Find the largest net horizontal force that keeps attitude and height, in each of four directions.
+
+    A linear programme for each: maximise ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0`` subject to
+    ``A f = h_b + M_b e a`` (six rows: the weight is carried, nothing else moves and nothing turns), the thrust limits
+    and ``|h_j + M_j e a| <= τ_max`` for the joints that hold the arm still; ``e`` moves the whole robot one way.
+
+    Args:
+        model: Free-flying model with effort limits.
+        propulsion: Rotor geometry, coefficients and limits.
+        q: Configuration, nq numbers; a level base for the force at zero tilt.
+    """
+    matrix = allocation_matrix(model, propulsion)
+    low, high = thrust_limits(propulsion)
+    q = _configuration(model, q)
+    data = model.createData()
+    load = np.asarray(pin.computeGeneralizedGravity(model, data, q))
+    mass_matrix = np.asarray(pin.crba(model, data, q, pin.Convention.WORLD))
+    rotation = pin.Quaternion(np.asarray(q[3:7])).toRotationMatrix()
+    mass = float(pin.computeTotalMass(model))
+    forward = rotation[:, 0] * np.array([1.0, 1.0, 0.0])
+    if np.linalg.norm(forward) < 1e-6:
+        raise PostureError("the base's x axis is vertical", where="lateral force", mend="give a level posture")
+    forward /= np.linalg.norm(forward)
+    left = np.array([-forward[1], forward[0], 0.0])
+    limits = np.asarray(model.effortLimit)[6:]
+
+    def largest(direction: Array) -> float:
+        push = mass_matrix[:, :3] @ (rotation.T @ direction)
+        count = matrix.shape[1]
+        held = np.isfinite(limits)
+        zeros = np.zeros((int(held.sum()), count))
+        result = linprog(
+            np.r_[np.zeros(count), -1.0],
+            A_eq=np.column_stack([matrix, -push[:6]]),
+            b_eq=load[:6],
+            A_ub=np.block([[zeros, push[6:][held, None]], [zeros, -push[6:][held, None]]]),
+            b_ub=np.r_[(limits - load[6:])[held], (limits + load[6:])[held]],
+            bounds=[(low, high)] * count + [(0.0, None)],
+            method="highs",
+        )
+        return mass * float(result.x[-1]) if result.status == 0 else float("nan")
+
+    return LateralForce(largest(forward), largest(-forward), largest(left), largest(-left), mass)
+
+
+def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
+    """Thrusts with ``A f = w``, as far from their limits as can be; the nearest within the limits if none exist."""
+    count = matrix.shape[1]
+    if count == 6 and np.linalg.matrix_rank(matrix) == 6:
+        return np.asarray(np.linalg.solve(matrix, wrench))
+    # Variables f and s: low + s (high - low) <= f <= high - s (high - low), s as large as possible.
+    width = np.full((count, 1), high - low)
+    result = linprog(
+        np.r_[np.zeros(count), -1.0],
+        A_eq=np.column_stack([matrix, np.zeros(6)]),
+        b_eq=wrench,
+        A_ub=np.block([[-np.eye(count), width], [np.eye(count), width]]),
+        b_ub=np.r_[np.full(count, -low), np.full(count, high)],
+        bounds=[(None, None)] * (count + 1),
+        method="highs",
+    )
+    if result.status == 0:
+        return np.asarray(result.x[:-1])
+    return np.asarray(lsq_linear(matrix, wrench, bounds=(low, high)).x)
+
+
+def _configuration(model: pin.Model, q: ArrayLike) -> Array:
+    values = np.asarray(q, dtype=float)
+    if values.shape != (model.nq,):
+        raise PostureError(f"{values.size} numbers where the model has nq = {model.nq}", where="posture")
+    if not np.all(np.isfinite(values)):
+        raise PostureError("a value is not finite", where="posture", mend="correct it")
+    return values
+
+
+def _is_free_flyer(model: pin.Model) -> bool:
+    return bool(model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer")
+
+
+def _require_free_flyer(model: pin.Model) -> None:
+    if not _is_free_flyer(model):
+        raise SpecError("rotors on a robot that cannot fly", where="propulsion", mend='set root = "free-flyer"')
+
+
+def _velocity_names(model: pin.Model) -> list[str]:
+    """Joint name of each entry of ν."""
+    # Joint 0 is the universe, which has no entry.
+    return [model.names[i] for i in range(1, model.njoints) for _ in range(model.joints[i].nv)]

@@ -1,0 +1,291 @@
+"""From a robot's name, or a path to a URDF, to a :class:`Robot`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
+from impact_posture.robot.robot import Robot, Vector
+from impact_posture.robot.spec import PostureSpec, RobotSpec, Root, read_spec, read_toml
+from impact_posture.robot.urdf import (
+    EXAMPLE_PREFIX,
+    build_model,
+    check_moved_mass,
+    example_robot_data,
+    resolve_path,
+    robots_data,
+)
+
+ArmatureOption = Mapping[str, float] | str | None
+
+
+@dataclass(frozen=True)
+class LoadOptions:
+    """What a user may say about a robot when naming it.
+
+    Attributes:
+        root: Put the robot on a free-flyer or weld it to the world; ``None``: as robot.toml says.
+        package_dirs: Where ``package://`` paths lead; dynamics needs none, pictures may.
+        srdf: Another SRDF.
+        config: Another robot.toml (else one beside the URDF).
+        armature: ``"none"``, a TOML file's path, or values by joint; ``None``: DESIGN's order.
+        lock: Joints made rigid at the default posture.
+    """
+
+    root: Root | None = None
+    package_dirs: tuple[str, ...] = ()
+    srdf: str | None = None
+    config: str | None = None
+    armature: ArmatureOption = None
+    lock: tuple[str, ...] = field(default=())
+
+
+def known_robots() -> tuple[str, ...]:
+    """Names of the robots that can be given without a path, sorted."""
+    return tuple(sorted(p.parent.name for p in robots_data().glob("*/robot.toml")))
+
+
+def load_robot(robot: str, options: LoadOptions | None = None) -> Robot:
+    """Load a robot by known name, by path to a ``.urdf``, or by ``example-robot-data:<path below robots/>``.
+
+    Raises:
+        RobotNotFound: With the nearest names.
+        UrdfError: The URDF or SRDF cannot be used.
+        SpecError: The robot.toml cannot be used.
+    """
+    options = options or LoadOptions()
+    spec, urdf, source, base, name = _locate(robot, options)
+    root: Root = options.root or spec.model.root
+    for folder in (*options.package_dirs, *spec.model.package_dirs):
+        if not (base / Path(folder).expanduser()).is_dir():
+            siblings = [p.name for p in (base / folder).parent.glob("*") if p.is_dir()]
+            raise PackageNotFound(folder, siblings, where="--package-dir", mend="name an existing folder")
+    model, warnings = build_model(
+        urdf, free_flyer=root == "free-flyer", accept_inertias=spec.model.accept_inertias
+    )
+    srdf = _srdf(spec, options, base)
+    postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec.postures, root, name)
+    _override_limits(model, spec, name)
+    default = spec.default_posture or next(iter(postures), "neutral")
+    postures.setdefault("neutral", _neutral(model))
+    if default not in postures:
+        raise SpecError(
+            f"default_posture '{default}' does not exist", where=name, mend=f"one of: {', '.join(postures)}"
+        )
+    locked = tuple(dict.fromkeys((*spec.model.lock, *options.lock)))
+    armature_source = _set_armature(model, spec, srdf, options.armature, name)
+    if locked:
+        model, postures = _lock(model, locked, postures, default, name)
+    check_moved_mass(model, source)
+    warnings = (*warnings, *_armature_warning(model, armature_source))
+    return Robot(
+        name=name,
+        source=source,
+        model=model,
+        root=root,
+        postures=postures,
+        default_posture=default,
+        spec=spec,
+        locked=locked,
+        armature_source=armature_source,
+        warnings=warnings,
+    )
+
+
+def _locate(robot: str, options: LoadOptions) -> tuple[RobotSpec, Path, str, Path, str]:
+    """Return spec, URDF file, its printable source, the folder that relative paths start from, and the name."""
+    own = robots_data() / robot / "robot.toml"
+    if "/" not in robot and own.is_file():
+        spec = read_spec(Path(options.config) if options.config else own)
+        text = spec.model.urdf or read_spec(own).model.urdf or ""
+        source = text if text.startswith(EXAMPLE_PREFIX) else f"impact-posture:{robot}/{text}"
+        return spec, resolve_path(text, own.parent), source, own.parent, spec.name or robot
+    if robot.startswith(EXAMPLE_PREFIX):
+        urdf, source = resolve_path(robot, Path()), robot
+    elif robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or Path(robot).is_file():
+        urdf = Path(robot).expanduser()
+        source = robot
+    else:
+        listed = list(known_robots())
+        raise RobotNotFound(robot, listed, mend="(or give a path to a .urdf)")
+    config = Path(options.config) if options.config else urdf.parent / "robot.toml"
+    if options.config or (config.is_file() and EXAMPLE_PREFIX not in source):
+        spec = read_spec(config)
+        base = config.parent
+    else:
+        spec, base = RobotSpec(), urdf.parent
+    return spec, urdf, source, base, spec.name or urdf.stem
+
+
+def _srdf(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
+    text = options.srdf or spec.model.srdf
+    if text is None:
+        return None
+    path = Path(text).expanduser() if options.srdf else resolve_path(text, base)
+    if not path.is_file():
+        raise UrdfError("no such file", where=str(path), mend="check --srdf or robot.toml [model] srdf")
+    return path
+
+
+def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict[str, Vector]:
+    if srdf is None:
+        return {}
+    try:
+        pin.loadReferenceConfigurations(model, str(srdf), False)
+    except Exception as error:  # Pinocchio's own parser raises what its XML library raises.
+        raise UrdfError(f"is no SRDF ({error})", where=str(srdf), mend="correct the SRDF") from None
+    states = {item.key(): np.array(item.data(), dtype=float) for item in model.referenceConfigurations}
+    return {name: pin.normalize(model, q) for name, q in states.items() if name not in spec.postures}
+
+
+def _toml_postures(
+    model: pin.Model, postures: Mapping[str, PostureSpec], root: Root, name: str
+) -> dict[str, Vector]:
+    result = {}
+    for key, posture in postures.items():
+        q = np.array(pin.neutral(model), dtype=float)
+        if posture.base is not None:
+            if root != "free-flyer":
+                raise SpecError(
+                    f"posture '{key}' gives a base pose, but the root is fixed", where=name, mend="remove it"
+                )
+            q[:7] = posture.base
+        for joint, value in posture.joints.items():
+            index = _joint_index(model, joint, f"{name} posture '{key}'")
+            first = model.idx_qs[index]
+            if model.nqs[index] == 2 and model.nvs[index] == 1:
+                q[first : first + 2] = np.cos(value), np.sin(value)
+            else:
+                q[first] = value
+        result[key] = np.asarray(pin.normalize(model, q))
+    return result
+
+
+def _neutral(model: pin.Model) -> Vector:
+    """The neutral configuration, moved to the nearest limits where zero lies outside them."""
+    q = np.array(pin.neutral(model), dtype=float)
+    scalar = [i for i in range(1, model.njoints) if model.nqs[i] == 1]
+    for i in scalar:
+        k = model.idx_qs[i]
+        q[k] = np.clip(q[k], model.lowerPositionLimit[k], model.upperPositionLimit[k])
+    return q
+
+
+def _joint_index(model: pin.Model, joint: str, where: str) -> int:
+    known = [n for n in model.names if n not in ("universe", "root_joint")]
+    if joint not in known:
+        raise JointNotFound(joint, known, where=where)
+    return int(model.getJointId(joint))
+
+
+def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
+    where = f"{name} robot.toml [limits]"
+    lower, upper = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
+    for joint, (low, high) in spec.limits.position.items():
+        if not low < high:
+            raise SpecError(f"position limits of '{joint}' are [{low}, {high}]", where=where, mend="lower < upper")
+        k = model.idx_qs[_joint_index(model, joint, where)]
+        lower[k], upper[k] = low, high
+    model.lowerPositionLimit, model.upperPositionLimit = lower, upper
+    for values, kind in ((spec.limits.velocity, "Velocity"), (spec.limits.effort, "Effort")):
+        low, high = getattr(model, f"lower{kind}Limit").copy(), getattr(model, f"upper{kind}Limit").copy()
+        for joint, value in values.items():
+            k = model.idx_vs[_joint_index(model, joint, where)]
+            low[k], high[k] = -value, value
+        setattr(model, f"lower{kind}Limit", low)
+        setattr(model, f"upper{kind}Limit", high)
+
+
+def _set_armature(
+    model: pin.Model, spec: RobotSpec, srdf: Path | None, option: ArmatureOption, name: str
+) -> str:
+    """Set ``model.armature``; order: the option, robot.toml, rotor data of the SRDF, zero."""
+    if option == "none":
+        model.armature = np.zeros(model.nv)
+        return "none (--armature none)"
+    armature, source = np.array(model.armature, dtype=float), "none"
+    if spec.armature.default is not None or spec.armature.joints:
+        armature = _armature_vector(model, spec.armature.default or 0.0, spec.armature.joints, name)
+        source = f"robot.toml ({spec.armature.source})" if spec.armature.source else "robot.toml"
+    elif srdf is not None and "rotor_params" in srdf.read_text(encoding="utf-8", errors="replace"):
+        pin.loadRotorParameters(model, str(srdf), False)
+        armature = np.array(model.armature, dtype=float)
+        armature[: _base_width(model)] = 0.0
+        source = "rotor data in the SRDF"
+    if isinstance(option, str):
+        armature = _armature_vector(model, 0.0, _armature_file(Path(option)), option)
+        source = f"--armature {option}"
+    elif option:
+        for joint, value in option.items():
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(f"armature {joint}={value:g}", where="--armature", mend="give a number ≥ 0")
+            index = _joint_index(model, joint, "--armature")
+            armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]] = value
+        source = f"--armature over {source}"
+    model.armature = armature
+    return source
+
+
+def _armature_file(path: Path) -> dict[str, float]:
+    data = read_toml(path)
+    table = data.get("armature", data)
+    values = table.get("joints", table) if isinstance(table, dict) else {}
+    try:
+        return {str(k): float(v) for k, v in values.items()}
+    except (TypeError, ValueError):
+        raise SpecError("holds no table joint = value", where=str(path), mend='write: joint_name = 0.01') from None
+
+
+def _armature_vector(
+    model: pin.Model, default: float, joints: Mapping[str, float], where: str
+) -> Vector:
+    armature = np.full(model.nv, default)
+    armature[: _base_width(model)] = 0.0
+    for joint, value in joints.items():
+        index = _joint_index(model, joint, f"{where} [armature]")
+        if not (np.isfinite(value) and value >= 0):
+            raise SpecError(f"armature of '{joint}' is {value:g}", where=where, mend="give a number ≥ 0")
+        armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]] = value
+    return armature
+
+
+def _base_width(model: pin.Model) -> int:
+    return 6 if model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer" else 0
+
+
+def _armature_warning(model: pin.Model, source: str) -> tuple[str, ...]:
+    joints = np.asarray(model.armature)[_base_width(model) :]
+    if joints.size and not (joints > 0).any():
+        return (
+            f"armature is zero ({source}): geared motors usually have some, and H scales like 1/armature² "
+            "where it dominates; give --armature or robot.toml [armature]",
+        )
+    return ()
+
+
+def _lock(
+    model: pin.Model, locked: Sequence[str], postures: dict[str, Vector], default: str, name: str
+) -> tuple[pin.Model, dict[str, Vector]]:
+    ids = [_joint_index(model, joint, f"{name} --lock") for joint in locked]
+    armature = np.array(model.armature)
+    reduced = pin.buildReducedModel(model, ids, postures[default])
+    kept_q: list[int] = []
+    kept_v: list[int] = []
+    for i in range(1, model.njoints):
+        if i not in ids:
+            kept_q += range(model.idx_qs[i], model.idx_qs[i] + model.nqs[i])
+            kept_v += range(model.idx_vs[i], model.idx_vs[i] + model.nvs[i])
+    if not kept_v:
+        raise InputError("every joint is locked", where=f"{name} --lock", mend="leave some free")
+    reduced.armature = armature[kept_v]
+    return reduced, {key: q[kept_q] for key, q in postures.items()}
+
+
+def describe_sources() -> tuple[str, str]:
+    """Where the known robots' data lie: our own folder and example-robot-data's."""
+    return str(robots_data()), str(example_robot_data())

@@ -1,0 +1,240 @@
+"""The robot as the rest of the package sees it: a ``pin.Model`` with names, postures and what URDF cannot say."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.errors import FrameNotFound, JointNotFound, NotWithinLimits, PostureError, PostureNotFound
+from impact_posture.robot.spec import ContactPose, RobotSpec, Root
+
+Vector = NDArray[np.float64]
+
+CONVENTION = (
+    "q = [x, y, z, qx, qy, qz, qw, joints]; v = [base linear, base angular, joint rates], base twist in the base "
+    "frame (Pinocchio LOCAL); SI units, radians"
+)
+FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A loaded robot.
+
+    Attributes:
+        name: What it is called in outputs.
+        source: Path or ``example-robot-data:`` URI of its URDF.
+        model: Pinocchio's model with armature, limits and locked joints as used.  Treat as read-only.
+        root: ``free-flyer`` or ``fixed``.
+        postures: Named configurations, shape (nq,).
+        default_posture: Name of the one to start from.
+        spec: The resolved ``robot.toml``.
+        locked: Joints made rigid.
+        armature_source: Where the armature came from, in words.
+        warnings: What a user should know about this model, one line each.
+    """
+
+    name: str
+    source: str
+    model: pin.Model
+    root: Root
+    postures: Mapping[str, Vector]
+    default_posture: str
+    spec: RobotSpec
+    locked: tuple[str, ...] = ()
+    armature_source: str = "none"
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def nq(self) -> int:
+        """Dimension of the configuration vector."""
+        return int(self.model.nq)
+
+    @property
+    def nv(self) -> int:
+        """Dimension of the tangent space."""
+        return int(self.model.nv)
+
+    @property
+    def floating(self) -> bool:
+        """Whether the robot's base is free to move."""
+        return self.root == "free-flyer"
+
+    @property
+    def convention(self) -> str:
+        """The order and meaning of ``q`` and ``v`` in one line."""
+        return CONVENTION if self.floating else FIXED_CONVENTION
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints in the model's order, the free-flyer left out."""
+        first = 2 if self.floating else 1
+        return tuple(self.model.names[i] for i in range(first, self.model.njoints))
+
+    @cached_property
+    def tangent_names(self) -> tuple[str, ...]:
+        """A name for each of the nv velocity entries: ``base vx`` … ``base wz``, then joints."""
+        names = [f"base {s}" for s in ("vx", "vy", "vz", "wx", "wy", "wz")] if self.floating else []
+        for joint in self.joint_names:
+            width = self.model.nvs[self.model.getJointId(joint)]
+            names += [joint] if width == 1 else [f"{joint}[{k}]" for k in range(width)]
+        return tuple(names)
+
+    @cached_property
+    def armature(self) -> Vector:
+        """Armature of each velocity entry, shape (nv,), kg·m² (kg for prismatic joints)."""
+        return np.array(self.model.armature, dtype=float)
+
+    @cached_property
+    def mass(self) -> float:
+        """Total moving mass, kg."""
+        return float(pin.computeTotalMass(self.model))
+
+    @cached_property
+    def frame_names(self) -> tuple[str, ...]:
+        """Names of all frames that a contact can be given at."""
+        return tuple(f.name for f in self.model.frames if f.name != "universe")
+
+    @cached_property
+    def model_sha256(self) -> str:
+        """Hash of what the dynamics depends on: joints, placements, inertias and armature as used."""
+        model = self.model
+        content = [
+            [
+                [str(model.names[i]), str(model.joints[i].shortname()), int(model.parents[i])]
+                + _rounded(model.jointPlacements[i].homogeneous)
+                + _rounded(model.inertias[i].matrix())
+                + _rounded(_axis(model.joints[i]))
+                for i in range(1, model.njoints)
+            ],
+            _rounded(model.armature),
+        ]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+    def frame_id(self, name: str) -> int:
+        """Index of the frame ``name``: a link's frame where a link and a joint share it.
+
+        Raises:
+            FrameNotFound: With the nearest names.
+        """
+        for index, frame in enumerate(self.model.frames):
+            if frame.name == name and frame.type == pin.FrameType.BODY:
+                return index
+        for index, frame in enumerate(self.model.frames):
+            if frame.name == name and name != "universe":
+                return index
+        raise FrameNotFound(name, self.frame_names, where=self.name)
+
+    def joint_id(self, name: str) -> int:
+        """Index of the joint ``name`` in the model.
+
+        Raises:
+            JointNotFound: With the nearest names.
+        """
+        if name not in self.joint_names:
+            raise JointNotFound(name, self.joint_names, where=self.name)
+        return int(self.model.getJointId(name))
+
+    def contact_pose(self, frame: str) -> ContactPose:
+        """What is held of a contact frame unless the user says otherwise."""
+        return self.spec.contact.frames.get(frame, self.spec.contact.pose)
+
+    def posture(self, name: str | None = None) -> Vector:
+        """Return a copy of the named posture (the default one without a name), shape (nq,).
+
+        Raises:
+            PostureNotFound: With the nearest names.
+        """
+        name = name or self.default_posture
+        if name not in self.postures:
+            raise PostureNotFound(name, self.postures, where=self.name)
+        return np.array(self.postures[name], dtype=float)
+
+    def check_posture(self, q: Vector, *, where: str = "posture", limits: bool = True) -> Vector:
+        """Check length, finiteness, quaternion and limits of ``q``; return it with unit quaternions.
+
+        Raises:
+            PostureError: What is wrong and how to mend it.
+        """
+        q = np.array(q, dtype=float).reshape(-1)
+        if q.size != self.nq:
+            raise PostureError(
+                f"a posture of {self.name} has {self.nq} numbers, this one {q.size}",
+                where=where,
+                mend=f"give {self.convention.split(';')[0]}",
+            )
+        if not np.isfinite(q).all():
+            raise PostureError(
+                f"entry {int(np.argmin(np.isfinite(q)))} is not finite", where=where, mend="correct it"
+            )
+        if self.floating:
+            self._check_quaternion(q[3:7], where)
+        q = pin.normalize(self.model, q)
+        if limits:
+            self.check_limits(q, where=where)
+        return np.asarray(q)
+
+    def _check_quaternion(self, quaternion: Vector, where: str) -> None:
+        norm = float(np.linalg.norm(quaternion))
+        if abs(norm - 1) > 1e-3:
+            raise PostureError(
+                f"the base quaternion has norm {norm:.4g}", where=where, mend="give a unit quaternion x y z w"
+            )
+        rotation = pin.Quaternion(*[float(quaternion[k]) for k in (3, 0, 1, 2)]).matrix()
+        swapped = pin.Quaternion(*[float(v) for v in quaternion]).matrix()
+        # Upside down as read, upright if the first number were w: nobody stands or hovers on their head.
+        if rotation[2, 2] < -0.9 and swapped[2, 2] > 0.9 and self.spec.kind in ("aerial", "quadruped", "humanoid"):
+            raise PostureError(
+                "the base quaternion puts the robot on its head and looks like w x y z",
+                where=where,
+                mend="give it as x y z w (scalar last)",
+            )
+        if abs(quaternion[0]) > 0.999 and abs(quaternion[3]) < 0.04:
+            raise PostureError(
+                "the base quaternion turns the robot by 180° about x and looks like w x y z",
+                where=where,
+                mend="give it as x y z w (scalar last)",
+            )
+
+    def check_limits(self, q: Vector, *, where: str = "posture", tolerance: float = 1e-6) -> None:
+        """Raise :class:`NotWithinLimits` for the first joint of ``q`` outside its position limits."""
+        for joint in self.joint_names:
+            index = self.model.getJointId(joint)
+            if self.model.nqs[index] != self.model.nvs[index]:
+                continue  # continuous joints have no limits
+            for k in range(self.model.idx_qs[index], self.model.idx_qs[index] + self.model.nqs[index]):
+                low, high = float(self.model.lowerPositionLimit[k]), float(self.model.upperPositionLimit[k])
+                if not low - tolerance <= q[k] <= high + tolerance:
+                    raise NotWithinLimits(joint, float(q[k]), low, high, where=where)
+
+
+def _axis(joint: pin.JointModel) -> Vector:
+    """The joint's motion subspace at the identity: what distinguishes two unaligned joints."""
+    data = joint.createData()
+    joint.calc(data, pin.neutral(_single(joint)))
+    return np.asarray(data.S).reshape(-1)
+
+
+def _single(joint: pin.JointModel) -> pin.Model:
+    model = pin.Model()
+    model.addJoint(0, joint, pin.SE3.Identity(), "joint")
+    return model
+
+
+def _rounded(values: object) -> list[str]:
+    # 12 digits: a model read twice, or on another machine, hashes the same.
+    return [f"{float(v) + 0.0:.12g}" for v in np.asarray(values).reshape(-1)]
+
+
+def posture_path(text: str) -> Path | None:
+    """Tell a posture file from a posture name."""
+    path = Path(text).expanduser()
+    return path if path.suffix in (".json", ".yaml", ".yml") or path.is_file() else None

@@ -1,0 +1,9 @@
+"""The robots known by name: one folder each, with ``robot.toml`` and, where the model is ours, URDF and SRDF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+DATA: Final = Path(__file__).resolve().parent
+"""Folder that holds ``<name>/robot.toml``."""
