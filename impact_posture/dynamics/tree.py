@@ -371,6 +371,12 @@ class Tree:
             rows[i] = row
         return ca.densify(ca.vertcat(*[rows[slot.index] for slot in self.chart.slots]))
 
+    def turning_gradient(self, point: PointOnLink, direction: ca.SX, covector: ca.SX) -> ca.SX:
+        """Tangent gradient of ``cᵀ d(q)`` where the world direction ``d`` turns with the point's link, shape (nv,)."""
+        turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
+        turning[point.joint] = -self.to_link(point.joint, cross(direction, covector))
+        return self._gather([], [], turning)
+
     @cached_property
     def _own_inertia(self) -> ByJoint:
         return {i: constant(self.model.inertias[i].matrix()) for i in self._R}

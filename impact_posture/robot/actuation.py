@@ -1,9 +1,9 @@
 """What a robot's rotors and motors can do: allocation, hover, and lateral force.
 
-Notation is that of the whole package: ``ν = [base linear, base angular, joint rates]`` with the base twist in the
-base frame.  The equation of motion of an aerial robot with arm is ``M(q) ν̇ + h(q, ν) = G u`` with
-``u = [rotor thrusts (N), joint torques (N·m)]``.  Generalised forces are dual to ``ν``, hence ``G`` is constant:
-its rotor columns are wrenches on the base, in the base frame at its origin.
+Notation is that of the whole package: ``ν = [base linear, base angular, joint rates]`` with the base twist in
+the base frame.  The equation of motion of an aerial robot with arm is ``M(q) ν̇ + h(q, ν) = G u`` with
+``u = [rotor thrusts (N), joint torques (N·m)]``.  Generalised forces are dual to ``ν``, hence ``G`` is
+constant: its rotor columns are wrenches on the base, in the base frame at its origin.
 """
 
 from __future__ import annotations
@@ -26,41 +26,34 @@ _RESIDUAL = 1e-6
 
 @dataclass(frozen=True)
 class Allocation:
-    """How rotor thrusts make a wrench on the base.
-
-    Attributes:
-        matrix: 6 × n: base wrench ``[force (N); moment (N·m)]`` per unit thrust (N), base frame, base origin.
-        rank: 6 for a fully actuated robot.
-        condition: Largest over smallest singular value (mixes N and N·m; infinite below rank 6).
-    """
+    """How rotor thrusts make a wrench on the base."""
 
     matrix: Array
+    """6 × n: base wrench ``[force (N); moment (N·m)]`` per unit thrust (N), base frame, base origin."""
     rank: int
+    """6 for a fully actuated robot."""
     condition: float
+    """Largest over smallest singular value (mixes N and N·m); infinite below rank 6."""
 
 
 @dataclass(frozen=True)
 class Hover:
-    """Static equilibrium ``h(q, 0) = G u`` at one posture.
-
-    Attributes:
-        thrusts: Rotor thrusts, N.
-        speeds: Rotor speeds in the unit of ``speed_max``; zero where the thrust would be negative.
-        joint_torques: Torques of all joints behind the base, N·m (N for a prismatic joint).
-        thrust_margin: Least distance of a thrust to its limits over the width of its range: at most 0.5, negative
-            outside the limits.
-        torque_margin: Least ``1 - |τ|/τ_max`` over the joints; 1 where there are none.
-        residual: Largest base force or moment (N, N·m) that the rotors leave unbalanced.
-        violations: What stands against hovering here, in words; empty if nothing does.
-    """
+    """Static equilibrium ``h(q, 0) = G u`` at one posture."""
 
     thrusts: Array
+    """Rotor thrusts, N."""
     speeds: Array
+    """Rotor speeds in the unit of ``speed_max``; zero where the thrust would be negative."""
     joint_torques: Array
+    """Torques of all joints behind the base, N·m (N for a prismatic joint)."""
     thrust_margin: float
+    """Least distance of a thrust to its limits over the width of its range: at most 0.5, negative outside."""
     torque_margin: float
+    """Least ``1 - |τ|/τ_max`` over the joints; 1 where there are none."""
     residual: float
+    """Largest base force or moment (N, N·m) that the rotors leave unbalanced."""
     violations: tuple[str, ...]
+    """What stands against hovering here, in words; empty if nothing does."""
 
     @property
     def feasible(self) -> bool:
@@ -70,10 +63,10 @@ class Hover:
 
 @dataclass(frozen=True)
 class LateralForce:
-    """Largest net horizontal force without tilting or turning, each way, N (zero or above; NaN without hover).
+    """Largest net horizontal force without tilting or turning, each way, N; NaN where the robot cannot hover.
 
-    The force acts through the centre of mass of the robot with its arm held still.  Forward and left are the base's
-    x and y axes made horizontal.
+    The force acts through the centre of mass of the robot with its arm held still.  Forward and left are the
+    base's x and y axes made horizontal.
     """
 
     forward: float
@@ -108,15 +101,9 @@ def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
 def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
     """Map rotor thrusts (N) to the base wrench ``[force; moment]``, in the base frame at its origin.
 
-    A rotor at ``p`` with unit thrust direction ``d``, spin ``s`` and drag ratio ``κ`` contributes per unit thrust
-    ``[d; p × d - s κ d]``, first in the propulsion frame, then carried to the base (root joint) frame.
-
-    Args:
-        model: Free-flying model; the propulsion frame must sit on its base body.
-        propulsion: Rotor geometry and coefficients.
-
-    Returns:
-        6 × n_rotors.
+    A rotor at ``p`` with unit thrust direction ``d``, spin ``s`` and drag ratio ``κ`` contributes per unit
+    thrust ``[d; p × d - s κ d]``, first in the propulsion frame, then carried to the base (root joint) frame:
+    6 × n_rotors.  The model must be free-flying, with the propulsion frame on its base body.
     """
     _require_free_flyer(model)
     if not model.existFrame(propulsion.frame):
@@ -129,7 +116,9 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
             mend="name a frame that is fixed to the floating base",
         )
     if not propulsion.rotors:
-        raise SpecError("there are no rotors", where="propulsion.rotors", mend="list them, or leave propulsion out")
+        raise SpecError(
+            "there are no rotors", where="propulsion.rotors", mend="list them, or leave propulsion out"
+        )
     columns = []
     for rotor in propulsion.rotors:
         direction = np.asarray(rotor.direction, dtype=float)
@@ -158,10 +147,8 @@ def allocation(model: pin.Model, propulsion: PropulsionSpec) -> Allocation:
 def actuation_matrix(model: pin.Model, propulsion: PropulsionSpec | None = None) -> Array:
     """Return the constant ``G`` of ``M ν̇ + h = G u``, ``u = [thrusts (N); joint torques (N·m)]``.
 
-    Without ``propulsion`` the base of a free-flying robot is not actuated; a fixed-base robot has ``G = I``.
-
-    Returns:
-        nv × (n_rotors + n_joints), joints in the order of ``ν``.
+    It is nv × (n_rotors + n_joints), joints in the order of ``ν``.  Without ``propulsion`` the base of a
+    free-flying robot is not actuated; a fixed-base robot has ``G = I``.
     """
     base = 6 if _is_free_flyer(model) else 0
     rotors = np.zeros((base, 0)) if propulsion is None else allocation_matrix(model, propulsion)
@@ -175,13 +162,9 @@ def actuation_matrix(model: pin.Model, propulsion: PropulsionSpec | None = None)
 def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
     """Find the thrusts and torques that hold posture ``q`` at rest: ``h(q, 0) = G u``.
 
-    The rows of the base fix the thrusts (six independent rotors: uniquely; more: those farthest from their limits;
-    where the rotors cannot make the wrench, the nearest one within the limits).  The other rows are the torques.
-
-    Args:
-        model: Free-flying model with effort limits.
-        propulsion: Rotor geometry, coefficients and limits.
-        q: Configuration, nq numbers.
+    The rows of the base fix the thrusts: six independent rotors uniquely; of more rotors, the thrusts farthest
+    from their limits; where the rotors cannot make the wrench, the nearest one within the limits.  The other
+    rows are the torques, compared with the model's effort limits.
     """
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)
@@ -218,13 +201,9 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
     """Find the largest net horizontal force that keeps attitude and height, in each of four directions.
 
     A linear programme for each: maximise ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0`` subject to
-    ``A f = h_b + M_b e a`` (six rows: the weight is carried, nothing else moves and nothing turns), the thrust limits
-    and ``|h_j + M_j e a| <= τ_max`` for the joints that hold the arm still; ``e`` moves the whole robot one way.
-
-    Args:
-        model: Free-flying model with effort limits.
-        propulsion: Rotor geometry, coefficients and limits.
-        q: Configuration, nq numbers; a level base for the force at zero tilt.
+    ``A f = h_b + M_b e a`` (six rows: the weight is carried, nothing else moves and nothing turns), to the
+    thrust limits and to ``|h_j + M_j e a| <= τ_max`` for the joints that hold the arm still, where ``e`` moves
+    the whole robot one way.  Give a level base for the force at zero tilt.
     """
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)
@@ -236,7 +215,9 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
     mass = float(pin.computeTotalMass(model))
     forward = rotation[:, 0] * np.array([1.0, 1.0, 0.0])
     if np.linalg.norm(forward) < 1e-6:
-        raise PostureError("the base's x axis is vertical", where="lateral force", mend="give a level posture")
+        raise PostureError(
+            "the base's x axis is vertical", where="lateral force", mend="give a level posture"
+        )
     forward /= np.linalg.norm(forward)
     left = np.array([-forward[1], forward[0], 0.0])
     limits = np.asarray(model.effortLimit)[6:]
@@ -261,7 +242,7 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
 
 
 def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
-    """Thrusts with ``A f = w``, as far from their limits as can be; the nearest within the limits if none exist."""
+    """Thrusts with ``A f = w``, as far from their limits as can be; if there are none, the nearest within."""
     count = matrix.shape[1]
     if count == 6 and np.linalg.matrix_rank(matrix) == 6:
         return np.asarray(np.linalg.solve(matrix, wrench))
@@ -296,7 +277,9 @@ def _is_free_flyer(model: pin.Model) -> bool:
 
 def _require_free_flyer(model: pin.Model) -> None:
     if not _is_free_flyer(model):
-        raise SpecError("rotors on a robot that cannot fly", where="propulsion", mend='set root = "free-flyer"')
+        raise SpecError(
+            "rotors on a robot that cannot fly", where="propulsion", mend='set root = "free-flyer"'
+        )
 
 
 def _velocity_names(model: pin.Model) -> list[str]:

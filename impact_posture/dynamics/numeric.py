@@ -1,0 +1,89 @@
+"""Pinocchio's numbers for the same model: the oracle that symbolic results are checked against."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.tree import PointOnLink
+
+Vector = NDArray[np.float64]
+
+
+class Numeric:
+    """Kinematics, mass matrix and their tangent derivatives at one configuration at a time.
+
+    Call :meth:`at` first; the other methods speak of that configuration.
+    """
+
+    def __init__(self, model: pin.Model) -> None:
+        # Gravity has no part in an impact: RNEA then is exactly M(q) a.
+        self.model = model.copy()
+        self.model.gravity = pin.Motion.Zero()
+        self.data = self.model.createData()
+        self.q = pin.neutral(model)
+        self._zero = np.zeros(model.nv)
+
+    def at(self, q: Vector) -> Numeric:
+        """Move to ``q``, shape (nq,)."""
+        self.q = np.array(q, dtype=float)
+        pin.computeJointJacobians(self.model, self.data, self.q)
+        return self
+
+    def mass_matrix(self) -> Vector:
+        """``M(q)``, shape (nv, nv), armature included."""
+        upper = np.triu(pin.crba(self.model, self.data, self.q))
+        return np.asarray(upper + np.triu(upper, 1).T)
+
+    def placement(self, point: PointOnLink) -> pin.SE3:
+        """World placement of a point's frame."""
+        return self.data.oMi[point.joint] * pin.SE3(point.rotation, point.position)
+
+    def jacobian(self, point: PointOnLink) -> Vector:
+        """``J``, shape (6, nv): world linear and angular velocity of the point (LOCAL_WORLD_ALIGNED)."""
+        local = pin.getJointJacobian(self.model, self.data, point.joint, pin.LOCAL)
+        local = np.asarray(local).reshape(6, -1)
+        R = self.data.oMi[point.joint].rotation
+        linear = local[:3] - pin.skew(point.position) @ local[3:]
+        return np.vstack([R @ linear, R @ local[3:]])
+
+    def center_of_mass(self) -> tuple[Vector, Vector]:
+        """World centre of mass, shape (3,), and its Jacobian, shape (3, nv)."""
+        J = np.array(pin.jacobianCenterOfMass(self.model, self.data, self.q)).reshape(3, -1)
+        return np.array(self.data.com[0]), J
+
+    def inertial_gradient(self, left: Vector, right: Vector) -> Vector:
+        """Tangent gradient of ``leftᵀ M(q) right``, shape (nv,), by Pinocchio's RNEA derivatives."""
+        dtau_dq = pin.computeRNEADerivatives(self.model, self.data, self.q, self._zero, right)[0]
+        gradient = np.asarray(dtau_dq).reshape(self.model.nv, -1).T @ left
+        self.at(self.q)  # the derivatives' sweep leaves its own state in data
+        return np.asarray(gradient)
+
+    def coupling_gradient(self, point: PointOnLink, wrench: Vector, v: Vector, *, in_frame: bool = False) -> Vector:
+        """Tangent gradient of ``wᵀ J(q) v``, shape (nv,), with ``w`` constant in the world or in the frame.
+
+        Pinocchio's LOCAL velocity derivatives are true derivatives of the local velocity; the world's follow by
+        turning them (its LOCAL_WORLD_ALIGNED ones leave the turning out).
+        """
+        pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
+        dv_dq = np.asarray(
+            pin.getJointVelocityDerivatives(self.model, self.data, point.joint, pin.LOCAL)[0]
+        ).reshape(6, -1)
+        motion = self.data.v[point.joint]
+        R = np.array(self.data.oMi[point.joint].rotation)
+        shift = -pin.skew(point.position)
+        d_linear = dv_dq[:3] + shift @ dv_dq[3:]
+        linear = motion.linear + shift @ motion.angular
+        axes = point.rotation if in_frame else R.T
+        force, moment = axes @ wrench[:3], axes @ wrench[3:]
+        gradient = d_linear.T @ force + dv_dq[3:].T @ moment
+        self.at(self.q)
+        if not in_frame:
+            angular = np.asarray(pin.getJointJacobian(self.model, self.data, point.joint, pin.LOCAL)).reshape(6, -1)[3:]
+            gradient = gradient + angular.T @ (np.cross(linear, force) + np.cross(motion.angular, moment))
+        return np.asarray(gradient)
+
+    def turning_gradient(self, point: PointOnLink, direction: Vector, covector: Vector) -> Vector:
+        """Tangent gradient of ``cᵀ d(q)`` where the world direction ``d`` turns with the point's link, shape (nv,)."""
+        return np.asarray(self.jacobian(point)[3:].T @ np.cross(direction, covector))

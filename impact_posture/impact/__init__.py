@@ -1,0 +1,1 @@
+"""The impact: contacts, metric, objectives, ellipsoids and their two ways of being computed."""

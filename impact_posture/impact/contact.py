@@ -1,0 +1,129 @@
+"""Where the blow comes from, and which feet stay on the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.errors import ContactError
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.spec import SupportKind, SupportSpec, Vector3
+
+Vector = NDArray[np.float64]
+NormalFrame = Literal["world", "contact"]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A point of the robot that will touch a surface.
+
+    Attributes:
+        frame: The frame that carries the contact point.
+        normal: Unit vector out of the surface, towards the robot, shape (3,).
+        offset: Contact point from the frame's origin, in the frame, metres.
+        normal_frame: Axes of ``normal``: the world, or the contact frame (the normal then turns with the robot).
+        impulse: Largest impulse λ̄ along the normal, N·s.
+    """
+
+    frame: str
+    normal: Vector3
+    offset: Vector3 = (0.0, 0.0, 0.0)
+    normal_frame: NormalFrame = "world"
+    impulse: float = 1.0
+
+    @staticmethod
+    def create(
+        frame: str,
+        normal: Vector3,
+        offset: Vector3 = (0.0, 0.0, 0.0),
+        normal_frame: NormalFrame = "world",
+        impulse: float = 1.0,
+    ) -> Contact:
+        """Check and normalise.
+
+        Raises:
+            ContactError: Zero or non-finite normal, offset or impulse.
+        """
+        n = np.array(normal, dtype=float)
+        if n.shape != (3,) or not np.isfinite(n).all() or np.linalg.norm(n) < 1e-9:
+            raise ContactError(
+                f"the normal {tuple(normal)} has no direction", where="--normal", mend="give three numbers, not all zero"
+            )
+        if not np.isfinite(np.array(offset, dtype=float)).all():
+            raise ContactError("the offset is not finite", where="--offset", mend="give three numbers")
+        if not (np.isfinite(impulse) and impulse > 0):
+            raise ContactError(f"the impulse bound is {impulse:g}", where="--impulse", mend="give N·s above zero")
+        n = n / np.linalg.norm(n)
+        x, y, z = (float(v) for v in n)
+        return Contact(frame, (x, y, z), tuple(float(v) for v in offset), normal_frame, float(impulse))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Support:
+    """A foot that stays: ``point`` holds three, ``surface`` six velocities at zero up to the compliance.
+
+    Attributes:
+        frame: The foot's frame.
+        kind: ``point`` or ``surface``.
+        offset: Contact point from the frame's origin, in the frame, metres.
+        size: Half extents (x, y) of the sole in its frame, metres.
+    """
+
+    frame: str
+    kind: SupportKind = "point"
+    offset: Vector3 = (0.0, 0.0, 0.0)
+    size: tuple[float, float] = (0.0, 0.0)
+
+    @staticmethod
+    def from_spec(spec: SupportSpec) -> Support:
+        """The support that a ``robot.toml`` names."""
+        return Support(spec.frame, spec.kind, spec.offset, spec.size)
+
+    @property
+    def rows(self) -> int:
+        """Velocities that it holds."""
+        return 3 if self.kind == "point" else 6
+
+
+def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> PointOnLink:
+    """Resolve a frame and an offset in it to a point on a link.
+
+    Raises:
+        FrameNotFound: No such frame.
+        ContactError: The frame is welded to the world.
+    """
+    found = robot.model.frames[robot.frame_id(frame)]
+    if found.parentJoint == 0:
+        raise ContactError(
+            f"frame '{frame}' is welded to the world and cannot move",
+            where=robot.name,
+            mend="choose a frame on a moving link, or --root free-flyer",
+        )
+    position = found.placement.act(np.array(offset, dtype=float))
+    return PointOnLink(int(found.parentJoint), np.array(position), np.array(found.placement.rotation))
+
+
+def default_compliance(robot: Robot) -> float:
+    """Support compliance ε in 1/kg: a foot held as if it weighed 10⁴ robots.
+
+    ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0, and moves a quantity along a direction
+    that the feet hold by about ``ε m``, here 1e-4 of itself.
+    """
+    return 1e-4 / robot.mass
+
+
+def support_inertia(robot: Robot, supports: tuple[Support, ...], compliance: float) -> dict[int, Vector]:
+    """``J_sᵀJ_s/ε`` as 6×6 inertias on the feet's links: a point mass ``1/ε`` (and for a surface a moment ``1/ε``)."""
+    extra: dict[int, Vector] = {}
+    for support in supports:
+        point = point_on(robot, support.frame, support.offset)
+        jacobian = np.eye(6)
+        jacobian[:3, 3:] = -pin.skew(point.position)
+        jacobian = jacobian[: support.rows]
+        extra[point.joint] = extra.get(point.joint, np.zeros((6, 6))) + jacobian.T @ jacobian / compliance
+    return extra

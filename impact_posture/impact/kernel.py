@@ -1,0 +1,190 @@
+"""The impact quantities and their tangent gradients as expressions, by the adjoints of the theory page.
+
+With feet held at compliance ε every formula below stands as it is, with ``M + J_sᵀJ_s/ε`` for ``M``: the robot whose
+feet carry the point mass 1/ε.  So there is one code path, free or standing.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.dynamics.tree import ByJoint, Coupling, PointOnLink, Product, Tree, Wrench
+from impact_posture.impact.contact import Contact, Support, point_on, support_inertia
+from impact_posture.impact.metric import Metric
+from impact_posture.robot.robot import Robot
+
+
+class ImpactKernel:
+    """Symbolic ``H, G, V, S, E, Λ_c`` and gradients of one contact.
+
+    Args:
+        robot: The robot.
+        contact: Frame, offset and the frame that the normal is given in.
+        metric: Weight of the jump.
+        supports: Feet that stay; empty for a robot that flies or is bolted down.
+        compliance: ε of the supports, 1/kg.
+        q: Configuration symbols, shape (nq, 1).
+        n: Normal symbols, shape (3, 1), in ``contact.normal_frame``.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        contact: Contact,
+        metric: Metric,
+        supports: tuple[Support, ...],
+        compliance: float,
+        q: ca.SX,
+        n: ca.SX,
+    ) -> None:
+        self.robot, self.contact, self.metric = robot, contact, metric
+        self.q, self.n = q, n
+        self.tree = Tree(robot.model, q, extra_inertia=support_inertia(robot, supports, compliance))
+        self.point: PointOnLink = point_on(robot, contact.frame, contact.offset)
+        self._supported = bool(supports)
+
+    @cached_property
+    def blow(self) -> Wrench:
+        """The unit impulse along the normal."""
+        return Wrench(self.point, self.n, ca.SX.zeros(3), in_frame=self.contact.normal_frame == "contact")
+
+    @cached_property
+    def world_normal(self) -> ca.SX:
+        """The normal in world axes, shape (3,)."""
+        if self.contact.normal_frame == "world":
+            return self.n
+        return self.tree.rotation(self.point) @ self.n
+
+    @cached_property
+    def jump(self) -> tuple[ca.SX, ByJoint]:
+        """``a = M⁻¹Jᵀn`` and its link velocities."""
+        return self.tree.solve(wrenches=[self.blow])
+
+    # ---- H, G and what follows from them ----------------------------------------------------------------------
+
+    @cached_property
+    def H(self) -> ca.SX:
+        """``aᵀWa``: squared jump per squared impulse."""
+        a, velocities = self.jump
+        return ca.dot(a, self._weigh(a, velocities))
+
+    @cached_property
+    def G(self) -> ca.SX:
+        """``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg."""
+        return self._along(self.blow, self.jump[1])
+
+    @cached_property
+    def grad_H(self) -> ca.SX:
+        """``2 ∂_q[nᵀJb − bᵀMa]`` with ``Mb = Wa`` (plus ``∂_q aᵀMa`` where W = M), shape (nv,)."""
+        a, va = self.jump
+        if self.metric.kind == "kinetic" and not self._supported:
+            return self.grad_G
+        _, vb = self.tree.solve(tau=self._weigh(a, va))
+        gradient = self.tree.bracket_gradient(
+            [Coupling(self.blow, vb, 2.0)], [Product(va, vb, -2.0), *self._metric_product(va)]
+        )
+        return gradient
+
+    @cached_property
+    def grad_G(self) -> ca.SX:
+        """``∂_q[2nᵀJa − aᵀMa]``, shape (nv,)."""
+        va = self.jump[1]
+        return self.tree.bracket_gradient([Coupling(self.blow, va, 2.0)], [Product(va, va, -1.0)])
+
+    @cached_property
+    def V(self) -> ca.SX:
+        """``H/G²``: squared jump per squared approach speed."""
+        return self.H / self.G**2
+
+    @cached_property
+    def grad_V(self) -> ca.SX:
+        """Tangent gradient of V, shape (nv,)."""
+        return self.grad_H / self.G**2 - 2 * self.H / self.G**3 * self.grad_G
+
+    @cached_property
+    def E(self) -> ca.SX:
+        """``1/(2G) = m_eff/2``, kg."""
+        return 1 / (2 * self.G)
+
+    @cached_property
+    def grad_E(self) -> ca.SX:
+        """Tangent gradient of E, shape (nv,)."""
+        return -self.grad_G / (2 * self.G**2)
+
+    # ---- three directions: the ellipsoid and sticking ---------------------------------------------------------
+
+    @cached_property
+    def _axes(self) -> list[tuple[ca.SX, ByJoint]]:
+        """``M⁻¹Jᵀe_k`` of the three world directions."""
+        eye = np.eye(3)
+        zero = ca.SX.zeros(3)
+        return [self.tree.solve(wrenches=[Wrench(self.point, ca.SX(eye[k]), zero)]) for k in range(3)]
+
+    @cached_property
+    def ellipsoid(self) -> ca.SX:
+        """``Λ_c = J M⁻¹ W M⁻¹ Jᵀ``, shape (3, 3)."""
+        columns = [self._weigh(a, v) for a, v in self._axes]
+        return ca.blockcat([[ca.dot(self._axes[i][0], columns[j]) for j in range(3)] for i in range(3)])
+
+    @cached_property
+    def mobility(self) -> ca.SX:
+        """``J M⁻¹ Jᵀ``, shape (3, 3), 1/kg."""
+        return ca.horzcat(*[self.tree.point_velocity(self.point, v)[:3] for _, v in self._axes])
+
+    @cached_property
+    def _sticking(self) -> tuple[ca.SX, ca.SX, ByJoint]:
+        """Impulse ``s`` per unit approach speed, jump ``a = M⁻¹Jᵀs`` and its link velocities."""
+        s = _inverse3(self.mobility) @ self.world_normal
+        a = sum((self._axes[k][0] * s[k] for k in range(3)), ca.SX.zeros(self.tree.nv))
+        velocities = {i: sum(self._axes[k][1][i] * s[k] for k in range(3)) for i in self._axes[0][1]}
+        return s, a, velocities
+
+    @cached_property
+    def S(self) -> ca.SX:
+        """``‖M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹n‖²_W``: as V when the contact point sticks."""
+        _, a, velocities = self._sticking
+        return ca.dot(a, self._weigh(a, velocities))
+
+    @cached_property
+    def grad_S(self) -> ca.SX:
+        """``2 ∂_q[sᵀJb + rᵀJa − bᵀMa]`` (and ``−2rᵀn(q)`` for a normal that turns with the robot), shape (nv,)."""
+        s, a, va = self._sticking
+        free_b, free_vb = self.tree.solve(tau=self._weigh(a, va))
+        r = -_inverse3(self.mobility) @ self.tree.point_velocity(self.point, free_vb)[:3]
+        vb = {i: free_vb[i] + sum(self._axes[k][1][i] * r[k] for k in range(3)) for i in free_vb}
+        zero = ca.SX.zeros(3)
+        gradient = self.tree.bracket_gradient(
+            [
+                Coupling(Wrench(self.point, s, zero), vb, 2.0),
+                Coupling(Wrench(self.point, r, zero), va, 2.0),
+            ],
+            [Product(va, vb, -2.0), *self._metric_product(va)],
+        )
+        if self.contact.normal_frame == "contact":
+            gradient = gradient - 2 * self.tree.turning_gradient(self.point, self.world_normal, r)
+        return gradient
+
+    # ---- parts ------------------------------------------------------------------------------------------------
+
+    def _weigh(self, a: ca.SX, velocities: ByJoint) -> ca.SX:
+        if self.metric.kind == "kinetic":
+            return self.tree.own_mass_times(a, velocities)
+        if self.metric.weights is None:
+            return a
+        return ca.SX(self.metric.diagonal(self.tree.nv)) * a
+
+    def _metric_product(self, va: ByJoint) -> list[Product]:
+        return [Product(va, va, 1.0, extra=False)] if self.metric.kind == "kinetic" else []
+
+    def _along(self, wrench: Wrench, velocities: ByJoint) -> ca.SX:
+        return ca.dot(self.tree.link_force(wrench), velocities[wrench.point.joint])
+
+
+def _inverse3(A: ca.SX) -> ca.SX:
+    """Inverse of a symmetric 3×3 by cofactors."""
+    rows = [A[k, :].T for k in range(3)]
+    cofactors = ca.horzcat(ca.cross(rows[1], rows[2]), ca.cross(rows[2], rows[0]), ca.cross(rows[0], rows[1]))
+    return cofactors / ca.dot(rows[0], cofactors[:, 0])

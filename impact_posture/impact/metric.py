@@ -1,0 +1,93 @@
+"""How a velocity jump is measured: ``‖Δν‖²_W``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from impact_posture.errors import MetricError
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.spec import read_toml
+
+MetricKind = Literal["euclidean", "kinetic", "weighted"]
+ObjectiveKind = Literal["impulse", "speed", "sticking", "energy"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """The weight ``W`` of ``‖Δν‖²_W``.
+
+    Attributes:
+        kind: ``euclidean`` (W = I), ``kinetic`` (W = M) or ``weighted`` (diagonal).
+        weights: The diagonal of ``weighted``, shape (nv,), else ``None``.
+        source: Where the weights came from.
+    """
+
+    kind: MetricKind = "euclidean"
+    weights: tuple[float, ...] | None = None
+    source: str = ""
+
+    def diagonal(self, nv: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        """The diagonal of ``W`` for a constant metric, shape (nv,)."""
+        return np.ones(nv) if self.weights is None else np.array(self.weights)
+
+
+def build_metric(robot: Robot, kind: MetricKind, weights: str | None = None) -> Metric:
+    """Build a metric; ``weights`` is a TOML file of joint = weight (``base = [6 numbers]``) or ``velocity-limits``.
+
+    Raises:
+        MetricError: Missing, zero or negative weights.
+    """
+    if kind != "weighted":
+        if weights is not None:
+            raise MetricError(
+                f"--weights goes with --metric weighted, not {kind}", where="--weights", mend="add --metric weighted"
+            )
+        return Metric(kind)
+    if weights is None:
+        raise MetricError(
+            "the weighted metric needs weights", where="--metric", mend="add --weights FILE or velocity-limits"
+        )
+    values = _from_limits(robot) if weights == "velocity-limits" else _from_file(robot, Path(weights))
+    for name, value in zip(robot.tangent_names, values, strict=True):
+        if not (np.isfinite(value) and value > 0):
+            raise MetricError(
+                f"the weight of '{name}' is {value:g}", where=weights, mend="every weight must be above zero"
+            )
+    return Metric("weighted", tuple(float(v) for v in values), weights)
+
+
+def _from_limits(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    limits = np.array(robot.model.upperVelocityLimit, dtype=float)
+    base = 6 if robot.floating else 0
+    # A base has no velocity limits; 1 m/s and 1 rad/s keep it in the sum.
+    limits[:base] = 1.0
+    for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
+        if not (np.isfinite(limit) and 0 < limit < 1e6):
+            raise MetricError(
+                f"joint '{name}' has no velocity limit", where="--weights velocity-limits",
+                mend="add it to robot.toml [limits.velocity] or give a file",
+            )
+    return np.asarray(1.0 / limits**2)
+
+
+def _from_file(robot: Robot, path: Path) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    table = read_toml(path)
+    values = np.ones(robot.nv)
+    base = 6 if robot.floating else 0
+    for key, value in table.items():
+        try:
+            if key == "base" and base:
+                values[:6] = np.array(value, dtype=float)
+            else:
+                joint = robot.joint_id(key)
+                first = robot.model.idx_vs[joint]
+                values[first : first + robot.model.nvs[joint]] = float(value)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            raise MetricError(
+                f"key '{key}' holds no number", where=str(path), mend="joint = weight; base = [6 numbers]"
+            ) from None
+    return values

@@ -1,0 +1,193 @@
+"""The impact quantities from Pinocchio's numbers, by dense linear algebra: an independent second opinion.
+
+Feet enter by the KKT system ``[M, −J_sᵀ; J_s, εI]`` and not by the heavy-foot shortcut of the symbolic kernel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.contact import Contact, Support, point_on
+from impact_posture.impact.metric import Metric
+from impact_posture.robot.robot import Robot
+
+Vector = NDArray[np.float64]
+
+# Relative size of a singular value of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
+_RANK = 1e-9
+
+
+@dataclass(frozen=True)
+class ImpactQuantities:
+    """Everything that one contact means at one posture.
+
+    Attributes:
+        H: ``nᵀΛ_c n``, squared jump per squared impulse.
+        G: ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg.
+        V: ``H/G²``, squared jump per squared approach speed (frictionless, e = 0).
+        S: The same when the contact sticks; ``None`` where it does not exist.
+        E: ``1/(2G)``, energy dissipated per squared approach speed, kg.
+        jump: ``a = M⁻¹Jᵀn``, shape (nv,).
+        sticking_jump: Jump per unit approach speed when sticking, shape (nv,), or ``None``.
+        sticking_impulse: Impulse per unit approach speed when sticking, world, shape (3,), or ``None``.
+        ellipsoid: ``Λ_c``, shape (3, 3).
+        mobility: ``JM⁻¹Jᵀ``, shape (3, 3), 1/kg.
+        normal: World unit normal, shape (3,).
+        support_impulse: ``f`` per unit impulse, stacked rows of the supports.
+    """
+
+    H: float
+    G: float
+    V: float
+    S: float | None
+    E: float
+    jump: Vector
+    sticking_jump: Vector | None
+    sticking_impulse: Vector | None
+    ellipsoid: Vector
+    mobility: Vector
+    normal: Vector
+    support_impulse: Vector
+
+
+class ImpactOracle:
+    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one contact."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        contact: Contact,
+        metric: Metric,
+        supports: tuple[Support, ...] = (),
+        compliance: float = 1.0,
+    ) -> None:
+        self.robot, self.contact, self.metric = robot, contact, metric
+        self.numeric = Numeric(robot.model)
+        self.point = point_on(robot, contact.frame, contact.offset)
+        self.feet = [(point_on(robot, s.frame, s.offset), s.rows) for s in supports]
+        self.compliance = compliance
+        self._q: Vector | None = None
+
+    def at(self, q: Vector) -> ImpactOracle:
+        """Move to ``q`` and factorise there."""
+        if self._q is not None and np.array_equal(q, self._q):
+            return self
+        self._q = np.array(q, dtype=float)
+        num = self.numeric.at(self._q)
+        self.M = num.mass_matrix()
+        self.J = num.jacobian(self.point)[:3]
+        parts = [num.jacobian(point)[:rows] for point, rows in self.feet]
+        self.Js = np.vstack(parts) if parts else np.zeros((0, self.robot.nv))
+        rows, nv = self.Js.shape
+        kkt = np.block([[self.M, -self.Js.T], [self.Js, self.compliance * np.eye(rows)]])
+        self._lu = scipy.linalg.lu_factor(kkt)
+        n = np.array(self.contact.normal)
+        self.n = n if self.contact.normal_frame == "world" else num.placement(self.point).rotation @ n
+        self._nv = nv
+        return self
+
+    def solve(self, tau: Vector) -> Vector:
+        """``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector or columns."""
+        rhs = np.vstack([tau.reshape(self._nv, -1), np.zeros((len(self.Js), tau.reshape(self._nv, -1).shape[1]))])
+        return np.asarray(scipy.linalg.lu_solve(self._lu, rhs)[: self._nv]).reshape(tau.shape)
+
+    def weigh(self, a: Vector) -> Vector:
+        """``W a``."""
+        if self.metric.kind == "kinetic":
+            return np.asarray(self.M @ a)
+        return np.asarray((self.metric.diagonal(self._nv) * a.T).T)
+
+    def quantities(self, q: Vector) -> ImpactQuantities:
+        """All quantities at ``q``."""
+        self.at(q)
+        A = self.solve(self.J.T)
+        mobility = self.J @ A
+        mobility = (mobility + mobility.T) / 2
+        ellipsoid = A.T @ self.weigh(A)
+        a = A @ self.n
+        H, G = float(a @ self.weigh(a)), float(self.n @ mobility @ self.n)
+        s = _sticking_impulse(mobility, self.n)
+        stuck = None if s is None else A @ s
+        return ImpactQuantities(
+            H=H,
+            G=G,
+            V=H / G**2 if G > 0 else float("inf"),
+            S=None if stuck is None else float(stuck @ self.weigh(stuck)),
+            E=1 / (2 * G) if G > 0 else float("inf"),
+            jump=a,
+            sticking_jump=stuck,
+            sticking_impulse=s,
+            ellipsoid=(ellipsoid + ellipsoid.T) / 2,
+            mobility=mobility,
+            normal=self.n.copy(),
+            support_impulse=-self.Js @ a / self.compliance,
+        )
+
+    # ---- gradients --------------------------------------------------------------------------------------------
+
+    def gradient_H(self, q: Vector) -> Vector:
+        """Tangent gradient of H, shape (nv,)."""
+        self.at(q)
+        a = self.solve(self.J.T @ self.n)
+        b = self.solve(self.weigh(a))
+        in_frame = self.contact.normal_frame == "contact"
+        gradient = 2 * (self._coupling(self.n, b, in_frame) - self._inertial(b, a))
+        return gradient + self._metric_gradient(a)
+
+    def gradient_G(self, q: Vector) -> Vector:
+        """Tangent gradient of G, shape (nv,)."""
+        self.at(q)
+        a = self.solve(self.J.T @ self.n)
+        return 2 * self._coupling(self.n, a, self.contact.normal_frame == "contact") - self._inertial(a, a)
+
+    def gradient_S(self, q: Vector) -> Vector:
+        """Tangent gradient of S where ``JM⁻¹Jᵀ`` is regular, shape (nv,)."""
+        self.at(q)
+        A = self.solve(self.J.T)
+        mobility = self.J @ A
+        s = np.linalg.solve(mobility, self.n)
+        a = A @ s
+        free = self.solve(self.weigh(a))
+        r = -np.linalg.solve(mobility, self.J @ free)
+        b = free + A @ r
+        gradient = 2 * (self._coupling(s, b, False) + self._coupling(r, a, False) - self._inertial(b, a))
+        if self.contact.normal_frame == "contact":
+            gradient = gradient - 2 * self.numeric.turning_gradient(self.point, self.n, r)
+        return gradient + self._metric_gradient(a)
+
+    def _coupling(self, world: Vector, v: Vector, in_frame: bool) -> Vector:
+        direction = np.array(self.contact.normal) if in_frame else world
+        wrench = np.concatenate([direction, np.zeros(3)])
+        return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)
+
+    def _inertial(self, left: Vector, right: Vector) -> Vector:
+        """``∂_q leftᵀ(M + J_sᵀJ_s/ε) right``."""
+        gradient = self.numeric.inertial_gradient(left, right)
+        first = 0
+        for point, rows in self.feet:
+            J = self.Js[first : first + rows]
+            for one, other in ((left, right), (right, left)):
+                wrench = np.zeros(6)
+                wrench[:rows] = J @ one / self.compliance
+                gradient = gradient + self.numeric.coupling_gradient(point, wrench, other)
+            first += rows
+        return gradient
+
+    def _metric_gradient(self, a: Vector) -> Vector:
+        return self.numeric.inertial_gradient(a, a) if self.metric.kind == "kinetic" else np.zeros(self._nv)
+
+
+def _sticking_impulse(mobility: Vector, n: Vector) -> Vector | None:
+    """``(JM⁻¹Jᵀ)⁺ n``, or ``None`` where the matrix is singular and ``n`` leaves its range."""
+    values, vectors = np.linalg.eigh(mobility)
+    kept = values > _RANK * max(values[-1], 1e-300)
+    coordinates = vectors.T @ n
+    if np.abs(coordinates[~kept]).max(initial=0.0) > np.sqrt(_RANK):
+        return None
+    inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
+    return np.asarray(vectors @ (inverse * coordinates))
