@@ -1,4 +1,4 @@
-"""The robots known by name: a folder each, with ``robot.toml`` and, where the model is ours, URDF and SRDF."""
+"""The robots known by name: a folder each, with ``robot.toml`` and, where it is ours, URDF and SRDF."""
 
 from __future__ import annotations
 

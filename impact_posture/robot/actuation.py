@@ -162,7 +162,7 @@ def actuation_matrix(model: pin.Model, propulsion: PropulsionSpec | None = None)
 def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
     """Find the thrusts and torques that hold posture ``q`` at rest: ``h(q, 0) = G u``.
 
-    The rows of the base fix the thrusts: six independent rotors uniquely; of more rotors, the thrusts farthest
+    The rows of the base fix the thrusts: six independent rotors uniquely; of more rotors, those farthest
     from their limits; where the rotors cannot make the wrench, the nearest one within the limits.  The other
     rows are the torques, compared with the model's effort limits.
     """
@@ -200,10 +200,10 @@ def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
 def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> LateralForce:
     """Find the largest net horizontal force that keeps attitude and height, in each of four directions.
 
-    A linear programme for each: maximise ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0`` subject to
-    ``A f = h_b + M_b e a`` (six rows: the weight is carried, nothing else moves and nothing turns), to the
-    thrust limits and to ``|h_j + M_j e a| <= τ_max`` for the joints that hold the arm still, where ``e`` moves
-    the whole robot one way.  Give a level base for the force at zero tilt.
+    A linear programme for each: maximise ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0``, subject
+    to ``A f = h_b + M_b e a`` (six rows: the weight is carried, nothing else moves and nothing turns), to the
+    thrust limits and to ``|h_j + M_j e a| <= τ_max`` for the joints that hold the arm still; ``e`` moves the
+    whole robot one way.  Give a level base for the force at zero tilt.
     """
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)

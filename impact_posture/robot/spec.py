@@ -55,8 +55,8 @@ class ContactSpec(_Strict):
 class SupportSpec(_Strict):
     """A foot that stays on the ground.
 
-    ``point``: the frame origin (plus ``offset``, in the frame) does not move.  ``surface``: the frame's whole pose.
-    ``size``: half extents (x, y) of a sole in its frame, metres; it widens the support polygon.
+    ``point``: the contact point (frame origin plus ``offset``, in the frame) does not move.  ``surface``: the whole pose.
+    ``size``: half extents (x, y) of a sole around that point, in the frame, metres; it widens the support polygon.
     """
 
     frame: str
