@@ -5,7 +5,6 @@ An objective is a metric × a kind × supports × one contact; none of the combi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -32,14 +31,12 @@ class Lifted:
     Attributes:
         variables: Auxiliary unknowns, shape (k, 1).
         residual: Equations that fix them, ``= 0``, shape (k, 1).
-        value: The objective in terms of configuration and auxiliaries, before λ̄².
-        guess: From a configuration ``q`` (and the normal) to the auxiliaries that solve the equations.
+        value: The objective in terms of configuration and auxiliaries.
     """
 
     variables: ca.SX
     residual: ca.SX
     value: ca.SX
-    guess: Callable[[Vector], Vector]
 
 
 class Objective(Protocol):
@@ -67,6 +64,10 @@ class Objective(Protocol):
 
     def lift(self, tree: Tree, n: ca.SX) -> Lifted:
         """The value as a quadratic in auxiliaries that solve linear equations at ``tree.q``."""
+        ...
+
+    def guess(self, q: Vector) -> Vector:
+        """The lifted form's auxiliaries at ``q``."""
         ...
 
     def value(self, q: Vector) -> float:
@@ -218,9 +219,10 @@ class ImpactObjective:
             value = ca.dot(a, ca.SX(self.metric.diagonal(tree.nv)) * a)
         variables = ca.vertcat(a, f, unknown)
         residual = ca.vertcat(momentum, *held, fixing)
-        return Lifted(variables, residual, self.scale * value, self._guess)
+        return Lifted(variables, residual, self.scale * value)
 
-    def _guess(self, q: Vector) -> Vector:
+    def guess(self, q: Vector) -> Vector:
+        """The auxiliaries of :meth:`lift` that solve its equations at ``q``."""
         quantities = self.oracle.quantities(q)
         if self.kind == "impulse":
             a, unknown = quantities.jump, np.zeros(0)

@@ -1,1 +1,1 @@
-"""."""
+"""The offline optimization: constraints, programme, multi-start, certificate, result."""

@@ -1,0 +1,173 @@
+"""The nonlinear programme: built once, solved for many starts, normals and targets.
+
+Formulation (the "lifted" one): the impact's linear solve is left to IPOPT,
+
+    min over x, a, f, s   aᵀWa        (or λ/2)
+    subject to            M(q)a − J_sᵀf − Jᵀs = 0,  J_s a + εf = 0,  what ties s to n,
+                          c(q) within bounds,  |quaternions| = 1,  limits,
+
+so that every function is linear or quadratic in the auxiliaries and the exact Hessian stays small: about a fifth of
+the reduced form's operations on talos (``tests/benchmarks/formulations.py`` measures both).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.tree import Tree
+from impact_posture.posture.compiled import CompileMode, compiled_solver
+from impact_posture.posture.problem import PostureProblem
+
+Vector = NDArray[np.float64]
+
+IPOPT_OPTIONS: dict[str, object] = {
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.tol": 1e-9,
+    "ipopt.constr_viol_tol": 1e-10,
+    "ipopt.dual_inf_tol": 1e-7,
+    "ipopt.compl_inf_tol": 1e-9,
+    # Bounds are the robot's limits: they are not for the solver to relax.
+    "ipopt.bound_relax_factor": 0.0,
+    "ipopt.honor_original_bounds": "yes",
+    "ipopt.mu_strategy": "adaptive",
+    "ipopt.max_iter": 300,
+    "print_time": False,
+    "calc_lam_p": False,
+    "error_on_fail": False,
+}
+CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+
+
+@dataclass(frozen=True)
+class SolveRecord:
+    """What one run of the solver gave.
+
+    Attributes:
+        q: Configuration at its end, shape (nq,).
+        status: IPOPT's word.
+        iterations: Its iterations.
+        time_s: Wall time of the call.
+    """
+
+    q: Vector
+    status: str
+    iterations: int
+    time_s: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether IPOPT says that it converged; no proof (see the certificate)."""
+        return self.status in CONVERGED
+
+
+@dataclass(frozen=True)
+class PostureNLP:
+    """A built programme.
+
+    Attributes:
+        problem: What it stands for.
+        chart: Coordinates.
+        solver: CasADi's ``nlpsol``.
+        size: Numbers of unknowns, of which the first ``chart.nx`` are ``x``.
+        build_time_s: Time to build (and compile) it.
+        compiled: Whether its functions run as machine code.
+    """
+
+    problem: PostureProblem
+    chart: Chart
+    solver: ca.Function
+    size: int
+    build_time_s: float
+    compiled: bool
+
+    def solve(self, start: Vector, *, scale: float | None = None, max_iter: int | None = None) -> SolveRecord:
+        """Solve from the configuration ``start``; the objective is scaled by its value there unless told otherwise."""
+        problem, nx = self.problem, self.chart.nx
+        x = np.clip(self.chart.to_x(start), problem.lower, problem.upper)
+        guess = np.concatenate([x, problem.objective.guess(self.chart.to_q(x))])
+        lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        lower[:nx], upper[:nx] = problem.lower, problem.upper
+        scale = scale or problem.objective.value(self.chart.to_q(x))
+        began = time.perf_counter()
+        answer = self.solver(
+            x0=guess, lbx=lower, ubx=upper, p=parameters(problem, self.chart, scale), **_row_bounds(problem, self)
+        )
+        elapsed = time.perf_counter() - began
+        stats = self.solver.stats()
+        if stats["return_status"] == "User_Requested_Stop":
+            raise KeyboardInterrupt
+        q = self.chart.to_q(np.array(answer["x"]).reshape(-1)[:nx])
+        return SolveRecord(q, str(stats["return_status"]), int(stats["iter_count"]), elapsed)
+
+
+def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts: int = 1) -> PostureNLP:
+    """Build the programme; ``starts`` tells how often it will be solved, so that compiling is worth it or not."""
+    began = time.perf_counter()
+    chart = Chart(problem.robot.model)
+    symbols = programme(problem, chart)
+    solver, compiled = compiled_solver(problem, symbols, IPOPT_OPTIONS, compile, starts)
+    return PostureNLP(problem, chart, solver, int(symbols["x"].numel()), time.perf_counter() - began, compiled)
+
+
+def programme(problem: PostureProblem, chart: Chart) -> dict[str, ca.SX]:
+    """The programme's expressions: ``x`` (unknowns), ``p`` (parameters), ``f``, ``g``."""
+    x = ca.SX.sym("x", chart.nx)
+    n, scale, weight = ca.SX.sym("n", 3), ca.SX.sym("scale"), ca.SX.sym("weight")
+    reference = ca.SX.sym("reference", chart.nx)
+    tree = Tree(problem.robot.model, chart.configuration(x), x)
+    lifted = problem.objective.lift(tree, n)
+    rows, targets = [chart.norms(x)], []
+    for index, constraint in enumerate(problem.constraints):
+        p = ca.SX.sym(f"p{index}", len(constraint.parameters))
+        targets.append(p)
+        rows.append(constraint.symbolic(tree, p)[problem.carried(index)])
+    rows.append(lifted.residual)
+    value = lifted.value / scale + weight * distance_squared(chart, x, reference)
+    return {
+        "x": ca.vertcat(x, lifted.variables),
+        "p": ca.vertcat(n, scale, weight, reference, *targets),
+        "f": value,
+        "g": ca.vertcat(*rows),
+    }
+
+
+def distance_squared(chart: Chart, x: ca.SX, reference: ca.SX) -> ca.SX:
+    """Squared distance of two chart points; quaternions by ``4 (1 − (q·r)²)``, the squared angle to first order."""
+    total = ca.SX(0)
+    for slot in chart.slots:
+        one, other = x[slot.x], reference[slot.x]
+        width = one.numel()
+        if slot.kind.family in ("free-flyer", "spherical"):
+            total += 4 * (1 - ca.dot(one[width - 4 :], other[width - 4 :]) ** 2)
+            one, other = one[: width - 4], other[: width - 4]
+        total += ca.sumsqr(one - other)
+    return total
+
+
+def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Vector:
+    """Values of the programme's parameters."""
+    return np.concatenate(
+        [
+            np.array(problem.objective.contact.normal),
+            [scale, problem.requirements.regularization],
+            chart.to_x(problem.given),
+            *[c.parameters for c in problem.constraints],
+        ]
+    )
+
+
+def _row_bounds(problem: PostureProblem, nlp: PostureNLP) -> dict[str, Vector]:
+    norms = np.zeros(len(nlp.chart.quaternion_slices()))
+    lifted = np.zeros(nlp.size - nlp.chart.nx)
+    rows = list(enumerate(problem.constraints))
+    return {
+        "lbg": np.concatenate([norms, *[c.lower[problem.carried(i)] for i, c in rows], lifted]),
+        "ubg": np.concatenate([norms, *[c.upper[problem.carried(i)] for i, c in rows], lifted]),
+    }

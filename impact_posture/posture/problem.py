@@ -1,0 +1,277 @@
+"""The optimization problem in the field's own terms, before any solver sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.errors import InputError
+from impact_posture.impact.contact import Support, point_on
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.constraint import (
+    CenterOfMassOverFeet,
+    Constraint,
+    HeldOrientation,
+    HeldPose,
+    HeldPosition,
+    PositionBox,
+)
+from impact_posture.posture.regular import pin_undetermined, regularize
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.spec import ContactPose, Vector3
+
+Vector = NDArray[np.float64]
+BaseMode = Literal["free", "level", "fixed", "box"]
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """What the task asks of the posture.
+
+    Attributes:
+        contact_pose: What is held of the contact frame.
+        target_position: Contact frame's position, world, metres; ``None``: where it is.
+        target_quaternion: Contact frame's orientation x y z w; ``None``: as it is.
+        box: Half extents of the box of ``contact_pose = box``, metres.
+        base: What the floating base may do: ``free``, ``level`` (tilt zero, yaw free), ``fixed``, ``box``.
+        base_box: Half extents of the box of ``base = box``, metres.
+        keep: Frames whose pose is held.
+        hold: Joints kept at their initial value.
+        com_over_feet: Keep the centre of mass above the support polygon.
+        com_margin: Distance from the polygon's edges, metres.
+        limit_margin: Distance from the joint limits, rad or m.
+        regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
+    """
+
+    contact_pose: ContactPose = "full"
+    target_position: Vector3 | None = None
+    target_quaternion: tuple[float, float, float, float] | None = None
+    box: Vector3 = (0.05, 0.05, 0.05)
+    base: BaseMode = "free"
+    base_box: Vector3 = (0.2, 0.2, 0.2)
+    keep: tuple[str, ...] = ()
+    hold: tuple[str, ...] = ()
+    com_over_feet: bool = False
+    com_margin: float = 0.0
+    limit_margin: float = 0.0
+    regularization: float = 0.0
+
+
+@dataclass(frozen=True)
+class PostureProblem:
+    """``min_q objective(q)`` under constraints, from a given posture.
+
+    Attributes:
+        robot: The robot.
+        objective: What is minimised.
+        requirements: As asked for.
+        given: Posture that the user started from, shape (nq,).
+        constraints: All but bounds.
+        lower: Bounds in chart coordinates, margin included, held joints pinned, shape (nx,).
+        upper: As ``lower``.
+        rows: Rows of each constraint that the programme carries; empty: all.
+        notes: What was decided for the user, one line each.
+    """
+
+    robot: Robot
+    objective: ImpactObjective
+    requirements: Requirements
+    given: Vector
+    constraints: tuple[Constraint, ...]
+    lower: Vector
+    upper: Vector
+    rows: tuple[tuple[int, ...], ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def carried(self, index: int) -> list[int]:
+        """Rows of constraint ``index`` that the programme carries."""
+        return list(self.rows[index]) if self.rows else list(range(self.constraints[index].rows))
+
+    def describe(self) -> list[str]:
+        """The constraints in words, one line each."""
+        lines = [_describe(c) for c in self.constraints]
+        margin = self.requirements.limit_margin
+        lines.append("joint limits" + (f", {margin:g} rad (m) inside" if margin else ""))
+        lines += [f"joint '{joint}' held" for joint in self.requirements.hold]
+        return lines
+
+
+def build_problem(
+    robot: Robot, objective: ImpactObjective, given: Vector, requirements: Requirements
+) -> PostureProblem:
+    """Turn requirements into constraints; nothing is solved yet.
+
+    Raises:
+        InputError: Requirements that contradict each other or the robot.
+    """
+    _check(robot, requirements)
+    numeric = Numeric(robot.model).at(given)
+    chart = Chart(robot.model)
+    constraints: list[Constraint] = []
+    for support in objective.supports:
+        constraints.append(_held_support(robot, numeric, support))
+    constraints += _contact_constraints(robot, objective, numeric, requirements)
+    held = {s.frame for s in objective.supports}
+    for frame in dict.fromkeys(requirements.keep):
+        if frame not in held:
+            point = point_on(robot, frame)
+            constraints.append(HeldPose(f"pose of {frame}", point, numeric.placement(point)))
+    constraints += _base_constraints(robot, numeric, requirements)
+    if requirements.com_over_feet:
+        constraints.append(_com_constraint(robot, objective.supports, numeric, requirements.com_margin))
+    lower, upper = _bounds(robot, chart, given, requirements)
+    more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
+    problem = PostureProblem(
+        robot, objective, requirements, given, (*constraints, *more), lower, upper, notes=tuple(notes)
+    )
+    return regularize(problem)
+
+
+def _check(robot: Robot, requirements: Requirements) -> None:
+    if not robot.floating and requirements.base != "free":
+        raise InputError(
+            f"base '{requirements.base}' asked of a robot whose root is fixed", where="--base",
+            mend="leave it out or use --root free-flyer",
+        )
+    for name, values in (("--box", requirements.box), ("--base-box", requirements.base_box)):
+        if not all(np.isfinite(v) and v > 0 for v in values):
+            raise InputError(f"half extents {values}", where=name, mend="give three lengths above zero")
+    for name, value in (
+        ("com_margin", requirements.com_margin),
+        ("limit_margin", requirements.limit_margin),
+        ("regularization", requirements.regularization),
+    ):
+        if not (np.isfinite(value) and value >= 0):
+            raise InputError(f"is {value:g}", where=name, mend="give a number ≥ 0")
+    quaternion = requirements.target_quaternion
+    if quaternion is not None and not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
+        raise InputError(
+            f"has norm {np.linalg.norm(quaternion):.4g}", where="--target-quaternion", mend="give a unit x y z w"
+        )
+    if requirements.target_position is not None and not np.isfinite(requirements.target_position).all():
+        raise InputError("is not finite", where="--target-position", mend="give three numbers")
+    for joint in requirements.hold:
+        robot.joint_id(joint)
+
+
+def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constraint:
+    point = point_on(robot, support.frame, support.offset)
+    placement = numeric.placement(point)
+    if support.kind == "point":
+        return HeldPosition(f"foot {support.frame}", point, placement.translation)
+    return HeldPose(f"foot {support.frame}", point, placement)
+
+
+def contact_target(robot: Robot, objective: ImpactObjective, numeric: Numeric, requirements: Requirements) -> pin.SE3:
+    """Where the contact frame is to be: the target given, else where it is at ``numeric.q``."""
+    placement = numeric.placement(point_on(robot, objective.contact.frame)).copy()
+    if requirements.target_position is not None:
+        placement.translation = np.array(requirements.target_position)
+    if requirements.target_quaternion is not None:
+        quaternion = pin.Quaternion(np.array(requirements.target_quaternion))
+        placement.rotation = quaternion.normalized().matrix()
+    return placement
+
+
+def _contact_constraints(
+    robot: Robot, objective: ImpactObjective, numeric: Numeric, requirements: Requirements
+) -> list[Constraint]:
+    contact, mode = objective.contact, requirements.contact_pose
+    point = point_on(robot, contact.frame)
+    target = contact_target(robot, objective, numeric, requirements)
+    name = f"pose of {contact.frame}"
+    if mode == "free":
+        if requirements.target_position is not None or requirements.target_quaternion is not None:
+            raise InputError(
+                "a target is given but the contact pose is free", where="--contact-pose",
+                mend="use full, position, aligned or box",
+            )
+        return []
+    if mode == "full":
+        return [HeldPose(name, point, target)]
+    if mode == "aligned":
+        n = np.array(contact.normal)
+        axis = n if contact.normal_frame == "contact" else target.rotation.T @ n
+        return [HeldPose(name, point, target, axis)]
+    if mode == "box":
+        return [PositionBox(f"position of {contact.frame}", point, target.translation, requirements.box)]
+    return [HeldPosition(f"position of {contact.frame}", point, target.translation)]
+
+
+def _base_point() -> PointOnLink:
+    return PointOnLink(1, np.zeros(3), np.eye(3))
+
+
+def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements) -> list[Constraint]:
+    if not robot.floating:
+        return []
+    base, placement = _base_point(), numeric.placement(_base_point())
+    if requirements.base == "level":
+        upright = np.array([0.0, 0.0, 1.0])
+        return [HeldOrientation("level base", base, np.eye(3), upright)]
+    if requirements.base == "fixed":
+        return [HeldPose("base", base, placement)]
+    if requirements.base == "box":
+        return [PositionBox("base position", base, placement.translation, requirements.base_box)]
+    return []
+
+
+def _com_constraint(
+    robot: Robot, supports: Sequence[Support], numeric: Numeric, margin: float
+) -> CenterOfMassOverFeet:
+    corners = []
+    for support in supports:
+        placement = numeric.placement(point_on(robot, support.frame, support.offset))
+        for sx in (-1, 1):
+            for sy in (-1, 1):
+                corner = placement.act(np.array([sx * support.size[0], sy * support.size[1], 0.0]))
+                corners.append(corner[:2])
+    try:
+        equations = ConvexHull(np.array(corners)).equations
+    except (QhullError, ValueError):
+        raise InputError(
+            "the feet span no area to keep the centre of mass above", where="com_over_feet",
+            mend="give three feet or soles with a size, or set com_over_feet = false (--no-com)",
+        ) from None
+    # One row an edge: qhull repeats the equation of an edge that it met in pieces.
+    unique = np.unique(np.round(equations, 12), axis=0)
+    return CenterOfMassOverFeet(unique[:, :2], -unique[:, 2], margin)
+
+
+def _bounds(robot: Robot, chart: Chart, given: Vector, requirements: Requirements) -> tuple[Vector, Vector]:
+    lower, upper = chart.bounds()
+    x = chart.to_x(given)
+    margin = requirements.limit_margin
+    lower, upper = lower + margin, upper - margin
+    for slot in chart.slots:
+        if slot.name in requirements.hold:
+            lower[slot.x] = upper[slot.x] = x[slot.x]
+        elif (lower[slot.x] > upper[slot.x]).any():
+            raise InputError(
+                f"a margin of {margin:g} leaves joint '{slot.name}' no room", where="limit_margin",
+                mend="give a smaller one",
+            )
+    return lower, upper
+
+
+def _describe(constraint: Constraint) -> str:
+    kind = "held" if constraint.equality else "kept within its bounds"
+    detail = ""
+    if isinstance(constraint, HeldOrientation):
+        kind, detail = "held", " (tilt zero, yaw free)" if constraint.name == "level base" else ""
+    elif isinstance(constraint, PositionBox):
+        detail = " (" + " × ".join(f"±{v:g}" for v in constraint.upper) + " m)"
+    elif isinstance(constraint, CenterOfMassOverFeet):
+        return f"{constraint.name}, {-constraint.upper[0]:g} m inside the support polygon"
+    elif isinstance(constraint, HeldPose) and constraint.rows == 5:
+        detail = " (position and normal; spin free)"
+    return f"{constraint.name} {kind}{detail}"
