@@ -1,0 +1,208 @@
+"""Does a posture solve the problem?  Asked of Pinocchio's numbers, never of the solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+import scipy.linalg
+import scipy.optimize
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.regular import RANK_TOLERANCE, equality_jacobian
+
+Vector = NDArray[np.float64]
+
+# An inequality or limit closer than this (m, rad) may carry a multiplier.
+_ACTIVE = 1e-6
+
+
+@dataclass(frozen=True)
+class Active:
+    """An inequality that holds the posture where it is.
+
+    Attributes:
+        constraint: Its name, such as ``joint 'elbow'``.
+        side: ``lower`` or ``upper``.
+        multiplier: Rise of the scaled objective per unit of the bound, ≥ 0.
+    """
+
+    constraint: str
+    side: str
+    multiplier: float
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """First-order optimality and feasibility at one posture, recomputed.
+
+    Attributes:
+        stationarity: ``‖∇f/f₀ + Aᵀλ‖_∞`` over the tangent space, f₀ the initial objective, at the best multipliers
+            with the right signs.
+        primal: Largest violation of any constraint, limit or unit norm (m, rad).
+        complementarity: Largest ``|multiplier × distance from its bound|``.
+        pose_error_m: Largest position error of a held frame, metres.
+        pose_error_rad: Largest orientation error of a held frame, radians.
+        limits: Largest violation of a joint limit, rad or m.
+        recomputed_with: What computed it.
+        active: Inequalities with a multiplier.
+    """
+
+    stationarity: float
+    primal: float
+    complementarity: float
+    pose_error_m: float
+    pose_error_rad: float
+    limits: float
+    recomputed_with: str
+    active: tuple[Active, ...]
+
+    def holds(self, *, stationarity: float = 1e-5, pose: float = 1e-6, primal: float = 1e-8) -> bool:
+        """Whether every number is within its tolerance."""
+        return (
+            self.stationarity <= stationarity
+            and self.primal <= primal
+            and self.complementarity <= stationarity
+            and max(self.pose_error_m, self.pose_error_rad) <= pose
+        )
+
+    def to_dict(self) -> dict[str, object]:
+        """The ``certificate`` block of ``result.json``."""
+        return {
+            "stationarity": self.stationarity,
+            "primal": self.primal,
+            "complementarity": self.complementarity,
+            "pose_error_m": self.pose_error_m,
+            "pose_error_rad": self.pose_error_rad,
+            "limits": self.limits,
+            "recomputed_with": self.recomputed_with,
+        }
+
+
+def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
+    """Certify ``q``; ``scale`` is the initial objective f₀."""
+    numeric = Numeric(problem.robot.model)
+    gradient = objective_gradient(problem, q, scale)
+    numeric.at(q)
+    errors = [c.pose_error(numeric) for c in problem.constraints]
+    names, sides, rows, slacks, violation = _inequalities(problem, numeric)
+    bound_rows, limit_violation = _limits(problem, q)
+    for name, side, row, slack in bound_rows:
+        names.append(name), sides.append(side), rows.append(row), slacks.append(slack)
+    multipliers, residual = _multipliers(gradient, equality_jacobian(problem, numeric), np.array(rows))
+    active = tuple(
+        Active(name, side, float(m))
+        for name, side, m in zip(names, sides, multipliers, strict=True)
+        if m > 1e-9
+    )
+    return Certificate(
+        stationarity=float(np.abs(residual).max()),
+        primal=max(violation, limit_violation),
+        complementarity=float(max((abs(m * s) for m, s in zip(multipliers, slacks, strict=True)), default=0.0)),
+        pose_error_m=max((e[0] for e in errors), default=0.0),
+        pose_error_rad=max((e[1] for e in errors), default=0.0),
+        limits=limit_violation,
+        recomputed_with=f"pinocchio {pin.__version__}",
+        active=active,
+    )
+
+
+def objective_gradient(problem: PostureProblem, q: Vector, scale: float) -> Vector:
+    """Tangent gradient of what the programme minimises: objective/scale plus the regularization, shape (nv,)."""
+    gradient = problem.objective.gradient(q) / scale
+    weight = problem.requirements.regularization
+    if weight:
+        gradient = gradient + weight * _distance_gradient(problem, q)
+    return np.asarray(gradient)
+
+
+def _distance_gradient(problem: PostureProblem, q: Vector) -> Vector:
+    """Tangent gradient of ``nlp.distance_squared``."""
+    gradient = np.zeros(problem.robot.nv)
+    chart = Chart(problem.robot.model)
+    x, reference = chart.to_x(q), chart.to_x(problem.given)
+    for slot in chart.slots:
+        one, other = x[slot.x], reference[slot.x]
+        if slot.kind.family in ("free-flyer", "spherical"):
+            R = pin.Quaternion(one[-4:]).matrix()
+            relative = pin.Quaternion(other[-4:]).inverse() * pin.Quaternion(one[-4:])
+            vector, w = np.array(relative.coeffs()[:3]), float(relative.w)
+            # d(4 (1 − w²)) = −8 w dw with dw = −½ v·ω.
+            gradient[slot.v.stop - 3 : slot.v.stop] = 4 * w * vector
+            if slot.kind.family == "free-flyer":
+                gradient[slot.v.start : slot.v.start + 3] = 2 * R.T @ (one[:3] - other[:3])
+        elif slot.kind.family == "planar":
+            c, s = np.cos(one[2]), np.sin(one[2])
+            d = 2 * (one - other)
+            gradient[slot.v] = c * d[0] + s * d[1], -s * d[0] + c * d[1], d[2]
+        else:
+            gradient[slot.v] = 2 * (one - other)
+    return gradient
+
+
+def _inequalities(
+    problem: PostureProblem, numeric: Numeric
+) -> tuple[list[str], list[str], list[Vector], list[float], float]:
+    """Rows near their bound, as outward gradients, and the largest violation of any constraint."""
+    names: list[str] = []
+    sides: list[str] = []
+    rows: list[Vector] = []
+    slacks: list[float] = []
+    violation = 0.0
+    for constraint in problem.constraints:
+        value, jacobian = constraint.numeric(numeric)
+        violation = max(violation, float(np.abs(value - np.clip(value, constraint.lower, constraint.upper)).max()))
+        if constraint.equality:
+            continue
+        for k in range(constraint.rows):
+            for side, slack, sign in (
+                ("lower", value[k] - constraint.lower[k], -1.0),
+                ("upper", constraint.upper[k] - value[k], 1.0),
+            ):
+                if slack < _ACTIVE:
+                    names.append(constraint.row_name(k)), sides.append(side)
+                    rows.append(sign * jacobian[k]), slacks.append(float(slack))
+    return names, sides, rows, slacks, violation
+
+
+def _limits(problem: PostureProblem, q: Vector) -> tuple[list[tuple[str, str, Vector, float]], float]:
+    """Joint limits that are near, and the largest violation of any."""
+    chart = Chart(problem.robot.model)
+    x = chart.to_x(q)
+    near: list[tuple[str, str, Vector, float]] = []
+    worst = 0.0
+    for slot in chart.slots:
+        if slot.kind.family not in ("revolute", "prismatic", "translation"):
+            continue
+        for k in range(slot.kind.nv):
+            low, high = problem.lower[slot.x.start + k], problem.upper[slot.x.start + k]
+            value, unit = x[slot.x.start + k], np.eye(problem.robot.nv)[slot.v.start + k]
+            worst = max(worst, low - value, value - high)
+            if low == high:
+                continue  # held: an equality
+            name = f"joint '{slot.name}'"
+            if value - low < _ACTIVE:
+                near.append((name, "lower", -unit, float(value - low)))
+            if high - value < _ACTIVE:
+                near.append((name, "upper", unit, float(high - value)))
+    return near, float(worst)
+
+
+def _multipliers(gradient: Vector, equalities: Vector, inequalities: Vector) -> tuple[Vector, Vector]:
+    """Nonnegative multipliers of the inequalities that best balance the gradient, and what stays unbalanced.
+
+    Equalities' multipliers are free: everything is projected onto their null space, whose rank may be deficient.
+    """
+    if len(equalities):
+        free = scipy.linalg.null_space(equalities, rcond=RANK_TOLERANCE)
+    else:
+        free = np.eye(len(gradient))
+    reduced = free.T @ gradient
+    if not len(inequalities) or not free.shape[1]:
+        return np.zeros(len(inequalities)), free @ reduced
+    multipliers, _ = scipy.optimize.nnls((inequalities @ free).T, -reduced)
+    return multipliers, free @ (reduced + (inequalities @ free).T @ multipliers)

@@ -1,0 +1,105 @@
+"""When nothing is feasible: which constraints conflict?  Found by letting each give way at a price."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import Tree
+from impact_posture.posture.nlp import IPOPT_OPTIONS, distance_squared
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.starts import random_posture
+
+Vector = NDArray[np.float64]
+
+# Below this (m, rad) a constraint counts as kept.
+_KEPT = 1e-6
+
+
+@dataclass(frozen=True)
+class ElasticAnswer:
+    """The least violation that could be found.
+
+    Attributes:
+        q: Where, shape (nq,).
+        conflicts: Constraints that give way there and by how much; empty if all are kept.
+        at_limits: Joints on a limit there.
+    """
+
+    q: Vector
+    conflicts: dict[str, float]
+    at_limits: tuple[str, ...]
+
+
+def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAnswer:
+    """Minimise the sum of violations, ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures."""
+    chart = Chart(problem.robot.model)
+    solver, rows = _build(problem, chart)
+    lower_rows = np.concatenate([c.lower[problem.carried(i)] for i, c in enumerate(problem.constraints)])
+    upper_rows = np.concatenate([c.upper[problem.carried(i)] for i, c in enumerate(problem.constraints)])
+    norms = np.zeros(len(chart.quaternion_slices()))
+    rng = np.random.default_rng(seed)
+    best: ElasticAnswer | None = None
+    for attempt in range(tries):
+        start = problem.given if attempt == 0 else random_posture(problem, chart, rng, near=attempt % 2 == 1)
+        x = np.clip(chart.to_x(start), problem.lower, problem.upper)
+        answer = solver(
+            x0=np.concatenate([x, np.full(2 * rows, 0.1)]),
+            p=np.concatenate([chart.to_x(problem.given), *[c.parameters for c in problem.constraints]]),
+            lbx=np.concatenate([problem.lower, np.zeros(2 * rows)]),
+            ubx=np.concatenate([problem.upper, np.full(2 * rows, np.inf)]),
+            lbg=np.concatenate([norms, lower_rows]),
+            ubg=np.concatenate([norms, upper_rows]),
+        )
+        found = _judge(problem, chart, chart.to_q(np.array(answer["x"]).reshape(-1)[: chart.nx]))
+        if best is None or sum(found.conflicts.values()) < sum(best.conflicts.values()):
+            best = found
+        if not best.conflicts:
+            break
+    assert best is not None
+    return best
+
+
+def _build(problem: PostureProblem, chart: Chart) -> tuple[ca.Function, int]:
+    x, reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
+    tree = Tree(problem.robot.model, chart.configuration(x), x)
+    rows, targets = [ca.SX(0, 1)], []
+    for index, constraint in enumerate(problem.constraints):
+        p = ca.SX.sym(f"p{index}", len(constraint.parameters))
+        targets.append(p)
+        rows.append(constraint.symbolic(tree, p)[problem.carried(index)])
+    stacked = ca.vertcat(*rows)
+    k = stacked.numel()
+    up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
+    programme = {
+        "x": ca.vertcat(x, up, down),
+        "p": ca.vertcat(reference, *targets),
+        "f": ca.sum1(up + down) + 1e-6 * distance_squared(chart, x, reference),
+        "g": ca.vertcat(chart.norms(x), stacked + up - down),
+    }
+    return ca.nlpsol("elastic", "ipopt", programme, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8}), k
+
+
+def _judge(problem: PostureProblem, chart: Chart, q: Vector) -> ElasticAnswer:
+    numeric = Numeric(problem.robot.model).at(q)
+    conflicts: dict[str, float] = {}
+    for constraint in problem.constraints:
+        value, _ = constraint.numeric(numeric)
+        violation = float(np.linalg.norm(value - np.clip(value, constraint.lower, constraint.upper)))
+        if violation > _KEPT:
+            conflicts[constraint.name] = conflicts.get(constraint.name, 0.0) + violation
+    x = chart.to_x(q)
+    limits = []
+    for slot in chart.slots:
+        if slot.kind.family not in ("revolute", "prismatic") or problem.lower[slot.x] == problem.upper[slot.x]:
+            continue
+        if x[slot.x] - problem.lower[slot.x] < 1e-4:
+            limits.append(f"'{slot.name}' at its lower limit")
+        elif problem.upper[slot.x] - x[slot.x] < 1e-4:
+            limits.append(f"'{slot.name}' at its upper limit")
+    return ElasticAnswer(q, conflicts, tuple(limits))

@@ -1,0 +1,263 @@
+"""Multi-start: many feasible starts, one programme, distinct optima, and the best that certifies."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.pool import Pool
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import Infeasible, SolverFailed
+from impact_posture.posture.certificate import Certificate, certify
+from impact_posture.posture.compiled import CompileMode
+from impact_posture.posture.elastic import elastic
+from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.regular import equality_jacobian, rank
+from impact_posture.posture.starts import Projector, feasible_start
+
+Vector = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+# Optima closer than this in posture (tangent norm) and in objective (relative) are one.
+_SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """A distinct local optimum.
+
+    Attributes:
+        q: Posture, shape (nq,).
+        objective: Its value.
+        hits: Starts that ended there.
+    """
+
+    q: Vector
+    objective: float
+    hits: int
+
+
+@dataclass(frozen=True)
+class PostureSolution:
+    """The answer.
+
+    Attributes:
+        problem: What was asked.
+        initial: The given posture, moved to the constraints where it did not satisfy them.
+        moved: How far, tangent norm.
+        q: The best certified posture.
+        certificate: Of ``q``.
+        redundancy: Degrees of freedom that the equalities leave at ``q``.
+        optima: Distinct optima, best first.
+        starts: Starts asked for.
+        feasible_starts: Starts that could be put on the constraints.
+        certified_starts: Starts whose end certified.
+        status: IPOPT's word for the best run.
+        iterations: Iterations of the best run.
+        solve_time_s: Wall time of all runs together.
+        build_time_s: Time to build the programme.
+        compiled: Whether it ran as machine code.
+        notes: What a user should know about the answer.
+    """
+
+    problem: PostureProblem
+    initial: Vector
+    moved: float
+    q: Vector
+    certificate: Certificate
+    redundancy: int
+    optima: tuple[Optimum, ...]
+    starts: int
+    feasible_starts: int
+    certified_starts: int
+    status: str
+    iterations: int
+    solve_time_s: float
+    build_time_s: float
+    compiled: bool
+    notes: tuple[str, ...]
+
+    @property
+    def reduction(self) -> float:
+        """``1 − objective(q)/objective(initial)``."""
+        objective = self.problem.objective
+        return 1 - objective.value(self.q) / objective.value(self.initial)
+
+
+@dataclass(frozen=True)
+class _Run:
+    start: Vector | None
+    record: SolveRecord | None
+    objective: float
+    certificate: Certificate | None
+
+
+def solve(
+    problem: PostureProblem,
+    *,
+    starts: int = 16,
+    seed: int = 0,
+    jobs: int = 2,
+    compile: CompileMode = "auto",
+    progress: Progress | None = None,
+) -> PostureSolution:
+    """Solve from the given posture and ``starts − 1`` random feasible ones.
+
+    Raises:
+        Infeasible: No posture satisfies the constraints; names those that conflict.
+        SolverFailed: No run ended at a posture that certifies.
+    """
+    initial = _initial(problem, seed)
+    began = time.perf_counter()
+    nlp = build_nlp(problem, compile=compile, starts=starts)
+    scale = problem.objective.value(initial)
+    runs = _run_all(nlp, initial, scale, starts, seed, jobs, progress)
+    good = [r for r in runs if r.certificate is not None and r.certificate.holds()]
+    if not good:
+        raise _failure(runs)
+    # The first of equally good ones: the answer does not hang on which process was faster.
+    best = min(good, key=lambda r: round(r.objective / scale, 9))
+    assert best.record is not None and best.certificate is not None
+    q, certificate, notes = best.record.q, best.certificate, []
+    numeric = Numeric(problem.robot.model)
+    redundancy = problem.robot.nv - rank(equality_jacobian(problem, numeric.at(q)))
+    if redundancy == 0:
+        notes.append("no redundancy left: the constraints alone determine the posture, there is nothing to optimize")
+    elif best.objective > scale * (1 - 1e-6):
+        notes.append("no better posture found: the initial one is already (locally) optimal for this blow")
+    return PostureSolution(
+        problem=problem,
+        initial=initial,
+        moved=float(np.linalg.norm(pin.difference(problem.robot.model, problem.given, initial))),
+        q=q,
+        certificate=certificate,
+        redundancy=redundancy,
+        optima=distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None]),
+        starts=starts,
+        feasible_starts=sum(r.start is not None for r in runs),
+        certified_starts=len(good),
+        status=best.record.status,
+        iterations=best.record.iterations,
+        solve_time_s=time.perf_counter() - began - nlp.build_time_s,
+        build_time_s=nlp.build_time_s,
+        compiled=nlp.compiled,
+        notes=(*problem.notes, *notes),
+    )
+
+
+def _initial(problem: PostureProblem, seed: int) -> Vector:
+    """The given posture on the constraints, or the reason why no posture is."""
+    start = feasible_start(problem, 0, seed)
+    if start is not None:
+        return start
+    for index in range(1, 5):
+        start = feasible_start(problem, index, seed)
+        if start is not None:
+            return start
+    answer = elastic(problem, seed)
+    if answer.conflicts:
+        limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
+        raise Infeasible(
+            answer.conflicts, mend=f"relax one of them, move the target, or start from another --posture{limits}"
+        )
+    found = Projector(problem).project(answer.q)
+    if found.violation > 1e-8:
+        raise SolverFailed(
+            f"a posture within {found.violation:.1e} of the constraints was found, but none on them",
+            where="problem",
+            mend="start from a --posture nearer to the target",
+        )
+    return found.q
+
+
+def run_start(nlp: PostureNLP, start: Vector, scale: float) -> tuple[SolveRecord, Certificate]:
+    """Solve from one feasible start and certify what comes out."""
+    record = nlp.solve(start, scale=scale)
+    return record, certify(nlp.problem, record.q, scale)
+
+
+def _run(nlp: PostureNLP, initial: Vector, scale: float, index: int, seed: int) -> _Run:
+    start = initial if index == 0 else feasible_start(nlp.problem, index, seed)
+    if start is None:
+        return _Run(None, None, np.inf, None)
+    record, certificate = run_start(nlp, start, scale)
+    return _Run(start, record, nlp.problem.objective.value(record.q), certificate)
+
+
+# Worker processes are forked and find the programme here: a CasADi solver cannot be sent to them.
+_WORK: dict[str, tuple[PostureNLP, Vector, float, int]] = {}
+
+
+def _worker(index: int) -> tuple[int, _Run]:
+    nlp, initial, scale, seed = _WORK["job"]
+    return index, _run(nlp, initial, scale, index, seed)
+
+
+def _run_all(
+    nlp: PostureNLP, initial: Vector, scale: float, starts: int, seed: int, jobs: int, progress: Progress | None
+) -> list[_Run]:
+    runs: dict[int, _Run] = {}
+    with _results(nlp, initial, scale, starts, seed, jobs) as results:
+        for index, run in results:
+            runs[index] = run
+            if progress:
+                progress(len(runs), starts)
+    return [runs[index] for index in range(starts)]
+
+
+@contextmanager
+def _results(
+    nlp: PostureNLP, initial: Vector, scale: float, starts: int, seed: int, jobs: int
+) -> Iterator[Iterator[tuple[int, _Run]]]:
+    """Runs as they finish, from forked processes where the system can fork and it pays."""
+    if jobs < 2 or starts < 4 or "fork" not in multiprocessing.get_all_start_methods():
+        yield ((index, _run(nlp, initial, scale, index, seed)) for index in range(starts))
+        return
+    _WORK["job"] = (nlp, initial, scale, seed)
+    pool: Pool = multiprocessing.get_context("fork").Pool(jobs, initializer=_ignore_interrupt)
+    try:
+        yield pool.imap_unordered(_worker, range(starts))
+    finally:
+        # On Ctrl-C as on success: nobody is left running.
+        pool.terminate()
+        pool.join()
+        _WORK.clear()
+
+
+def _ignore_interrupt() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def distinct(problem: PostureProblem, ends: list[tuple[Vector, float]]) -> tuple[Optimum, ...]:
+    """Gather ends that are the same posture, best objective first."""
+    found: list[Optimum] = []
+    for q, objective in sorted(ends, key=lambda end: end[1]):
+        for k, known in enumerate(found):
+            near = abs(objective - known.objective) <= _SAME_OBJECTIVE * max(abs(known.objective), 1e-300)
+            if near and np.linalg.norm(pin.difference(problem.robot.model, known.q, q)) < _SAME_POSTURE:
+                found[k] = Optimum(known.q, known.objective, known.hits + 1)
+                break
+        else:
+            found.append(Optimum(q, objective, 1))
+    return tuple(found)
+
+
+def _failure(runs: list[_Run]) -> SolverFailed:
+    solved = [r for r in runs if r.record is not None and r.certificate is not None]
+    words = sorted({r.record.status for r in solved if r.record is not None})
+    nearest = min((r.certificate for r in solved if r.certificate), key=lambda c: c.stationarity)
+    return SolverFailed(
+        f"none of {len(solved)} feasible starts ended at a certified posture (solver: {', '.join(words)}; best "
+        f"stationarity {nearest.stationarity:.1e}, violation {nearest.primal:.1e})",
+        where="solver",
+        mend="try more --starts, another --seed or --posture, or a small --regularization",
+    )

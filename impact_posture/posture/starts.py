@@ -1,0 +1,144 @@
+"""Feasible starts: random postures pulled onto the constraint manifold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.regular import held_rows
+
+Vector = NDArray[np.float64]
+
+_ATTEMPTS = 20
+_STEPS = 80
+
+
+@dataclass(frozen=True)
+class Projection:
+    """A posture pulled towards the constraints.
+
+    Attributes:
+        q: Where it ended, shape (nq,).
+        violation: Largest violation there (m, rad, or the constraint's own unit).
+    """
+
+    q: Vector
+    violation: float
+
+
+class Projector:
+    """Levenberg–Marquardt onto the constraints, inside the limits; held joints stay."""
+
+    def __init__(self, problem: PostureProblem) -> None:
+        self.problem = problem
+        self.numeric = Numeric(problem.robot.model)
+        self.chart = Chart(problem.robot.model)
+        self._held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
+        self._to_v = _bounded_entries(self.chart)
+
+    def clip(self, q: Vector) -> Vector:
+        """Clamp ``q`` to the bounds."""
+        x = np.clip(self.chart.to_x(q), self.problem.lower, self.problem.upper)
+        return self.chart.to_q(x)
+
+    def residual(self, q: Vector) -> tuple[Vector, Vector]:
+        """Violations of all rows (zero where an inequality holds) and their Jacobian, at ``q``."""
+        self.numeric.at(q)
+        values, jacobians = [np.zeros(0)], [np.zeros((0, self.problem.robot.nv))]
+        for constraint in self.problem.constraints:
+            value, jacobian = constraint.numeric(self.numeric)
+            violation = value - np.clip(value, constraint.lower, constraint.upper)
+            values.append(violation)
+            jacobians.append(np.where((violation != 0)[:, None], jacobian, 0.0) if not constraint.equality else jacobian)
+        return np.concatenate(values), np.vstack(jacobians)
+
+    def project(self, q: Vector, tolerance: float = 1e-9) -> Projection:
+        """Pull ``q`` onto the constraints; the result may still violate them."""
+        q = self.clip(q)
+        value, jacobian = self.residual(q)
+        damping = 1e-3
+        for _ in range(_STEPS):
+            size = float(np.abs(value).max(initial=0.0))
+            if size < tolerance or damping > 1e6:
+                break
+            free = jacobian.copy()
+            free[:, self._held | self._blocked(q, -jacobian.T @ value)] = 0.0
+            gram = free @ free.T
+            step = -free.T @ np.linalg.solve(gram + damping * min(1.0, size) * np.eye(len(gram)), value)
+            step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-12))
+            candidate = self.clip(pin.integrate(self.problem.robot.model, q, step))
+            new_value, new_jacobian = self.residual(candidate)
+            if new_value @ new_value < value @ value:
+                q, value, jacobian, damping = candidate, new_value, new_jacobian, max(damping / 5, 1e-9)
+            else:
+                damping = max(damping * 10, 1e-6)
+        return Projection(q, float(np.abs(value).max(initial=0.0)))
+
+    def _blocked(self, q: Vector, direction: Vector) -> NDArray[np.bool_]:
+        """Joints on a limit that the descent direction would leave."""
+        x = self.chart.to_x(q)
+        blocked = np.zeros(self.problem.robot.nv, dtype=bool)
+        for v, k in self._to_v:
+            at_low = x[k] <= self.problem.lower[k] + 1e-12 and direction[v] < 0
+            at_high = x[k] >= self.problem.upper[k] - 1e-12 and direction[v] > 0
+            blocked[v] = at_low or at_high
+        return blocked
+
+
+def feasible_start(problem: PostureProblem, index: int, seed: int, tolerance: float = 1e-8) -> Vector | None:
+    """Return the ``index``-th feasible start of a seed, or ``None`` where no attempt reached the constraints.
+
+    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near it, even ones anywhere within the
+    limits: near ones are reached more often, far ones find other optima.
+    """
+    projector = Projector(problem)
+    if index == 0:
+        found = projector.project(problem.given)
+        return found.q if found.violation <= tolerance else None
+    rng = np.random.default_rng([seed, index])
+    for attempt in range(_ATTEMPTS):
+        near = (index + attempt) % 2 == 1
+        found = projector.project(random_posture(problem, projector.chart, rng, near=near))
+        if found.violation <= tolerance:
+            return found.q
+    return None
+
+
+def random_posture(problem: PostureProblem, chart: Chart, rng: np.random.Generator, *, near: bool) -> Vector:
+    """A random posture within the bounds, not yet on the constraints."""
+    model = problem.robot.model
+    base = 6 if problem.robot.floating else 0
+    if near:
+        step = rng.normal(size=model.nv) * rng.uniform(0.1, 0.8)
+        step[:base] *= 0.2
+        return np.asarray(pin.integrate(model, problem.given, step))
+    x = chart.to_x(problem.given)
+    for slot in chart.slots:
+        low, high = problem.lower[slot.x], problem.upper[slot.x]
+        if slot.kind.family in ("revolute", "prismatic", "translation"):
+            span = np.pi if slot.kind.family == "revolute" else 1.0
+            low, high = np.where(np.isfinite(low), low, -span), np.where(np.isfinite(high), high, span)
+            x[slot.x] = rng.uniform(np.minimum(low, high), high)
+        elif slot.kind.family in ("continuous", "planar"):
+            x[slot.x.stop - 1] = rng.uniform(-np.pi, np.pi)
+    q = chart.to_q(x)
+    if base:
+        step = np.zeros(model.nv)
+        step[:base] = rng.normal(size=base) * np.array([0.15] * 3 + [0.15, 0.15, 0.6])
+        q = pin.integrate(model, q, step)
+    return np.asarray(q)
+
+
+def _bounded_entries(chart: Chart) -> list[tuple[int, int]]:
+    """Pairs (tangent index, chart index) of coordinates that move one to one."""
+    pairs = []
+    for slot in chart.slots:
+        if slot.kind.family in ("revolute", "prismatic", "translation"):
+            pairs += list(zip(range(slot.v.start, slot.v.stop), range(slot.x.start, slot.x.stop), strict=True))
+    return pairs
