@@ -17,8 +17,10 @@ from impact_posture.posture.regular import RANK_TOLERANCE, equality_jacobian
 
 Vector = NDArray[np.float64]
 
-# An inequality or limit closer than this (m, rad) may carry a multiplier.
-_ACTIVE = 1e-6
+# An inequality closer than this (m, rad) may carry a multiplier; the product of the two is the complementarity.
+_ACTIVE = 1e-3
+# Multipliers below this are rounding.
+_MULTIPLIER = 1e-6
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,19 @@ class Certificate:
     recomputed_with: str
     active: tuple[Active, ...]
 
-    def holds(self, *, stationarity: float = 1e-5, pose: float = 1e-6, primal: float = 1e-8) -> bool:
+    def holds(
+        self,
+        *,
+        stationarity: float = 1e-6,
+        complementarity: float = 1e-7,
+        pose: float = 1e-6,
+        primal: float = 1e-8,
+    ) -> bool:
         """Whether every number is within its tolerance."""
         return (
             self.stationarity <= stationarity
             and self.primal <= primal
-            and self.complementarity <= stationarity
+            and self.complementarity <= complementarity
             and max(self.pose_error_m, self.pose_error_rad) <= pose
         )
 
@@ -97,7 +106,7 @@ def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
     active = tuple(
         Active(name, side, float(m))
         for name, side, m in zip(names, sides, multipliers, strict=True)
-        if m > 1e-9
+        if m > _MULTIPLIER
     )
     return Certificate(
         stationarity=float(np.abs(residual).max()),

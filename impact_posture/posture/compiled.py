@@ -97,7 +97,11 @@ def _compile(solver: ca.Function, compiler: str, library: Path) -> None:
     library.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         source, built = Path(folder) / "programme.c", Path(folder) / "programme.so"
-        solver.generate_dependencies(str(source))
+        generator = ca.CodeGenerator(source.name)
+        generator.add(solver.oracle())
+        for name in solver.get_function():
+            generator.add(solver.get_function(name))
+        generator.generate(f"{folder}{os.sep}")
         command = [compiler, "-O1", "-fPIC", "-shared", str(source), "-o", str(built), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:

@@ -1,0 +1,57 @@
+"""The way from the initial posture to the optimum, along the constraints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.starts import Projector
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NullSpacePath:
+    """Postures that all satisfy the constraints, and the impact along them.
+
+    Attributes:
+        q: Postures, shape (N, nq).
+        s: Length of the way so far, tangent norm, shape (N,).
+        H: Squared jump per squared impulse, shape (N,).
+        G: Inverse effective mass, shape (N,).
+        V: Squared jump per squared approach speed, shape (N,).
+        S: The same when sticking, NaN where undefined, shape (N,).
+        objective: What was minimised, shape (N,).
+    """
+
+    q: Vector
+    s: Vector
+    H: Vector
+    G: Vector
+    V: Vector
+    S: Vector
+    objective: Vector
+
+
+def null_space_path(problem: PostureProblem, start: Vector, end: Vector, points: int = 61) -> NullSpacePath:
+    """Interpolate from ``start`` to ``end`` on the manifold and pull every point onto the constraints."""
+    projector, model = Projector(problem), problem.robot.model
+    postures = [start]
+    for t in np.linspace(0, 1, points)[1:-1]:
+        postures.append(projector.project(pin.interpolate(model, start, end, float(t))).q)
+    postures.append(end)
+    steps = [np.linalg.norm(pin.difference(model, a, b)) for a, b in zip(postures, postures[1:], strict=False)]
+    found = [problem.objective.oracle.quantities(q) for q in postures]
+    return NullSpacePath(
+        q=np.array(postures),
+        s=np.concatenate([[0.0], np.cumsum(steps)]),
+        H=np.array([f.H for f in found]),
+        G=np.array([f.G for f in found]),
+        V=np.array([f.V for f in found]),
+        S=np.array([np.nan if f.S is None else f.S for f in found]),
+        objective=np.array([problem.objective.value(q) for q in postures]),
+    )
