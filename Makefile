@@ -1,0 +1,61 @@
+# Everything from a bare clone: `make demo`, `make test`.  Needs Python >= 3.11, make and a C compiler.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+JOBS ?= 2
+
+.PHONY: help demo test lint types docs bench regression clean
+
+help:
+	@echo "make demo        install into .venv, optimize a real robot, leave pictures and C code in demo/"
+	@echo "make test        install with the test extras and run the whole suite"
+	@echo "make lint types  ruff; mypy"
+	@echo "make docs        the documentation site in docs/_build/html"
+	@echo "make bench       solve times on this machine"
+	@echo "make regression  recompute the committed reference results"
+	@echo "make clean       remove what make made"
+
+$(BIN)/python:
+	$(PYTHON) -c 'import sys; sys.exit("impact-posture needs Python 3.11 or newer, this is " + sys.version.split()[0] + ": make PYTHON=python3.12" if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+$(VENV)/.installed-test: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@touch $@ $(VENV)/.installed
+
+demo: $(VENV)/.installed
+	$(BIN)/impact-posture optimize tilthex_arm --frame ee --normal 0 0 1 --out demo --force
+	@cp docs/demo.txt demo/LOOK.txt
+	@echo
+	@cat demo/LOOK.txt
+
+test: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -q
+
+lint: $(VENV)/.installed-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.installed-test
+	$(BIN)/mypy
+
+docs: $(VENV)/.installed-docs
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
+bench: $(VENV)/.installed
+	$(BIN)/python -m tests.benchmarks.solve_times
+
+regression: $(VENV)/.installed
+	$(BIN)/python -m tests.regression.make
+
+clean:
+	rm -rf $(VENV) demo docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,119 @@
+"""The main job from end to end: settings in, result folder out; and a result folder read back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from impact_posture.codegen.export import Export, export
+from impact_posture.errors import SpecError
+from impact_posture.folder import whole_folder
+from impact_posture.plot import PathData, ResultView, draw_all
+from impact_posture.posture.path import NullSpacePath, null_space_path
+from impact_posture.posture.result import result_arrays, result_document
+from impact_posture.posture.settings import Prepared, dump_settings, prepare, read_settings, resolved_settings
+from impact_posture.posture.solve import PostureSolution
+from impact_posture.robot.postures import write_posture
+
+# What makes a folder an earlier result, which --force may replace.
+MARKS = ("result.json",)
+FORMATS = ("png", "svg", "pdf")
+
+
+@dataclass(frozen=True)
+class Written:
+    """What :func:`write_result` left behind.
+
+    Attributes:
+        out: The folder.
+        document: The content of ``result.json``.
+        export: The C export, or ``None``.
+    """
+
+    out: Path
+    document: dict[str, object]
+    export: Export | None
+
+
+def default_out(prepared: Prepared) -> Path:
+    """``./<robot>-<frame>``."""
+    return Path(f"{prepared.impact.robot.name}-{prepared.impact.contact.frame}".replace("/", "_"))
+
+
+def write_result(
+    prepared: Prepared,
+    solution: PostureSolution,
+    out: Path,
+    *,
+    force: bool = False,
+    codegen: bool = True,
+    formats: Sequence[str] = FORMATS,
+) -> Written:
+    """Write the result folder, whole or not at all.
+
+    Raises:
+        OutputError: It exists without ``force``, or cannot be written.
+    """
+    document = result_document(prepared, solution)
+    path = null_space_path(solution.problem, solution.initial, solution.q)
+    made: Export | None = None
+    with whole_folder(out, force=force, marks=MARKS) as folder:
+        _write_json(folder / "result.json", document)
+        np.savez_compressed(folder / "result.npz", **result_arrays(solution, path))  # type: ignore[arg-type]
+        _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
+        (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
+        draw_all(_view(prepared, solution.initial, solution.q, path), folder, formats)
+        if codegen:
+            (folder / "c").mkdir()
+            made = export(prepared.impact.objective, folder / "c", posture=solution.q)
+    return Written(out, document, made)
+
+
+def _view(prepared: Prepared, initial: np.ndarray, optimal: np.ndarray, path: NullSpacePath) -> ResultView:
+    impact = prepared.impact
+    return ResultView(
+        robot=impact.robot,
+        objective=impact.objective,
+        q_initial=initial,
+        q_optimal=optimal,
+        speed=impact.speed,
+        restitution=impact.restitution,
+        path=PathData(s=path.s, H=path.H, G=path.G, V=path.V, S=path.S),
+    )
+
+
+def _write_json(path: Path, document: dict[str, object]) -> None:
+    # allow_nan=False: a result with NaN in it must fail here and not at its reader.
+    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def load_view(folder: Path) -> ResultView:
+    """Read a result folder back as what its pictures are drawn from.
+
+    Raises:
+        SpecError: It is no result folder, or the robot is not the one it was made with.
+    """
+    if not (folder / "result.json").is_file():
+        raise SpecError("holds no result.json", where=str(folder), mend="name a folder that optimize wrote")
+    try:
+        document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        prepared = prepare(read_settings(folder / "problem.toml"))
+        with np.load(folder / "result.npz") as arrays:
+            path = NullSpacePath(
+                **{key: arrays[f"path_{key}"] for key in ("q", "s", "H", "G", "V", "S", "objective")}
+            )
+        initial, optimal = np.array(document["initial"]["q"]), np.array(document["optimal"]["q"])
+        recorded = document["robot"]["model_sha256"]
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise SpecError(f"is no whole result ({error})", where=str(folder), mend="run optimize again") from None
+    if recorded != prepared.impact.robot.model_sha256:
+        raise SpecError(
+            f"was made with another model of {prepared.impact.robot.name} (sha256 {recorded[:12]}…)",
+            where=str(folder),
+            mend="run optimize again, or use the URDF and armature of then",
+        )
+    return _view(prepared, initial, optimal, path)

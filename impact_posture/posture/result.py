@@ -1,0 +1,95 @@
+"""``result.json``: the answer as a document, and as arrays."""
+
+from __future__ import annotations
+
+import platform
+from importlib import metadata
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture import __version__
+from impact_posture.impact.evaluation import Evaluation, evaluate
+from impact_posture.posture.path import NullSpacePath
+from impact_posture.posture.settings import Prepared
+from impact_posture.posture.solve import PostureSolution
+
+SCHEMA = "impact-posture/result/1"
+
+
+def evaluations(prepared: Prepared, solution: PostureSolution) -> tuple[Evaluation, Evaluation]:
+    """The impact at the initial (feasible) and at the optimal posture."""
+    impact = prepared.impact
+    initial = evaluate(impact.objective, solution.initial, impact.speed, impact.restitution)
+    return initial, evaluate(impact.objective, solution.q, impact.speed, impact.restitution)
+
+
+def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, object]:
+    """The content of ``result.json``."""
+    initial, optimal = evaluations(prepared, solution)
+    impact = prepared.impact
+    return {
+        "schema": SCHEMA,
+        **impact.to_dict(),
+        "constraints": prepared.problem.describe(),
+        "initial": {
+            "given_q": [float(v) for v in prepared.problem.given],
+            "moved": solution.moved,
+            **initial.to_dict(),
+        },
+        "optimal": optimal.to_dict(),
+        "reduction": solution.reduction,
+        "redundancy": solution.redundancy,
+        "certificate": solution.certificate.to_dict(),
+        "active": [
+            {"constraint": a.constraint, "side": a.side, "multiplier": a.multiplier}
+            for a in solution.certificate.active
+        ],
+        "solver": {
+            "status": solution.status,
+            "iterations": solution.iterations,
+            "solve_time_s": solution.solve_time_s,
+            "build_time_s": solution.build_time_s,
+            "compiled": solution.compiled,
+            "seed": prepared.settings.seed,
+            "starts": solution.starts,
+            "feasible_starts": solution.feasible_starts,
+            "certified_starts": solution.certified_starts,
+            "optima": [
+                {"q": [float(v) for v in o.q], "objective": o.objective, "hits": o.hits} for o in solution.optima
+            ],
+        },
+        "notes": list(solution.notes),
+        "warnings": list(impact.warnings),
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that a result depends on."""
+    found = {"impact-posture": __version__, "python": platform.python_version()}
+    found |= {"casadi": ca.__version__, "pinocchio": pin.__version__, "numpy": np.__version__}
+    try:
+        found["example-robot-data"] = metadata.version("example-robot-data")
+    except metadata.PackageNotFoundError:
+        pass
+    return found
+
+
+def result_arrays(solution: PostureSolution, path: NullSpacePath) -> dict[str, NDArray[np.float64]]:
+    """The content of ``result.npz``: postures, ellipsoids, jumps and the null-space path."""
+    oracle = solution.problem.objective.oracle
+    arrays: dict[str, NDArray[np.float64]] = {}
+    for name, q in (("initial", solution.initial), ("optimal", solution.q)):
+        found = oracle.quantities(q)
+        arrays |= {
+            f"{name}_q": q,
+            f"{name}_jump": found.jump,
+            f"{name}_ellipsoid": found.ellipsoid,
+            f"{name}_mobility": found.mobility,
+            f"{name}_gradient": oracle.gradient_H(q),
+        }
+    arrays |= {f"path_{key}": getattr(path, key) for key in ("q", "s", "H", "G", "V", "S", "objective")}
+    return arrays

@@ -1,0 +1,253 @@
+"""``problem.toml``: an optimization as a file.  Every key is the option of the same name, ``-`` written ``_``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from impact_posture.errors import InputError, SpecError
+from impact_posture.impact.metric import Metric, MetricKind, ObjectiveKind
+from impact_posture.impact.request import ImpactRequest, ResolvedImpact
+from impact_posture.posture.problem import BaseMode, PostureProblem, Requirements, build_problem
+from impact_posture.robot.loader import LoadOptions
+from impact_posture.robot.spec import ContactPose, Root, Vector3, read_toml, validate
+from impact_posture.robot.urdf import EXAMPLE_PREFIX
+
+SCHEMA = "impact-posture/problem/1"
+
+_FILES = ("srdf", "config")
+
+
+class ProblemSettings(BaseModel):
+    """The content of a ``problem.toml``; what is ``None`` comes from the robot or is the option's default."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    schema_: Literal["impact-posture/problem/1"] = Field(default=SCHEMA, alias="schema")
+    robot: str
+    root: Root | None = None
+    package_dir: tuple[str, ...] = ()
+    srdf: str | None = None
+    config: str | None = None
+    armature: str | dict[str, float] | None = None
+    lock: tuple[str, ...] = ()
+    frame: str | None = None
+    normal: Vector3 | None = None
+    normal_frame: Literal["world", "contact"] = "world"
+    offset: Vector3 | None = None
+    contact: str | tuple[str, ...] | None = None
+    impulse: float = 1.0
+    speed: float = 1.0
+    restitution: float = 0.0
+    posture: str | None = None
+    q: tuple[float, ...] | None = None
+    target_position: Vector3 | None = None
+    target_quaternion: tuple[float, float, float, float] | None = None
+    contact_pose: ContactPose | None = None
+    box: Vector3 = (0.05, 0.05, 0.05)
+    support: tuple[str, ...] | None = None
+    support_compliance: float | None = None
+    keep: tuple[str, ...] = ()
+    hold: tuple[str, ...] | None = None
+    base: BaseMode | None = None
+    base_box: Vector3 = (0.2, 0.2, 0.2)
+    com: bool | None = None
+    com_margin: float | None = None
+    limit_margin: float | None = None
+    regularization: float = 0.0
+    metric: MetricKind = "euclidean"
+    weights: str | tuple[float, ...] | None = None
+    objective: ObjectiveKind = "impulse"
+    normal_cone: float = 0.0
+    starts: Annotated[int, Field(ge=1)] = 16
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A problem ready to be solved.
+
+    Attributes:
+        settings: As merged from file and command line.
+        impact: Robot, contact, metric, supports, given posture.
+        problem: The optimization.
+    """
+
+    settings: ProblemSettings
+    impact: ResolvedImpact
+    problem: PostureProblem
+
+
+def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemSettings:
+    """Read a ``problem.toml``; ``over`` (options of the command line) wins.  Paths in it start from its folder."""
+    data = read_toml(path)
+    folder = path.resolve().parent
+    for key in (*_FILES, "weights", "armature", "posture"):
+        value = data.get(key)
+        if isinstance(value, str) and (folder / value).is_file():
+            data[key] = str(folder / value)
+    robot = data.get("robot")
+    if isinstance(robot, str) and not robot.startswith(EXAMPLE_PREFIX) and (folder / robot).is_file():
+        data["robot"] = str(folder / robot)
+    if isinstance(data.get("package_dir"), list):
+        data["package_dir"] = [str(folder / str(p)) for p in data["package_dir"]]  # type: ignore[attr-defined]
+    return validate(ProblemSettings, data | (over or {}), str(path))
+
+
+def make_settings(values: dict[str, object]) -> ProblemSettings:
+    """Check values that came as options."""
+    return validate(ProblemSettings, values, "options")
+
+
+def prepare(settings: ProblemSettings) -> Prepared:
+    """Load the robot, resolve defaults, build the problem; nothing is solved yet.
+
+    Raises:
+        ImpactPostureError: The first thing that is wrong, in one line.
+    """
+    contacts = (settings.contact,) if isinstance(settings.contact, str) else settings.contact or ()
+    if len(contacts) > 1:
+        raise InputError(
+            f"{len(contacts)} contacts are given", where="--contact", mend="this version optimizes one contact at a time"
+        )
+    if settings.normal_cone:
+        raise InputError(
+            f"a cone of {settings.normal_cone:g}° is asked for", where="--normal-cone",
+            mend="this version knows the exact normal only: give 0",
+        )
+    weights = settings.weights if isinstance(settings.weights, str) else None
+    request = ImpactRequest(
+        robot=settings.robot,
+        load=LoadOptions(
+            root=settings.root,
+            package_dirs=settings.package_dir,
+            srdf=settings.srdf,
+            config=settings.config,
+            armature=settings.armature,
+            lock=settings.lock,
+        ),
+        frame=settings.frame,
+        normal=settings.normal,
+        offset=settings.offset,
+        normal_frame=settings.normal_frame,
+        contact=contacts[0] if contacts else None,
+        impulse=settings.impulse,
+        posture=settings.posture if settings.q is None else None,
+        supports=settings.support,
+        metric="euclidean" if isinstance(settings.weights, tuple) else settings.metric,
+        weights=weights,
+        objective=settings.objective,
+        speed=settings.speed,
+        restitution=settings.restitution,
+        compliance=settings.support_compliance,
+    )
+    impact = request.resolve()
+    if isinstance(settings.weights, tuple):
+        impact = replace(impact, objective=replace(impact.objective, metric=_listed_metric(settings, impact)))
+    if settings.q is not None:
+        impact = replace(impact, q=impact.robot.check_posture(np.array(settings.q), where="q"))
+    problem = build_problem(impact.robot, impact.objective, impact.q, _requirements(settings, impact))
+    return Prepared(settings, impact, problem)
+
+
+def _listed_metric(settings: ProblemSettings, impact: ResolvedImpact) -> Metric:
+    weights = np.array(settings.weights, dtype=float)
+    if weights.size != impact.robot.nv or not (np.isfinite(weights).all() and (weights > 0).all()):
+        raise SpecError(
+            f"has {weights.size} entries", where="weights", mend=f"give {impact.robot.nv} numbers above zero"
+        )
+    return Metric("weighted", tuple(float(w) for w in weights), "problem.toml")
+
+
+def _requirements(settings: ProblemSettings, impact: ResolvedImpact) -> Requirements:
+    robot, spec = impact.robot, impact.robot.spec.constraints
+    frame = impact.contact.frame
+    free = tuple(j for j in spec.hold if j not in robot.locked)
+    base: BaseMode = "level" if spec.level_base and robot.floating else "free"
+    com = spec.com_over_feet and bool(impact.supports) if settings.com is None else settings.com
+    if com and not impact.supports:
+        raise InputError(
+            "there are no feet to keep the centre of mass over", where="--com", mend="add --support or --no-com"
+        )
+    return Requirements(
+        contact_pose=settings.contact_pose or robot.contact_pose(frame),
+        target_position=settings.target_position,
+        target_quaternion=settings.target_quaternion,
+        box=settings.box,
+        base=settings.base or base,
+        base_box=settings.base_box,
+        keep=settings.keep,
+        hold=free if settings.hold is None else settings.hold,
+        com_over_feet=com,
+        com_margin=spec.com_margin if settings.com_margin is None else settings.com_margin,
+        limit_margin=spec.limit_margin if settings.limit_margin is None else settings.limit_margin,
+        regularization=settings.regularization,
+    )
+
+
+def resolved_settings(prepared: Prepared) -> ProblemSettings:
+    """The same problem with every default written out: solved again, it gives the same result."""
+    settings, impact, wanted = prepared.settings, prepared.impact, prepared.problem.requirements
+    robot = settings.robot
+    if robot.endswith((".urdf", ".xml")) and not robot.startswith(EXAMPLE_PREFIX):
+        robot = str(Path(robot).expanduser().resolve())
+    changes: dict[str, object] = {
+        "robot": robot,
+        "root": impact.robot.root,
+        "package_dir": tuple(str(Path(p).expanduser().resolve()) for p in settings.package_dir),
+        "frame": impact.contact.frame,
+        "normal": impact.contact.normal,
+        "offset": impact.contact.offset,
+        "contact": None,
+        "impulse": impact.contact.impulse,
+        "posture": None,
+        "q": tuple(float(v) for v in impact.q),
+        "contact_pose": wanted.contact_pose,
+        "support": tuple(f"{s.frame}:{s.kind}" for s in impact.supports),
+        "support_compliance": impact.objective.compliance if impact.supports else None,
+        "hold": wanted.hold,
+        "base": wanted.base,
+        "com": wanted.com_over_feet,
+        "com_margin": wanted.com_margin,
+        "limit_margin": wanted.limit_margin,
+        "weights": impact.metric.weights,
+    }
+    for key in _FILES:
+        value = getattr(settings, key)
+        changes[key] = None if value is None else str(Path(value).expanduser().resolve())
+    if settings.armature is not None:
+        changes["armature"] = _armature_by_joint(impact)
+    return settings.model_copy(update=changes)
+
+
+def _armature_by_joint(impact: ResolvedImpact) -> str | dict[str, float]:
+    robot = impact.robot
+    first = {name: robot.model.idx_vs[robot.joint_id(name)] for name in robot.joint_names}
+    values = {name: float(robot.armature[k]) for name, k in first.items()}
+    return values if any(values.values()) else "none"
+
+
+def dump_settings(settings: ProblemSettings) -> str:
+    """Write settings as TOML, keys in the model's order, what is ``None`` left out."""
+    lines = [f"schema = {_toml(SCHEMA)}"]
+    for key in ProblemSettings.model_fields:
+        value = getattr(settings, key)
+        if key != "schema_" and value is not None:
+            lines.append(f"{key} = {_toml(value)}")
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml(v) for v in value) + "]"
+    if isinstance(value, float):
+        return repr(value)
+    # JSON's strings, integers and booleans are TOML's.
+    return json.dumps(value)
