@@ -1,0 +1,240 @@
+"""``impact-posture optimize ROBOT --frame F --normal X Y Z`` or ``impact-posture optimize PROBLEM.toml``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from impact_posture_cli import options
+
+if TYPE_CHECKING:
+    from impact_posture.job import Written
+    from impact_posture.posture.settings import Prepared, ProblemSettings
+    from impact_posture.posture.solve import PostureSolution
+    from impact_posture_cli.output import Page
+
+# Options that say how to solve and where to write, not what the problem is.
+_NOT_SETTINGS = {"robot", "out", "force", "no_codegen", "jobs", "compile", "format", "json", "quiet", "no_support"}
+
+RobotOrProblem = Annotated[
+    str,
+    typer.Argument(metavar="ROBOT|PROBLEM.toml", help="Known name, path to a .urdf, example-robot-data:PATH, or a problem."),
+]
+
+
+def optimize(
+    context: typer.Context,
+    robot: RobotOrProblem,
+    frame: options.Frame = None,
+    normal: options.Normal = None,
+    offset: options.Offset = None,
+    normal_frame: options.NormalAxes = "world",
+    contact: options.ContactList = None,
+    impulse: options.Impulse = 1.0,
+    speed: options.Speed = 1.0,
+    restitution: options.Restitution = 0.0,
+    metric: options.MetricName = "euclidean",
+    weights: options.Weights = None,
+    objective: options.ObjectiveName = "impulse",
+    normal_cone: options.NormalCone = 0.0,
+    posture: options.Posture = None,
+    target_position: options.TargetPosition = None,
+    target_quaternion: options.TargetQuaternion = None,
+    contact_pose: options.ContactPoseHeld = None,
+    box: options.Box = None,
+    support: options.SupportList = None,
+    no_support: options.NoSupport = False,
+    keep: options.Keep = None,
+    hold: options.Hold = None,
+    base: options.Base = None,
+    base_box: options.BaseBox = None,
+    com: options.ComOverFeet = None,
+    com_margin: options.ComMargin = None,
+    limit_margin: options.LimitMargin = None,
+    regularization: options.Regularization = 0.0,
+    lock: options.Lock = None,
+    root: options.Root = None,
+    armature: options.Armature = None,
+    config: options.Config = None,
+    srdf: options.Srdf = None,
+    package_dir: options.PackageDirs = None,
+    starts: options.Starts = 16,
+    seed: options.Seed = 0,
+    jobs: options.Jobs = 2,
+    compile: options.Compile = "auto",
+    out: options.Out = None,
+    force: options.Force = False,
+    no_codegen: options.NoCodegen = False,
+    format: options.Formats = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Find the posture that takes the blow best; write posture, pictures and C code."""
+    given = _given(context)
+    settings = _settings(robot, given)
+    from impact_posture.folder import check_output
+    from impact_posture.job import FORMATS, MARKS, default_out, write_result
+    from impact_posture.posture.settings import prepare
+    from impact_posture.posture.solve import solve
+    from impact_posture_cli.output import Page, print_json
+
+    page = Page(quiet=quiet or json)
+    prepared = prepare(settings)
+    folder = Path(out) if out else default_out(prepared)
+    check_output(folder, force=force, marks=MARKS)
+    if not json:
+        _announce(page, prepared)
+    with _progress(shown=not (quiet or json)) as progress:
+        solution = solve(
+            prepared.problem, starts=settings.starts, seed=settings.seed, jobs=jobs, compile=compile, progress=progress
+        )
+    written = write_result(
+        prepared, solution, folder, force=force, codegen=not no_codegen, formats=[f.value for f in format or ()] or FORMATS
+    )
+    if json:
+        print_json(written.document)
+        return
+    _summarize(page, prepared, solution, written)
+
+
+def _given(context: typer.Context) -> dict[str, Any]:
+    """The problem's options that stand on the command line; defaults are not given."""
+    given = {}
+    for name, value in context.params.items():
+        source = context.get_parameter_source(name)
+        if name not in _NOT_SETTINGS and source is not None and source.name == "COMMANDLINE":
+            given[name] = tuple(value) if isinstance(value, list) else value
+    supports = options.check_supports(context.params["support"], context.params["no_support"])
+    return given if supports is None else given | {"support": supports}
+
+
+def _settings(robot: str, given: dict[str, Any]) -> ProblemSettings:
+    from_file = robot.endswith(".toml")
+    contacts = given.get("contact")
+    if not from_file or "contact" in given:
+        options.check_contact(given.get("frame"), given.get("normal"), contacts[0] if contacts else None)
+    from impact_posture.impact.request import parse_armature
+    from impact_posture.posture.settings import make_settings, read_settings
+
+    if "armature" in given:
+        given["armature"] = parse_armature(given["armature"])
+    if from_file:
+        if "posture" in given:
+            given["q"] = None
+        if "contact" in given:
+            given |= {"frame": None, "normal": None}
+        return read_settings(Path(robot), given)
+    return make_settings({"robot": robot, **given})
+
+
+def _announce(page: Page, prepared: Prepared) -> None:
+    from impact_posture_cli.output import vector
+
+    if page.quiet:
+        return
+    impact, problem = prepared.impact, prepared.problem
+    page.title(f"{impact.robot.name} at {impact.contact.frame}", f"objective {impact.objective.kind}")
+    axes = "world" if impact.contact.normal_frame == "world" else "contact frame"
+    feet = ", ".join(s.frame for s in impact.supports) or "none"
+    page.pairs(
+        [
+            ("normal", f"{vector(impact.contact.normal)} ({axes})"),
+            ("metric", impact.metric.kind),
+            ("supports", feet),
+            ("armature from", impact.robot.armature_source),
+        ]
+    )
+    page.gap()
+    page.line("constraints")
+    for line in problem.describe():
+        page.line(f"  {line}")
+    for note in problem.notes:
+        page.line(f"  ({note})", style="dim")
+    page.warnings(impact.warnings)
+    page.gap()
+
+
+@contextmanager
+def _progress(*, shown: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """A bar on standard error while the starts are solved."""
+    if not shown:
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("solving"), BarColumn(), MofNCompleteColumn(), TextColumn("starts"), TimeElapsedColumn())
+    # The bar starts with the first result: worker processes are forked before its thread runs.
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task("solving", total=None)
+
+    def advance(done: int, total: int) -> None:
+        bar.start()
+        bar.update(task, completed=done, total=total)
+
+    try:
+        yield advance
+    finally:
+        bar.stop()
+
+
+def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, written: Written) -> None:
+    from impact_posture_cli.output import number
+
+    document: dict[str, Any] = written.document
+    initial, optimal = document["initial"], document["optimal"]
+    rows = []
+    for key, unit, words in (
+        ("objective", "", f"what was minimized ({prepared.impact.objective.kind})"),
+        ("H", "", "squared jump per squared impulse"),
+        ("G", "1/kg", "inverse effective mass along n"),
+        ("V", "", "squared jump per squared speed, no friction"),
+        ("S", "", "the same when the contact sticks"),
+        ("E", "kg", "energy lost per squared speed"),
+    ):
+        rows.append((f"  {key}", number(initial[key]), number(optimal[key]), unit, words))
+    page.table(("", "before", "after", "unit", "meaning"), rows, right=(1, 2))
+    page.gap()
+    page.line(f"reduction {solution.reduction:.1%}; {_redundancy(solution.redundancy)} left by the constraints")
+    for note in solution.notes[len(prepared.problem.notes) :]:
+        page.line(note)
+    if solution.moved > 1e-6:
+        page.line(f"the given posture did not satisfy the constraints: moved by {solution.moved:.3g} first")
+    if document["active"]:
+        page.line("active: " + ", ".join(_active(a) for a in document["active"]))
+    found = solution.certificate
+    page.line(
+        f"certificate ({found.recomputed_with}): stationarity {found.stationarity:.1e}, violation {found.primal:.1e}, "
+        f"pose error {found.pose_error_m:.1e} m, {found.pose_error_rad:.1e} rad"
+    )
+    optima = ", ".join(f"{number(o.objective)} ({o.hits}×)" for o in solution.optima[:5])
+    more = f" and {len(solution.optima) - 5} more" if len(solution.optima) > 5 else ""
+    page.line(
+        f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
+        f"optima: {optima}{more}"
+    )
+    if not page.quiet:
+        page.gap()
+        page.line(f"written to {written.out}: {_contents(written)}")
+
+
+def _redundancy(count: int) -> str:
+    return "1 degree of freedom" if count == 1 else f"{count} degrees of freedom"
+
+
+def _active(entry: dict[str, Any]) -> str:
+    words = "limit" if entry["constraint"].startswith("joint ") else "bound"
+    return f"{entry['constraint']} at its {entry['side']} {words}"
+
+
+def _contents(written: Written) -> str:
+    names = "posture.json, result.json, pictures"
+    if written.export is None:
+        return names
+    if written.export.agreement is None:
+        return f"{names}, C code in c/ (no compiler here to try it: install gcc or clang, or set CC)"
+    return f"{names}, C code in c/ (compiled, agrees to {written.export.agreement:.0e})"

@@ -1,0 +1,42 @@
+"""``impact-posture plot RESULT_DIR``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impact_posture_cli import options
+
+ResultFolder = Annotated[str, typer.Argument(metavar="RESULT_DIR", help="A folder that optimize wrote.")]
+Figures = Annotated[
+    list[str] | None,
+    typer.Option("--figure", help="ellipsoid, postures, jump, nullspace or classical; repeatable.", show_default="all"),
+]
+PictureOut = Annotated[
+    str | None, typer.Option("--out", metavar="DIR", help="Folder for the pictures.", show_default="RESULT_DIR")
+]
+
+
+def plot(
+    result_dir: ResultFolder,
+    figure: Figures = None,
+    format: options.Formats = None,
+    out: PictureOut = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Draw a result again: ellipsoids, postures, jumps, the null-space path."""
+    from impact_posture.job import FORMATS, load_view
+    from impact_posture.plot import draw_all
+    from impact_posture_cli.output import Page, print_json
+
+    folder = Path(result_dir)
+    written = draw_all(load_view(folder), Path(out) if out else folder, [f.value for f in format or ()] or FORMATS, figure)
+    if json:
+        print_json({"schema": "impact-posture/plot/1", "files": [str(path) for path in written]})
+        return
+    page = Page(quiet=quiet)
+    for path in written:
+        page.line(str(path))
