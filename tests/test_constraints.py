@@ -1,0 +1,105 @@
+"""Every constraint says the same twice, and its Jacobian is that of the manifold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import PointOnLink, Tree
+from impact_posture.impact.contact import point_on
+from impact_posture.posture.constraint import (
+    CenterOfMassOverFeet,
+    Constraint,
+    HeldOrientation,
+    HeldPose,
+    HeldPosition,
+    HeldTurn,
+    PositionBox,
+)
+from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot import Robot
+
+Factory = Callable[[PointOnLink, pin.SE3], Constraint]
+
+AXIS = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
+SQUARE = np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
+FACTORIES: dict[str, Factory] = {
+    "position": lambda point, target: HeldPosition("x", point, target.translation),
+    "box": lambda point, target: PositionBox("x", point, target.translation, (0.1, 0.2, 0.3)),
+    "orientation": lambda point, target: HeldOrientation("x", point, target.rotation),
+    "axis": lambda point, target: HeldOrientation("x", point, target.rotation, AXIS),
+    "pose": lambda point, target: HeldPose("x", point, target),
+    "pose, spin free": lambda point, target: HeldPose("x", point, target, AXIS),
+    "turn": lambda point, target: HeldTurn(point, target.rotation, 1),
+    "center of mass": lambda point, target: CenterOfMassOverFeet(SQUARE, np.full(4, 0.4), 0.01),
+}
+ROBOTS = {
+    "tilthex_arm": "ee",
+    "talos": "gripper_left_base_link",
+    "panda": "panda_hand",
+    "kinova": "j2s6s200_end_effector",
+}
+
+
+def _random(robot: Robot, rng: np.random.Generator, size: float = 0.8) -> np.ndarray:
+    return pin.integrate(robot.model, pin.neutral(robot.model), rng.normal(size=robot.nv) * size)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("kind", FACTORIES)
+def test_constraint_agrees_with_itself_and_with_finite_differences(name: str, kind: str) -> None:
+    robot, rng = load_robot(name), np.random.default_rng(3)
+    point = point_on(robot, ROBOTS[name], (0.05, -0.02, 0.1))
+    numeric, chart = Numeric(robot.model), Chart(robot.model)
+    target = numeric.at(_random(robot, rng)).placement(point).copy()
+    constraint = FACTORIES[kind](point, target)
+    x, p = ca.SX.sym("x", chart.nx), ca.SX.sym("p", len(constraint.parameters))
+    tree = Tree(robot.model, chart.configuration(x), x)
+    symbolic = ca.Function("c", [x, p], [constraint.symbolic(tree, p)])
+    for _ in range(4):
+        q = _random(robot, rng)
+        value, jacobian = constraint.numeric(numeric.at(q))
+        said = np.array(symbolic(chart.to_x(q), constraint.parameters)).reshape(-1)
+        # A quaternion and its negative are one orientation: rows of an orientation may flip together.
+        flipped = said.copy()
+        if kind not in ("position", "box", "center of mass"):
+            flipped[3 if "pose" in kind else 0 :] *= -1
+        assert min(np.abs(said - value).max(), np.abs(flipped - value).max()) < 1e-12
+        h = 1e-6
+        for k, unit in enumerate(np.eye(robot.nv)):
+            ahead = constraint.numeric(numeric.at(pin.integrate(robot.model, q, h * unit)))[0]
+            behind = constraint.numeric(numeric.at(pin.integrate(robot.model, q, -h * unit)))[0]
+            assert np.allclose((ahead - behind) / (2 * h), jacobian[:, k], atol=2e-8)
+
+
+@pytest.mark.parametrize("angle", [1e-9, 1e-3, 1.0, 3.0, np.pi - 1e-6, np.pi])
+def test_orientation_error_is_zero_at_the_target_only(angle: float) -> None:
+    """The skew-symmetric error vanishes at 180° as well; this one is largest there."""
+    robot = load_robot("tilthex_arm")
+    base = PointOnLink(1, np.zeros(3), np.eye(3))
+    constraint = HeldOrientation("x", base, np.eye(3))
+    q = robot.posture()
+    q[3:7] = pin.Quaternion(pin.exp3(angle * AXIS)).coeffs()
+    numeric = Numeric(robot.model).at(q)
+    value, _ = constraint.numeric(numeric)
+    assert np.linalg.norm(value) == pytest.approx(2 * np.sin(angle / 2), abs=1e-12)
+    assert constraint.pose_error(numeric)[1] == pytest.approx(angle, abs=1e-7)
+
+
+def test_level_base_leaves_yaw_free_and_nothing_else() -> None:
+    robot = load_robot("tilthex_arm")
+    base = PointOnLink(1, np.zeros(3), np.eye(3))
+    level = HeldOrientation("level base", base, np.eye(3), np.array([0.0, 0.0, 1.0]))
+    for yaw in (-3.0, -1.0, 0.5, 2.0):
+        q = robot.posture()
+        q[3:7] = pin.Quaternion(pin.exp3(np.array([0, 0, yaw]))).coeffs()
+        assert np.abs(level.numeric(Numeric(robot.model).at(q))[0]).max() < 1e-14
+    for tilt in ([0.1, 0, 0], [0, -0.2, 0], [np.pi, 0, 0]):
+        q[3:7] = pin.Quaternion(pin.exp3(np.array(tilt))).coeffs()
+        assert np.abs(level.numeric(Numeric(robot.model).at(q))[0]).max() > 0.05
