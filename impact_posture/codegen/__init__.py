@@ -1,1 +1,1 @@
-"""."""
+"""The C export: emitter, source, manifest, compiler."""

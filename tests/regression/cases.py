@@ -1,0 +1,61 @@
+"""The optimizations whose results are committed, each as the one command that gives it."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+from impact_posture.posture.settings import Prepared, ProblemSettings, make_settings, prepare
+from impact_posture.posture.solve import PostureSolution, solve
+
+ROOT = Path(__file__).parents[2]
+EXPECTED = Path(__file__).with_name("expected.json")
+PAGE = ROOT / "docs" / "generated" / "regression.md"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One optimization.
+
+    Attributes:
+        name: Its key in ``expected.json``.
+        robot: As given to the command, relative to the repository.
+        frame: Contact frame.
+        normal: Contact normal, world.
+    """
+
+    name: str
+    robot: str
+    frame: str
+    normal: tuple[float, float, float]
+
+    @property
+    def command(self) -> str:
+        """What a user types."""
+        normal = " ".join(f"{v:g}" for v in self.normal)
+        return f"impact-posture optimize {shlex.quote(self.robot)} --frame {self.frame} --normal {normal}"
+
+    @property
+    def settings(self) -> ProblemSettings:
+        """The same as settings."""
+        robot = str(ROOT / self.robot) if self.robot.endswith(".urdf") else self.robot
+        return make_settings({"robot": robot, "frame": self.frame, "normal": self.normal})
+
+    def solve(self) -> tuple[Prepared, PostureSolution]:
+        """Solve with the command's defaults."""
+        prepared = prepare(self.settings)
+        settings = prepared.settings
+        return prepared, solve(prepared.problem, starts=settings.starts, seed=settings.seed)
+
+
+CASES = (
+    Case("tilthex_arm, floor", "tilthex_arm", "ee", (0, 0, 1)),
+    Case("tilthex_arm, wall", "tilthex_arm", "ee", (1, 0, 0)),
+    Case("solo8, push at the base", "solo8", "base_link", (1, 0, 0)),
+    Case("talos, push at the torso", "talos", "torso_2_link", (1, 0, 0)),
+    Case("talos, right hand", "talos", "gripper_right_base_link", (1, 0, 0)),
+    Case("panda, hand", "panda", "panda_hand_tcp", (0, 0, 1)),
+    Case("hextilt, gripper", "hextilt", "flying_arm_5__gripper", (0, 0, 1)),
+    Case("rail_arm, your own URDF", "docs/examples/rail_arm/rail_arm.urdf", "tool", (0, 0, 1)),
+)
