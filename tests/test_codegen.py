@@ -22,9 +22,7 @@ from impact_posture.codegen.compiler import (
     casadi_difference,
     compile_and_check,
     compiled,
-    find_compiler,
     oracle_difference,
-    run_compiler,
 )
 from impact_posture.codegen.emitter import _OPERATIONS, c_double, emit_function
 from impact_posture.codegen.export import Export, c_identifier, export
@@ -35,6 +33,7 @@ from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.loader import load_robot
+from impact_posture.toolchain import find_compiler, run_compiler
 
 KINOVA = "example-robot-data:kinova_description/robots/kinova.urdf"
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")

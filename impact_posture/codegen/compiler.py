@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
-import shlex
-import shutil
-import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +17,7 @@ from impact_posture.codegen.manifest import sample_postures
 from impact_posture.errors import CompilerError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.toolchain import find_compiler, run_compiler
 
 Vector = NDArray[np.float64]
 
@@ -30,15 +27,6 @@ FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared")
 _CASADI_TOLERANCE = 1e-9
 # The oracle factorises another matrix; feet at compliance ε cost digits there (condition about 1/ε).
 _ORACLE_TOLERANCE = 1e-5
-
-
-def find_compiler() -> list[str] | None:
-    """The C compiler as the head of a command: ``$CC`` (which may carry options), cc, gcc or clang; else ``None``."""
-    for text in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
-        words = shlex.split(text)
-        if words and shutil.which(words[0]):
-            return words
-    return None
 
 
 class CompiledExport:
@@ -99,28 +87,6 @@ def compiled(
         command = [*compiler, *FLAGS, *extra_flags, f"{prefix}.c", "-o", str(library), "-lm"]
         run_compiler(command, export_dir)
         yield CompiledExport(library, prefix, nq, nv)
-
-
-def run_compiler(command: list[str], folder: Path) -> None:
-    """Run a compiler's command in ``folder``.
-
-    Raises:
-        CompilerError: With the compiler's first error line and the command.
-    """
-    try:
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace", check=False)
-    except OSError as error:
-        raise CompilerError(f"{error.strerror} ({shlex.join(command)})", where="codegen", mend="set CC") from None
-    output = Path(command[command.index("-o") + 1])
-    if done.returncode == 0 and (folder / output).is_file():
-        return
-    said = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
-    first = next((line for line in said if "error" in line.lower()), said[0] if said else None)
-    raise CompilerError(
-        f"{first or f'it said nothing, exit code {done.returncode}'} (command: {shlex.join(command)}, in {folder})",
-        where="the C compiler failed",
-        mend="check the compiler or set CC to another",
-    )
 
 
 def compile_and_check(export_dir: Path, prefix: str, objective: ImpactObjective, samples: int = 20) -> float:

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.codegen.compiler import compile_and_check, find_compiler
+from impact_posture.codegen.compiler import compile_and_check
 from impact_posture.codegen.manifest import build_manifest
 from impact_posture.codegen.source import build_texts
 from impact_posture.errors import InputError, OutputError
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.toolchain import find_compiler
 
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 

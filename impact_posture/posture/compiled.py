@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shutil
-import subprocess
 import tempfile
 from pathlib import Path
 from typing import Literal
@@ -20,6 +18,7 @@ import casadi as ca
 from impact_posture import __version__
 from impact_posture.errors import CompilerError
 from impact_posture.posture.problem import PostureProblem
+from impact_posture.toolchain import find_compiler, run_compiler
 
 CompileMode = Literal["auto", "always", "never"]
 
@@ -35,14 +34,6 @@ def cache_folder() -> Path:
     if own:
         return Path(own)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "impact-posture"
-
-
-def find_compiler() -> str | None:
-    """The C compiler: ``$CC``, cc, gcc or clang; ``None`` where there is none."""
-    for name in (os.environ.get("CC"), "cc", "gcc", "clang"):
-        if name and shutil.which(name):
-            return name
-    return None
 
 
 def compiled_solver(
@@ -93,7 +84,7 @@ def _own_source() -> str:
     return digest.hexdigest()
 
 
-def _compile(solver: ca.Function, compiler: str, library: Path) -> None:
+def _compile(solver: ca.Function, compiler: list[str], library: Path) -> None:
     library.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         source, built = Path(folder) / "programme.c", Path(folder) / "programme.so"
@@ -102,9 +93,5 @@ def _compile(solver: ca.Function, compiler: str, library: Path) -> None:
         for name in solver.get_function():
             generator.add(solver.get_function(name))
         generator.generate(f"{folder}{os.sep}")
-        command = [compiler, "-O1", "-fPIC", "-shared", str(source), "-o", str(built), "-lm"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            words = (done.stderr or done.stdout).strip().split("\n")[0]
-            raise CompilerError(f"'{' '.join(command)}' failed: {words}", where="compile", mend="check the compiler")
+        run_compiler([*compiler, "-O1", "-fPIC", "-shared", source.name, "-o", built.name, "-lm"], Path(folder))
         os.replace(built, library)
