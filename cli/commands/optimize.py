@@ -22,7 +22,9 @@ _NOT_SETTINGS = {"robot", "out", "force", "no_codegen", "jobs", "compile", "form
 
 RobotOrProblem = Annotated[
     str,
-    typer.Argument(metavar="ROBOT|PROBLEM.toml", help="Known name, path to a .urdf, example-robot-data:PATH, or a problem."),
+    typer.Argument(
+        metavar="ROBOT|PROBLEM.toml", help="Known name, path to a .urdf, example-robot-data:PATH, or a problem."
+    ),
 ]
 
 

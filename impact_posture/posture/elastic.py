@@ -37,7 +37,7 @@ class ElasticAnswer:
 
 
 def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAnswer:
-    """Minimise the sum of violations, ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures."""
+    """Minimize ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures."""
     chart = Chart(problem.robot.model)
     solver, rows = _build(problem, chart)
     lower_rows = np.concatenate([c.lower[problem.carried(i)] for i, c in enumerate(problem.constraints)])

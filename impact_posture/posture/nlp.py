@@ -6,8 +6,8 @@ Formulation (the "lifted" one): the impact's linear solve is left to IPOPT,
     subject to            M(q)a − J_sᵀf − Jᵀs = 0,  J_s a + εf = 0,  what ties s to n,
                           c(q) within bounds,  |quaternions| = 1,  limits,
 
-so that every function is linear or quadratic in the auxiliaries and the exact Hessian stays small: about a fifth of
-the reduced form's operations on talos (``tests/benchmarks/formulations.py`` measures both).
+so that every function is linear or quadratic in the auxiliaries and the exact Hessian stays small
+(``tests/benchmarks/formulations.py`` measures both forms).
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ class PostureNLP:
     build_time_s: float
     compiled: bool
 
-    def solve(self, start: Vector, *, scale: float | None = None, max_iter: int | None = None) -> SolveRecord:
-        """Solve from the configuration ``start``; the objective is scaled by its value there unless told otherwise."""
+    def solve(self, start: Vector, *, scale: float | None = None) -> SolveRecord:
+        """Solve from ``start``; the objective is divided by ``scale``, its value there unless given."""
         problem, nx = self.problem, self.chart.nx
         x = np.clip(self.chart.to_x(start), problem.lower, problem.upper)
         guess = np.concatenate([x, problem.objective.guess(self.chart.to_q(x))])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -44,7 +45,7 @@ def null_space_path(problem: PostureProblem, start: Vector, end: Vector, points:
     for t in np.linspace(0, 1, points)[1:-1]:
         postures.append(projector.project(pin.interpolate(model, start, end, float(t))).q)
     postures.append(end)
-    steps = [np.linalg.norm(pin.difference(model, a, b)) for a, b in zip(postures, postures[1:], strict=False)]
+    steps = [np.linalg.norm(pin.difference(model, a, b)) for a, b in pairwise(postures)]
     found = [problem.objective.oracle.quantities(q) for q in postures]
     return NullSpacePath(
         q=np.array(postures),

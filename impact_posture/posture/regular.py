@@ -104,7 +104,7 @@ def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTu
 
 
 def _independent_rows(problem: PostureProblem, numeric: Numeric) -> tuple[tuple[int, ...], ...]:
-    """For each constraint the rows that the programme carries: all of an inequality, independent ones of equalities."""
+    """For each constraint the rows that the programme carries: all inequalities, independent equalities."""
     held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
     labels, blocks = [], []
     for index, constraint in enumerate(problem.constraints):

@@ -113,7 +113,9 @@ def prepare(settings: ProblemSettings) -> Prepared:
     contacts = (settings.contact,) if isinstance(settings.contact, str) else settings.contact or ()
     if len(contacts) > 1:
         raise InputError(
-            f"{len(contacts)} contacts are given", where="--contact", mend="this version optimizes one contact at a time"
+            f"{len(contacts)} contacts are given",
+            where="--contact",
+            mend="this version optimizes one contact at a time",
         )
     if settings.normal_cone:
         raise InputError(

@@ -55,7 +55,9 @@ class Projector:
             value, jacobian = constraint.numeric(self.numeric)
             violation = value - np.clip(value, constraint.lower, constraint.upper)
             values.append(violation)
-            jacobians.append(np.where((violation != 0)[:, None], jacobian, 0.0) if not constraint.equality else jacobian)
+            if not constraint.equality:
+                jacobian = np.where((violation != 0)[:, None], jacobian, 0.0)
+            jacobians.append(jacobian)
         return np.concatenate(values), np.vstack(jacobians)
 
     def project(self, q: Vector, tolerance: float = 1e-9) -> Projection:
