@@ -1,1 +1,24 @@
-"""."""
+"""One thin file a command: options in, library call, output out.
+
+A new command is a file here and a line in ``COMMANDS``.  Nothing heavy is imported before a command runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from impact_posture_cli.commands.evaluate import evaluate
+from impact_posture_cli.commands.inspect import inspect
+from impact_posture_cli.commands.optimize import optimize
+from impact_posture_cli.commands.plot import plot
+from impact_posture_cli.commands.robots import robots
+
+COMMANDS: Final[dict[str, Callable[..., None]]] = {
+    "robots": robots,
+    "inspect": inspect,
+    "evaluate": evaluate,
+    "optimize": optimize,
+    "plot": plot,
+}
+"""Name to function, in the order of the help page."""

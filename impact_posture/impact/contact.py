@@ -52,7 +52,9 @@ class Contact:
         n = np.array(normal, dtype=float)
         if n.shape != (3,) or not np.isfinite(n).all() or np.linalg.norm(n) < 1e-9:
             raise ContactError(
-                f"the normal {tuple(normal)} has no direction", where="--normal", mend="give three numbers, not all zero"
+                f"the normal {tuple(normal)} has no direction",
+                where="--normal",
+                mend="give three numbers, not all zero",
             )
         if not np.isfinite(np.array(offset, dtype=float)).all():
             raise ContactError("the offset is not finite", where="--offset", mend="give three numbers")
@@ -118,7 +120,7 @@ def default_compliance(robot: Robot) -> float:
 
 
 def support_inertia(robot: Robot, supports: tuple[Support, ...], compliance: float) -> dict[int, Vector]:
-    """``J_sᵀJ_s/ε`` as 6×6 inertias on the feet's links: a point mass ``1/ε`` (and for a surface a moment ``1/ε``)."""
+    """``J_sᵀJ_s/ε`` as 6×6 inertias on the feet's links: point masses ``1/ε``, for a surface also moments ``1/ε``."""
     extra: dict[int, Vector] = {}
     for support in supports:
         point = point_on(robot, support.frame, support.offset)

@@ -10,11 +10,17 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
 
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import ByJoint, Coupling, PointOnLink, Product, Tree, Wrench
 from impact_posture.impact.contact import Contact, Support, point_on, support_inertia
 from impact_posture.impact.metric import Metric
 from impact_posture.robot.robot import Robot
+
+# Singular values of stacked Jacobians below this part of the largest are rounding.
+_FROZEN = 1e-9
 
 
 class ImpactKernel:
@@ -137,10 +143,19 @@ class ImpactKernel:
     @cached_property
     def _sticking(self) -> tuple[ca.SX, ca.SX, ByJoint]:
         """Impulse ``s`` per unit approach speed, jump ``a = M⁻¹Jᵀs`` and its link velocities."""
-        s = _inverse3(self.mobility) @ self.world_normal
+        s = self._mobility_inverse @ self.world_normal
         a = sum((self._axes[k][0] * s[k] for k in range(3)), ca.SX.zeros(self.tree.nv))
-        velocities = {i: sum(self._axes[k][1][i] * s[k] for k in range(3)) for i in self._axes[0][1]}
-        return s, a, velocities
+        return s, a, self._combine(s)
+
+    @cached_property
+    def _mobility_inverse(self) -> ca.SX:
+        """``(JM⁻¹Jᵀ)⁻¹``; the pseudo-inverse of a planar robot's."""
+        frozen = frozen_directions(self.robot, self.point)
+        return _inverse3(self.mobility + frozen if frozen.any() else self.mobility)
+
+    def _combine(self, weights: ca.SX) -> ByJoint:
+        """Link velocities of ``M⁻¹Jᵀ weights``."""
+        return {i: sum((self._axes[k][1][i] * weights[k] for k in range(3)), ca.SX(6, 1)) for i in self._axes[0][1]}
 
     @cached_property
     def S(self) -> ca.SX:
@@ -152,9 +167,9 @@ class ImpactKernel:
     def grad_S(self) -> ca.SX:
         """``2 ∂_q[sᵀJb + rᵀJa − bᵀMa]`` (and ``−2rᵀn(q)`` for a normal that turns with the robot), shape (nv,)."""
         s, a, va = self._sticking
-        free_b, free_vb = self.tree.solve(tau=self._weigh(a, va))
-        r = -_inverse3(self.mobility) @ self.tree.point_velocity(self.point, free_vb)[:3]
-        vb = {i: free_vb[i] + sum(self._axes[k][1][i] * r[k] for k in range(3)) for i in free_vb}
+        _, free_vb = self.tree.solve(tau=self._weigh(a, va))
+        r = -self._mobility_inverse @ self.tree.point_velocity(self.point, free_vb)[:3]
+        vb = {i: free_vb[i] + added for i, added in self._combine(r).items()}
         zero = ca.SX.zeros(3)
         gradient = self.tree.bracket_gradient(
             [
@@ -181,6 +196,24 @@ class ImpactKernel:
 
     def _along(self, wrench: Wrench, velocities: ByJoint) -> ca.SX:
         return ca.dot(self.tree.link_force(wrench), velocities[wrench.point.joint])
+
+
+def frozen_directions(robot: Robot, point: PointOnLink) -> NDArray[np.float64]:
+    """Projector, shape (3, 3), on the world directions that a point can move in nowhere; zero but for planar robots.
+
+    Added to ``JM⁻¹Jᵀ`` it makes the inverse act as the pseudo-inverse on the directions that remain.
+    """
+    numeric, generator = Numeric(robot.model), np.random.default_rng(0)
+    rest = pin.neutral(robot.model)
+    columns = np.hstack(
+        [
+            numeric.at(pin.integrate(robot.model, rest, generator.normal(size=robot.nv))).jacobian(point)[:3]
+            for _ in range(3)
+        ]
+    )
+    axes, sizes, _ = np.linalg.svd(columns)
+    missing = axes[:, sizes <= _FROZEN * sizes[0]]
+    return np.asarray(missing @ missing.T)
 
 
 def _inverse3(A: ca.SX) -> ca.SX:

@@ -5,7 +5,7 @@ An objective is a metric × a kind × supports × one contact; none of the combi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import Tree, Wrench
-from impact_posture.errors import MetricError
 from impact_posture.impact.contact import Contact, Support, default_compliance, point_on
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.metric import Metric, ObjectiveKind
-from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.impact.oracle import ImpactOracle, no_sticking
 from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
@@ -102,7 +101,7 @@ class ImpactObjective:
 
     robot: Robot
     contact: Contact
-    metric: Metric = Metric()
+    metric: Metric = field(default_factory=Metric)
     kind: ObjectiveKind = "impulse"
     supports: tuple[Support, ...] = ()
     compliance: float = 0.0
@@ -199,22 +198,21 @@ class ImpactObjective:
         if self.kind == "impulse":
             unknown, fixing = ca.SX(0, 1), ca.SX(0, 1)
             blow = Wrench(point, n, zero, in_frame=in_frame)
-            s = world_n
         elif self.kind == "sticking":
             unknown = ca.SX.sym("s", 3)
             fixing = contact_velocity - world_n
-            blow, s = Wrench(point, unknown, zero), unknown
+            blow = Wrench(point, unknown, zero)
         else:
             unknown = ca.SX.sym("lam")
             fixing = ca.dot(world_n, contact_velocity) - 1
             blow = Wrench(point, n * unknown, zero, in_frame=in_frame)
-            s = world_n * unknown
-        momentum = tree.mass_times(a) - tree.generalized_force([*wrenches, blow])
+        mass_a = tree.mass_times(a)
+        momentum = mass_a - tree.generalized_force([*wrenches, blow])
         if self.kind == "energy":
             value = unknown / 2
         elif self.metric.kind == "kinetic":
-            # aᵀMa = aᵀ(J_sᵀf + Jᵀs) on the equations.
-            value = ca.dot(s, contact_velocity) - self.compliance * ca.sumsqr(f)
+            # Not sᵀJa − ε|f|², equal on the equations: stiff feet make that a small difference of large numbers.
+            value = ca.dot(a, mass_a)
         else:
             value = ca.dot(a, ca.SX(self.metric.diagonal(tree.nv)) * a)
         variables = ca.vertcat(a, f, unknown)
@@ -256,12 +254,7 @@ class ImpactObjective:
         if self.kind == "energy":
             return found.E
         if found.S is None:
-            raise MetricError(
-                "S does not exist here: the contact point cannot move in every direction and the normal leaves "
-                "those it can",
-                where="--objective sticking",
-                mend="choose --objective speed, or another frame, normal or posture",
-            )
+            raise no_sticking()
         return found.S
 
     def gradient(self, q: Vector) -> Vector:

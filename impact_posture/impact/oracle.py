@@ -12,6 +12,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import MetricError
 from impact_posture.impact.contact import Contact, Support, point_on
 from impact_posture.impact.metric import Metric
 from impact_posture.robot.robot import Robot
@@ -111,7 +112,7 @@ class ImpactOracle:
         ellipsoid = A.T @ self.weigh(A)
         a = A @ self.n
         H, G = float(a @ self.weigh(a)), float(self.n @ mobility @ self.n)
-        s = _sticking_impulse(mobility, self.n)
+        s = _Inverse.of(mobility).solve(self.n)
         stuck = None if s is None else A @ s
         return ImpactQuantities(
             H=H,
@@ -146,14 +147,23 @@ class ImpactOracle:
         return 2 * self._coupling(self.n, a, self.contact.normal_frame == "contact") - self._inertial(a, a)
 
     def gradient_S(self, q: Vector) -> Vector:
-        """Tangent gradient of S where ``JM⁻¹Jᵀ`` is regular, shape (nv,)."""
+        """Tangent gradient of S, shape (nv,).
+
+        Where ``JM⁻¹Jᵀ`` is singular its pseudo-inverse stands for the inverse: right where the directions that the
+        contact can move in stay the same, as in a planar robot.
+
+        Raises:
+            MetricError: S does not exist here.
+        """
         self.at(q)
         A = self.solve(self.J.T)
-        mobility = self.J @ A
-        s = np.linalg.solve(mobility, self.n)
+        inverse = _Inverse.of(self.J @ A)
+        s = inverse.solve(self.n)
+        if s is None:
+            raise no_sticking()
         a = A @ s
         free = self.solve(self.weigh(a))
-        r = -np.linalg.solve(mobility, self.J @ free)
+        r = -inverse.matrix @ (self.J @ free)
         b = free + A @ r
         gradient = 2 * (self._coupling(s, b, False) + self._coupling(r, a, False) - self._inertial(b, a))
         if self.contact.normal_frame == "contact":
@@ -182,12 +192,31 @@ class ImpactOracle:
         return self.numeric.inertial_gradient(a, a) if self.metric.kind == "kinetic" else np.zeros(self._nv)
 
 
-def _sticking_impulse(mobility: Vector, n: Vector) -> Vector | None:
-    """``(JM⁻¹Jᵀ)⁺ n``, or ``None`` where the matrix is singular and ``n`` leaves its range."""
-    values, vectors = np.linalg.eigh(mobility)
-    kept = values > _RANK * max(values[-1], 1e-300)
-    coordinates = vectors.T @ n
-    if np.abs(coordinates[~kept]).max(initial=0.0) > np.sqrt(_RANK):
-        return None
-    inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
-    return np.asarray(vectors @ (inverse * coordinates))
+@dataclass(frozen=True)
+class _Inverse:
+    """``(JM⁻¹Jᵀ)⁺`` and the projector out of its range."""
+
+    matrix: Vector
+    outside: Vector
+
+    @staticmethod
+    def of(mobility: Vector) -> _Inverse:
+        values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
+        kept = values > _RANK * max(float(values[-1]), 1e-300)
+        reciprocal = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
+        return _Inverse((vectors * reciprocal) @ vectors.T, vectors[:, ~kept] @ vectors[:, ~kept].T)
+
+    def solve(self, n: Vector) -> Vector | None:
+        """The impulse per unit approach speed, or ``None`` where ``n`` leaves the range."""
+        if np.linalg.norm(self.outside @ n) > np.sqrt(_RANK):
+            return None
+        return np.asarray(self.matrix @ n)
+
+
+def no_sticking() -> MetricError:
+    """Build the error for a posture where S does not exist."""
+    return MetricError(
+        "S does not exist here: the contact point cannot move in every direction and the normal leaves those it can",
+        where="--objective sticking",
+        mend="choose --objective speed, or another frame, normal or posture",
+    )

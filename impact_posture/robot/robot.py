@@ -7,7 +7,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +22,9 @@ CONVENTION = (
     "frame (Pinocchio LOCAL); SI units, radians"
 )
 FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
+
+# What rounding leaves of a zero in a rotation matrix or an inertia (SI units).
+_DUST = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +111,14 @@ class Robot:
         model = self.model
         content = [
             [
-                [str(model.names[i]), str(model.joints[i].shortname()), int(model.parents[i])]
-                + _rounded(model.jointPlacements[i].homogeneous)
-                + _rounded(model.inertias[i].matrix())
-                + _rounded(_axis(model.joints[i]))
+                [
+                    str(model.names[i]),
+                    str(model.joints[i].shortname()),
+                    int(model.parents[i]),
+                    *_rounded(model.jointPlacements[i].homogeneous),
+                    *_rounded(model.inertias[i].matrix()),
+                    *_rounded(_axis(model.joints[i])),
+                ]
                 for i in range(1, model.njoints)
             ],
             _rounded(model.armature),
@@ -175,19 +181,32 @@ class Robot:
             raise PostureError(
                 f"entry {int(np.argmin(np.isfinite(q)))} is not finite", where=where, mend="correct it"
             )
+        self._check_norms(q, where)
         if self.floating:
-            self._check_quaternion(q[3:7], where)
+            self._check_swapped(q[3:7], where)
         q = pin.normalize(self.model, q)
         if limits:
             self.check_limits(q, where=where)
         return np.asarray(q)
 
-    def _check_quaternion(self, quaternion: Vector, where: str) -> None:
-        norm = float(np.linalg.norm(quaternion))
-        if abs(norm - 1) > 1e-3:
-            raise PostureError(
-                f"the base quaternion has norm {norm:.4g}", where=where, mend="give a unit quaternion x y z w"
-            )
+    def _check_norms(self, q: Vector, where: str) -> None:
+        """Refuse quaternions, and cosines with sines of continuous joints, that are not of unit length."""
+        for i in range(1, self.model.njoints):
+            width, name = int(self.model.nqs[i]), str(self.model.names[i])
+            if width == int(self.model.nvs[i]):
+                continue
+            # Quaternions (and cosine with sine) come last in a joint's numbers.
+            count = 4 if int(self.model.nvs[i]) in (3, 6) and "Planar" not in self.model.joints[i].shortname() else 2
+            last = int(self.model.idx_qs[i]) + width
+            norm = float(np.linalg.norm(q[last - count : last]))
+            if abs(norm - 1) > 1e-3:
+                what = "quaternion" if count == 4 else "pair of cosine and sine"
+                whose = f"the base {what}" if self.floating and i == 1 else f"the {what} of joint '{name}'"
+                order = " x y z w" if count == 4 else ""
+                raise PostureError(f"{whose} has norm {norm:.4g}", where=where, mend=f"give a unit {what}{order}")
+
+    def _check_swapped(self, quaternion: Vector, where: str) -> None:
+        """Refuse a base quaternion that is plainly w x y z: read as x y z w it would put the robot on its head."""
         rotation = pin.Quaternion(*[float(quaternion[k]) for k in (3, 0, 1, 2)]).matrix()
         swapped = pin.Quaternion(*[float(v) for v in quaternion]).matrix()
         # Upside down as read, upright if the first number were w: nobody stands or hovers on their head.
@@ -230,11 +249,5 @@ def _single(joint: pin.JointModel) -> pin.Model:
 
 
 def _rounded(values: object) -> list[str]:
-    # 12 digits: a model read twice, or on another machine, hashes the same.
-    return [f"{float(v) + 0.0:.12g}" for v in np.asarray(values).reshape(-1)]
-
-
-def posture_path(text: str) -> Path | None:
-    """Tell a posture file from a posture name."""
-    path = Path(text).expanduser()
-    return path if path.suffix in (".json", ".yaml", ".yml") or path.is_file() else None
+    # 12 digits, and no dust of sines that should be zero: a model read twice, or on another machine, hashes the same.
+    return [f"{v:.12g}" if abs(v) > _DUST else "0" for v in map(float, np.asarray(values).reshape(-1))]

@@ -1,0 +1,96 @@
+"""From the options of a command to the library's request: the same for every command that has them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from impact_posture_cli.checks import Three
+from impact_posture_cli.options import (
+    MetricKind,
+    NormalFrame,
+    ObjectiveKind,
+    RootKind,
+    check_contact,
+    check_supports,
+)
+
+if TYPE_CHECKING:
+    from impact_posture.impact.request import ImpactRequest
+    from impact_posture.robot.loader import LoadOptions
+
+
+def load_options(
+    *,
+    root: RootKind | None,
+    package_dir: list[str] | None,
+    srdf: str | None,
+    config: str | None,
+    armature: list[str] | None,
+    lock: list[str] | None,
+) -> LoadOptions:
+    """How to load the robot."""
+    from impact_posture.impact.request import parse_armature
+    from impact_posture.robot.loader import LoadOptions
+
+    return LoadOptions(
+        root=root,
+        package_dirs=tuple(package_dir or ()),
+        srdf=srdf,
+        config=config,
+        armature=parse_armature(armature or ()),
+        lock=tuple(lock or ()),
+    )
+
+
+def impact_request(
+    robot: str,
+    *,
+    frame: str | None,
+    normal: Three | None,
+    offset: Three | None,
+    normal_frame: NormalFrame,
+    contact: str | None,
+    impulse: float,
+    posture: str | None,
+    support: list[str] | None,
+    no_support: bool,
+    metric: MetricKind,
+    weights: str | None,
+    objective: ObjectiveKind,
+    speed: float,
+    restitution: float,
+    root: RootKind | None,
+    package_dir: list[str] | None,
+    srdf: str | None,
+    config: str | None,
+    armature: list[str] | None,
+    lock: list[str] | None,
+) -> ImpactRequest:
+    """What impact is meant.
+
+    Raises:
+        typer.BadParameter: Wrong from the command line alone; exit code 2.
+    """
+    check_contact(frame, normal, contact)
+    supports = check_supports(support, no_support)
+    from impact_posture.impact.request import ImpactRequest
+
+    return ImpactRequest(
+        robot=robot,
+        load=load_options(
+            root=root, package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock
+        ),
+        frame=frame,
+        normal=normal,
+        offset=offset,
+        normal_frame=normal_frame,
+        contact=contact,
+        impulse=impulse,
+        posture=posture,
+        supports=supports,
+        metric=metric,
+        weights=weights,
+        objective=objective,
+        speed=speed,
+        restitution=restitution,
+    )

@@ -1,0 +1,120 @@
+"""The one place where an error becomes a line on standard error and an exit code."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Any
+
+import typer
+
+from impact_posture_cli.checks import UsageError
+
+DEBUG_VARIABLE = "IMPACT_POSTURE_DEBUG"
+_INTERRUPTED = 130
+
+
+def run(command: Any, arguments: Sequence[str]) -> int:
+    """Run a Typer command and return its exit code.
+
+    0 done; 1 an error to act on; 2 a wrong command line; other codes as the error says; 130 interrupted.  One line on
+    standard error, and with ``--json`` the same as ``{"error": {code, kind, what, where, mend}}`` on standard output.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            # λ and × must not crash a terminal that has no letter for them.
+            stream.reconfigure(errors="replace")
+    wants_json = "--json" in arguments
+    try:
+        code = command.main(args=list(arguments), prog_name="impact-posture", standalone_mode=False)
+        sys.stdout.flush()
+        if code == _INTERRUPTED:  # newer Typers hand Ctrl-C back as a code
+            return _interrupted(wants_json)
+        return code if isinstance(code, int) else 0
+    except BrokenPipeError:
+        return _closed_pipe()
+    except (KeyboardInterrupt, typer.Abort):
+        return _interrupted(wants_json)
+    except SystemExit as error:
+        # Rich leaves this way when its pipe closes.
+        return error.code if isinstance(error.code, int) else 1
+    except Exception as error:
+        if os.environ.get(DEBUG_VARIABLE):
+            traceback.print_exc()
+        return _explain(error, wants_json)
+
+
+def _interrupted(wants_json: bool) -> int:
+    return _report(_INTERRUPTED, "Interrupted", "interrupted", wants_json=wants_json)
+
+
+def _explain(error: Exception, wants_json: bool) -> int:
+    from impact_posture.errors import ImpactPostureError
+
+    kind = type(error).__name__
+    if isinstance(error, ImpactPostureError):
+        return _report(error.exit_code, kind, error.what, error.where, error.mend, wants_json=wants_json)
+    if isinstance(error, UsageError):
+        return _usage(error, wants_json)
+    if isinstance(error, OSError):
+        if error.errno == errno.EPIPE:
+            return _closed_pipe()
+        mend = "free some space" if error.errno == errno.ENOSPC else "check the path and its permissions"
+        where = str(error.filename) if error.filename is not None else ""
+        return _report(1, kind, error.strerror or str(error), where, mend, wants_json=wants_json)
+    what = f"{kind}: {error}" if str(error) else kind
+    mend = f"please report it with the output of {DEBUG_VARIABLE}=1"
+    return _report(1, "InternalError", what, "internal error", mend, wants_json=wants_json)
+
+
+def _usage(error: Any, wants_json: bool) -> int:
+    """Typer's own message, plain: how to call it, and what was wrong."""
+    code = int(getattr(error, "exit_code", 2))
+    with contextlib.suppress(OSError):
+        error.show(file=sys.stderr)
+    if wants_json:
+        context = getattr(error, "ctx", None)
+        where = context.command_path if context is not None else "command line"
+        _document(code, "UsageError", error.format_message(), where, f"see {where} --help")
+    return code
+
+
+def _report(
+    code: int, kind: str, what: str, where: str = "", mend: str = "", *, wants_json: bool
+) -> int:
+    what, where, mend = (" ".join(part.split()) for part in (what, where, mend))
+    line = f"{where}: {what}" if where else what
+    with contextlib.suppress(OSError):
+        sys.stderr.write(f"error: {line}; {mend}\n" if mend else f"error: {line}\n")
+        sys.stderr.flush()
+    if wants_json:
+        _document(code, kind, what, where, mend)
+    _discard_output()
+    return code
+
+
+def _document(code: int, kind: str, what: str, where: str, mend: str) -> None:
+    content = {"code": code, "kind": kind, "what": what, "where": where, "mend": mend}
+    with contextlib.suppress(OSError):
+        sys.stdout.write(json.dumps({"error": content}, allow_nan=False) + "\n")
+        sys.stdout.flush()
+
+
+def _closed_pipe() -> int:
+    """The reader has gone (``| head``): say nothing, and keep the interpreter quiet at its end."""
+    _discard_output()
+    return 1
+
+
+def _discard_output() -> None:
+    """What could not be written must not fail again when the interpreter flushes it."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,28 @@
+"""``impact-posture robots``."""
+
+from __future__ import annotations
+
+from impact_posture_cli import options
+
+
+def robots(json: options.Json = False, quiet: options.Quiet = False) -> None:
+    """List the robots known by name, and how else to name one."""
+    from impact_posture.robot.summary import WAYS_TO_NAME, catalogue
+    from impact_posture_cli.output import Page, print_json
+
+    entries = catalogue()
+    if json:
+        print_json({"robots": entries, "ways_to_name": list(WAYS_TO_NAME)})
+        return
+    page = Page(quiet=quiet)
+    page.table(
+        ("name", "kind", "contact frame", "description"),
+        [(e["name"], e["kind"], e["frame"] or "", e["description"]) for e in entries],
+    )
+    if not quiet:
+        page.gap()
+        page.line("ROBOT is one of:")
+        page.table((), [("  -", way) for way in WAYS_TO_NAME])
+        page.line("Models come from the example-robot-data package, except:")
+        own = [e["name"] for e in entries if e["from"] != "example-robot-data"]
+        page.line(f"  {', '.join(own)} (impact-posture's own). --json has every source.")

@@ -1,0 +1,106 @@
+"""What the command line shows: Rich tables for people, one JSON document for programs, warnings apart."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def print_json(document: object) -> None:
+    """Write one strictly valid JSON document to standard output: NaN and infinity would raise here."""
+    sys.stdout.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+class Page:
+    """A page of titled tables on standard output; warnings go to standard error."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        from rich.console import Console
+
+        self.console: Console = Console(highlight=False, soft_wrap=False)
+        self.quiet = quiet
+
+    def title(self, text: str, detail: str = "") -> None:
+        """A bold line."""
+        from rich.text import Text
+
+        line = Text(text, style="bold")
+        if detail:
+            line.append(f"  {detail}", style="not bold dim")
+        self.console.print(line)
+
+    def line(self, text: str, *, style: str = "") -> None:
+        """A paragraph, wrapped at words."""
+        from rich.text import Text
+
+        self.console.print(Text(text, style=style))
+
+    def gap(self) -> None:
+        """An empty line."""
+        self.console.print()
+
+    def pairs(self, rows: Iterable[tuple[str, str]]) -> None:
+        """Two columns: what, and its value."""
+        self.table((), [(f"  {key}", value) for key, value in rows], dim=0)
+
+    def table(
+        self,
+        headers: Sequence[str],
+        rows: Iterable[Sequence[str]],
+        *,
+        right: Sequence[int] = (),
+        dim: int | None = None,
+        fold: int = -1,
+    ) -> None:
+        """A table; text is taken as it is, never as markup.
+
+        Args:
+            headers: Titles of the columns; none for a table without a head.
+            rows: Cells as text.
+            right: Columns aligned to the right: numbers.
+            dim: A column of lesser weight.
+            fold: The column that wraps where the terminal is too narrow; the others stay whole.
+        """
+        from rich.table import Table
+        from rich.text import Text
+
+        rows = [tuple(row) for row in rows]
+        count = len(headers) or max((len(row) for row in rows), default=1)
+        table = Table(box=None, show_header=bool(headers), padding=(0, 2, 0, 0), pad_edge=False)
+        for k in range(count):
+            header = Text(headers[k], style="bold") if headers else ""
+            table.add_column(
+                header,
+                justify="right" if k in right else "left",
+                style="dim" if k == dim else "",
+                no_wrap=k != fold % count,
+                overflow="fold",
+            )
+        for row in rows:
+            table.add_row(*[Text(cell) for cell in row])
+        self.console.print(table)
+
+    def warnings(self, lines: Iterable[str]) -> None:
+        """One line each on standard error, unless quiet."""
+        if not self.quiet:
+            for line in lines:
+                sys.stderr.write(f"warning: {' '.join(line.split())}\n")
+
+
+def number(value: float | None, unit: str = "", *, missing: str = "undefined") -> str:
+    """Four significant digits with a unit, or what to say where there is none."""
+    if value is None:
+        return missing
+    text = f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
+    return f"{text} {unit}".rstrip()
+
+
+def vector(values: Iterable[Any]) -> str:
+    """A unit vector; right-aligned, its numbers stand below each other."""
+    # Adding zero turns -0.0 into 0.0.
+    return " ".join(f"{round(float(v), 3) + 0.0:6.3f}" for v in values).strip()

@@ -1,0 +1,232 @@
+"""Everything that one impact means at one posture, by name: what ``evaluate`` and ``result.json`` show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.errors import InputError
+from impact_posture.impact.classical import Ellipsoid, ellipsoid_of
+from impact_posture.impact.contact import point_on
+from impact_posture.impact.jump import Dominance, Jump, find_dominance, weighed_jump
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
+
+Vector = NDArray[np.float64]
+
+# Below this share of the largest mobility the contact counts as blocked along n, and JM⁻¹Jᵀ as singular.
+_BLOCKED = 1e-12
+_SINGULAR = 1e-9
+# A relative change of H above this, when the supports are made ten times stiffer, is worth a warning.
+_SOFT = 0.01
+
+
+@dataclass(frozen=True)
+class Scalars:
+    """The five numbers of an impact; ``None`` where one does not exist.
+
+    Attributes:
+        H: Squared jump per squared impulse.
+        G: Inverse effective mass along the normal, 1/kg.
+        V: Squared jump per squared approach speed, frictionless, e = 0.
+        S: The same when the contact point sticks.
+        E: Energy dissipated per squared approach speed, e = 0: half the effective mass, kg.
+    """
+
+    H: float
+    G: float
+    V: float | None
+    S: float | None
+    E: float | None
+
+    @staticmethod
+    def of(found: ImpactQuantities) -> Scalars:
+        """Read them off; ``V`` and ``E`` do not exist where the contact cannot move along the normal."""
+        if _blocked(found):
+            return Scalars(found.H, found.G, None, found.S, None)
+        return Scalars(found.H, found.G, found.V, found.S, found.E)
+
+    @property
+    def effective_mass(self) -> float | None:
+        """``1/G``, kg; ``None`` where unbounded."""
+        return None if self.E is None else 1 / self.G
+
+    def to_dict(self) -> dict[str, float | None]:
+        """JSON content."""
+        return {"H": self.H, "G": self.G, "V": self.V, "S": self.S, "E": self.E}
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """One impact at one posture.
+
+    Attributes:
+        q: Configuration, shape (nq,).
+        scalars: H, G, V, S, E, contact-consistent where there are supports.
+        objective: The objective's value, λ̄² included; ``None`` where it does not exist.
+        gradient: Tangent gradient of H, shape (nv,).
+        objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` where it does not exist.
+        worst_normal: World unit normal that the numbers hold for, shape (3,).
+        ellipsoid: Dynamic impact ellipsoid ``Λ_c``.
+        pose: World placement of the contact frame.
+        speed: Approach speed of the predicted jumps, m/s.
+        restitution: Their coefficient of restitution.
+        frictionless: Jump without friction; ``None`` where the contact is blocked along the normal.
+        sticking: Jump of a contact point that does not slip; ``None`` where it does not exist.
+        energy_loss: What the frictionless impact dissipates, J; ``None`` where the contact is blocked.
+        dominance: Whether one light joint makes up most of H.
+        free: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
+        compliance_effect: Relative change of H when the supports' compliance is a tenth; ``None`` without supports.
+        warnings: What limits these numbers, one line each.
+    """
+
+    q: Vector
+    scalars: Scalars
+    objective: float | None
+    gradient: Vector
+    objective_gradient: Vector | None
+    worst_normal: Vector
+    ellipsoid: Ellipsoid
+    pose: pin.SE3
+    speed: float
+    restitution: float
+    frictionless: Jump | None
+    sticking: Jump | None
+    energy_loss: float | None
+    dominance: Dominance
+    free: Scalars | None
+    compliance_effect: float | None
+    warnings: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, object]:
+        """The ``initial`` or ``optimal`` block of ``result.json``; ``None`` for what does not exist."""
+        quaternion = pin.Quaternion(self.pose.rotation)
+        block: dict[str, object] = {"q": _listed(self.q), "objective": self.objective}
+        block |= self.scalars.to_dict()
+        block |= {
+            "effective_mass": self.scalars.effective_mass,
+            "gradient": _listed(self.gradient),
+            "objective_gradient": None if self.objective_gradient is None else _listed(self.objective_gradient),
+            "worst_normal": _listed(self.worst_normal),
+            "ellipsoid": self.ellipsoid.to_dict(),
+            "pose": {
+                "position": _listed(self.pose.translation),
+                "quaternion_xyzw": _listed(quaternion.coeffs()),
+            },
+            "jump": {
+                "speed": self.speed,
+                "restitution": self.restitution,
+                "frictionless": None if self.frictionless is None else self.frictionless.to_dict(),
+                "sticking": None if self.sticking is None else self.sticking.to_dict(),
+                "energy_loss": self.energy_loss,
+            },
+            "dominance": self.dominance.to_dict(),
+        }
+        if self.free is not None:
+            block |= {"free": self.free.to_dict(), "compliance_effect": self.compliance_effect}
+        return block
+
+
+def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitution: float = 0.0) -> Evaluation:
+    """Compute all impact quantities at ``q`` from Pinocchio's numbers, and predict the jump of one impact.
+
+    Frictionless: ``Δν = a (1+e) v_n / G``, impulse ``(1+e) v_n / G`` along n.  Sticking:
+    ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``.
+
+    Args:
+        objective: Robot, contact, metric, kind and supports.
+        q: Configuration, shape (nq,).
+        speed: Approach speed ``v_n``, m/s.
+        restitution: Coefficient of restitution ``e``.
+
+    Raises:
+        InputError: A negative or non-finite speed, or a restitution outside [0, 1].
+    """
+    if not (np.isfinite(speed) and speed >= 0):
+        raise InputError(f"the approach speed is {speed:g}", where="--speed", mend="give m/s, zero or more")
+    if not 0 <= restitution <= 1:
+        raise InputError(f"the restitution is {restitution:g}", where="--restitution", mend="give 0 to 1")
+    robot, oracle = objective.robot, objective.oracle
+    found = oracle.quantities(q)
+    scalars = Scalars.of(found)
+    rebound = (1 + restitution) * speed
+    free, effect = _without_supports(objective, q, found.H)
+    return Evaluation(
+        q=np.array(q, dtype=float),
+        scalars=scalars,
+        objective=_objective_value(objective, scalars),
+        gradient=oracle.gradient_H(q),
+        objective_gradient=_objective_gradient(objective, q, found),
+        worst_normal=found.normal,
+        ellipsoid=ellipsoid_of(found.ellipsoid),
+        pose=oracle.numeric.at(q).placement(point_on(robot, objective.contact.frame)),
+        speed=speed,
+        restitution=restitution,
+        frictionless=(
+            None if scalars.E is None
+            else weighed_jump(objective, found.jump * rebound / found.G, found.normal * rebound / found.G)
+        ),
+        sticking=(
+            None if found.sticking_jump is None or found.sticking_impulse is None
+            else weighed_jump(objective, found.sticking_jump * rebound, found.sticking_impulse * rebound)
+        ),
+        energy_loss=None if scalars.E is None else scalars.E * speed**2 * (1 - restitution**2),
+        dominance=find_dominance(objective, found),
+        free=free,
+        compliance_effect=effect,
+        warnings=_warnings(scalars, effect),
+    )  # fmt: skip
+
+
+def _blocked(found: ImpactQuantities) -> bool:
+    return found.G <= _BLOCKED * float(np.linalg.eigvalsh(found.mobility)[-1])
+
+
+def _objective_value(objective: ImpactObjective, scalars: Scalars) -> float | None:
+    values = {"impulse": scalars.H, "speed": scalars.V, "sticking": scalars.S, "energy": scalars.E}
+    value = values[objective.kind]
+    return None if value is None else objective.scale * value
+
+
+def _objective_gradient(objective: ImpactObjective, q: Vector, found: ImpactQuantities) -> Vector | None:
+    values = np.linalg.eigvalsh(found.mobility)
+    if objective.kind == "sticking" and values[0] <= _SINGULAR * values[-1]:
+        return None
+    if objective.kind in ("speed", "energy") and _blocked(found):
+        return None
+    return objective.gradient(q)
+
+
+def _without_supports(objective: ImpactObjective, q: Vector, H: float) -> tuple[Scalars | None, float | None]:
+    if not objective.supports:
+        return None, None
+    parts = (objective.robot, objective.contact, objective.metric)
+    free = Scalars.of(ImpactOracle(*parts).quantities(q))
+    stiffer = ImpactOracle(*parts, objective.supports, objective.compliance / 10).quantities(q).H
+    return free, abs(stiffer - H) / H if H > 0 else 0.0
+
+
+def _warnings(scalars: Scalars, effect: float | None) -> tuple[str, ...]:
+    lines = []
+    if scalars.E is None:
+        lines.append(
+            "the contact point cannot move along the normal in this posture: its effective mass is unbounded, "
+            "V and E are undefined"
+        )
+    if scalars.S is None:
+        lines.append(
+            "S is undefined: the contact point cannot move in every direction, and the normal leaves those it can"
+        )
+    if effect is not None and effect > _SOFT:
+        lines.append(
+            f"H changes by {100 * effect:.2g} % when the supports' compliance is a tenth: along this normal the "
+            "supports hold by their compliance"
+        )
+    return tuple(lines)
+
+
+def _listed(values: Vector) -> list[float]:
+    return [float(v) for v in np.asarray(values).reshape(-1)]

@@ -1,0 +1,146 @@
+"""The velocity jump of an impact by name and unit, and which joint makes up ``H``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.joints import joint_kind
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.robot.robot import Robot
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Jump:
+    """A predicted velocity jump.
+
+    Attributes:
+        velocity: ``Δν``, shape (nv,), m/s and rad/s.
+        norm: ``‖Δν‖_W``.
+        impulse: What the surface gives, world, shape (3,), N·s.
+        largest: ``(name, value, unit)`` of the largest entries, largest first.
+    """
+
+    velocity: Vector
+    norm: float
+    impulse: Vector
+    largest: tuple[tuple[str, float, str], ...]
+
+    @property
+    def impulse_size(self) -> float:
+        """Size of the impulse, N·s."""
+        return float(np.linalg.norm(self.impulse))
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON content."""
+        return {
+            "velocity": [float(v) for v in self.velocity],
+            "norm": self.norm,
+            "impulse": [float(v) for v in self.impulse],
+            "largest": [{"name": name, "value": value, "unit": unit} for name, value, unit in self.largest],
+        }
+
+
+@dataclass(frozen=True)
+class Dominance:
+    """Whether one light joint makes up most of ``H``.
+
+    Attributes:
+        joint: The joint with the largest share.
+        share: Its part of ``H = Σ a_i (Wa)_i``.
+        base: The floating base's part; zero without one.
+        line: The verdict in words.
+    """
+
+    joint: str
+    share: float
+    base: float
+    line: str
+
+    @property
+    def dominates(self) -> bool:
+        """Whether the joint carries more than half of ``H``."""
+        return self.share > 0.5
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON content."""
+        return {
+            "joint": self.joint,
+            "share": self.share,
+            "base": self.base,
+            "dominates": self.dominates,
+            "line": self.line,
+        }
+
+
+def tangent_units(robot: Robot) -> tuple[str, ...]:
+    """``m/s`` or ``rad/s`` for each of the nv velocity entries."""
+    units: list[str] = []
+    for index in range(1, robot.model.njoints):
+        subspace = joint_kind(robot.model.joints[index], str(robot.model.names[index])).subspace
+        units += ["m/s" if np.abs(column[:3]).max() > 0 else "rad/s" for column in subspace.T]
+    return tuple(units)
+
+
+def largest_entries(robot: Robot, values: Vector, count: int = 5) -> tuple[tuple[str, float, str], ...]:
+    """``(name, value, velocity unit)`` of the largest entries of a tangent vector, those above 0.1 % of the first."""
+    units, sizes = tangent_units(robot), np.abs(values)
+    order = np.argsort(-sizes, kind="stable")[:count]
+    kept = [int(k) for k in order if sizes[k] > 1e-3 * sizes[order[0]]]
+    return tuple((robot.tangent_names[k], float(values[k]), units[k]) for k in kept)
+
+
+def merged_entries(
+    robot: Robot, *jumps: Jump | None, count: int = 6
+) -> list[tuple[str, str, tuple[float | None, ...]]]:
+    """``(name, unit, values)`` of the entries largest in any of the jumps; ``None`` for a missing jump."""
+    units, names = tangent_units(robot), robot.tangent_names
+    sizes = np.max([np.zeros(robot.nv), *(np.abs(j.velocity) for j in jumps if j is not None)], axis=0)
+    order = np.argsort(-sizes, kind="stable")[:count]
+    return [
+        (names[k], units[k], tuple(None if j is None else float(j.velocity[k]) for j in jumps))
+        for k in order
+        if sizes[k] > 1e-3 * sizes[order[0]]
+    ]
+
+
+def weighed_jump(objective: ImpactObjective, velocity: Vector, impulse: Vector) -> Jump:
+    """Name and measure the jump ``velocity``, shape (nv,), in the metric at the oracle's posture."""
+    norm = float(np.sqrt(max(float(velocity @ objective.oracle.weigh(velocity)), 0.0)))
+    return Jump(velocity, norm, impulse, largest_entries(objective.robot, velocity))
+
+
+def find_dominance(objective: ImpactObjective, found: ImpactQuantities) -> Dominance:
+    """Shares ``a_i (Wa)_i / H`` summed over each joint's entries."""
+    robot, oracle = objective.robot, objective.oracle
+    parts = found.jump * oracle.weigh(found.jump)
+    width = 6 if robot.floating else 0
+    if found.H <= 0 or not robot.joint_names:
+        return Dominance("", 0.0, float(found.H > 0), "no joint takes part in H")
+    base = float(parts[:width].sum() / found.H)
+    slots = [(name, robot.joint_id(name)) for name in robot.joint_names]
+    first = {name: int(robot.model.idx_vs[k]) for name, k in slots}
+    shares = {name: float(parts[first[name] :][: robot.model.nvs[k]].sum() / found.H) for name, k in slots}
+    joint = max(shares, key=lambda name: shares[name])
+    share, k = shares[joint], first[joint]
+    percent = f"{100 * share:.0f} %"
+    if share > 0.5:
+        unit = "kg" if tangent_units(robot)[k] == "m/s" else "kg·m²"
+        line = (
+            f"joint '{joint}' carries {percent} of H (armature {robot.armature[k]:.3g} of the "
+            f"{oracle.M[k, k]:.3g} {unit} it moves)"
+        )
+        if objective.metric.kind != "kinetic":
+            line += "; the rest of the robot hardly counts: compare --metric kinetic"
+    elif base > 0.5:
+        line = (
+            f"no single joint dominates H (the base carries {100 * base:.0f} %; largest joint: '{joint}', {percent})"
+        )
+    else:
+        line = f"no single joint dominates H (largest: '{joint}', {percent})"
+    return Dominance(joint, share, base, line)

@@ -1,0 +1,193 @@
+"""Postures as people give them: a name, ``posture.json``, joints by name, or a ``sensor_msgs/JointState`` as YAML."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from impact_posture.errors import JointNotFound, PostureError, PostureNotFound, nearest
+from impact_posture.robot.robot import Robot, Vector
+
+SCHEMA = "impact-posture/posture/1"
+
+_OUR_KEYS = ("schema", "robot", "convention", "joint_names", "q")
+_BY_NAME_KEYS = ("schema", "robot", "base", "joints")
+_SHAPES = "q with joint_names, joints by name, or a JointState's name and position"
+
+
+def read_posture(robot: Robot, text: str | None, where: str = "--posture") -> Vector:
+    """Return the configuration that ``text`` names, shape (nq,), checked against length, quaternion and limits.
+
+    Args:
+        robot: The robot.
+        text: Name of one of its postures, or a file: ``posture.json`` (``q`` in the order of ``joint_names``),
+            ``{"base": [x, y, z, qx, qy, qz, qw], "joints": {name: value}}``, or a ``sensor_msgs/JointState`` in YAML
+            (``name: [...]``, ``position: [...]``).  By name, a continuous joint is one angle in rad, and what is not
+            named stays as in the default posture.  ``None``: the default posture.
+        where: The option or file to name in errors.
+
+    Raises:
+        PostureNotFound: Neither a posture nor a file, with the nearest names.
+        JointNotFound: A file names a joint that the robot lacks, with the nearest names.
+        PostureError: The file cannot be read, or its numbers make no posture of this robot.
+    """
+    if text is None or text in robot.postures:
+        return robot.check_posture(robot.posture(text), where=f"{where} {text or robot.default_posture}")
+    path = posture_path(text)
+    if path is None:
+        raise PostureNotFound(text, robot.postures, where=where, mend="(or give a .json or .yaml file)")
+    data = _load(path)
+    return robot.check_posture(_configuration(robot, data, str(path)), where=str(path))
+
+
+def write_posture(robot: Robot, q: Vector) -> dict[str, object]:
+    """Return ``posture.json``'s content for ``q``, shape (nq,); :func:`read_posture` reads it back.
+
+    Raises:
+        PostureError: ``q`` is no posture of this robot.
+    """
+    q = robot.check_posture(q, limits=False)
+    return {
+        "schema": SCHEMA,
+        "robot": robot.name,
+        "convention": robot.convention,
+        "joint_names": list(robot.joint_names),
+        "q": [float(v) for v in q],
+    }
+
+
+def posture_path(text: str) -> Path | None:
+    """Tell a posture file from a posture name."""
+    path = Path(text).expanduser()
+    return path if path.suffix in (".json", ".yaml", ".yml") or path.is_file() else None
+
+
+def _load(path: Path) -> Mapping[str, object]:
+    kind = "JSON" if path.suffix == ".json" else "YAML"
+    try:
+        text = path.read_text(encoding="utf-8")
+        # `ros2 topic echo` ends every message with `---`: the first document counts.
+        data = json.loads(text) if kind == "JSON" else next(iter(yaml.safe_load_all(text)), None)
+    except FileNotFoundError:
+        raise PostureError("no such file", where=str(path), mend="check the path") from None
+    except OSError as error:
+        raise PostureError(f"cannot be read ({error.strerror})", where=str(path), mend="check the file") from None
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        raise PostureError(f"is not valid {kind} ({error})", where=str(path), mend="correct the syntax") from None
+    if not isinstance(data, dict):
+        raise PostureError("holds no posture", where=str(path), mend=f"give {_SHAPES}")
+    return {str(key): value for key, value in data.items()}
+
+
+def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Vector:
+    """Tell the three shapes apart by their keys."""
+    schema = data.get("schema", SCHEMA)
+    if schema != SCHEMA:
+        raise PostureError(f"schema '{schema}' is no posture", where=where, mend=f'give a file of "{SCHEMA}"')
+    if "q" in data:
+        _only(data, _OUR_KEYS, where)
+        return _in_order(robot, data, where)
+    if "joints" in data or "base" in data:
+        _only(data, _BY_NAME_KEYS, where)
+        joints = data.get("joints", {})
+        if not isinstance(joints, dict):
+            raise PostureError("'joints' is no table", where=where, mend='write "joints": {"name": value}')
+        return _by_name(robot, {str(k): v for k, v in joints.items()}, data.get("base"), where)
+    if "name" in data and "position" in data:
+        return _by_name(robot, _joint_state(data["name"], data["position"], where), None, where)
+    raise PostureError("holds no posture", where=where, mend=f"give {_SHAPES}")
+
+
+def _only(data: Mapping[str, object], known: Sequence[str], where: str) -> None:
+    for key in data:
+        if key not in known:
+            hint = ", ".join(nearest(key, known))
+            raise PostureError(f"unknown key '{key}'", where=where, mend=f"did you mean {hint}?")
+
+
+def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Vector:
+    if "joint_names" in data:
+        names = _names(data["joint_names"], "joint_names", where)
+        for name in names:
+            if name not in robot.joint_names:
+                raise JointNotFound(name, robot.joint_names, where=where)
+        if tuple(names) != robot.joint_names:
+            missing = [name for name in robot.joint_names if name not in names]
+            fault = f"leaves out joint '{missing[0]}'" if missing else "has the joints in another order"
+            raise PostureError(
+                f"{fault}, so that q cannot be read", where=where, mend='give them by name: "joints": {"name": value}'
+            )
+    return np.array(_numbers(data["q"], "q", where))
+
+
+def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: str) -> Vector:
+    q = robot.posture()
+    if base is not None:
+        if not robot.floating:
+            raise PostureError("gives a base pose, but the root is fixed", where=where, mend="remove 'base'")
+        pose = _numbers(base, "base", where)
+        if len(pose) != 7:
+            raise PostureError(
+                f"'base' has {len(pose)} numbers", where=where, mend="give [x, y, z, qx, qy, qz, qw]"
+            )
+        q[:7] = pose
+    for name, value in joints.items():
+        if name in robot.locked:
+            continue  # a robot's own message names all its joints; a rigid one has no value to set
+        if name not in robot.joint_names:
+            raise JointNotFound(name, robot.joint_names, where=where)
+        index = robot.joint_id(name)
+        first, nq, nv = (int(v[index]) for v in (robot.model.idx_qs, robot.model.nqs, robot.model.nvs))
+        if nv == 1:
+            angle = _number(value, f"joint '{name}'", where)
+            # nq = 2: a continuous joint is kept as cosine and sine, which hide what is not finite.
+            if not math.isfinite(angle):
+                raise PostureError(f"joint '{name}' is not finite", where=where, mend="correct it")
+            q[first : first + nq] = (angle,) if nq == 1 else (math.cos(angle), math.sin(angle))
+        else:
+            numbers = _numbers(value, f"joint '{name}'", where)
+            if len(numbers) != nq:
+                raise PostureError(
+                    f"joint '{name}' takes {nq} numbers, not {len(numbers)}", where=where, mend="correct it"
+                )
+            q[first : first + nq] = numbers
+    return q
+
+
+def _joint_state(name: object, position: object, where: str) -> dict[str, object]:
+    names, positions = _names(name, "name", where), _numbers(position, "position", where)
+    if len(names) != len(positions):
+        raise PostureError(
+            f"{len(names)} names but {len(positions)} positions", where=where, mend="give one position a name"
+        )
+    return dict(zip(names, positions, strict=True))
+
+
+def _names(value: object, key: str, where: str) -> list[str]:
+    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+        raise PostureError(f"'{key}' is no list of names", where=where, mend="correct it")
+    for name in value:
+        if value.count(name) > 1:
+            raise PostureError(f"'{key}' names '{name}' twice", where=where, mend="remove one")
+    return value
+
+
+def _numbers(value: object, key: str, where: str) -> list[float]:
+    if not isinstance(value, list):
+        raise PostureError(f"'{key}' is no list of numbers", where=where, mend="correct it")
+    return [_number(item, f"'{key}' entry {k}", where) for k, item in enumerate(value)]
+
+
+def _number(value: object, key: str, where: str) -> float:
+    # PyYAML reads 1e-3 as text: YAML 1.1 wants a point in it.
+    if isinstance(value, (int, float, str)) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except (ValueError, OverflowError):
+            pass
+    raise PostureError(f"{key} is '{value}', no number", where=where, mend="correct it")
