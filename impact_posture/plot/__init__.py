@@ -1,1 +1,79 @@
-"""."""
+"""Pictures of a result: :func:`draw_all` writes them, the ``*_figure`` functions return matplotlib figures.
+
+Nothing here touches pyplot's global state or shows a window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from impact_posture.errors import NameNotFound
+from impact_posture.plot.classical import classical_figure
+from impact_posture.plot.ellipsoid import ellipsoid_figure
+from impact_posture.plot.jump import jump_figure
+from impact_posture.plot.path import path_figure
+from impact_posture.plot.robot import postures_figure
+from impact_posture.plot.style import FORMATS, check_formats, save
+from impact_posture.plot.view import PathData, ResultView, sample_path
+
+__all__ = [
+    "FIGURES",
+    "FORMATS",
+    "FigureNotFound",
+    "PathData",
+    "ResultView",
+    "classical_figure",
+    "draw_all",
+    "ellipsoid_figure",
+    "jump_figure",
+    "path_figure",
+    "postures_figure",
+    "sample_path",
+    "save",
+]
+
+FIGURES: dict[str, Callable[[ResultView], Figure]] = {
+    "ellipsoid": ellipsoid_figure,
+    "postures": postures_figure,
+    "jump": jump_figure,
+    "nullspace": path_figure,
+    "classical": classical_figure,
+}
+
+
+class FigureNotFound(NameNotFound):
+    """There is no figure of that name."""
+
+    kind = "figure"
+
+
+def draw_all(
+    view: ResultView,
+    out: Path,
+    formats: Iterable[str] = FORMATS,
+    only: Collection[str] | None = None,
+) -> list[Path]:
+    """Write the figures of ``view`` into ``out`` as ``<name>.<format>``; return the paths.
+
+    Args:
+        view: The result.
+        out: Folder, made if missing; files of the same name are replaced.
+        formats: Of ``png``, ``svg`` and ``pdf``.
+        only: Names of :data:`FIGURES` to draw; all if ``None`` (``nullspace`` only if the view has a path).
+
+    Raises:
+        FigureNotFound: An unknown name in ``only``.
+        InputError: An unknown format, or ``nullspace`` asked for without a path.
+        OutputError: The folder or a file cannot be written.
+    """
+    wanted = check_formats(formats)
+    names = list(FIGURES if only is None else dict.fromkeys(only))
+    for name in names:
+        if name not in FIGURES:
+            raise FigureNotFound(name, FIGURES, where="plot")
+    if only is None and view.path is None:
+        names.remove("nullspace")
+    return [path for name in names for path in save(FIGURES[name](view), out, name, wanted)]

@@ -1,0 +1,134 @@
+"""Ellipsoids as points and lines: shadows on planes, half-widths, surfaces.  No drawing here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+# A direction within 1° of a plane counts as in it: its half-width differs there by less than 2e-4 of itself.
+IN_PLANE = float(np.cos(np.radians(1.0)))
+# A semi-axis this much shorter than the longest is a rounding error (or cannot be seen).
+_NEGLIGIBLE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A picture plane.
+
+    Attributes:
+        axes: Rows are the orthonormal world directions drawn to the right and up, shape (2, 3).
+        right: Name of the first.
+        up: Name of the second.
+    """
+
+    axes: Vector
+    right: str
+    up: str
+
+    @property
+    def name(self) -> str:
+        """``xy`` and the like."""
+        return f"{self.right}{self.up}" if len(self.right + self.up) == 2 else "plane of n and z"
+
+    def contains(self, direction: Vector) -> bool:
+        """Whether a unit direction lies in the plane, up to a degree."""
+        return bool(np.linalg.norm(self.axes @ direction) >= IN_PLANE)
+
+
+_X, _Y, _Z = np.eye(3)
+XY = Plane(np.array([_X, _Y]), "x", "y")
+XZ = Plane(np.array([_X, _Z]), "x", "z")
+YZ = Plane(np.array([_Y, _Z]), "y", "z")
+COORDINATE_PLANES = (XY, XZ, YZ)
+
+
+def upright_plane(n: Vector) -> Plane:
+    """The plane of the vertical and a unit vector that is not vertical."""
+    across = np.array([n[0], n[1], 0.0]) / np.hypot(n[0], n[1])
+    name = f"along ({across[0]:.2f}, {across[1]:.2f}, 0)".replace("-", "−")
+    return Plane(np.array([across, _Z]), name, "z")
+
+
+def root(matrix: Vector) -> Vector:
+    """The symmetric square root of a positive semidefinite matrix; a tiny negative eigenvalue counts as zero."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+def half_width(matrix: Vector, direction: Vector) -> float:
+    """Half-width ``√(dᵀΛd)`` of ``{x: xᵀΛ⁻¹x ≤ 1}`` along a unit ``d``: to its tangent planes, not its edge."""
+    return float(np.sqrt(max(float(direction @ matrix @ direction), 0.0)))
+
+
+def shadow(matrix: Vector, axes: Vector, points: int = 181) -> Vector:
+    """Edge of the projection of ``{x: xᵀΛ⁻¹x ≤ 1}`` on the plane of ``axes`` (rows, orthonormal), shape (2, points).
+
+    The projection is the ellipse of ``P Λ Pᵀ``; a degenerate one is a segment from end to end, or a point.
+    """
+    return _ring(_semi_axes(axes @ matrix @ axes.T), points)
+
+
+def surface(matrix: Vector, rings: int = 25) -> Vector:
+    """Points of the ellipsoid's surface on a grid, shape (3, rings, 2·rings)."""
+    across, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
+    sphere = np.array([np.sin(across) * np.cos(around), np.sin(across) * np.sin(around), np.cos(across)])
+    return np.asarray(np.einsum("ij,jkl->ikl", root(matrix), sphere))
+
+
+def principal_sections(matrix: Vector, points: int = 121) -> list[Vector]:
+    """The ellipses through two principal axes each, shape (3, points); those that are only a point left out."""
+    axes = _semi_axes(matrix)
+    flat = _NEGLIGIBLE * np.linalg.norm(axes[:, 2])
+    pairs = [pair for pair in ([0, 1], [0, 2], [1, 2]) if np.linalg.norm(axes[:, pair[1]]) > flat]
+    # A rod's two long sections are the same segment.
+    pairs = pairs[1:] if len(pairs) == 2 and np.linalg.norm(axes[:, 1]) <= flat else pairs
+    return [_ring(axes[:, pair], points) for pair in pairs]
+
+
+def _semi_axes(matrix: Vector) -> Vector:
+    """Semi-axes as columns, the longest last."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _ring(axes: Vector, points: int) -> Vector:
+    """The ellipse with two semi-axes (columns, the longer last); a segment if the shorter is negligible.
+
+    There and back would put the gaps of a dashed line under its dashes.
+    """
+    angle = np.linspace(0.0, 2 * np.pi, points)
+    if np.linalg.norm(axes[:, 0]) <= _NEGLIGIBLE * np.linalg.norm(axes[:, 1]):
+        angle = np.linspace(0.0, np.pi, points)
+        return np.asarray(axes[:, 1:] * np.cos(angle))
+    return np.asarray(axes[:, ::-1] @ np.array([np.cos(angle), np.sin(angle)]))
+
+
+def polar(matrix: Vector, infinite: float) -> tuple[Vector, Vector]:
+    """The matrix of the polar dual ``{f: fᵀAf ≤ 1}`` of ``{x: xᵀA⁻¹x ≤ 1}``, and where it has no end.
+
+    Args:
+        matrix: ``A``, positive semidefinite, shape (3, 3).
+        infinite: Half-length to draw in the directions in which the dual is unbounded.
+
+    Returns:
+        ``A⁻¹`` with those directions cut at ``infinite``, and the unbounded directions as columns, shape (3, k).
+    """
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    bounded = values > 1e-10 * max(float(values[-1]), 1e-300)
+    inverse = np.where(bounded, 1 / np.where(bounded, values, 1.0), infinite**2)
+    return np.asarray((vectors * inverse) @ vectors.T), np.asarray(vectors[:, ~bounded])
+
+
+def square(center: Vector, n: Vector, side: float) -> Vector:
+    """Corners of a square perpendicular to the unit vector ``n``, closed, shape (3, 5)."""
+    # The square's edges lean on the world axis that n is farthest from.
+    first = np.eye(3)[int(np.argmin(np.abs(n)))]
+    first = first - (first @ n) * n
+    first = first / np.linalg.norm(first)
+    second = np.cross(n, first)
+    corners = np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * side / 2
+    return np.asarray(center[:, None] + np.outer(first, corners[0]) + np.outer(second, corners[1]))

@@ -1,0 +1,107 @@
+"""The robot as sticks: which points to join, from the model alone (no mesh)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.impact.contact import point_on
+from impact_posture.plot.shapes import Vector
+from impact_posture.plot.view import ResultView
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A robot's sticks in one posture, world, metres.
+
+    Attributes:
+        bones: Pairs of points to join, shape (k, 2, 3).
+        joints: Origins of the moving joints, shape (j, 3).
+        base: Placement of the base: the free-flyer, or the world for a fixed root.
+        contact: The contact point, shape (3,).
+        normal: World unit normal, shape (3,).
+        feet: Contact points of the supports, shape (f, 3).
+        rotors: Circles of the propellers, shape (r, 3, points).
+    """
+
+    bones: Vector
+    joints: Vector
+    base: pin.SE3
+    contact: Vector
+    normal: Vector
+    feet: Vector
+    rotors: Vector
+
+    @property
+    def points(self) -> Vector:
+        """Everything that has to be in the picture, shape (m, 3)."""
+        circles = self.rotors.transpose(0, 2, 1).reshape(-1, 3)
+        origin = np.asarray(self.base.translation)[None]
+        return np.vstack([self.bones.reshape(-1, 3), origin, self.contact[None], self.feet, circles])
+
+
+def build_skeleton(view: ResultView, q: Vector) -> Skeleton:
+    """Place the sticks at ``q``.
+
+    A bone joins a joint's origin to its parent's.  The contact and the feet hang on their links; the last link of a
+    chain without one goes on to its farthest frame, or to its center of mass where it has none.
+    """
+    model, numeric = view.robot.model, view.objective.oracle.numeric.at(q)
+    places = numeric.data.oMi
+    first = 2 if view.robot.floating else 1
+    base = pin.SE3(places[1]) if view.robot.floating else pin.SE3.Identity()
+    origins = [np.zeros(3), *(np.array(places[i].translation) for i in range(1, model.njoints))]
+    bones = [(origins[model.parents[i]], origins[i]) for i in range(first, model.njoints)]
+    held = [point_on(view.robot, s.frame, s.offset) for s in view.objective.supports]
+    hanging = [view.contact_point, *held]
+    ends = [np.array(numeric.placement(point).translation) for point in hanging]
+    contact, feet = ends[0], ends[1:]
+    bones += [(origins[point.joint], end) for point, end in zip(hanging, ends, strict=True)]
+    # A link that already goes on to its foot or contact needs no other tip.
+    done = {int(model.parents[i]) for i in range(1, model.njoints)}
+    done |= {point.joint for point in hanging if np.linalg.norm(point.position) > 1e-3}
+    for leaf in range(first, model.njoints):
+        if leaf not in done:
+            bones.append((origins[leaf], np.array(places[leaf].act(_tip(model, leaf)))))
+    rotors = _rotors(view, places)
+    for circle in rotors:
+        bones.append((np.array(base.translation), circle.mean(axis=1)))
+    return Skeleton(
+        bones=np.array(bones),
+        joints=np.array(origins[first:]).reshape(-1, 3),
+        base=base,
+        contact=contact,
+        normal=np.array(view.objective.oracle.at(q).n),
+        feet=np.array(feet).reshape(-1, 3),
+        rotors=rotors,
+    )
+
+
+def _tip(model: pin.Model, joint: int) -> Vector:
+    """The frame of a link that is farthest from its joint, in the joint's axes; else its center of mass."""
+    places = [np.array(f.placement.translation) for f in model.frames if f.parentJoint == joint]
+    tip = max(places, key=lambda place: float(np.linalg.norm(place)), default=np.zeros(3))
+    return tip if np.linalg.norm(tip) > 1e-3 else np.array(model.inertias[joint].lever)
+
+
+def _rotors(view: ResultView, places: list[pin.SE3]) -> Vector:
+    """Circles across the thrust directions, as large as the rotors' spacing allows."""
+    propulsion = view.robot.spec.propulsion
+    if propulsion is None:
+        return np.zeros((0, 3, 24))
+    frame = view.robot.model.frames[view.robot.frame_id(propulsion.frame)]
+    place = places[frame.parentJoint] * frame.placement
+    centers = [np.array(rotor.position) for rotor in propulsion.rotors]
+    gaps = [float(np.linalg.norm(a - b)) for k, a in enumerate(centers) for b in centers[:k]]
+    radius = 0.4 * min(gaps, default=0.5)
+    angle = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+    circles = []
+    for center, rotor in zip(centers, propulsion.rotors, strict=True):
+        thrust = np.array(rotor.direction) / np.linalg.norm(rotor.direction)
+        # Two directions across the thrust: the null space of its row.
+        across = np.linalg.svd(thrust[None])[2][1:]
+        ring = center[:, None] + radius * across.T @ np.array([np.cos(angle), np.sin(angle)])
+        circles.append(np.asarray(place.rotation) @ ring + np.asarray(place.translation)[:, None])
+    return np.array(circles)

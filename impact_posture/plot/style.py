@@ -1,0 +1,152 @@
+"""How every picture looks: one color-blind-safe palette that also works in gray, sizes that print, and saving."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import text_to_path
+
+from impact_posture.errors import InputError, OutputError
+from impact_posture.plot.view import SEPARATOR, ResultView, header_lines
+
+# Okabe and Ito's palette, "Color Universal Design", 2008.
+VERMILLION, BLUE, GREEN, SKY, PURPLE = "#D55E00", "#0072B2", "#009E73", "#56B4E9", "#CC79A7"
+INK, GRAY, PALE = "#000000", "#6b6b6b", "#d9d9d9"
+
+# Before and after differ by line and hatch as well, so that a gray print tells them apart.
+# The dashes lie on top: where both coincide, the solid line shows in their gaps.
+BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (4, 2)), "linewidth": 1.4, "zorder": 3.5}
+AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.6, "zorder": 3.0}
+BEFORE_BAR: dict[str, Any] = {"facecolor": "#fbe3d3", "edgecolor": VERMILLION, "hatch": "//////", "linewidth": 0.6}
+AFTER_BAR: dict[str, Any] = {"facecolor": BLUE, "edgecolor": BLUE, "linewidth": 0.6}
+
+FORMATS = ("png", "svg", "pdf")
+# Width of a two-column page, inches.
+WIDTH = 7.2
+_SMALL = 7.0
+_LINE = 0.15
+_RC: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.0,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.0,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "legend.fontsize": 7.5,
+    "axes.linewidth": 0.7,
+    "axes.grid": False,
+    "axes.axisbelow": True,
+    "grid.color": PALE,
+    "grid.linewidth": 0.5,
+    "hatch.linewidth": 0.5,
+    "legend.frameon": False,
+    "savefig.dpi": 200,
+    # TrueType in the PDF (publishers refuse Type 3), and files that do not change when nothing changed.
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "impact-posture",
+}
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Draw and save with our settings, whatever the user's matplotlibrc says; theirs are put back afterwards."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_RC)
+        yield
+
+
+def framed(view: ResultView, height: float, notes: Sequence[str] = ()) -> tuple[Figure, Any]:
+    """Make a figure with the header above and ``notes`` below; return it and the part to draw in.
+
+    Args:
+        view: What is drawn.
+        height: Height of the part to draw in, inches.
+        notes: Sentences below the picture.
+    """
+    title, lines = header_lines(view)
+    small = [part for line in lines for part in wrap(line, SEPARATOR)]
+    below = [part for line in notes for part in wrap(line, " ")]
+    head, foot = 0.26 + _LINE * len(small), 0.06 + _LINE * len(below)
+    figure = Figure(figsize=(WIDTH, head + height + foot), layout="constrained")
+    parts: Any = figure.subfigures(3, 1, height_ratios=[head, height, foot])
+    top, body, bottom = parts
+    top.text(0.012, 1 - 0.06 / head, title, fontsize=10, fontweight="bold", va="top", parse_math=False)
+    top.text(0.012, 1 - 0.26 / head, "\n".join(small), fontsize=_SMALL, va="top", linespacing=1.4, parse_math=False)
+    bottom.text(0.012, 1, "\n".join(below), fontsize=_SMALL, va="top", linespacing=1.4, color="#333333")
+    return figure, body
+
+
+def wrap(line: str, separator: str) -> list[str]:
+    """Break a line of small print at separators so that it fits the page, by the font's own widths."""
+    font = FontProperties(family="DejaVu Sans", size=_SMALL)
+    parts, room = [""], 72 * WIDTH * 0.975
+    for piece in line.split(separator):
+        longer = f"{parts[-1]}{separator}{piece}" if parts[-1] else piece
+        width, _, _ = text_to_path.get_text_width_height_descent(longer.replace("$", ""), font, ismath=False)
+        if width <= room:
+            parts[-1] = longer
+        else:
+            parts.append(piece)
+    return [part for part in parts if part]
+
+
+def lay_out(figure: Figure) -> None:
+    """Give everything its place and keep it: every format then shows the same picture, in half the time."""
+    # Panels with equal axes change their size in the first round and are placed in the second.
+    for _ in range(2):
+        figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    # The layout's solver differs in the last digits from run to run; the files must not.
+    for part in figure.subfigs:
+        box = part.bbox_relative
+        box.p0, box.p1 = np.round(box.p0, 6), np.round(box.p1, 6)
+    for axes in figure.axes:
+        axes.set_position(np.round(axes.get_position(original=True).bounds, 6))
+
+
+def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
+    """Return the formats in order, once each.
+
+    Raises:
+        InputError: A format that pictures are not written in.
+    """
+    wanted = tuple(dict.fromkeys(f.lower().lstrip(".") for f in formats))
+    for one in wanted:
+        if one not in FORMATS:
+            raise InputError(f"no format '{one}'", where="plot", mend=f"choose from {', '.join(FORMATS)}")
+    return wanted
+
+
+def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = FORMATS) -> list[Path]:
+    """Write ``figure`` as ``out_dir/name.<format>`` for each format; return the paths.
+
+    Raises:
+        InputError: An unknown format.
+        OutputError: The folder or a file cannot be written.
+    """
+    paths = []
+    wanted = check_formats(formats)
+    with style():
+        lay_out(figure)
+    for extension in wanted:
+        path = Path(out_dir) / f"{name}.{extension}"
+        # No date: the same result gives the same file.
+        metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(extension, {})
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with style():
+                figure.savefig(path, metadata=metadata)
+        except OSError as error:
+            raise OutputError(
+                f"cannot be written ({error.strerror or error})", where=str(path), mend="choose another folder"
+            ) from None
+        paths.append(path)
+    return paths

@@ -1,0 +1,201 @@
+"""What the pictures are drawn from: a contact, two postures, an approach, and the way from one to the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.impact.contact import point_on
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.robot.robot import Robot
+
+Vector = NDArray[np.float64]
+
+# Between the facts of a header line.
+SEPARATOR = "  ·  "
+
+
+@dataclass(frozen=True, eq=False)
+class PathData:
+    """The impact quantities along a path of postures, one entry for each.
+
+    Attributes:
+        s: Path length in the tangent norm, ``∫‖dν‖`` (rad mixed with m), increasing, shape (k,).
+        H: ``nᵀΛ_c n``, shape (k,).
+        G: ``1/m_eff`` along the normal, 1/kg, shape (k,).
+        V: ``H/G²``, shape (k,).
+        S: The sticking counterpart of V, shape (k,); NaN where it does not exist.
+        start: Index of the posture that the others are compared with.
+        optimum: Index of the optimal posture.
+    """
+
+    s: Vector
+    H: Vector
+    G: Vector
+    V: Vector
+    S: Vector
+    start: int = 0
+    optimum: int = -1
+
+
+@dataclass(frozen=True, eq=False)
+class ResultView:
+    """Everything that a picture needs to know of one result.
+
+    Attributes:
+        robot: The robot.
+        objective: Contact, metric, kind and supports; its oracle gives the numbers.
+        q_initial: Posture before, shape (nq,).
+        q_optimal: Posture after, shape (nq,).
+        speed: Approach speed along the normal, m/s.
+        restitution: Coefficient of restitution e, in [0, 1].
+        path: Quantities along the null-space path between them, if known.
+        title: First line of every picture; robot and contact frame if empty.
+    """
+
+    robot: Robot
+    objective: ImpactObjective
+    q_initial: Vector
+    q_optimal: Vector
+    speed: float = 1.0
+    restitution: float = 0.0
+    path: PathData | None = None
+    title: str = ""
+
+    @cached_property
+    def before(self) -> ImpactQuantities:
+        """The quantities at ``q_initial``."""
+        return self.objective.oracle.quantities(self.q_initial)
+
+    @cached_property
+    def after(self) -> ImpactQuantities:
+        """The quantities at ``q_optimal``."""
+        return self.objective.oracle.quantities(self.q_optimal)
+
+    @cached_property
+    def contact_point(self) -> PointOnLink:
+        """The contact point on its link."""
+        return point_on(self.robot, self.objective.contact.frame, self.objective.contact.offset)
+
+    def jacobian(self, q: Vector) -> Vector:
+        """``J(q)``, shape (3, nv): world velocity of the contact point, supports left out."""
+        return np.array(self.objective.oracle.numeric.at(q).jacobian(self.contact_point)[:3])
+
+
+def sample_path(
+    objective: ImpactObjective, configurations: Sequence[Vector], start: int = 0, optimum: int = -1
+) -> PathData:
+    """Evaluate the quantities along ``configurations``, each of shape (nq,), in the order of the path.
+
+    ``s`` adds up ``‖q_{k+1} ⊖ q_k‖`` on the tangent space.
+    """
+    model = objective.robot.model
+    steps = [float(np.linalg.norm(pin.difference(model, q, p))) for q, p in pairwise(configurations)]
+    found = [objective.oracle.quantities(q) for q in configurations]
+    return PathData(
+        s=np.concatenate([[0.0], np.cumsum(steps)]),
+        H=np.array([f.H for f in found]),
+        G=np.array([f.G for f in found]),
+        V=np.array([f.V for f in found]),
+        S=np.array([np.nan if f.S is None else f.S for f in found]),
+        start=start,
+        optimum=optimum,
+    )
+
+
+def velocity_units(robot: Robot) -> tuple[str, ...]:
+    """``m/s`` or ``rad/s`` for each of the nv velocity entries."""
+    units = []
+    for index in range(1, robot.model.njoints):
+        joint = robot.model.joints[index]
+        data = joint.createData()
+        own = pin.Model()
+        own.addJoint(0, joint, pin.SE3.Identity(), "joint")
+        joint.calc(data, pin.neutral(own))
+        motion = np.asarray(data.S).reshape(6, -1)
+        units += ["rad/s" if turns else "m/s" for turns in (np.abs(motion[3:]).max(axis=0) > 1e-12)]
+    return tuple(units)
+
+
+def jump_unit(view: ResultView) -> str:
+    """Unit of ``‖Δν‖_W`` in the view's metric."""
+    metric = view.objective.metric
+    if metric.kind == "kinetic":
+        return "√J"
+    if metric.kind == "weighted":
+        return "weighted"
+    kinds = [u for u in ("m/s", "rad/s") if u in velocity_units(view.robot)]
+    return kinds[0] if len(kinds) == 1 else f"({', '.join(kinds)})"
+
+
+def header_lines(view: ResultView) -> tuple[str, list[str]]:
+    """Title, and the small lines below it: what was computed, for which robot, and all five quantities.
+
+    H never stands alone: G, V, S and E stand beside it.
+    """
+    contact, robot = view.objective.contact, view.robot
+    title = view.title or f"{robot.name}, impact at {contact.frame}"
+    normal = ", ".join(number(v) for v in contact.normal)
+    axes = "world" if contact.normal_frame == "world" else "contact frame"
+    facts = [f"robot {robot.name}", f"contact {contact.frame}"] if view.title else []
+    if any(contact.offset):
+        facts.append(f"offset ({', '.join(number(v) for v in contact.offset)}) m")
+    facts += [
+        f"n = ({normal}) in {axes}",
+        f"objective {view.objective.name}",
+        f"metric {view.objective.metric.kind}" + (f" ({_short(view.objective.metric.source)})" * _sourced(view)),
+        f"armature {_armature(robot)}",
+    ]
+    feet = [s.frame for s in view.objective.supports]
+    facts.append(f"contact-consistent, on {', '.join(feet)}" if feet else "no supports")
+    quantities: list[tuple[str, str, Callable[[ImpactQuantities], float | None]]] = [
+        ("H", "‖Δν‖²/(N·s)²", lambda f: f.H),
+        ("G", "1/kg", lambda f: f.G),
+        ("V", "‖Δν‖²/(m/s)²", lambda f: f.V),
+        ("S", "‖Δν‖²/(m/s)²", lambda f: f.S),
+        ("E", "J/(m/s)²", lambda f: f.E),
+    ]
+    numbers = [
+        f"{name} {number(get(view.before))} → {number(get(view.after))}"
+        + (f" {unit}" if (get(view.before), get(view.after)) != (None, None) else "")
+        for name, unit, get in quantities
+    ]
+    return title, [SEPARATOR.join(facts), SEPARATOR.join(numbers)]
+
+
+def number(value: float | None) -> str:
+    """Three digits with a true minus sign; ``undefined`` for ``None``."""
+    if value is None or np.isnan(value):
+        return "undefined"
+    if np.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    rounded = float(f"{value:.3g}") + 0.0
+    text = f"{rounded:g}" if abs(rounded) < 1e5 else f"{rounded:.3g}"
+    mantissa, _, exponent = text.partition("e")
+    return (f"{mantissa}e{int(exponent)}" if exponent else mantissa).replace("-", "−")
+
+
+def _sourced(view: ResultView) -> bool:
+    return view.objective.metric.kind == "weighted" and bool(view.objective.metric.source)
+
+
+def _short(source: str) -> str:
+    """A source without its explanation in parentheses, and a path without its folders."""
+    return source.split(" (")[0].rsplit("/", 1)[-1]
+
+
+def _armature(robot: Robot) -> str:
+    source = _short(robot.armature_source)
+    joints = robot.armature[6 if robot.floating else 0 :]
+    if not joints.size or not joints.any():
+        return "zero" if source == "none" else f"zero ({source})"
+    low, high = f"{joints.min():.2g}", f"{joints.max():.2g}"
+    return f"{low if low == high else f'{low}–{high}'} kg·m² ({source})"
