@@ -98,20 +98,21 @@ def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
     gradient = objective_gradient(problem, q, scale)
     numeric.at(q)
     errors = [c.pose_error(numeric) for c in problem.constraints]
-    names, sides, rows, slacks, violation = _inequalities(problem, numeric)
-    bound_rows, limit_violation = _limits(problem, q)
-    for name, side, row, slack in bound_rows:
-        names.append(name), sides.append(side), rows.append(row), slacks.append(slack)
-    multipliers, residual = _multipliers(gradient, equality_jacobian(problem, numeric), np.array(rows))
+    near, violation = _inequalities(problem, numeric)
+    limits, limit_violation = _limits(problem, q)
+    near += limits
+    multipliers, residual = _multipliers(
+        gradient, equality_jacobian(problem, numeric), np.array([row.outward for row in near])
+    )
     active = tuple(
-        Active(name, side, float(m))
-        for name, side, m in zip(names, sides, multipliers, strict=True)
+        Active(row.name, row.side, float(m))
+        for row, m in zip(near, multipliers, strict=True)
         if m > _MULTIPLIER
     )
     return Certificate(
         stationarity=float(np.abs(residual).max()),
         primal=max(violation, limit_violation),
-        complementarity=float(max((abs(m * s) for m, s in zip(multipliers, slacks, strict=True)), default=0.0)),
+        complementarity=max((abs(float(m) * row.slack) for row, m in zip(near, multipliers, strict=True)), default=0.0),
         pose_error_m=max((e[0] for e in errors), default=0.0),
         pose_error_rad=max((e[1] for e in errors), default=0.0),
         limits=limit_violation,
@@ -153,14 +154,19 @@ def _distance_gradient(problem: PostureProblem, q: Vector) -> Vector:
     return gradient
 
 
-def _inequalities(
-    problem: PostureProblem, numeric: Numeric
-) -> tuple[list[str], list[str], list[Vector], list[float], float]:
-    """Rows near their bound, as outward gradients, and the largest violation of any constraint."""
-    names: list[str] = []
-    sides: list[str] = []
-    rows: list[Vector] = []
-    slacks: list[float] = []
+@dataclass(frozen=True, eq=False)
+class _Near:
+    """An inequality close to its bound: name, side, outward tangent gradient, distance."""
+
+    name: str
+    side: str
+    outward: Vector
+    slack: float
+
+
+def _inequalities(problem: PostureProblem, numeric: Numeric) -> tuple[list[_Near], float]:
+    """Rows near their bound, and the largest violation of any constraint."""
+    near: list[_Near] = []
     violation = 0.0
     for constraint in problem.constraints:
         value, jacobian = constraint.numeric(numeric)
@@ -173,16 +179,15 @@ def _inequalities(
                 ("upper", constraint.upper[k] - value[k], 1.0),
             ):
                 if slack < _ACTIVE:
-                    names.append(constraint.row_name(k)), sides.append(side)
-                    rows.append(sign * jacobian[k]), slacks.append(float(slack))
-    return names, sides, rows, slacks, violation
+                    near.append(_Near(constraint.row_name(k), side, sign * jacobian[k], float(slack)))
+    return near, violation
 
 
-def _limits(problem: PostureProblem, q: Vector) -> tuple[list[tuple[str, str, Vector, float]], float]:
+def _limits(problem: PostureProblem, q: Vector) -> tuple[list[_Near], float]:
     """Joint limits that are near, and the largest violation of any."""
     chart = Chart(problem.robot.model)
     x = chart.to_x(q)
-    near: list[tuple[str, str, Vector, float]] = []
+    near: list[_Near] = []
     worst = 0.0
     for slot in chart.slots:
         if slot.kind.family not in ("revolute", "prismatic", "translation"):
@@ -195,9 +200,9 @@ def _limits(problem: PostureProblem, q: Vector) -> tuple[list[tuple[str, str, Ve
                 continue  # held: an equality
             name = f"joint '{slot.name}'"
             if value - low < _ACTIVE:
-                near.append((name, "lower", -unit, float(value - low)))
+                near.append(_Near(name, "lower", -unit, float(value - low)))
             if high - value < _ACTIVE:
-                near.append((name, "upper", unit, float(high - value)))
+                near.append(_Near(name, "upper", unit, float(high - value)))
     return near, float(worst)
 
 

@@ -11,7 +11,7 @@ import hashlib
 import os
 import tempfile
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 
@@ -37,7 +37,7 @@ def cache_folder() -> Path:
 
 
 def compiled_solver(
-    problem: PostureProblem, symbols: dict[str, ca.SX], options: dict[str, object], mode: CompileMode, starts: int
+    problem: PostureProblem, symbols: dict[str, ca.SX], options: dict[str, Any], mode: CompileMode, starts: int
 ) -> tuple[ca.Function, bool]:
     """``nlpsol`` on the expressions, compiled or interpreted, and which of the two."""
     compiler = find_compiler()
@@ -64,7 +64,7 @@ def _key(problem: PostureProblem) -> str:
     content = [
         __version__,
         _own_source(),
-        ca.__version__,
+        ca.CasadiMeta.version(),
         problem.robot.model_sha256,
         repr((objective.kind, objective.metric, objective.supports, objective.compliance)),
         repr((objective.contact.frame, objective.contact.offset, objective.contact.normal_frame)),

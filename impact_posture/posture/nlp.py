@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -26,7 +27,7 @@ from impact_posture.posture.problem import PostureProblem
 
 Vector = NDArray[np.float64]
 
-IPOPT_OPTIONS: dict[str, object] = {
+IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
     "ipopt.tol": 1e-9,

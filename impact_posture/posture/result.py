@@ -70,7 +70,7 @@ def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, 
 def versions() -> dict[str, str]:
     """Versions of everything that a result depends on."""
     found = {"impact-posture": __version__, "python": platform.python_version()}
-    found |= {"casadi": ca.__version__, "pinocchio": pin.__version__, "numpy": np.__version__}
+    found |= {"casadi": ca.CasadiMeta.version(), "pinocchio": pin.__version__, "numpy": np.__version__}
     try:
         found["example-robot-data"] = metadata.version("example-robot-data")
     except metadata.PackageNotFoundError:

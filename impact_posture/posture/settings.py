@@ -28,7 +28,7 @@ class ProblemSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    schema_: Literal["impact-posture/problem/1"] = Field(default=SCHEMA, alias="schema")
+    schema_: Literal["impact-posture/problem/1"] = Field(default="impact-posture/problem/1", alias="schema")
     robot: str
     root: Root | None = None
     package_dir: tuple[str, ...] = ()
