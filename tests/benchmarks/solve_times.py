@@ -9,9 +9,13 @@ import argparse
 import statistics
 import time
 
-from impact_posture.posture.nlp import build_nlp
+import numpy as np
+
+from impact_posture.posture.nlp import PostureNLP, build_nlp
+from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.solve import run_start, solve
 from impact_posture.posture.starts import feasible_start
+from impact_posture.toolchain import find_compiler
 from tests.benchmarks.common import crba_time, default_problem, machine
 
 CASES = [
@@ -27,31 +31,15 @@ def main() -> None:
     """Print one row a case."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--many", type=int, default=0, help="also compare the best of 16 starts with the best of MANY")
-    parser.add_argument("--compile", choices=["auto", "always", "never"], default="auto")
     args = parser.parse_args()
     print(machine())
     print(f"single start, median of {STARTS} random feasible starts; target from the project's goals")
     print("robot         normal   build s  code         solve ms  target  x crba  iterations  certified")
     for name, frame, normal, target in CASES:
         problem = default_problem(name, frame, normal)
-        nlp = build_nlp(problem, compile=args.compile)
-        scale = problem.objective.value(problem.given)
-        starts, index = [], 1
-        while len(starts) < STARTS:
-            start = feasible_start(problem, index, seed=1)
-            index += 1
-            if start is not None:
-                starts.append(start)
-        runs = [run_start(nlp, start, scale) for start in starts]
-        times = [record.time_s for record, _ in runs]
-        certified = sum(certificate.holds() for _, certificate in runs) / len(runs)
-        took = statistics.median(times)
-        print(
-            f"{name:13s} {'%g %g %g' % normal:8s} {nlp.build_time_s:7.2f}  "
-            f"{'compiled' if nlp.compiled else 'interpreted':11s} {took * 1e3:9.1f} {target:7.0f} "
-            f"{took / crba_time(problem.robot.model):7.0f} {statistics.median(r.iterations for r, _ in runs):11.0f} "
-            f"{certified:10.0%}"
-        )
+        starts = _starts(problem)
+        for mode in ("never", "always") if find_compiler() else ("never",):
+            _row(name, normal, target, build_nlp(problem, compile=mode), starts)
     if args.many:
         print(f"best of 16 starts against the best of {args.many}")
         for name, frame, normal, _ in CASES:
@@ -63,6 +51,31 @@ def main() -> None:
                 f"{name:13s} {'%g %g %g' % normal:8s} {few / many - 1:+.2%} of the best of {args.many} "
                 f"({time.perf_counter() - began:.0f} s)"
             )
+
+
+def _starts(problem: PostureProblem) -> list[np.ndarray]:
+    starts: list[np.ndarray] = []
+    index = 1
+    while len(starts) < STARTS:
+        start = feasible_start(problem, index, seed=1)
+        index += 1
+        if start is not None:
+            starts.append(start)
+    return starts
+
+
+def _row(name: str, normal: tuple[float, ...], target: float, nlp: PostureNLP, starts: list[np.ndarray]) -> None:
+    scale = nlp.problem.objective.value(nlp.problem.given)
+    runs = [run_start(nlp, start, scale) for start in starts]
+    took = statistics.median(record.time_s for record, _ in runs)
+    certified = sum(certificate.holds() for _, certificate in runs) / len(runs)
+    print(
+        f"{name:13s} {'%g %g %g' % normal:8s} {nlp.build_time_s:7.2f}  "
+        f"{'compiled' if nlp.compiled else 'interpreted':11s} {took * 1e3:9.1f} {target:7.0f} "
+        f"{took / crba_time(nlp.problem.robot.model):7.0f} {statistics.median(r.iterations for r, _ in runs):11.0f} "
+        f"{certified:10.0%}",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":
