@@ -1,6 +1,6 @@
 """The nonlinear programme: built once, solved for many starts, normals and targets.
 
-Formulation (the "lifted" one): the impact's linear solve is left to IPOPT,
+Formulation (the "lifted" one): the impact's linear solve is left to IPOPT::
 
     min over x, a, f, s   aᵀWa        (or λ/2)
     subject to            M(q)a − J_sᵀf − Jᵀs = 0,  J_s a + εf = 0,  what ties s to n,

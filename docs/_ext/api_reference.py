@@ -1,0 +1,55 @@
+"""``api-reference PACKAGE…``: one section for each module, found by looking, so that none is forgotten."""
+
+from __future__ import annotations
+
+import pkgutil
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+ROOT = "impact_posture"
+
+
+def modules(name: str) -> list[str]:
+    """A module of the library, or a package's public modules (itself first, where it exports something)."""
+    full = f"{ROOT}.{name}"
+    package = import_module(full)
+    if not hasattr(package, "__path__"):
+        return [full]
+    inner = sorted(f"{full}.{m.name}" for m in pkgutil.iter_modules(package.__path__) if not m.name.startswith("_"))
+    return [full, *inner] if getattr(package, "__all__", ()) else inner
+
+
+def markdown(names: list[str]) -> str:
+    """A heading and an ``automodule`` for each module."""
+    parts = []
+    for module in (m for name in names for m in modules(name)):
+        parts += [
+            f"## `{module.removeprefix(ROOT + '.')}`",
+            "",
+            "```{eval-rst}",
+            f".. automodule:: {module}",
+            "```",
+            "",
+        ]
+    return "\n".join(parts)
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the directive."""
+    from docutils import nodes
+    from sphinx.util.docutils import SphinxDirective
+
+    class ApiReference(SphinxDirective):
+        """Insert :func:`markdown` where it stands."""
+
+        required_arguments = 1
+        optional_arguments = 9
+
+        def run(self) -> list[nodes.Node]:
+            return self.parse_text_to_nodes(markdown(self.arguments), allow_section_headings=True)
+
+    app.add_directive("api-reference", ApiReference)
+    return {"version": "1", "parallel_read_safe": True}

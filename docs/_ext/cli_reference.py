@@ -1,0 +1,146 @@
+"""``cli-reference``: the command line as pages show it, read from the commands' own signatures.
+
+Typer's public ``OptionInfo`` is read, not the parser that it builds: that one differs from version to version.
+"""
+
+from __future__ import annotations
+
+import inspect
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import typer
+from typer.models import ArgumentInfo, OptionInfo
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+_WORDS = {int: "INTEGER", float: "NUMBER", str: "TEXT"}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """An argument or option of a command: how to write it, its default and meaning, in Markdown."""
+
+    names: tuple[str, ...]
+    takes: str
+    default: str
+    meaning: str
+    panel: str
+    argument: bool
+
+    @property
+    def spelling(self) -> str:
+        """Every name, and what it takes."""
+        return f"{', '.join(self.names)} {self.takes}".strip()
+
+
+def commands() -> dict[str, Callable[..., None]]:
+    """The subcommands by name, in the order of ``--help``."""
+    from impact_posture_cli.main import app
+
+    return {info.name or "": info.callback for info in app.registered_commands if info.callback}
+
+
+def parameters(command: Callable[..., None]) -> list[Parameter]:
+    """What a command takes, in the order of its signature."""
+    hints = get_type_hints(command, include_extras=True)
+    found = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        annotation = hints[name]
+        infos = [m for m in getattr(annotation, "__metadata__", ()) if isinstance(m, ArgumentInfo | OptionInfo)]
+        if annotation is typer.Context:
+            continue
+        if not infos:
+            raise TypeError(f"parameter '{name}' of '{command.__name__}' is no documented option")
+        info, value = infos[0], parameter.default
+        inner = _plain(get_args(annotation)[0])
+        argument = isinstance(info, ArgumentInfo)
+        # Inside Annotated, Typer keeps the first name where the default would stand.
+        first = (info.default,) if isinstance(info.default, str) else ()
+        names = (*first, *(info.param_decls or ())) or (f"--{name.replace('_', '-')}",)
+        takes = info.metavar or ("" if inner is bool else _choices(inner) or _WORDS.get(inner, "TEXT"))
+        names = (info.metavar or name.upper(),) if argument else tuple(n.replace("/", " / ") for n in names)
+        found.append(
+            Parameter(
+                names=names,
+                takes="" if argument else takes,
+                default=_default(info, value),
+                meaning=" ".join((info.help or "").split()) + _kinds(info, inner),
+                panel=getattr(info, "rich_help_panel", None) or "Other",
+                argument=argument,
+            )
+        )
+    return found
+
+
+def _plain(annotation: Any) -> Any:
+    """The type without ``| None`` and without the list around a repeatable option."""
+    if get_origin(annotation) in (Union, types.UnionType):
+        annotation = next(a for a in get_args(annotation) if a is not type(None))
+    return get_args(annotation)[0] if get_origin(annotation) is list else annotation
+
+
+def _choices(inner: Any) -> str:
+    if get_origin(inner) is Literal:
+        return "|".join(str(a) for a in get_args(inner))
+    members = getattr(inner, "__members__", None)
+    return "|".join(str(m.value) for m in members.values()) if members else ""
+
+
+def _kinds(info: ArgumentInfo | OptionInfo, inner: Any) -> str:
+    """The choices, where a metavar hides them and the help does not name them all."""
+    choices = _choices(inner)
+    if not (info.metavar and choices) or all(c in (info.help or "") for c in choices.split("|")):
+        return ""
+    return f" One of {choices.replace('|', ', ')}."
+
+
+def _default(info: ArgumentInfo | OptionInfo, value: Any) -> str:
+    if isinstance(info.show_default, str):
+        return info.show_default
+    if value is inspect.Parameter.empty:
+        return "required"
+    return "–" if value is None or value is False else f"`{value}`"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def markdown() -> str:
+    """One section a command: what it does, how to call it, a table of its options."""
+    parts = []
+    for name, command in commands().items():
+        every = parameters(command)
+        arguments, options = [p for p in every if p.argument], [p for p in every if not p.argument]
+        usage = " ".join([f"impact-posture {name}", *[a.names[0] for a in arguments], "[OPTIONS]"])
+        parts += [f"## {name}", "", " ".join((command.__doc__ or "").split()), "", "```text", usage, "```", ""]
+        if arguments:
+            parts += ["| argument | meaning |", "|---|---|"]
+            parts += [f"| `{_cell(a.spelling)}` | {_cell(a.meaning)} |" for a in arguments] + [""]
+        for panel in dict.fromkeys(o.panel for o in options):
+            parts += [f"| {panel} | default | meaning |", "|---|---|---|"]
+            parts += [
+                f"| `{_cell(o.spelling)}` | {_cell(o.default)} | {_cell(o.meaning)} |"
+                for o in options
+                if o.panel == panel
+            ] + [""]
+    return "\n".join(parts)
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the directive."""
+    from docutils import nodes
+    from sphinx.util.docutils import SphinxDirective
+
+    class CliReference(SphinxDirective):
+        """Insert :func:`markdown` where it stands."""
+
+        def run(self) -> list[nodes.Node]:
+            return self.parse_text_to_nodes(markdown(), allow_section_headings=True)
+
+    app.add_directive("cli-reference", CliReference)
+    return {"version": "1", "parallel_read_safe": True}

@@ -1,0 +1,168 @@
+"""The reference pages: every key and option that exists has its row, with its default, and no row is stale."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import re
+from pathlib import Path
+from typing import get_args
+
+import pytest
+import typer.main
+from pydantic import BaseModel
+
+from impact_posture.posture.certificate import Certificate
+from impact_posture.posture.result import result_document
+from impact_posture.posture.settings import ProblemSettings, make_settings, prepare
+from impact_posture.posture.solve import solve
+from impact_posture.robot.spec import ContactPose, RobotSpec
+from impact_posture_cli.main import app
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def rows(page: Path) -> dict[str, list[str]]:
+    """Table rows of a page whose first cell is code: that code to the other cells."""
+    found: dict[str, list[str]] = {}
+    for line in page.read_text(encoding="utf-8").splitlines():
+        if not line.startswith("| `"):
+            continue
+        cells = [c.strip() for c in re.split(r"(?<!\\)\|", line.strip().strip("|"))]
+        for key in re.findall(r"`([^`]+)`", cells[0]):
+            assert key not in found, f"{page.name} has two rows for '{key}'"
+            found[key] = cells[1:]
+    return found
+
+
+def nested(annotation: object) -> type[BaseModel] | None:
+    """The model inside ``Model``, ``Model | None``, ``tuple[Model, ...]`` or ``dict[str, Model]``."""
+    if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((m for a in getattr(annotation, "__args__", ()) if (m := nested(a)) is not None), None)
+
+
+def keys(model: type[BaseModel], prefix: str = "") -> dict[str, object]:
+    """Dotted keys of a model and their defaults; ``...`` where there is none."""
+    found: dict[str, object] = {}
+    for name, field in model.model_fields.items():
+        key = prefix + (field.alias or name)
+        inner = nested(field.annotation)
+        if inner is not None:
+            named = str(field.annotation).startswith("dict")
+            found |= keys(inner, f"{key}.NAME." if named else f"{key}.")
+        else:
+            found[key] = ... if field.is_required() else field.default
+    return found
+
+
+def test_keys_are_found_in_nested_models() -> None:
+    found = keys(RobotSpec)
+    assert {"schema", "model.root", "postures.NAME.base", "supports.kind", "propulsion.rotors.spin"} <= set(found)
+
+
+def shown_default(value: object) -> str:
+    """A default as the pages write it."""
+    if value is ...:
+        return "required"
+    if value is None:
+        return "none"
+    if isinstance(value, tuple):
+        return f"`{list(value)}`"
+    if isinstance(value, str):
+        return f'`"{value}"`'
+    return f"`{json.dumps(value)}`"
+
+
+def test_every_robot_toml_key_has_its_row() -> None:
+    expected = keys(RobotSpec)
+    found = {
+        key: cells for key, cells in rows(DOCS / "reference" / "robot-toml.md").items()
+        if "." in key or key in RobotSpec.model_fields or key == "schema"
+    }  # fmt: skip
+    assert set(found) == set(expected)
+    for key, value in expected.items():
+        assert found[key][1] == shown_default(value), f"default of {key}"
+        assert len(found[key][2]) > 8, f"{key} is not explained"
+
+
+def test_contact_poses_are_explained() -> None:
+    for page in (DOCS / "reference" / "robot-toml.md", DOCS / "tutorials" / "arm.md"):
+        assert set(get_args(ContactPose)) <= set(rows(page)), page.name
+
+
+def test_every_problem_toml_key_has_its_row() -> None:
+    expected = keys(ProblemSettings)
+    found = rows(DOCS / "reference" / "problem-toml.md")
+    assert set(found) == set(expected)
+    for key, value in expected.items():
+        shown = found[key][1]
+        # None means: from the robot, or where it is.  Such a default is said in words.
+        if value is None:
+            assert not shown.startswith("`"), f"default of {key}"
+        elif key != "normal":
+            assert shown == shown_default(value), f"default of {key}"
+
+
+def test_every_option_is_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reference reads signatures, the parser is Typer's: what one has the other must have."""
+    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+    reference = importlib.import_module("cli_reference").markdown()
+    sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", reference, re.MULTILINE | re.DOTALL))
+    commands = typer.main.get_command(app).commands
+    assert list(sections) == list(commands)
+    for name, command in commands.items():
+        table = [line for line in sections[name].splitlines() if line.startswith("| `-")]
+        shown = {word for line in table for word in re.findall(r"(?<![\w-])--?[a-z][a-z-]*", line.split("` |")[0])}
+        taken = {o for p in command.params for o in (*p.opts, *p.secondary_opts) if o.startswith("-")}
+        assert shown == taken - {"--help"}, name
+        assert all(len(line.split(" | ")[-1].strip(" |")) > 5 for line in table), f"{name}: an option without help"
+
+
+def test_every_problem_key_is_an_option() -> None:
+    """``problem.toml`` says that each of its keys is an option."""
+    command = typer.main.get_command(app).commands["optimize"]
+    names = {o[2:].replace("-", "_") for p in command.params for o in p.opts if o.startswith("--")}
+    names |= {"schema", "robot"}
+    # Written by the tool itself: the start as numbers, and the compliance in force.
+    assert set(keys(ProblemSettings)) - names == {"q", "support_compliance"}
+
+
+def test_result_keys_have_their_rows() -> None:
+    prepared = prepare(make_settings({"robot": "solo8", "normal": (1, 0, 0), "starts": 1}))
+    document = result_document(prepared, solve(prepared.problem, starts=1, jobs=1, compile="never"))
+    shown = set(rows(DOCS / "reference" / "result-json.md"))
+    for key, value in document.items():
+        if key in ("initial", "optimal"):
+            assert isinstance(value, dict)
+            for inner, content in value.items():
+                parts = content if isinstance(content, dict) and inner in ("ellipsoid", "pose") else {None: None}
+                for part in parts:
+                    name = inner if part is None else f"{inner}.{part}"
+                    assert {name, f"{key}.{name}"} & shown, f"no row for {key}.{name}"
+        elif isinstance(value, dict) and key in ("robot", "metric", "solver"):
+            assert not {f"{key}.{inner}" for inner in value} - shown
+        else:
+            assert key in shown, f"no row for {key}"
+
+
+def test_certificate_tolerances_are_those_of_the_theory_page() -> None:
+    text = (DOCS / "theory.md").read_text(encoding="utf-8")
+    table = {k: v[-1] for k, v in rows_of(text, "## The certificate").items()}
+    defaults = {k: p.default for k, p in inspect.signature(Certificate.holds).parameters.items() if k != "self"}
+    shown = {"pose": table["pose_error_m"], **{k: table[k] for k in ("stationarity", "primal", "complementarity")}}
+    assert {k: power(v) for k, v in shown.items()} == defaults
+
+
+def rows_of(text: str, heading: str) -> dict[str, list[str]]:
+    """First code of each table row below a heading to its other cells."""
+    section = text.split(heading, 1)[1].split("\n## ", 1)[0]
+    lines = [line for line in section.splitlines() if line.startswith("| `")]
+    return {re.findall(r"`([^`]+)`", line)[0]: [c.strip() for c in line.strip("| ").split("|")] for line in lines}
+
+
+def power(text: str) -> float:
+    found = re.fullmatch(r"\$10\^\{(-\d+)\}\$", text)
+    assert found, text
+    return float(f"1e{found[1]}")
