@@ -176,7 +176,9 @@ def _coefficients(t: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         ca.if_else(t < _SMALL, 0.5 - t / 48 + t**2 / 3840 - t**3 / 645120, ca.sin(theta / 2) / theta),
         ca.if_else(t < _SMALL, 1 - t / 8 + t**2 / 384 - t**3 / 46080, ca.cos(theta / 2)),
         ca.if_else(t < _SMALL, 0.5 - t / 24 + t**2 / 720 - t**3 / 40320, (1 - ca.cos(theta)) / safe),
-        ca.if_else(t < _SMALL, 1 / 6 - t / 120 + t**2 / 5040 - t**3 / 362880, (theta - ca.sin(theta)) / (safe * theta)),
+        ca.if_else(
+            t < _SMALL, 1 / 6 - t / 120 + t**2 / 5040 - t**3 / 362880, (theta - ca.sin(theta)) / (safe * theta)
+        ),
     )
 
 

@@ -24,7 +24,8 @@ class JointKind:
     """What a joint is, read off a ``pin.JointModel``.
 
     Attributes:
-        family: ``revolute``, ``continuous``, ``prismatic``, ``free-flyer``, ``planar``, ``spherical``, ``translation``.
+        family: ``revolute``, ``continuous``, ``prismatic``, ``free-flyer``, ``planar``, ``spherical`` or
+            ``translation``.
         axis: Unit axis in the joint frame, shape (3,); zeros where it has none.
         subspace: Motion subspace ``S`` in the joint frame, shape (6, nv); constant for all of these.
         nq: Numbers in the configuration.
@@ -110,8 +111,8 @@ def axis_rotation(axis: NDArray[np.float64], cosine: ca.SX, sine: ca.SX) -> ca.S
 def joint_quaternion(kind: JointKind, x: ca.SX) -> ca.SX:
     """Unit quaternion ``x y z w`` of the joint's rotation, smooth everywhere, from its chart coordinates.
 
-    Continuous and planar joints enter by their angle (see :class:`~impact_posture.dynamics.chart.Chart`): a half angle
-    is no smooth function of its cosine and sine.
+    Continuous and planar joints enter by their angle (see :class:`~impact_posture.dynamics.chart.Chart`): a half
+    angle is no smooth function of its cosine and sine.
     """
     if kind.family in ("revolute", "continuous"):
         return _half(kind.axis, x[0])

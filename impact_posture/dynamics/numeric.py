@@ -80,10 +80,11 @@ class Numeric:
         gradient = d_linear.T @ force + dv_dq[3:].T @ moment
         self.at(self.q)
         if not in_frame:
-            angular = np.asarray(pin.getJointJacobian(self.model, self.data, point.joint, pin.LOCAL)).reshape(6, -1)[3:]
+            local = pin.getJointJacobian(self.model, self.data, point.joint, pin.LOCAL)
+            angular = np.asarray(local).reshape(6, -1)[3:]
             gradient = gradient + angular.T @ (np.cross(linear, force) + np.cross(motion.angular, moment))
         return np.asarray(gradient)
 
     def turning_gradient(self, point: PointOnLink, direction: Vector, covector: Vector) -> Vector:
-        """Tangent gradient of ``cᵀ d(q)`` where the world direction ``d`` turns with the point's link, shape (nv,)."""
+        """Tangent gradient of ``cᵀ d(q)`` where the world direction ``d`` turns with the point's link: (nv,)."""
         return np.asarray(self.jacobian(point)[3:].T @ np.cross(direction, covector))

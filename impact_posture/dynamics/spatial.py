@@ -1,7 +1,7 @@
 """Spatial algebra on CasADi expressions, in Pinocchio's order: linear part first.
 
-A motion ``[v; w]`` and a force ``[f; m]`` are 6-vectors of ``SX``.  ``R`` and ``p`` place a child frame in its parent:
-``x_parent = R x_child + p``.  Structural zeros are kept, so that CasADi never multiplies by a constant zero.
+A motion ``[v; w]`` and a force ``[f; m]`` are 6-vectors of ``SX``.  ``R`` and ``p`` place a child frame in its
+parent: ``x_parent = R x_child + p``.  Structural zeros are kept, so that CasADi never multiplies by a constant zero.
 """
 
 from __future__ import annotations

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
+from impact_posture.errors import InputError, PackageNotFound, RobotNotFound, SpecError, UrdfError
+from impact_posture.robot.armature import ArmatureOption, armature_warning, set_armature
+from impact_posture.robot.inertia import check_mass_matrix, check_moved_mass
 from impact_posture.robot.robot import Robot, Vector
-from impact_posture.robot.spec import PostureSpec, RobotSpec, Root, read_spec, read_toml
+from impact_posture.robot.spec import RobotSpec, Root, read_spec
 from impact_posture.robot.urdf import (
     EXAMPLE_PREFIX,
     build_model,
-    check_moved_mass,
     example_robot_data,
+    joint_index,
     resolve_path,
     robots_data,
 )
-
-ArmatureOption = Mapping[str, float] | str | None
 
 
 @dataclass(frozen=True)
@@ -61,15 +61,13 @@ def load_robot(robot: str, options: LoadOptions | None = None) -> Robot:
     options = options or LoadOptions()
     spec, urdf, source, base, name = _locate(robot, options)
     root: Root = options.root or spec.model.root
-    for folder in (*options.package_dirs, *spec.model.package_dirs):
-        if not (base / Path(folder).expanduser()).is_dir():
-            siblings = [p.name for p in (base / folder).parent.glob("*") if p.is_dir()]
-            raise PackageNotFound(folder, siblings, where="--package-dir", mend="name an existing folder")
+    _check_package_dirs(options.package_dirs, Path(), "--package-dir")
+    _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
     model, warnings = build_model(
         urdf, free_flyer=root == "free-flyer", accept_inertias=spec.model.accept_inertias
     )
     srdf = _srdf(spec, options, base)
-    postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec.postures, root, name)
+    postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec, root, name)
     _override_limits(model, spec, name)
     default = spec.default_posture or next(iter(postures), "neutral")
     postures.setdefault("neutral", _neutral(model))
@@ -78,12 +76,12 @@ def load_robot(robot: str, options: LoadOptions | None = None) -> Robot:
             f"default_posture '{default}' does not exist", where=name, mend=f"one of: {', '.join(postures)}"
         )
     locked = tuple(dict.fromkeys((*spec.model.lock, *options.lock)))
-    armature_source = _set_armature(model, spec, srdf, options.armature, name)
+    armature_source = set_armature(model, spec, srdf, options.armature, name)
     if locked:
         model, postures = _lock(model, locked, postures, default, name)
     check_moved_mass(model, source)
-    warnings = (*warnings, *_armature_warning(model, armature_source))
-    return Robot(
+    warnings = (*warnings, *armature_warning(model, armature_source))
+    loaded = Robot(
         name=name,
         source=source,
         model=model,
@@ -95,16 +93,32 @@ def load_robot(robot: str, options: LoadOptions | None = None) -> Robot:
         armature_source=armature_source,
         warnings=warnings,
     )
+    check_mass_matrix(model, postures[default], loaded.tangent_names, source, default)
+    return loaded
+
+
+def _check_package_dirs(folders: Sequence[str], base: Path, where: str) -> None:
+    for folder in folders:
+        path = base / Path(folder).expanduser()
+        if not path.is_dir():
+            siblings = sorted(str(Path(folder).with_name(p.name)) for p in path.parent.glob("*") if p.is_dir())
+            raise PackageNotFound(folder, siblings, where=where, mend="name an existing folder")
 
 
 def _locate(robot: str, options: LoadOptions) -> tuple[RobotSpec, Path, str, Path, str]:
     """Return spec, URDF file, its printable source, the folder that relative paths start from, and the name."""
     own = robots_data() / robot / "robot.toml"
     if "/" not in robot and own.is_file():
-        spec = read_spec(Path(options.config) if options.config else own)
-        text = spec.model.urdf or read_spec(own).model.urdf or ""
+        spec, base = read_spec(own), own.parent
+        text = spec.model.urdf or ""
         source = text if text.startswith(EXAMPLE_PREFIX) else f"impact-posture:{robot}/{text}"
-        return spec, resolve_path(text, own.parent), source, own.parent, spec.name or robot
+        urdf = resolve_path(text, base)
+        if options.config:
+            spec, base = read_spec(Path(options.config)), Path(options.config).parent
+            if spec.model.urdf:
+                urdf = resolve_path(spec.model.urdf, base)
+                source = spec.model.urdf if spec.model.urdf.startswith(EXAMPLE_PREFIX) else str(urdf)
+        return spec, urdf, source, base, spec.name or robot
     if robot.startswith(EXAMPLE_PREFIX):
         urdf, source = resolve_path(robot, Path()), robot
     elif robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or Path(robot).is_file():
@@ -143,27 +157,41 @@ def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict
     return {name: pin.normalize(model, q) for name, q in states.items() if name not in spec.postures}
 
 
-def _toml_postures(
-    model: pin.Model, postures: Mapping[str, PostureSpec], root: Root, name: str
-) -> dict[str, Vector]:
+def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> dict[str, Vector]:
     result = {}
-    for key, posture in postures.items():
+    for key, posture in spec.postures.items():
         q = np.array(pin.neutral(model), dtype=float)
-        if posture.base is not None:
-            if root != "free-flyer":
-                raise SpecError(
-                    f"posture '{key}' gives a base pose, but the root is fixed", where=name, mend="remove it"
-                )
+        if posture.base is not None and spec.model.root != "free-flyer" and root != "free-flyer":
+            raise SpecError(
+                f"posture '{key}' gives a base pose, but the root is fixed", where=name, mend="remove it"
+            )
+        # A floating robot that --root bolts down keeps its postures, without their base.
+        if posture.base is not None and root == "free-flyer":
+            _check_base(posture.base, f"{name} posture '{key}'")
             q[:7] = posture.base
         for joint, value in posture.joints.items():
-            index = _joint_index(model, joint, f"{name} posture '{key}'")
+            index = joint_index(model, joint, f"{name} posture '{key}'")
             first = model.idx_qs[index]
-            if model.nqs[index] == 2 and model.nvs[index] == 1:
+            if model.nvs[index] != 1:
+                raise SpecError(
+                    f"posture '{key}': joint '{joint}' has {model.nvs[index]} degrees of freedom, not one number",
+                    where=name,
+                    mend="give it in an SRDF",
+                )
+            if not np.isfinite(value):
+                raise SpecError(f"posture '{key}': joint '{joint}' is {value}", where=name, mend="give a number")
+            if model.nqs[index] == 2:
                 q[first : first + 2] = np.cos(value), np.sin(value)
             else:
                 q[first] = value
         result[key] = np.asarray(pin.normalize(model, q))
     return result
+
+
+def _check_base(base: Sequence[float], where: str) -> None:
+    norm = float(np.linalg.norm(base[3:]))
+    if not (np.isfinite(base).all() and abs(norm - 1) < 1e-3):
+        raise SpecError(f"base quaternion of norm {norm:.4g}", where=where, mend="give a unit quaternion x y z w")
 
 
 def _neutral(model: pin.Model) -> Vector:
@@ -176,102 +204,30 @@ def _neutral(model: pin.Model) -> Vector:
     return q
 
 
-def _joint_index(model: pin.Model, joint: str, where: str) -> int:
-    known = [n for n in model.names if n not in ("universe", "root_joint")]
-    if joint not in known:
-        raise JointNotFound(joint, known, where=where)
-    return int(model.getJointId(joint))
-
-
 def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
     where = f"{name} robot.toml [limits]"
     lower, upper = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
     for joint, (low, high) in spec.limits.position.items():
         if not low < high:
             raise SpecError(f"position limits of '{joint}' are [{low}, {high}]", where=where, mend="lower < upper")
-        k = model.idx_qs[_joint_index(model, joint, where)]
-        lower[k], upper[k] = low, high
+        index = joint_index(model, joint, where)
+        if model.nqs[index] != 1:
+            raise SpecError(f"joint '{joint}' has no position limits", where=where, mend="remove it: it turns freely")
+        lower[model.idx_qs[index]], upper[model.idx_qs[index]] = low, high
     model.lowerPositionLimit, model.upperPositionLimit = lower, upper
     for values, kind in ((spec.limits.velocity, "Velocity"), (spec.limits.effort, "Effort")):
         low, high = getattr(model, f"lower{kind}Limit").copy(), getattr(model, f"upper{kind}Limit").copy()
         for joint, value in values.items():
-            k = model.idx_vs[_joint_index(model, joint, where)]
+            k = model.idx_vs[joint_index(model, joint, where)]
             low[k], high[k] = -value, value
         setattr(model, f"lower{kind}Limit", low)
         setattr(model, f"upper{kind}Limit", high)
 
 
-def _set_armature(
-    model: pin.Model, spec: RobotSpec, srdf: Path | None, option: ArmatureOption, name: str
-) -> str:
-    """Set ``model.armature``; order: the option, robot.toml, rotor data of the SRDF, zero."""
-    if option == "none":
-        model.armature = np.zeros(model.nv)
-        return "none (--armature none)"
-    armature, source = np.array(model.armature, dtype=float), "none"
-    if spec.armature.default is not None or spec.armature.joints:
-        armature = _armature_vector(model, spec.armature.default or 0.0, spec.armature.joints, name)
-        source = f"robot.toml ({spec.armature.source})" if spec.armature.source else "robot.toml"
-    elif srdf is not None and "rotor_params" in srdf.read_text(encoding="utf-8", errors="replace"):
-        pin.loadRotorParameters(model, str(srdf), False)
-        armature = np.array(model.armature, dtype=float)
-        armature[: _base_width(model)] = 0.0
-        source = "rotor data in the SRDF"
-    if isinstance(option, str):
-        armature = _armature_vector(model, 0.0, _armature_file(Path(option)), option)
-        source = f"--armature {option}"
-    elif option:
-        for joint, value in option.items():
-            if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"armature {joint}={value:g}", where="--armature", mend="give a number ≥ 0")
-            index = _joint_index(model, joint, "--armature")
-            armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]] = value
-        source = f"--armature over {source}"
-    model.armature = armature
-    return source
-
-
-def _armature_file(path: Path) -> dict[str, float]:
-    data = read_toml(path)
-    table = data.get("armature", data)
-    values = table.get("joints", table) if isinstance(table, dict) else {}
-    try:
-        return {str(k): float(v) for k, v in values.items()}
-    except (TypeError, ValueError):
-        raise SpecError("holds no table joint = value", where=str(path), mend='write: joint_name = 0.01') from None
-
-
-def _armature_vector(
-    model: pin.Model, default: float, joints: Mapping[str, float], where: str
-) -> Vector:
-    armature = np.full(model.nv, default)
-    armature[: _base_width(model)] = 0.0
-    for joint, value in joints.items():
-        index = _joint_index(model, joint, f"{where} [armature]")
-        if not (np.isfinite(value) and value >= 0):
-            raise SpecError(f"armature of '{joint}' is {value:g}", where=where, mend="give a number ≥ 0")
-        armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]] = value
-    return armature
-
-
-def _base_width(model: pin.Model) -> int:
-    return 6 if model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer" else 0
-
-
-def _armature_warning(model: pin.Model, source: str) -> tuple[str, ...]:
-    joints = np.asarray(model.armature)[_base_width(model) :]
-    if joints.size and not (joints > 0).any():
-        return (
-            f"armature is zero ({source}): geared motors usually have some, and H scales like 1/armature² "
-            "where it dominates; give --armature or robot.toml [armature]",
-        )
-    return ()
-
-
 def _lock(
     model: pin.Model, locked: Sequence[str], postures: dict[str, Vector], default: str, name: str
 ) -> tuple[pin.Model, dict[str, Vector]]:
-    ids = [_joint_index(model, joint, f"{name} --lock") for joint in locked]
+    ids = [joint_index(model, joint, f"{name} --lock") for joint in locked]
     armature = np.array(model.armature)
     reduced = pin.buildReducedModel(model, ids, postures[default])
     kept_q: list[int] = []

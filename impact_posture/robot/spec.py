@@ -55,7 +55,8 @@ class ContactSpec(_Strict):
 class SupportSpec(_Strict):
     """A foot that stays on the ground.
 
-    ``point``: the contact point (frame origin plus ``offset``, in the frame) does not move.  ``surface``: the whole pose.
+    ``point``: the contact point (frame origin plus ``offset``, in the frame) does not move.
+    ``surface``: neither does the frame turn.
     ``size``: half extents (x, y) of a sole around that point, in the frame, metres; it widens the support polygon.
     """
 
@@ -145,9 +146,8 @@ def validate(cls: type[_Model], data: object, where: str) -> _Model:
         path = ".".join(str(part) for part in fault["loc"])
         if fault["type"] == "extra_forbidden":
             known = _keys_at(cls, fault["loc"][:-1])
-            raise SpecError(
-                f"unknown key '{path}'", where=where, mend=f"did you mean {', '.join(nearest(str(fault['loc'][-1]), known))}?"
-            ) from None
+            close = ", ".join(nearest(str(fault["loc"][-1]), known))
+            raise SpecError(f"unknown key '{path}'", where=where, mend=f"did you mean {close}?") from None
         raise SpecError(f"key '{path}': {fault['msg']}", where=where, mend="correct the value") from None
 
 
@@ -177,7 +177,9 @@ def read_toml(path: Path) -> dict[str, object]:
 
 def read_spec(path: Path) -> RobotSpec:
     """Read and check a ``robot.toml``."""
-    spec = validate(RobotSpec, read_toml(path), str(path))
-    if spec.schema_ != SCHEMA:
-        raise SpecError(f"schema '{spec.schema_}'", where=str(path), mend=f'write schema = "{SCHEMA}"')
-    return spec
+    data = read_toml(path)
+    # Before the keys: those of another schema are not misspelt.
+    schema = data.get("schema", SCHEMA)
+    if schema != SCHEMA:
+        raise SpecError(f"schema '{schema}'", where=str(path), mend=f'write schema = "{SCHEMA}"')
+    return validate(RobotSpec, data, str(path))

@@ -10,15 +10,12 @@ from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 
-import numpy as np
 import pinocchio as pin
 
-from impact_posture.errors import InertiaError, PackageNotFound, UrdfError
+from impact_posture.errors import JointNotFound, PackageNotFound, UrdfError
+from impact_posture.robot.inertia import check_inertias
 
 EXAMPLE_PREFIX = "example-robot-data:"
-# Below _TINY a mass (kg) or a moment (kg m²) counts as zero; a relative fault below the slack is rounding.
-_TINY = 1e-10
-_TRIANGLE_SLACK = 1e-3
 
 
 def example_robot_data() -> Path:
@@ -49,17 +46,21 @@ def robots_data() -> Path:
 
 
 def resolve_path(text: str, base: Path) -> Path:
-    """Turn a path of robot.toml into a file: ``example-robot-data:<below robots/>``, absolute, or relative to ``base``."""
+    """Turn a path of robot.toml into a file.
+
+    It is ``example-robot-data:<below robots/>``, absolute, or relative to ``base``.
+
+    Raises:
+        PackageNotFound: With the nearest paths below ``robots/``.
+    """
     if not text.startswith(EXAMPLE_PREFIX):
         return (base / Path(text).expanduser()).resolve()
     root = example_robot_data()
     path = root / text.removeprefix(EXAMPLE_PREFIX)
     if not path.is_file():
         known = [p.relative_to(root).as_posix() for p in sorted(root.rglob("*.[us]rdf"))]
-        suffix = path.suffix
-        raise PackageNotFound(
-            text.removeprefix(EXAMPLE_PREFIX), [k for k in known if k.endswith(suffix)], where=EXAMPLE_PREFIX.rstrip(":")
-        )
+        fitting = [k for k in known if k.endswith(path.suffix)]
+        raise PackageNotFound(text.removeprefix(EXAMPLE_PREFIX), fitting, where=EXAMPLE_PREFIX.rstrip(":"))
     return path
 
 
@@ -87,7 +88,19 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
         raise UrdfError(f"makes no robot ({said})", where=str(path), mend="correct the URDF") from None
     if model.nv == 0:
         raise UrdfError("has no movable joint", where=str(path), mend="use --root free-flyer or another URDF")
-    return model, _check_inertias(root, model, path, accept_inertias)
+    return model, check_inertias(root, model, path, accept_inertias)
+
+
+def joint_index(model: pin.Model, joint: str, where: str) -> int:
+    """Index of a movable joint by name.
+
+    Raises:
+        JointNotFound: With the nearest names.
+    """
+    known = [n for n in model.names if n not in ("universe", "root_joint")]
+    if joint not in known:
+        raise JointNotFound(joint, known, where=where)
+    return int(model.getJointId(joint))
 
 
 def _parse(path: Path) -> ET.Element:
@@ -110,90 +123,6 @@ def _parse(path: Path) -> ET.Element:
     if root.find("link") is None:
         raise UrdfError("has no <link>", where=str(path), mend="expand xacro first, or give the .urdf")
     return root
-
-
-def _check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool) -> tuple[str, ...]:
-    """Refuse impossible inertias; a fault too small to matter in the body it is lumped into is a warning."""
-    where, warnings = str(path), []
-    for link in root.iter("link"):
-        fault = _link_fault(link, where)
-        if fault is None:
-            continue
-        name = link.get("name", "?")
-        frame = model.getFrameId(name, pin.FrameType.BODY)
-        joint = model.frames[frame].parentJoint if frame < model.nframes else 0
-        if joint == 0:
-            continue  # welded to the world: it never moves
-        size, words = fault
-        body = float(np.linalg.eigvalsh(model.inertias[joint].inertia)[-1])
-        if size <= _TRIANGLE_SLACK * body:
-            warnings.append(f"{words}; too small to matter in the body it belongs to")
-        elif accept:
-            warnings.append(f"{words}; accepted as robot.toml asks")
-        else:
-            raise InertiaError(
-                words, where=where, mend="correct its <inertial>, or set accept_inertias = true in robot.toml [model]"
-            )
-    return tuple(warnings)
-
-
-def check_moved_mass(model: pin.Model, where: str) -> None:
-    """Refuse a joint that moves nothing: the mass matrix would be singular.
-
-    Raises:
-        InertiaError: A joint without armature whose whole subtree has neither mass nor rotational inertia.
-    """
-    moved = np.array([max(i.mass, float(np.abs(i.inertia).max())) for i in model.inertias])
-    for joint in range(model.njoints - 1, 0, -1):
-        first = model.idx_vs[joint]
-        armature = np.asarray(model.armature)[first : first + model.nvs[joint]]
-        if moved[joint] <= _TINY and not (armature > 0).all():
-            raise InertiaError(
-                f"joint '{model.names[joint]}' moves no mass", where=where, mend="give its links a mass or --lock it"
-            )
-        moved[model.parents[joint]] += moved[joint]
-
-
-def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:
-    """Return how far, in kg m², a link's inertia is from a possible one, and the fault in words."""
-    inertial, name = link.find("inertial"), link.get("name", "?")
-    if inertial is None:
-        return None
-    mass_tag, inertia_tag = inertial.find("mass"), inertial.find("inertia")
-    if mass_tag is None:
-        raise InertiaError(f"link '{name}' has an <inertial> without <mass>", where=where, mend="add its mass")
-    mass = _number(mass_tag, "value", name, where)
-    if mass < 0:
-        raise InertiaError(f"link '{name}' has the mass {mass:g} kg", where=where, mend="give a positive mass")
-    if inertia_tag is None:
-        return None
-    xx, xy, xz, yy, yz, zz = (
-        _number(inertia_tag, key, name, where) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    )
-    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    largest = float(np.abs(moments).max())
-    if largest <= _TINY:
-        return None
-    if mass <= _TINY:
-        return largest, f"link '{name}' has no mass but rotational inertia"
-    if moments[0] < -_TRIANGLE_SLACK * largest:
-        return -float(moments[0]), f"link '{name}' has a negative principal moment of inertia ({moments[0]:g} kg m²)"
-    excess = float(moments[2] - moments[0] - moments[1])
-    if excess > _TRIANGLE_SLACK * largest:
-        listed = ", ".join(f"{m:.4g}" for m in moments)
-        return excess, f"link '{name}' breaks the triangle inequality (principal moments {listed} kg m²)"
-    return None
-
-
-def _number(tag: ET.Element, key: str, link: str, where: str) -> float:
-    text = tag.get(key, "0")
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        raise InertiaError(f"link '{link}': {tag.tag} {key}='{text}' is no number", where=where, mend="correct it")
-    return value
 
 
 @contextlib.contextmanager

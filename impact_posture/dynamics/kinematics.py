@@ -1,0 +1,142 @@
+"""The kinematic tree at one symbolic configuration: placements of links, points and frames.
+
+Everything is in link coordinates; world placements are computed only where they are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.joints import joint_quaternion, joint_transform
+from impact_posture.dynamics.spatial import constant, quaternion_product
+
+# Spatial inertias, forces or motions by joint index.
+ByJoint = dict[int, ca.SX]
+
+
+@dataclass(frozen=True)
+class PointOnLink:
+    """A point (and the axes of its frame) fixed to the link of joint ``joint``.
+
+    Attributes:
+        joint: Index of the moving joint that carries it.
+        position: The point in link coordinates, metres, shape (3,).
+        rotation: The frame's axes in link coordinates, shape (3, 3).
+    """
+
+    joint: int
+    position: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+
+
+class Kinematics:
+    """A ``pin.Model`` at the configuration ``q`` (``SX``), with optional extra inertias on its links.
+
+    Args:
+        model: The model; every joint type of Pinocchio's URDF parser.
+        q: Configuration, shape (nq, 1).
+        chart_x: The chart coordinates that ``q`` was made of; only :attr:`quaternions` needs them.
+        extra_inertia: Constant 6×6 matrices in link coordinates added to links in ``M`` (not in ``pin.Model``'s own):
+            a foot held with compliance ε is a foot with the point mass 1/ε.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        q: ca.SX,
+        chart_x: ca.SX | None = None,
+        extra_inertia: Mapping[int, NDArray[np.float64]] | None = None,
+    ) -> None:
+        self.model, self.q = model, q
+        self.chart = Chart(model)
+        self.nv = self.chart.nv
+        self._x = chart_x
+        self._parents = [int(p) for p in model.parents]
+        self._extra = dict(extra_inertia or {})
+        self._R: ByJoint = {}
+        self._p: ByJoint = {}
+        self._S: ByJoint = {}
+        self._inertia: ByJoint = {}
+        for slot in self.chart.slots:
+            i = slot.index
+            placement = model.jointPlacements[i]
+            R, p = joint_transform(slot.kind, q[slot.q])
+            place_R, place_p = constant(placement.rotation), constant(placement.translation)
+            self._R[i] = place_R @ R
+            self._p[i] = ca.densify(place_p) + place_R @ p
+            self._S[i] = constant(slot.kind.subspace)
+            self._inertia[i] = constant(model.inertias[i].matrix() + self._extra.get(i, 0.0))
+        self._armature = np.array(model.armature, dtype=float)
+
+    @cached_property
+    def rotations(self) -> ByJoint:
+        """World rotation of every link."""
+        found: ByJoint = {0: ca.SX.eye(3)}
+        for i in self._R:
+            found[i] = found[self._parents[i]] @ self._R[i]
+        return found
+
+    @cached_property
+    def origins(self) -> ByJoint:
+        """World position of every link's origin."""
+        found: ByJoint = {0: ca.SX.zeros(3)}
+        for i in self._R:
+            parent = self._parents[i]
+            found[i] = found[parent] + self.rotations[parent] @ self._p[i]
+        return found
+
+    @cached_property
+    def quaternions(self) -> ByJoint:
+        """World orientation of every link as a quaternion x y z w, polynomial in half angles."""
+        if self._x is None:
+            raise ValueError("quaternions need chart_x")
+        found: ByJoint = {0: ca.SX([0, 0, 0, 1])}
+        for slot in self.chart.slots:
+            i = slot.index
+            rest = constant_quaternion(self.model.jointPlacements[i].rotation)
+            turned = quaternion_product(rest, joint_quaternion(slot.kind, self._x[slot.x]))
+            found[i] = quaternion_product(found[self._parents[i]], turned)
+        return found
+
+    def position(self, point: PointOnLink) -> ca.SX:
+        """World position of a point, shape (3,)."""
+        return self.origins[point.joint] + self.rotations[point.joint] @ ca.SX(point.position)
+
+    def rotation(self, point: PointOnLink) -> ca.SX:
+        """World axes of a point's frame, shape (3, 3)."""
+        return self.rotations[point.joint] @ constant(point.rotation)
+
+    def quaternion(self, point: PointOnLink) -> ca.SX:
+        """World orientation of a point's frame, x y z w; its sign is not unique."""
+        return quaternion_product(self.quaternions[point.joint], constant_quaternion(point.rotation))
+
+    def center_of_mass(self) -> ca.SX:
+        """World position of the centre of mass, shape (3,)."""
+        total, weighted = 0.0, ca.SX.zeros(3)
+        for i in self._R:
+            body = self.model.inertias[i]
+            total += body.mass
+            weighted += body.mass * (self.origins[i] + self.rotations[i] @ ca.SX(np.array(body.lever)))
+        return weighted / total
+
+    def to_link(self, joint: int, direction: ca.SX) -> ca.SX:
+        """Rotate a world direction into link coordinates, down the chain from the root."""
+        chain = [joint]
+        while self._parents[chain[-1]] > 0:
+            chain.append(self._parents[chain[-1]])
+        for i in reversed(chain):
+            direction = self._R[i].T @ direction
+        return direction
+
+
+def constant_quaternion(rotation: NDArray[np.float64]) -> ca.SX:
+    """Quaternion x y z w of a constant rotation."""
+    return constant(pin.Quaternion(np.asarray(rotation)).coeffs())

@@ -1,0 +1,148 @@
+"""Masses and inertias that no rigid body can have, and mass matrices that cannot be inverted."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.errors import InertiaError
+
+# Below _TINY a mass (kg) or a moment (kg m²) counts as zero; a relative fault below the slack is rounding.
+_TINY = 1e-10
+_TRIANGLE_SLACK = 1e-3
+# Least eigenvalue over the largest of a mass matrix with unit diagonal; known robots stay above 1e-3.
+_SINGULAR = 1e-12
+
+
+def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool) -> tuple[str, ...]:
+    """Refuse links that no rigid body can be; returns warnings.
+
+    A fault too small to matter in the body that the link is lumped into is a warning, and so is any with ``accept``.
+
+    Raises:
+        InertiaError: A negative mass, a mass without extent that has moments, or moments that break the triangle
+            inequality.
+    """
+    where, warnings = str(path), []
+    for link in root.iter("link"):
+        fault = _link_fault(link, where)
+        if fault is None:
+            continue
+        name = link.get("name", "?")
+        frame = model.getFrameId(name, pin.FrameType.BODY)
+        joint = model.frames[frame].parentJoint if frame < model.nframes else 0
+        if joint == 0:
+            continue  # welded to the world: it never moves
+        size, words = fault
+        body = float(np.linalg.eigvalsh(model.inertias[joint].inertia)[-1])
+        if size <= _TRIANGLE_SLACK * body:
+            warnings.append(f"{words}; too small to matter in the body it belongs to")
+        elif accept:
+            warnings.append(f"{words}; accepted as robot.toml asks")
+        else:
+            raise InertiaError(
+                words, where=where, mend="correct its <inertial>, or set accept_inertias = true in robot.toml [model]"
+            )
+    return tuple(warnings)
+
+
+def check_moved_mass(model: pin.Model, where: str) -> None:
+    """Refuse a joint that moves nothing: the mass matrix would be singular.
+
+    Raises:
+        InertiaError: A joint without armature whose whole subtree has neither mass nor rotational inertia.
+    """
+    moved = np.array([max(i.mass, float(np.abs(i.inertia).max())) for i in model.inertias])
+    for joint in range(model.njoints - 1, 0, -1):
+        first = model.idx_vs[joint]
+        armature = np.asarray(model.armature)[first : first + model.nvs[joint]]
+        if moved[joint] <= _TINY and not (armature > 0).all():
+            raise InertiaError(
+                f"joint '{model.names[joint]}' moves no mass", where=where, mend="give its links a mass or --lock it"
+            )
+        moved[model.parents[joint]] += moved[joint]
+
+
+def check_mass_matrix(
+    model: pin.Model, q: NDArray[np.float64], tangent_names: Sequence[str], where: str, posture: str
+) -> None:
+    """Refuse a singular mass matrix: a massless floating base, a point mass that turns, two joints about one axis.
+
+    ``M`` is scaled to a unit diagonal first, so that kilograms and kg m² compare.
+
+    Args:
+        model: The model, armature included.
+        q: Configuration, shape (nq,).
+        tangent_names: A name for each of the nv directions.
+        where: The model's source.
+        posture: Name of ``q``.
+
+    Raises:
+        InertiaError: Naming the directions that move without moving anything.
+    """
+    upper = np.triu(pin.crba(model, model.createData(), q))
+    M = upper + np.triu(upper, 1).T
+    diagonal = np.diag(M)
+    free = diagonal <= _TINY
+    if not free.any():
+        scale = 1 / np.sqrt(diagonal)
+        values, vectors = np.linalg.eigh(M * np.outer(scale, scale))
+        if values[0] >= _SINGULAR * values[-1]:
+            return
+        # Back in rad and m (per s), the way that the robot moves freely.
+        motion = np.abs(scale * vectors[:, 0])
+        free = motion >= 0.1 * motion.max()
+    named = [name for name, moves in zip(tangent_names, free, strict=True) if moves]
+    verb = "moves no inertia" if len(named) == 1 else "move no inertia together"
+    raise InertiaError(
+        f"the mass matrix is singular at posture '{posture}': {', '.join(named)} {verb}",
+        where=where,
+        mend="give the links mass and rotational inertia, or the joints --armature, or --lock one",
+    )
+
+
+def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:
+    """Return how far, in kg m², a link's inertia is from a possible one, and the fault in words."""
+    inertial, name = link.find("inertial"), link.get("name", "?")
+    if inertial is None:
+        return None
+    mass_tag, inertia_tag = inertial.find("mass"), inertial.find("inertia")
+    if mass_tag is None:
+        raise InertiaError(f"link '{name}' has an <inertial> without <mass>", where=where, mend="add its mass")
+    mass = _number(mass_tag, "value", name, where)
+    if mass < 0:
+        raise InertiaError(f"link '{name}' has the mass {mass:g} kg", where=where, mend="give a positive mass")
+    if inertia_tag is None:
+        return None
+    xx, xy, xz, yy, yz, zz = (
+        _number(inertia_tag, key, name, where) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    )
+    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    largest = float(np.abs(moments).max())
+    if largest <= _TINY:
+        return None
+    if mass <= _TINY:
+        return largest, f"link '{name}' has no mass but rotational inertia"
+    if moments[0] < -_TRIANGLE_SLACK * largest:
+        return -float(moments[0]), f"link '{name}' has a negative principal moment of inertia ({moments[0]:g} kg m²)"
+    excess = float(moments[2] - moments[0] - moments[1])
+    if excess > _TRIANGLE_SLACK * largest:
+        listed = ", ".join(f"{m:.4g}" for m in moments)
+        return excess, f"link '{name}' breaks the triangle inequality (principal moments {listed} kg m²)"
+    return None
+
+
+def _number(tag: ET.Element, key: str, link: str, where: str) -> float:
+    text = tag.get(key, "0")
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise InertiaError(f"link '{link}': {tag.tag} {key}='{text}' is no number", where=where, mend="correct it")
+    return value

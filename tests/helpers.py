@@ -1,0 +1,101 @@
+"""What the tests of the mathematics share: robots, random configurations, errors, finite differences, raw Pinocchio.
+
+Nothing here calls the code under test except to load a robot.
+"""
+
+from __future__ import annotations
+
+import functools
+import zlib
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from impact_posture.robot.loader import known_robots, load_robot
+from impact_posture.robot.robot import Robot
+
+Vector = NDArray[np.float64]
+
+NAMES = known_robots()
+
+
+@functools.cache
+def robot(name: str) -> Robot:
+    """Load a known robot once a process."""
+    return load_robot(name)
+
+
+def rng(*key: object) -> np.random.Generator:
+    """A generator of one's own for each test, the same on every run and machine."""
+    return np.random.default_rng(zlib.crc32(repr(key).encode()))
+
+
+def random_configurations(model: pin.Model, count: int, *key: object, spread: float = 1.0) -> list[Vector]:
+    """Configurations ``neutral ⊕ v`` with ``v`` normal."""
+    generator = rng(*key)
+    return [
+        np.array(pin.integrate(model, pin.neutral(model), spread * generator.normal(size=model.nv)))
+        for _ in range(count)
+    ]
+
+
+def unit(generator: np.random.Generator, size: int = 3) -> Vector:
+    """A random unit vector."""
+    v = generator.normal(size=size)
+    return v / np.linalg.norm(v)
+
+
+def relative(found: ArrayLike, expected: ArrayLike, scale: float = 0.0) -> float:
+    """Largest deviation over the largest expected entry, or over ``scale`` if that is larger.
+
+    A scale is for what may vanish: a gradient that is zero is judged against the value that it belongs to.
+    """
+    x, y = np.array(found, dtype=float), np.array(expected, dtype=float)
+    assert x.size == y.size, (x.shape, y.shape)
+    x = x.reshape(y.shape)
+    if not np.isfinite(x).all():
+        return float("inf")
+    return float(np.abs(x - y).max() / max(np.abs(y).max(), scale))
+
+
+def assert_close(found: ArrayLike, expected: ArrayLike, tolerance: float, what: str, scale: float = 0.0) -> None:
+    """Fail unless the relative error (:func:`relative`) is within the tolerance."""
+    error = relative(found, expected, scale)
+    assert error <= tolerance, f"{what}: relative error {error:.2e} above {tolerance:.0e}"
+
+
+def central_gradient(f: Callable[[Vector], ArrayLike], model: pin.Model, q: Vector, step: float) -> Vector:
+    """Fourth-order central differences of ``f(q ⊕ ε e_i)``; the last axis is i."""
+
+    def along(direction: Vector) -> Vector:
+        def at(k: int) -> Vector:
+            return np.asarray(f(np.array(pin.integrate(model, q, k * step * direction))), dtype=float)
+
+        return (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
+
+    return np.stack([along(e) for e in np.eye(model.nv)], axis=-1)
+
+
+def mass_matrix(model: pin.Model, q: Vector) -> Vector:
+    """Pinocchio's ``M``; its C++ CRBA fills the upper triangle only."""
+    upper = np.triu(pin.crba(model, model.createData(), q))
+    return np.asarray(upper + np.triu(upper, 1).T)
+
+
+def frame_jacobian(model: pin.Model, q: Vector, frame: int, offset: ArrayLike = (0, 0, 0)) -> Vector:
+    """Pinocchio's 6 × nv Jacobian of a point given in a frame, LOCAL_WORLD_ALIGNED, by adding a frame there."""
+    copy = model.copy()
+    old = copy.frames[frame]
+    placement = old.placement * pin.SE3(np.eye(3), np.array(offset, dtype=float))
+    added = copy.addFrame(pin.Frame("there", old.parentJoint, frame, placement, pin.FrameType.OP_FRAME), False)
+    J = pin.computeFrameJacobian(copy, copy.createData(), q, added, pin.LOCAL_WORLD_ALIGNED)
+    return np.array(J).reshape(6, model.nv)
+
+
+def frame_placement(model: pin.Model, q: Vector, frame: int) -> pin.SE3:
+    """World placement of a frame."""
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return pin.SE3(data.oMf[frame])
