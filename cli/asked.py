@@ -77,9 +77,7 @@ def impact_request(
 
     return ImpactRequest(
         robot=robot,
-        load=load_options(
-            root=root, package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock
-        ),
+        load=load_options(root=root, package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock),
         frame=frame,
         normal=normal,
         offset=offset,

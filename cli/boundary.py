@@ -84,9 +84,7 @@ def _usage(error: Any, wants_json: bool) -> int:
     return code
 
 
-def _report(
-    code: int, kind: str, what: str, where: str = "", mend: str = "", *, wants_json: bool
-) -> int:
+def _report(code: int, kind: str, what: str, where: str = "", mend: str = "", *, wants_json: bool) -> int:
     what, where, mend = (" ".join(part.split()) for part in (what, where, mend))
     line = f"{where}: {what}" if where else what
     with contextlib.suppress(OSError):

@@ -104,12 +104,8 @@ ContactText = Annotated[
         help="Instead of --frame and --normal.",
     ),
 ]  # fmt: skip
-Impulse = Annotated[
-    float, _option("--impulse", panel=CONTACT, callback=positive, help="Bound on the impulse, N·s.")
-]
-Speed = Annotated[
-    float, _option("--speed", panel=CONTACT, callback=not_negative, help="Approach speed, m/s.")
-]
+Impulse = Annotated[float, _option("--impulse", panel=CONTACT, callback=positive, help="Bound on the impulse, N·s.")]
+Speed = Annotated[float, _option("--speed", panel=CONTACT, callback=not_negative, help="Approach speed, m/s.")]
 Restitution = Annotated[
     float, _option("--restitution", panel=CONTACT, callback=unit_share, help="0 (plastic) to 1 (elastic).")
 ]
@@ -276,9 +272,7 @@ NoCodegen = Annotated[bool, _option("--no-codegen", panel=OUTPUT, help="Leave th
 Json = Annotated[bool, _option("--json", panel=OUTPUT, help="One JSON document on standard output.")]
 Quiet = Annotated[bool, _option("--quiet", "-q", panel=OUTPUT, help="The result alone: no warnings, no progress.")]
 Jobs = Annotated[int, _option("--jobs", panel=OUTPUT, min=1, help="Processes that search.")]
-Compile = Annotated[
-    CompileMode, _option("--compile", panel=OUTPUT, help="Whether the programme becomes machine code.")
-]
+Compile = Annotated[CompileMode, _option("--compile", panel=OUTPUT, help="Whether the program becomes machine code.")]
 Formats = Annotated[
     list[PictureFormat] | None,
     _option("--format", panel=OUTPUT, show_default="png svg pdf", help="Of the pictures; repeatable."),

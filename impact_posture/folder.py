@@ -30,7 +30,8 @@ def check_output(out: Path, *, force: bool, marks: tuple[str, ...]) -> None:
             raise OutputError("exists", where=str(out), mend="choose another --out, or --force to replace it")
         if not any(any(out.glob(mark)) for mark in marks):
             raise OutputError(
-                "exists and does not look like an earlier result", where=str(out),
+                "exists and does not look like an earlier result",
+                where=str(out),
                 mend="choose another --out: --force replaces results only",
             )
     parent = _first_existing(out.absolute().parent)
@@ -57,8 +58,9 @@ def whole_folder(out: Path, *, force: bool, marks: tuple[str, ...]) -> Iterator[
         made = []
     except OSError as error:
         words = error.strerror or str(error)
-        raise OutputError(f"cannot be written ({words})", where=str(out), mend="free space or choose another --out") \
-            from error
+        raise OutputError(
+            f"cannot be written ({words})", where=str(out), mend="free space or choose another --out"
+        ) from error
     finally:
         if beside is not None and beside.exists():
             shutil.rmtree(beside, ignore_errors=True)

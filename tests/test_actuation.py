@@ -78,9 +78,7 @@ def test_rotor_directions_follow_the_stated_tilts(propulsion: PropulsionSpec) ->
             @ pin.AngleAxis(beta, np.array([0.0, 1.0, 0.0])).matrix()
         )
         np.testing.assert_allclose(rotor.direction, turned[:, 2], atol=1e-8)
-        np.testing.assert_allclose(
-            rotor.position, [0.39 * np.cos(angle), 0.39 * np.sin(angle), 0.0], atol=1e-8
-        )
+        np.testing.assert_allclose(rotor.position, [0.39 * np.cos(angle), 0.39 * np.sin(angle), 0.0], atol=1e-8)
 
 
 def test_one_rotor_by_hand(model: pin.Model) -> None:
@@ -118,9 +116,7 @@ def test_actuation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> None:
 
 
 @pytest.mark.parametrize("posture", POSTURES)
-def test_hovers_level_in_every_named_posture(
-    posture: str, model: pin.Model, propulsion: PropulsionSpec
-) -> None:
+def test_hovers_level_in_every_named_posture(posture: str, model: pin.Model, propulsion: PropulsionSpec) -> None:
     q = model.referenceConfigurations[posture]
     result = hover(model, propulsion, q)
     assert result.feasible, result.violations
@@ -140,9 +136,7 @@ def test_hovers_level_in_every_named_posture(
 
 
 @pytest.mark.parametrize("posture", POSTURES)
-def test_lateral_force_is_about_five_newtons(
-    posture: str, model: pin.Model, propulsion: PropulsionSpec
-) -> None:
+def test_lateral_force_is_about_five_newtons(posture: str, model: pin.Model, propulsion: PropulsionSpec) -> None:
     force = lateral_force_range(model, propulsion, model.referenceConfigurations[posture])
     assert force.mass == pytest.approx(3.02)
     for value in (force.forward, force.backward, force.left, force.right):
@@ -221,9 +215,7 @@ def test_weak_rotors_and_weak_joints_are_named(model: pin.Model, propulsion: Pro
     result = hover(limp, propulsion, q)
     assert result.torque_margin < 0
     assert any("shoulder_pitch" in v for v in result.violations)
-    assert (
-        lateral_force_range(limp, propulsion, q).forward != lateral_force_range(model, propulsion, q).forward
-    )
+    assert lateral_force_range(limp, propulsion, q).forward != lateral_force_range(model, propulsion, q).forward
 
 
 def test_bad_input(model: pin.Model, propulsion: PropulsionSpec) -> None:

@@ -86,7 +86,9 @@ def test_solved_again_from_its_own_problem(result: Path, tmp_path: Path) -> None
 
 
 def test_plot_draws_again(result: Path, tmp_path: Path) -> None:
-    done = run("plot", result, "--out", tmp_path / "pictures", "--format", "svg", "--figure", "ellipsoid", cwd=tmp_path)
+    done = run(
+        "plot", result, "--out", tmp_path / "pictures", "--format", "svg", "--figure", "ellipsoid", cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "pictures" / "ellipsoid.svg").is_file()
     refused = run("plot", tmp_path, cwd=tmp_path)
@@ -95,7 +97,17 @@ def test_plot_draws_again(result: Path, tmp_path: Path) -> None:
 
 def test_posture_file_starts_the_next_optimization(result: Path, tmp_path: Path) -> None:
     done = run(
-        "optimize", "tilthex_arm", "--normal", 0, 0, 1, "--posture", result / "posture.json", "--json", *FAST, cwd=tmp_path
+        "optimize",
+        "tilthex_arm",
+        "--normal",
+        0,
+        0,
+        1,
+        "--posture",
+        result / "posture.json",
+        "--json",
+        *FAST,
+        cwd=tmp_path,
     )
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
@@ -104,9 +116,7 @@ def test_posture_file_starts_the_next_optimization(result: Path, tmp_path: Path)
 
 
 def test_human_output_fits_80_columns(tmp_path: Path) -> None:
-    done = run(
-        "optimize", "solo8", "--normal", 1, 0, 0, *FAST, cwd=tmp_path, env=os.environ | {"COLUMNS": "80"}
-    )
+    done = run("optimize", "solo8", "--normal", 1, 0, 0, *FAST, cwd=tmp_path, env=os.environ | {"COLUMNS": "80"})
     assert done.returncode == 0
     assert max(len(line.rstrip()) for line in done.stdout.splitlines()) <= 80
     for word in ("constraints", "reduction", "certificate", "base roll", "before", "after"):
@@ -210,7 +220,9 @@ URDF = """<robot name="two">
 <joint name="j2" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>
  <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
 </robot>"""
-INERTIAL = """<inertial><mass value="{m}"/><inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/></inertial>"""
+INERTIAL = (
+    """<inertial><mass value="{m}"/><inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/></inertial>"""
+)
 
 
 @pytest.mark.parametrize(

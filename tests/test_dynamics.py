@@ -318,6 +318,7 @@ def test_joints_that_no_urdf_makes_are_refused_by_name() -> None:
 
 # ---- joints that only Pinocchio's URDF parser makes --------------------------------------------------------------
 
+
 def write_urdf(path: Path, joints: list[tuple[str, str]]) -> Path:
     """Write a chain of links; ``joints`` are (type, axis)."""
     text = ["<robot name='chain'>", _LINK.format("l0", 2.0)]

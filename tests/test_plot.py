@@ -87,7 +87,12 @@ def make_view(
         v[:6] *= 0.2
     way = [pin.integrate(robot.model, q0, v * t) for t in np.linspace(0, 1, 12)]
     return ResultView(
-        robot, objective, q0, way[-1], path=sample_path(objective, way) if path else None, **keys  # type: ignore[arg-type]
+        robot,
+        objective,
+        q0,
+        way[-1],
+        path=sample_path(objective, way) if path else None,
+        **keys,  # type: ignore[arg-type]
     )
 
 
@@ -251,9 +256,7 @@ def test_the_same_view_gives_the_same_files(pendulum: ResultView, tmp_path: Path
     ("name", "figure"),
     [("talos", postures_figure), ("talos", jump_figure), ("solo8", ellipsoid_figure), ("panda", postures_figure)],
 )
-def test_nothing_hangs_over_its_part_of_the_page(
-    name: str, figure: object, request: pytest.FixtureRequest
-) -> None:
+def test_nothing_hangs_over_its_part_of_the_page(name: str, figure: object, request: pytest.FixtureRequest) -> None:
     page = figure(request.getfixturevalue(name))  # type: ignore[operator]
     lay_out(page)
     head, body, foot = page.subfigs

@@ -63,7 +63,9 @@ def walk(problem: PostureProblem, q: np.ndarray, step: float, count: int) -> lis
         ("xarm7", (0, 1, 1), {"objective": "energy"}),
     ],
 )
-def test_no_posture_along_the_null_space_is_better(robot: str, normal: tuple[float, float, float], more: dict) -> None:
+def test_no_posture_along_the_null_space_is_better(
+    robot: str, normal: tuple[float, float, float], more: dict
+) -> None:
     """With one degree of freedom left, brute force sees everything that is connected to the optimum."""
     problem = problem_of(robot, normal, **more)
     solution = solve(problem, starts=6, jobs=1)
@@ -187,9 +189,7 @@ def test_planar_legs_get_regular_equalities() -> None:
     problem = problem_of("solo8", (1, 0, 0), frame="base_link")
     assert "base roll" in [c.name for c in problem.constraints]
     numeric, q = Numeric(problem.robot.model).at(problem.given), problem.given
-    carried = [
-        c.numeric(numeric)[1][problem.carried(i)] for i, c in enumerate(problem.constraints) if c.equality
-    ]
+    carried = [c.numeric(numeric)[1][problem.carried(i)] for i, c in enumerate(problem.constraints) if c.equality]
     stacked = np.vstack(carried)
     assert rank(stacked) == len(stacked) == rank(equality_jacobian(problem, numeric.at(q))) == 11
 

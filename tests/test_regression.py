@@ -11,7 +11,7 @@ from tests.regression.cases import CASES, EXPECTED, PAGE, Case
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_result_is_reproduced(case: Case) -> None:
-    """Objective within 1e-6, redundancy exactly; the posture may be a mirror image, so its numbers are not compared."""
+    """Objective within 1e-6, redundancy exactly; the posture itself may be a mirror image."""
     expected = json.loads(EXPECTED.read_text())[case.name]
     prepared, solution = case.solve()
     assert prepared.impact.robot.model_sha256 == expected["model_sha256"], "the robot's data changed: make regression"

@@ -54,9 +54,7 @@ def full_model(name: str) -> pin.Model:
     assert spec.model.urdf is not None
     urdf = str(_path(name, spec.model.urdf))
     floating = spec.model.root == "free-flyer"
-    model = (
-        pin.buildModelFromUrdf(urdf, pin.JointModelFreeFlyer()) if floating else pin.buildModelFromUrdf(urdf)
-    )
+    model = pin.buildModelFromUrdf(urdf, pin.JointModelFreeFlyer()) if floating else pin.buildModelFromUrdf(urdf)
     if spec.model.srdf is not None:
         pin.loadReferenceConfigurations(model, str(_path(name, spec.model.srdf)), False)
     return model
@@ -72,9 +70,7 @@ def postures(name: str) -> dict[str, np.ndarray]:
             q[:7] = posture.base
         for joint_name, value in posture.joints.items():
             joint = model.joints[model.getJointId(joint_name)]
-            q[joint.idx_q : joint.idx_q + joint.nq] = (
-                [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-            )
+            q[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
         result[key] = q
     return result
 

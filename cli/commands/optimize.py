@@ -92,10 +92,20 @@ def optimize(
         _announce(page, prepared)
     with _progress(shown=not (quiet or json)) as progress:
         solution = solve(
-            prepared.problem, starts=settings.starts, seed=settings.seed, jobs=jobs, compile=compile, progress=progress
+            prepared.problem,
+            starts=settings.starts,
+            seed=settings.seed,
+            jobs=jobs,
+            compile=compile,
+            progress=progress,
         )
     written = write_result(
-        prepared, solution, folder, force=force, codegen=not no_codegen, formats=[f.value for f in format or ()] or FORMATS
+        prepared,
+        solution,
+        folder,
+        force=force,
+        codegen=not no_codegen,
+        formats=[f.value for f in format or ()] or FORMATS,
     )
     if json:
         print_json(written.document)
@@ -210,8 +220,8 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, writte
         page.line("active: " + ", ".join(_active(a) for a in document["active"]))
     found = solution.certificate
     page.line(
-        f"certificate ({found.recomputed_with}): stationarity {found.stationarity:.1e}, violation {found.primal:.1e}, "
-        f"pose error {found.pose_error_m:.1e} m, {found.pose_error_rad:.1e} rad"
+        f"certificate ({found.recomputed_with}): stationarity {found.stationarity:.1e}, "
+        f"violation {found.primal:.1e}, pose error {found.pose_error_m:.1e} m, {found.pose_error_rad:.1e} rad"
     )
     optima = ", ".join(f"{number(o.objective)} ({o.hits}×)" for o in solution.optima[:5])
     more = f" and {len(solution.optima) - 5} more" if len(solution.optima) > 5 else ""

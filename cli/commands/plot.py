@@ -12,7 +12,9 @@ from impact_posture_cli import options
 ResultFolder = Annotated[str, typer.Argument(metavar="RESULT_DIR", help="A folder that optimize wrote.")]
 Figures = Annotated[
     list[str] | None,
-    typer.Option("--figure", help="ellipsoid, postures, jump, nullspace or classical; repeatable.", show_default="all"),
+    typer.Option(
+        "--figure", help="ellipsoid, postures, jump, nullspace or classical; repeatable.", show_default="all"
+    ),
 ]
 PictureOut = Annotated[
     str | None, typer.Option("--out", metavar="DIR", help="Folder for the pictures.", show_default="RESULT_DIR")
@@ -33,7 +35,9 @@ def plot(
     from impact_posture_cli.output import Page, print_json
 
     folder = Path(result_dir)
-    written = draw_all(load_view(folder), Path(out) if out else folder, [f.value for f in format or ()] or FORMATS, figure)
+    written = draw_all(
+        load_view(folder), Path(out) if out else folder, [f.value for f in format or ()] or FORMATS, figure
+    )
     if json:
         print_json({"schema": "impact-posture/plot/1", "files": [str(path) for path in written]})
         return

@@ -25,7 +25,7 @@ FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared")
 
 # Compiled and interpreted code do the same operations in the same order: what is left is the compiler's rounding.
 _CASADI_TOLERANCE = 1e-9
-# The oracle factorises another matrix; feet at compliance ε cost digits there (condition about 1/ε).
+# The oracle factorizes another matrix; feet at compliance ε cost digits there (condition about 1/ε).
 _ORACLE_TOLERANCE = 1e-5
 
 

@@ -106,9 +106,7 @@ def _facts(objective: ImpactObjective, prefix: str, manifest: dict[str, Any]) ->
 
 
 def _unit_checks(objective: ImpactObjective) -> str:
-    sums = [
-        " + ".join(f"q[{k}] * q[{k}]" for k in range(s.start, s.stop)) for s in unit_slices(objective.robot)
-    ]
+    sums = [" + ".join(f"q[{k}] * q[{k}]" for k in range(s.start, s.stop)) for s in unit_slices(objective.robot)]
     checks = "".join(templates.UNIT_CHECK.substitute(sum=text) for text in sums)
     return f"  double s;\n{checks}" if checks else ""
 

@@ -43,7 +43,11 @@ class Chart:
             q0, v0 = int(model.idx_qs[i]), int(model.idx_vs[i])
             self.slots.append(
                 JointSlot(
-                    i, str(model.names[i]), kind, slice(q0, q0 + kind.nq), slice(v0, v0 + kind.nv),
+                    i,
+                    str(model.names[i]),
+                    kind,
+                    slice(q0, q0 + kind.nq),
+                    slice(v0, v0 + kind.nv),
                     slice(start, start + width),
                 )
             )
@@ -90,7 +94,7 @@ class Chart:
         return x
 
     def to_q(self, x: Vector) -> Vector:
-        """Configuration of chart coordinates, quaternions normalised."""
+        """Configuration of chart coordinates, quaternions normalized."""
         q = np.zeros(self.nq)
         for slot in self.slots:
             piece = x[slot.x]

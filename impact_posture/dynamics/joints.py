@@ -103,9 +103,7 @@ def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
 def axis_rotation(axis: NDArray[np.float64], cosine: ca.SX, sine: ca.SX) -> ca.SX:
     """Rodrigues' rotation ``aaᵀ + cos (I − aaᵀ) + sin [a]×``."""
     outer = np.outer(axis, axis)
-    return ca.sparsify(
-        constant(outer) + cosine * constant(np.eye(3) - outer) + sine * skew(constant(axis))
-    )
+    return ca.sparsify(constant(outer) + cosine * constant(np.eye(3) - outer) + sine * skew(constant(axis)))
 
 
 def joint_quaternion(kind: JointKind, x: ca.SX) -> ca.SX:

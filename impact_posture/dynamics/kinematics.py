@@ -28,7 +28,7 @@ class PointOnLink:
 
     Attributes:
         joint: Index of the moving joint that carries it.
-        position: The point in link coordinates, metres, shape (3,).
+        position: The point in link coordinates, meters, shape (3,).
         rotation: The frame's axes in link coordinates, shape (3, 3).
     """
 
@@ -119,7 +119,7 @@ class Kinematics:
         return quaternion_product(self.quaternions[point.joint], constant_quaternion(point.rotation))
 
     def center_of_mass(self) -> ca.SX:
-        """World position of the centre of mass, shape (3,)."""
+        """World position of the center of mass, shape (3,)."""
         total, weighted = 0.0, ca.SX.zeros(3)
         for i in self._R:
             body = self.model.inertias[i]

@@ -49,7 +49,7 @@ class Numeric:
         return np.vstack([R @ linear, R @ local[3:]])
 
     def center_of_mass(self) -> tuple[Vector, Vector]:
-        """World centre of mass, shape (3,), and its Jacobian, shape (3, nv)."""
+        """World center of mass, shape (3,), and its Jacobian, shape (3, nv)."""
         J = np.array(pin.jacobianCenterOfMass(self.model, self.data, self.q)).reshape(3, -1)
         return np.array(self.data.com[0]), J
 
@@ -67,9 +67,9 @@ class Numeric:
         turning them (its LOCAL_WORLD_ALIGNED ones leave the turning out).
         """
         pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
-        dv_dq = np.asarray(
-            pin.getJointVelocityDerivatives(self.model, self.data, point.joint, pin.LOCAL)[0]
-        ).reshape(6, -1)
+        dv_dq = np.asarray(pin.getJointVelocityDerivatives(self.model, self.data, point.joint, pin.LOCAL)[0]).reshape(
+            6, -1
+        )
         motion = self.data.v[point.joint]
         R = np.array(self.data.oMi[point.joint].rotation)
         shift = -pin.skew(point.position)

@@ -44,9 +44,7 @@ def force_to_parent(R: ca.SX, p: ca.SX, force: ca.SX) -> ca.SX:
 def motion_cross_force(motion: ca.SX, force: ca.SX) -> ca.SX:
     """``motion ×* force = [w × f; w × m + v × f]`` (Featherstone 2008, eq. 2.32)."""
     linear, angular = motion[:3], motion[3:]
-    return ca.vertcat(
-        cross(angular, force[:3]), cross(angular, force[3:]) + cross(linear, force[:3])
-    )
+    return ca.vertcat(cross(angular, force[:3]), cross(angular, force[3:]) + cross(linear, force[:3]))
 
 
 def inertia_to_parent(R: ca.SX, p: ca.SX, inertia: ca.SX) -> ca.SX:

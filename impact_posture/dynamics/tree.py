@@ -1,4 +1,4 @@
-"""Dynamics of the kinematic tree at one symbolic configuration: sweeps and an O(n) articulated-body factorisation.
+"""Dynamics of the kinematic tree at one symbolic configuration: sweeps and an O(n) articulated-body factorization.
 
 Everything is in link coordinates, and the base's own pose enters only where a world direction is rotated into it:
 ``M`` does not depend on it.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms* (2008), in
@@ -73,7 +73,7 @@ class Tree(Kinematics):
     # ---- sweeps -----------------------------------------------------------------------------------------------
 
     def velocities(self, v: ca.SX) -> ByJoint:
-        """Spatial velocity of every link, in link coordinates, for the generalised velocity ``v``."""
+        """Spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
         found: ByJoint = {}
         for slot in self.chart.slots:
             i, parent = slot.index, self._parents[slot.index]
@@ -166,7 +166,7 @@ class Tree(Kinematics):
         return U, D
 
     def solve(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> tuple[ca.SX, ByJoint]:
-        """``a = M⁻¹(τ + Σ Jᵀ w)`` by the articulated-body factorisation, in O(n) and without forming ``M``.
+        """``a = M⁻¹(τ + Σ Jᵀ w)`` by the articulated-body factorization, in O(n) and without forming ``M``.
 
         Returns:
             ``a``, shape (nv,), and the spatial velocity of every link under it.
@@ -181,9 +181,7 @@ class Tree(Kinematics):
             own = tau[slot.v] if tau is not None else ca.SX(slot.kind.nv, 1)
             torque[i] = ca.densify(ldl_solve(D[i], own - self._S[i].T @ bias[i]))
             if parent:
-                bias[parent] = bias[parent] + force_to_parent(
-                    self._R[i], self._p[i], bias[i] + U[i] @ torque[i]
-                )
+                bias[parent] = bias[parent] + force_to_parent(self._R[i], self._p[i], bias[i] + U[i] @ torque[i])
         motions: ByJoint = {}
         parts = []
         for slot in self.chart.slots:

@@ -25,7 +25,7 @@ class Contact:
     Attributes:
         frame: The frame that carries the contact point.
         normal: Unit vector out of the surface, towards the robot, shape (3,).
-        offset: Contact point from the frame's origin, in the frame, metres.
+        offset: Contact point from the frame's origin, in the frame, meters.
         normal_frame: Axes of ``normal``: the world, or the contact frame (the normal then turns with the robot).
         impulse: Largest impulse λ̄ along the normal, N·s.
     """
@@ -44,7 +44,7 @@ class Contact:
         normal_frame: NormalFrame = "world",
         impulse: float = 1.0,
     ) -> Contact:
-        """Check and normalise.
+        """Check and normalize.
 
         Raises:
             ContactError: Zero or non-finite normal, offset or impulse.
@@ -72,8 +72,8 @@ class Support:
     Attributes:
         frame: The foot's frame.
         kind: ``point`` or ``surface``.
-        offset: Contact point from the frame's origin, in the frame, metres.
-        size: Half extents (x, y) of the sole in its frame, metres.
+        offset: Contact point from the frame's origin, in the frame, meters.
+        size: Half extents (x, y) of the sole in its frame, meters.
     """
 
     frame: str

@@ -68,7 +68,8 @@ def _from_limits(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
         if not (np.isfinite(limit) and 0 < limit < 1e6):
             raise MetricError(
-                f"joint '{name}' has no velocity limit", where="--weights velocity-limits",
+                f"joint '{name}' has no velocity limit",
+                where="--weights velocity-limits",
                 mend="add it to robot.toml [limits.velocity] or give a file",
             )
     return np.asarray(1.0 / limits**2)

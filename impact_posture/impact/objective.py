@@ -1,4 +1,4 @@
-"""The one ``Objective`` protocol: what the programme, the C export, the certificate and TSID see of an impact.
+"""The one ``Objective`` protocol: what the program, the C export, the certificate and TSID see of an impact.
 
 An objective is a metric × a kind × supports × one contact; none of the combinations is a class of its own.
 """
@@ -25,7 +25,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Lifted:
-    """An objective with its inner linear solve left to the programme.
+    """An objective with its inner linear solve left to the program.
 
     Attributes:
         variables: Auxiliary unknowns, shape (k, 1).
@@ -39,7 +39,7 @@ class Lifted:
 
 
 class Objective(Protocol):
-    """What can be minimised: a value with units, its tangent gradient, an oracle, and a lifted form."""
+    """What can be minimized: a value with units, its tangent gradient, an oracle, and a lifted form."""
 
     robot: Robot
 
@@ -129,11 +129,9 @@ class ImpactObjective:
     def warnings(self) -> tuple[str, ...]:
         """Degenerate combinations, in words."""
         if self.metric.kind == "kinetic" and self.kind == "speed" and not self.supports:
-            return (
-                "with the kinetic metric 'speed' is 1/G, the exact opposite of 'impulse' (G) and twice 'energy'",
-            )
+            return ("with the kinetic metric 'speed' is 1/G, the exact opposite of 'impulse' (G) and twice 'energy'",)
         if self.metric.kind == "kinetic" and self.kind == "impulse" and not self.supports:
-            return ("with the kinetic metric 'impulse' is G = 1/m_eff: it only maximises the effective mass",)
+            return ("with the kinetic metric 'impulse' is G = 1/m_eff: it only maximizes the effective mass",)
         return ()
 
     # ---- symbolic ---------------------------------------------------------------------------------------------

@@ -75,7 +75,7 @@ class ImpactOracle:
         self._q: Vector | None = None
 
     def at(self, q: Vector) -> ImpactOracle:
-        """Move to ``q`` and factorise there."""
+        """Move to ``q`` and factorize there."""
         if self._q is not None and np.array_equal(q, self._q):
             return self
         self._q = np.array(q, dtype=float)

@@ -34,7 +34,7 @@ class ImpactRequest:
         load: How to load it.
         frame: Contact frame.
         normal: Direction out of the surface, shape (3,), any length.
-        offset: Contact point in the frame, metres.
+        offset: Contact point in the frame, meters.
         normal_frame: Axes of ``normal``.
         contact: ``FRAME:NX,NY,NZ[:IMPULSE]`` instead of ``frame`` and ``normal``.
         impulse: λ̄, N·s.
@@ -42,7 +42,7 @@ class ImpactRequest:
         supports: ``FRAME[:point|surface]`` each; empty for none.
         metric: How the jump is weighed.
         weights: File or ``velocity-limits``, for the weighted metric.
-        objective: What is minimised.
+        objective: What is minimized.
         speed: Approach speed, m/s.
         restitution: Coefficient of restitution.
         compliance: ε of the supports, 1/kg.

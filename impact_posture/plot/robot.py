@@ -26,7 +26,7 @@ _PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.6}
 def postures_figure(view: ResultView) -> Figure:
     """Draw both postures in the same axes: in 3-D, and from the side that shows n and most of the motion.
 
-    Equal axes in metres; the contact plane as a square (from the side: an edge with hatched matter below it), feet
+    Equal axes in meters; the contact plane as a square (from the side: an edge with hatched matter below it), feet
     and rotors where there are any.
     """
     first, second = (build_skeleton(view, q) for q in (view.q_initial, view.q_optimal))
@@ -101,9 +101,7 @@ def _box(axes: Any, points: Vector) -> None:
     axes.view_init(elev=20, azim=-60)
 
 
-def _window(
-    states: list[Skeleton], plane: Plane, surfaces: list[Skeleton], patch: float
-) -> tuple[Vector, Vector]:
+def _window(states: list[Skeleton], plane: Plane, surfaces: list[Skeleton], patch: float) -> tuple[Vector, Vector]:
     """Lower left and upper right corner of what the side view shows: everything drawn, with a margin."""
     drawn = [plane.axes @ state.points.T for state in states]
     for s in surfaces:

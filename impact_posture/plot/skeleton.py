@@ -14,7 +14,7 @@ from impact_posture.plot.view import ResultView
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A robot's sticks in one posture, world, metres.
+    """A robot's sticks in one posture, world, meters.
 
     Attributes:
         bones: Pairs of points to join, shape (k, 2, 3).

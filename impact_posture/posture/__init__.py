@@ -1,1 +1,1 @@
-"""The offline optimization: constraints, programme, multi-start, certificate, result."""
+"""The offline optimization: constraints, program, multi-start, certificate, result."""

@@ -47,7 +47,7 @@ class Certificate:
             with the right signs.
         primal: Largest violation of any constraint, limit or unit norm (m, rad).
         complementarity: Largest ``|multiplier × distance from its bound|``.
-        pose_error_m: Largest position error of a held frame, metres.
+        pose_error_m: Largest position error of a held frame, meters.
         pose_error_rad: Largest orientation error of a held frame, radians.
         limits: Largest violation of a joint limit, rad or m.
         recomputed_with: What computed it.
@@ -105,14 +105,14 @@ def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
         gradient, equality_jacobian(problem, numeric), np.array([row.outward for row in near])
     )
     active = tuple(
-        Active(row.name, row.side, float(m))
-        for row, m in zip(near, multipliers, strict=True)
-        if m > _MULTIPLIER
+        Active(row.name, row.side, float(m)) for row, m in zip(near, multipliers, strict=True) if m > _MULTIPLIER
     )
     return Certificate(
         stationarity=float(np.abs(residual).max()),
         primal=max(violation, limit_violation),
-        complementarity=max((abs(float(m) * row.slack) for row, m in zip(near, multipliers, strict=True)), default=0.0),
+        complementarity=max(
+            (abs(float(m) * row.slack) for row, m in zip(near, multipliers, strict=True)), default=0.0
+        ),
         pose_error_m=max((e[0] for e in errors), default=0.0),
         pose_error_rad=max((e[1] for e in errors), default=0.0),
         limits=limit_violation,
@@ -122,7 +122,7 @@ def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
 
 
 def objective_gradient(problem: PostureProblem, q: Vector, scale: float) -> Vector:
-    """Tangent gradient of what the programme minimises: objective/scale plus the regularization, shape (nv,)."""
+    """Tangent gradient of what the program minimizes: objective/scale plus the regularization, shape (nv,)."""
     gradient = problem.objective.gradient(q) / scale
     weight = problem.requirements.regularization
     if weight:

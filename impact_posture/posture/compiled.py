@@ -1,4 +1,4 @@
-"""Machine code for the programme's functions where it pays, kept in a cache by content.
+"""Machine code for the program's functions where it pays, kept in a cache by content.
 
 CasADi interprets its expressions at a few nanoseconds an operation; a compiler makes that a few tenths, after a wait
 of some 100 µs an operation.  So one optimization of a small robot is interpreted, and a study of thousands compiles
@@ -29,7 +29,7 @@ _ITERATIONS = 35
 
 
 def cache_folder() -> Path:
-    """Where compiled programmes are kept: ``$IMPACT_POSTURE_CACHE``, else the user's cache folder."""
+    """Where compiled programs are kept: ``$IMPACT_POSTURE_CACHE``, else the user's cache folder."""
     own = os.environ.get("IMPACT_POSTURE_CACHE")
     if own:
         return Path(own)
@@ -59,7 +59,7 @@ def _pays(solver: ca.Function, starts: int) -> bool:
 
 
 def _key(problem: PostureProblem) -> str:
-    """Hash of everything that shapes the programme's functions; targets, normals and limits are parameters."""
+    """Hash of everything that shapes the program's functions; targets, normals and limits are parameters."""
     objective = problem.objective
     content = [
         __version__,
@@ -87,7 +87,7 @@ def _own_source() -> str:
 def _compile(solver: ca.Function, compiler: list[str], library: Path) -> None:
     library.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-        source, built = Path(folder) / "programme.c", Path(folder) / "programme.so"
+        source, built = Path(folder) / "program.c", Path(folder) / "program.so"
         generator = ca.CodeGenerator(source.name)
         generator.add(solver.oracle())
         for name in solver.get_function():

@@ -1,6 +1,6 @@
 """What a posture has to satisfy.  A constraint says it twice: as an expression, and in Pinocchio's numbers.
 
-To add one, derive from :class:`Constraint` and give ``symbolic`` and ``numeric``; the programme, the search for
+To add one, derive from :class:`Constraint` and give ``symbolic`` and ``numeric``; the program, the search for
 feasible starts, the certificate and the elastic diagnosis take it from there.
 """
 
@@ -26,7 +26,7 @@ class Constraint(ABC):
 
     Attributes:
         name: What it is called when it is active or in conflict.
-        parameters: Numbers that may change without rebuilding the programme (targets, polygons).
+        parameters: Numbers that may change without rebuilding the program (targets, polygons).
         lower: Lower bounds, shape (rows,).
         upper: Upper bounds, shape (rows,).
     """
@@ -64,12 +64,12 @@ class Constraint(ABC):
         return self.name if self.rows == 1 else f"{self.name}[{row}]"
 
     def pose_error(self, numeric: Numeric) -> tuple[float, float]:
-        """Error in metres and radians where it holds a pose, else zeros."""
+        """Error in meters and radians where it holds a pose, else zeros."""
         return 0.0, 0.0
 
 
 class HeldPosition(Constraint):
-    """The point stays where it is: ``p(q) − p*``, world axes, metres."""
+    """The point stays where it is: ``p(q) − p*``, world axes, meters."""
 
     def __init__(self, name: str, point: PointOnLink, target: Vector) -> None:
         self.name, self.point = name, point
@@ -90,7 +90,7 @@ class HeldPosition(Constraint):
 
 
 class PositionBox(HeldPosition):
-    """The point stays within a box around a place: ``|p(q) − p*| ≤ half``, world axes, metres."""
+    """The point stays within a box around a place: ``|p(q) − p*| ≤ half``, world axes, meters."""
 
     def __init__(self, name: str, point: PointOnLink, target: Vector, half: Sequence[float]) -> None:
         super().__init__(name, point, target)
@@ -214,7 +214,7 @@ class HeldTurn(Constraint):
 
 
 class CenterOfMassOverFeet(Constraint):
-    """The centre of mass stays above the feet: ``margin − (A xy − b) ≥ 0`` written as ``A xy − b ≤ −margin``, metres.
+    """The center of mass stays above the feet: ``margin − (A xy − b) ≥ 0`` written as ``A xy − b ≤ −margin``, meters.
 
     Args:
         normals: Outward unit normals of the support polygon's edges, shape (k, 2).
@@ -223,7 +223,7 @@ class CenterOfMassOverFeet(Constraint):
     """
 
     def __init__(self, normals: Vector, offsets: Vector, margin: float) -> None:
-        self.name = "centre of mass over the feet"
+        self.name = "center of mass over the feet"
         self._k = len(offsets)
         self.parameters = np.concatenate([normals.T.reshape(-1), offsets])
         self.lower = np.full(self._k, -np.inf)

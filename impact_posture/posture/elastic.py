@@ -76,13 +76,13 @@ def _build(problem: PostureProblem, chart: Chart) -> tuple[ca.Function, int]:
     stacked = ca.vertcat(*rows)
     k = stacked.numel()
     up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
-    programme = {
+    program = {
         "x": ca.vertcat(x, up, down),
         "p": ca.vertcat(reference, *targets),
         "f": ca.sum1(up + down) + 1e-6 * distance_squared(chart, x, reference),
         "g": ca.vertcat(chart.norms(x), stacked + up - down),
     }
-    return ca.nlpsol("elastic", "ipopt", programme, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8}), k
+    return ca.nlpsol("elastic", "ipopt", program, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8}), k
 
 
 def _judge(problem: PostureProblem, chart: Chart, q: Vector) -> ElasticAnswer:

@@ -1,4 +1,4 @@
-"""The nonlinear programme: built once, solved for many starts, normals and targets.
+"""The nonlinear program: built once, solved for many starts, normals and targets.
 
 Formulation (the "lifted" one): the impact's linear solve is left to IPOPT::
 
@@ -70,7 +70,7 @@ class SolveRecord:
 
 @dataclass(frozen=True)
 class PostureNLP:
-    """A built programme.
+    """A built program.
 
     Attributes:
         problem: What it stands for.
@@ -109,16 +109,16 @@ class PostureNLP:
 
 
 def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts: int = 1) -> PostureNLP:
-    """Build the programme; ``starts`` tells how often it will be solved, so that compiling is worth it or not."""
+    """Build the program; ``starts`` tells how often it will be solved, so that compiling is worth it or not."""
     began = time.perf_counter()
     chart = Chart(problem.robot.model)
-    symbols = programme(problem, chart)
+    symbols = program(problem, chart)
     solver, compiled = compiled_solver(problem, symbols, IPOPT_OPTIONS, compile, starts)
     return PostureNLP(problem, chart, solver, int(symbols["x"].numel()), time.perf_counter() - began, compiled)
 
 
-def programme(problem: PostureProblem, chart: Chart) -> dict[str, ca.SX]:
-    """The programme's expressions: ``x`` (unknowns), ``p`` (parameters), ``f``, ``g``."""
+def program(problem: PostureProblem, chart: Chart) -> dict[str, ca.SX]:
+    """The program's expressions: ``x`` (unknowns), ``p`` (parameters), ``f``, ``g``."""
     x = ca.SX.sym("x", chart.nx)
     n, scale, weight = ca.SX.sym("n", 3), ca.SX.sym("scale"), ca.SX.sym("weight")
     reference = ca.SX.sym("reference", chart.nx)
@@ -153,7 +153,7 @@ def distance_squared(chart: Chart, x: ca.SX, reference: ca.SX) -> ca.SX:
 
 
 def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Vector:
-    """Values of the programme's parameters."""
+    """Values of the program's parameters."""
     return np.concatenate(
         [
             np.array(problem.objective.contact.normal),

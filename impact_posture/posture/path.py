@@ -26,7 +26,7 @@ class NullSpacePath:
         G: Inverse effective mass, shape (N,).
         V: Squared jump per squared approach speed, shape (N,).
         S: The same when sticking, NaN where undefined, shape (N,).
-        objective: What was minimised, shape (N,).
+        objective: What was minimized, shape (N,).
     """
 
     q: Vector

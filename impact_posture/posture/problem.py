@@ -39,15 +39,15 @@ class Requirements:
 
     Attributes:
         contact_pose: What is held of the contact frame.
-        target_position: Contact frame's position, world, metres; ``None``: where it is.
+        target_position: Contact frame's position, world, meters; ``None``: where it is.
         target_quaternion: Contact frame's orientation x y z w; ``None``: as it is.
-        box: Half extents of the box of ``contact_pose = box``, metres.
+        box: Half extents of the box of ``contact_pose = box``, meters.
         base: What the floating base may do: ``free``, ``level`` (tilt zero, yaw free), ``fixed``, ``box``.
-        base_box: Half extents of the box of ``base = box``, metres.
+        base_box: Half extents of the box of ``base = box``, meters.
         keep: Frames whose pose is held.
         hold: Joints kept at their initial value.
-        com_over_feet: Keep the centre of mass above the support polygon.
-        com_margin: Distance from the polygon's edges, metres.
+        com_over_feet: Keep the center of mass above the support polygon.
+        com_margin: Distance from the polygon's edges, meters.
         limit_margin: Distance from the joint limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
     """
@@ -72,13 +72,13 @@ class PostureProblem:
 
     Attributes:
         robot: The robot.
-        objective: What is minimised.
+        objective: What is minimized.
         requirements: As asked for.
         given: Posture that the user started from, shape (nq,).
         constraints: All but bounds.
         lower: Bounds in chart coordinates, margin included, held joints pinned, shape (nx,).
         upper: As ``lower``.
-        rows: Rows of each constraint that the programme carries; empty: all.
+        rows: Rows of each constraint that the program carries; empty: all.
         notes: What was decided for the user, one line each.
     """
 
@@ -93,7 +93,7 @@ class PostureProblem:
     notes: tuple[str, ...] = ()
 
     def carried(self, index: int) -> list[int]:
-        """Rows of constraint ``index`` that the programme carries."""
+        """Rows of constraint ``index`` that the program carries."""
         return list(self.rows[index]) if self.rows else list(range(self.constraints[index].rows))
 
     def describe(self) -> list[str]:
@@ -139,7 +139,8 @@ def build_problem(
 def _check(robot: Robot, requirements: Requirements) -> None:
     if not robot.floating and requirements.base != "free":
         raise InputError(
-            f"base '{requirements.base}' asked of a robot whose root is fixed", where="--base",
+            f"base '{requirements.base}' asked of a robot whose root is fixed",
+            where="--base",
             mend="leave it out or use --root free-flyer",
         )
     for name, values in (("--box", requirements.box), ("--base-box", requirements.base_box)):
@@ -192,7 +193,8 @@ def _contact_constraints(
     if mode == "free":
         if requirements.target_position is not None or requirements.target_quaternion is not None:
             raise InputError(
-                "a target is given but the contact pose is free", where="--contact-pose",
+                "a target is given but the contact pose is free",
+                where="--contact-pose",
                 mend="use full, position, aligned or box",
             )
         return []
@@ -239,7 +241,8 @@ def _com_constraint(
         equations = ConvexHull(np.array(corners)).equations
     except (QhullError, ValueError):
         raise InputError(
-            "the feet span no area to keep the centre of mass above", where="com_over_feet",
+            "the feet span no area to keep the center of mass above",
+            where="com_over_feet",
             mend="give three feet or soles with a size, or set com_over_feet = false (--no-com)",
         ) from None
     # One row an edge: qhull repeats the equation of an edge that it met in pieces.
@@ -257,7 +260,8 @@ def _bounds(robot: Robot, chart: Chart, given: Vector, requirements: Requirement
             lower[slot.x] = upper[slot.x] = x[slot.x]
         elif (lower[slot.x] > upper[slot.x]).any():
             raise InputError(
-                f"a margin of {margin:g} leaves joint '{slot.name}' no room", where="limit_margin",
+                f"a margin of {margin:g} leaves joint '{slot.name}' no room",
+                where="limit_margin",
                 mend="give a smaller one",
             )
     return lower, upper

@@ -51,10 +51,10 @@ def held_rows(robot: Robot, hold: Sequence[str]) -> Vector:
 
 
 def regularize(problem: PostureProblem) -> PostureProblem:
-    """Choose an independent set of equality rows for the programme; hold turns that exist to first order only.
+    """Choose an independent set of equality rows for the program; hold turns that exist to first order only.
 
     Four point feet on planar legs (solo8) are 12 equations of rank 10: two repeat others, and the base may roll to
-    first order although any finite roll would spread the feet.  A programme cannot live with either.  The rows that
+    first order although any finite roll would spread the feet.  A program cannot live with either.  The rows that
     repeat others are left out of it (the certificate still checks them), and such a turn is held explicitly.
     """
     robot = problem.robot
@@ -71,14 +71,12 @@ def regularize(problem: PostureProblem) -> PostureProblem:
             if _only_to_first_order(problem, numeric, turn):
                 added.append(turn)
                 notes.append(f"{turn.name} held: the feet allow it to first order only")
-    problem = replace(
-        problem, constraints=(*problem.constraints, *added), notes=(*problem.notes, *notes)
-    )
+    problem = replace(problem, constraints=(*problem.constraints, *added), notes=(*problem.notes, *notes))
     return replace(problem, rows=_independent_rows(problem, numeric.at(problem.given)))
 
 
 def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTurn) -> bool:
-    """Whether the equalities' linearisation allows a turn that the equalities themselves undo."""
+    """Whether the equalities' linearization allows a turn that the equalities themselves undo."""
     model, q = problem.robot.model, problem.given
     jacobian = equality_jacobian(problem, numeric.at(q))
     free = scipy.linalg.null_space(jacobian, rcond=RANK_TOLERANCE)
@@ -104,7 +102,7 @@ def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTu
 
 
 def _independent_rows(problem: PostureProblem, numeric: Numeric) -> tuple[tuple[int, ...], ...]:
-    """For each constraint the rows that the programme carries: all inequalities, independent equalities."""
+    """For each constraint the rows that the program carries: all inequalities, independent equalities."""
     held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
     labels, blocks = [], []
     for index, constraint in enumerate(problem.constraints):
@@ -160,5 +158,3 @@ def pin_undetermined(
         added.append(HeldTurn(base, placement.rotation, 2))
         notes.append("base yaw fixed at its initial value: nothing else determines it")
     return added, notes
-
-

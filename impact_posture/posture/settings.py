@@ -119,7 +119,8 @@ def prepare(settings: ProblemSettings) -> Prepared:
         )
     if settings.normal_cone:
         raise InputError(
-            f"a cone of {settings.normal_cone:g}° is asked for", where="--normal-cone",
+            f"a cone of {settings.normal_cone:g}° is asked for",
+            where="--normal-cone",
             mend="this version knows the exact normal only: give 0",
         )
     weights = settings.weights if isinstance(settings.weights, str) else None
@@ -174,7 +175,7 @@ def _requirements(settings: ProblemSettings, impact: ResolvedImpact) -> Requirem
     com = spec.com_over_feet and bool(impact.supports) if settings.com is None else settings.com
     if com and not impact.supports:
         raise InputError(
-            "there are no feet to keep the centre of mass over", where="--com", mend="add --support or --no-com"
+            "there are no feet to keep the center of mass over", where="--com", mend="add --support or --no-com"
         )
     return Requirements(
         contact_pose=settings.contact_pose or robot.contact_pose(frame),

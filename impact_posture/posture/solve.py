@@ -1,4 +1,4 @@
-"""Multi-start: many feasible starts, one programme, distinct optima, and the best that certifies."""
+"""Multi-start: many feasible starts, one program, distinct optima, and the best that certifies."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class PostureSolution:
         status: IPOPT's word for the best run.
         iterations: Iterations of the best run.
         solve_time_s: Wall time of all runs together.
-        build_time_s: Time to build the programme.
+        build_time_s: Time to build the program.
         compiled: Whether it ran as machine code.
         notes: What a user should know about the answer.
     """
@@ -193,7 +193,7 @@ def _run(nlp: PostureNLP, initial: Vector, scale: float, index: int, seed: int) 
     return _Run(start, record, nlp.problem.objective.value(record.q), certificate)
 
 
-# Worker processes are forked and find the programme here: a CasADi solver cannot be sent to them.
+# Worker processes are forked and find the program here: a CasADi solver cannot be sent to them.
 _WORK: dict[str, tuple[PostureNLP, Vector, float, int]] = {}
 
 
@@ -223,7 +223,12 @@ def _results(
         yield ((index, _run(nlp, initial, scale, index, seed)) for index in range(starts))
         return
     _WORK["job"] = (nlp, initial, scale, seed)
-    pool: Pool = multiprocessing.get_context("fork").Pool(jobs, initializer=_ignore_interrupt)
+    # Ctrl-C reaches every process of the terminal's group: workers must never see it, not even at birth.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        pool: Pool = multiprocessing.get_context("fork").Pool(jobs, initializer=_ignore_interrupt)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     try:
         yield pool.imap_unordered(_worker, range(starts))
     finally:

@@ -2,7 +2,7 @@
 
 Notation is that of the whole package: ``ν = [base linear, base angular, joint rates]`` with the base twist in
 the base frame.  The equation of motion of an aerial robot with arm is ``M(q) ν̇ + h(q, ν) = G u`` with
-``u = [rotor thrusts (N), joint torques (N·m)]``.  Generalised forces are dual to ``ν``, hence ``G`` is
+``u = [rotor thrusts (N), joint torques (N·m)]``.  Generalized forces are dual to ``ν``, hence ``G`` is
 constant: its rotor columns are wrenches on the base, in the base frame at its origin.
 """
 
@@ -65,7 +65,7 @@ class Hover:
 class LateralForce:
     """Largest net horizontal force without tilting or turning, each way, N; NaN where the robot cannot hover.
 
-    The force acts through the centre of mass of the robot with its arm held still.  Forward and left are the
+    The force acts through the center of mass of the robot with its arm held still.  Forward and left are the
     base's x and y axes made horizontal.
     """
 
@@ -116,9 +116,7 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
             mend="name a frame that is fixed to the floating base",
         )
     if not propulsion.rotors:
-        raise SpecError(
-            "there are no rotors", where="propulsion.rotors", mend="list them, or leave propulsion out"
-        )
+        raise SpecError("there are no rotors", where="propulsion.rotors", mend="list them, or leave propulsion out")
     columns = []
     for rotor in propulsion.rotors:
         direction = np.asarray(rotor.direction, dtype=float)
@@ -200,7 +198,7 @@ def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
 def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> LateralForce:
     """Find the largest net horizontal force that keeps attitude and height, in each of four directions.
 
-    A linear programme for each: maximise ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0``, subject
+    A linear program for each: maximize ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0``, subject
     to ``A f = h_b + M_b e a`` (six rows: the weight is carried, nothing else moves and nothing turns), to the
     thrust limits and to ``|h_j + M_j e a| <= τ_max`` for the joints that hold the arm still; ``e`` moves the
     whole robot one way.  Give a level base for the force at zero tilt.
@@ -215,9 +213,7 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
     mass = float(pin.computeTotalMass(model))
     forward = rotation[:, 0] * np.array([1.0, 1.0, 0.0])
     if np.linalg.norm(forward) < 1e-6:
-        raise PostureError(
-            "the base's x axis is vertical", where="lateral force", mend="give a level posture"
-        )
+        raise PostureError("the base's x axis is vertical", where="lateral force", mend="give a level posture")
     forward /= np.linalg.norm(forward)
     left = np.array([-forward[1], forward[0], 0.0])
     limits = np.asarray(model.effortLimit)[6:]
@@ -277,9 +273,7 @@ def _is_free_flyer(model: pin.Model) -> bool:
 
 def _require_free_flyer(model: pin.Model) -> None:
     if not _is_free_flyer(model):
-        raise SpecError(
-            "rotors on a robot that cannot fly", where="propulsion", mend='set root = "free-flyer"'
-        )
+        raise SpecError("rotors on a robot that cannot fly", where="propulsion", mend='set root = "free-flyer"')
 
 
 def _velocity_names(model: pin.Model) -> list[str]:

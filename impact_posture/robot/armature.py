@@ -18,9 +18,7 @@ Vector = NDArray[np.float64]
 ArmatureOption = Mapping[str, float] | str | None
 
 
-def set_armature(
-    model: pin.Model, spec: RobotSpec, srdf: Path | None, option: ArmatureOption, name: str
-) -> str:
+def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: ArmatureOption, name: str) -> str:
     """Set ``model.armature``, kg·m² (kg for prismatic joints).
 
     First of: the option, robot.toml, rotor data of the SRDF, zero.
@@ -64,12 +62,10 @@ def _armature_file(path: Path) -> dict[str, float]:
     try:
         return {str(k): float(v) for k, v in values.items()}
     except (TypeError, ValueError):
-        raise SpecError("holds no table joint = value", where=str(path), mend='write: joint_name = 0.01') from None
+        raise SpecError("holds no table joint = value", where=str(path), mend="write: joint_name = 0.01") from None
 
 
-def _armature_vector(
-    model: pin.Model, default: float, joints: Mapping[str, float], where: str
-) -> Vector:
+def _armature_vector(model: pin.Model, default: float, joints: Mapping[str, float], where: str) -> Vector:
     armature = np.full(model.nv, default)
     armature[: _base_width(model)] = 0.0
     for joint, value in joints.items():

@@ -63,9 +63,7 @@ def load_robot(robot: str, options: LoadOptions | None = None) -> Robot:
     root: Root = options.root or spec.model.root
     _check_package_dirs(options.package_dirs, Path(), "--package-dir")
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
-    model, warnings = build_model(
-        urdf, free_flyer=root == "free-flyer", accept_inertias=spec.model.accept_inertias
-    )
+    model, warnings = build_model(urdf, free_flyer=root == "free-flyer", accept_inertias=spec.model.accept_inertias)
     srdf = _srdf(spec, options, base)
     postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec, root, name)
     _override_limits(model, spec, name)
@@ -162,9 +160,7 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
     for key, posture in spec.postures.items():
         q = np.array(pin.neutral(model), dtype=float)
         if posture.base is not None and spec.model.root != "free-flyer" and root != "free-flyer":
-            raise SpecError(
-                f"posture '{key}' gives a base pose, but the root is fixed", where=name, mend="remove it"
-            )
+            raise SpecError(f"posture '{key}' gives a base pose, but the root is fixed", where=name, mend="remove it")
         # A floating robot that --root bolts down keeps its postures, without their base.
         if posture.base is not None and root == "free-flyer":
             _check_base(posture.base, f"{name} posture '{key}'")

@@ -132,9 +132,7 @@ def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: st
             raise PostureError("gives a base pose, but the root is fixed", where=where, mend="remove 'base'")
         pose = _numbers(base, "base", where)
         if len(pose) != 7:
-            raise PostureError(
-                f"'base' has {len(pose)} numbers", where=where, mend="give [x, y, z, qx, qy, qz, qw]"
-            )
+            raise PostureError(f"'base' has {len(pose)} numbers", where=where, mend="give [x, y, z, qx, qy, qz, qw]")
         q[:7] = pose
     for name, value in joints.items():
         if name in robot.locked:

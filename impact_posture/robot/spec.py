@@ -57,7 +57,7 @@ class SupportSpec(_Strict):
 
     ``point``: the contact point (frame origin plus ``offset``, in the frame) does not move.
     ``surface``: neither does the frame turn.
-    ``size``: half extents (x, y) of a sole around that point, in the frame, metres; it widens the support polygon.
+    ``size``: half extents (x, y) of a sole around that point, in the frame, meters; it widens the support polygon.
     """
 
     frame: str

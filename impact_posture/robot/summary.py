@@ -74,8 +74,7 @@ def summarize(robot: Robot) -> dict[str, Any]:
             "frames": dict(spec.contact.frames),
         },
         "supports": [
-            {"frame": s.frame, "kind": s.kind, "offset": list(s.offset), "size": list(s.size)}
-            for s in spec.supports
+            {"frame": s.frame, "kind": s.kind, "offset": list(s.offset), "size": list(s.size)} for s in spec.supports
         ],
         "constraints": spec.constraints.model_dump(mode="json"),
         "actuation": _actuation(robot, spec.propulsion) if spec.propulsion and robot.floating else None,

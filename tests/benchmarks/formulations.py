@@ -1,4 +1,4 @@
-"""Lifted against reduced: the impact's linear solve as equations of the programme, or inside the objective.
+"""Lifted against reduced: the impact's linear solve as equations of the program, or inside the objective.
 
 Both by IPOPT with exact Hessians on the same starts, interpreted.  Run: python -m tests.benchmarks.formulations
 """
@@ -48,14 +48,16 @@ class ReducedObjective:
         rows = [chart.norms(x)]
         for index, constraint in enumerate(problem.constraints):
             rows.append(constraint.symbolic(tree, ca.SX(constraint.parameters))[problem.carried(index)])
-        programme = {"x": x, "p": scale, "f": objective.scale * kernel.H / scale, "g": ca.vertcat(*rows)}
-        return ca.nlpsol("reduced", "ipopt", programme, IPOPT_OPTIONS)
+        program = {"x": x, "p": scale, "f": objective.scale * kernel.H / scale, "g": ca.vertcat(*rows)}
+        return ca.nlpsol("reduced", "ipopt", program, IPOPT_OPTIONS)
 
 
 def main() -> None:
     """Print one row a formulation and case."""
     print(machine())
-    print("robot        formulation  unknowns  operations of Hessian  Jacobian  gradient  solve ms  iterations  ended")
+    print(
+        "robot        formulation  unknowns  operations of Hessian  Jacobian  gradient  solve ms  iterations  ended"
+    )
     for name, frame, normal in CASES:
         problem = default_problem(name, frame, normal)
         nlp = build_nlp(problem, compile="never")

@@ -30,7 +30,9 @@ STARTS = 50
 def main() -> None:
     """Print one row a case."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--many", type=int, default=0, help="also compare the best of 16 starts with the best of MANY")
+    parser.add_argument(
+        "--many", type=int, default=0, help="also compare the best of 16 starts with the best of MANY"
+    )
     args = parser.parse_args()
     print(machine())
     print(f"single start, median of {STARTS} random feasible starts; target from the project's goals")
@@ -48,9 +50,13 @@ def main() -> None:
             few = min(o.objective for o in solve(problem, starts=16).optima)
             many = min(o.objective for o in solve(problem, starts=args.many, seed=7, compile="never").optima)
             print(
-                f"{name:13s} {'%g %g %g' % normal:8s} {few / many - 1:+.2%} of the best of {args.many} "
+                f"{name:13s} {_text(normal):8s} {few / many - 1:+.2%} of the best of {args.many} "
                 f"({time.perf_counter() - began:.0f} s)"
             )
+
+
+def _text(normal: tuple[float, ...]) -> str:
+    return " ".join(f"{v:g}" for v in normal)
 
 
 def _starts(problem: PostureProblem) -> list[np.ndarray]:
@@ -70,7 +76,7 @@ def _row(name: str, normal: tuple[float, ...], target: float, nlp: PostureNLP, s
     took = statistics.median(record.time_s for record, _ in runs)
     certified = sum(certificate.holds() for _, certificate in runs) / len(runs)
     print(
-        f"{name:13s} {'%g %g %g' % normal:8s} {nlp.build_time_s:7.2f}  "
+        f"{name:13s} {_text(normal):8s} {nlp.build_time_s:7.2f}  "
         f"{'compiled' if nlp.compiled else 'interpreted':11s} {took * 1e3:9.1f} {target:7.0f} "
         f"{took / crba_time(nlp.problem.robot.model):7.0f} {statistics.median(r.iterations for r, _ in runs):11.0f} "
         f"{certified:10.0%}",
