@@ -331,3 +331,17 @@ def test_interrupt_in_mid_solve_leaves_nothing(jobs: int, tmp_path: Path) -> Non
     untouched(tmp_path)
     with pytest.raises(ProcessLookupError):
         os.killpg(process.pid, 0)
+
+
+def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
+    """Rotors that reach half of their speed leave the weight unbalanced; the optimum does not hide it."""
+    from impact_posture_robots import DATA
+
+    spec = (DATA / "tilthex_arm" / "robot.toml").read_text().replace("speed_max = 100.0", "speed_max = 50.0")
+    assert "speed_max = 50.0" in spec
+    for name in ("tilthex_arm.urdf", "tilthex_arm.srdf"):
+        shutil.copy(DATA / "tilthex_arm" / name, tmp_path)
+    (tmp_path / "robot.toml").write_text(spec)
+    done = run("optimize", "tilthex_arm.urdf", "--normal", 0, 0, 1, "--json", *FAST, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert any("cannot hover" in warning for warning in json.loads(done.stdout)["warnings"])

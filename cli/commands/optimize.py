@@ -229,6 +229,8 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, writte
         f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
         f"optima: {optima}{more}"
     )
+    # Those of the robot stood above the solving.
+    page.warnings(document["warnings"][len(prepared.impact.warnings) :])
     if not page.quiet:
         page.gap()
         page.line(f"written to {written.out}: {_contents(written)}")

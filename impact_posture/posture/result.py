@@ -15,6 +15,7 @@ from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.posture.path import NullSpacePath
 from impact_posture.posture.settings import Prepared
 from impact_posture.posture.solve import PostureSolution
+from impact_posture.robot.actuation import hover
 
 SCHEMA = "impact-posture/result/1"
 
@@ -62,9 +63,18 @@ def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, 
             ],
         },
         "notes": list(solution.notes),
-        "warnings": list(impact.warnings),
+        "warnings": [*impact.warnings, *optimal.warnings, *_hover_warnings(prepared, solution)],
         "versions": versions(),
     }
+
+
+def _hover_warnings(prepared: Prepared, solution: PostureSolution) -> list[str]:
+    """What keeps an aerial robot from hovering in the optimal posture."""
+    robot = prepared.impact.robot
+    if robot.spec.propulsion is None or not robot.floating:
+        return []
+    violations = hover(robot.model, robot.spec.propulsion, solution.q).violations
+    return [f"the robot cannot hover in the optimal posture: {violation}" for violation in violations]
 
 
 def versions() -> dict[str, str]:
