@@ -76,7 +76,7 @@ def test_symbolic_oracle_and_differences_agree(name: str) -> None:
         k = ImpactKernel(found, contact, metric, supports, compliance, q, n)
         kernel_fun = ca.Function(
             "kernel", [q, n],
-            [k.H, k.G, k.V, k.S, k.E, k.ellipsoid, k.mobility, k.jump[0], k.world_normal,
+            [k.H, k.G, k.V, k.S, k.E, k.ellipsoid, k.mobility, k.jump.a, k.world_normal,
              k.grad_H, k.grad_G, k.grad_V, k.grad_S, k.grad_E],
         )  # fmt: skip
         oracle = ImpactOracle(found, contact, metric, supports, compliance)

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.dynamics.spatial import constant, quaternion_matrix, skew
+from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, skew
 from impact_posture.errors import UnsupportedJoint
 
 _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
@@ -98,6 +98,15 @@ def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     if kind.family == "spherical":
         return quaternion_matrix(q), zero
     return ca.SX.eye(3), q[:3]
+
+
+def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
+    """The joint's rotation as a turn about a coordinate axis; ``None`` where it is none."""
+    axis = int(np.argmax(np.abs(kind.axis)))
+    if kind.family not in ("revolute", "continuous") or abs(kind.axis[axis]) < 1 - 1e-15:
+        return None
+    cosine, sine = (ca.cos(q[0]), ca.sin(q[0])) if kind.family == "revolute" else (q[0], q[1])
+    return Spin(axis, cosine, float(np.sign(kind.axis[axis])) * sine)
 
 
 def axis_rotation(axis: NDArray[np.float64], cosine: ca.SX, sine: ca.SX) -> ca.SX:

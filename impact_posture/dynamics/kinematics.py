@@ -15,8 +15,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
-from impact_posture.dynamics.joints import joint_quaternion, joint_transform
-from impact_posture.dynamics.spatial import constant, quaternion_product
+from impact_posture.dynamics.joints import joint_quaternion, joint_spin, joint_transform
+from impact_posture.dynamics.spatial import Spin, constant, quaternion_product
 
 # Spatial inertias, forces or motions by joint index.
 ByJoint = dict[int, ca.SX]
@@ -63,6 +63,8 @@ class Kinematics:
         self._extra = dict(extra_inertia or {})
         self._R: ByJoint = {}
         self._p: ByJoint = {}
+        self._rest: ByJoint = {}
+        self._spin: dict[int, Spin | None] = {}
         self._S: ByJoint = {}
         self._inertia: ByJoint = {}
         for slot in self.chart.slots:
@@ -71,6 +73,8 @@ class Kinematics:
             R, p = joint_transform(slot.kind, q[slot.q])
             place_R, place_p = constant(placement.rotation), constant(placement.translation)
             self._R[i] = place_R @ R
+            self._rest[i] = place_R
+            self._spin[i] = joint_spin(slot.kind, q[slot.q])
             self._p[i] = ca.densify(place_p) + place_R @ p
             self._S[i] = constant(slot.kind.subspace)
             self._inertia[i] = constant(model.inertias[i].matrix() + self._extra.get(i, 0.0))

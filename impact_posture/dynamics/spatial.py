@@ -6,6 +6,9 @@ parent: ``x_parent = R x_child + p``.  Structural zeros are kept, so that CasADi
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,16 +50,55 @@ def motion_cross_force(motion: ca.SX, force: ca.SX) -> ca.SX:
     return ca.vertcat(cross(angular, force[:3]), cross(angular, force[3:]) + cross(linear, force[:3]))
 
 
-def inertia_to_parent(R: ca.SX, p: ca.SX, inertia: ca.SX) -> ca.SX:
-    """Congruence of a symmetric 6×6 (articulated) inertia from the child to the parent frame."""
-    A = R @ inertia[:3, :3] @ R.T
-    B = R @ inertia[:3, 3:] @ R.T
-    D = R @ inertia[3:, 3:] @ R.T
+@dataclass(frozen=True)
+class Spin:
+    """A turn about a coordinate axis: ``axis`` 0, 1 or 2, and the angle's cosine and sine."""
+
+    axis: int
+    cosine: ca.SX
+    sine: ca.SX
+
+    @cached_property
+    def double(self) -> tuple[ca.SX, ca.SX]:
+        """Cosine and sine of twice the angle: what a symmetric matrix turns by."""
+        return (self.cosine - self.sine) * (self.cosine + self.sine), 2 * self.sine * self.cosine
+
+    def matrix(self, M: ca.SX) -> ca.SX:
+        """``R M Rᵀ`` of a 3×3 matrix by plane rotations: 16 products, and 12 if ``M`` is symmetric."""
+        i, j, k = (self.axis + 1) % 3, (self.axis + 2) % 3, self.axis
+        c2, s2 = self.double
+        mean, half = (M[i, i] + M[j, j]) / 2, (M[i, i] - M[j, j]) / 2
+        even, odd = (M[i, j] + M[j, i]) / 2, (M[i, j] - M[j, i]) / 2
+        turned, mixed = half * c2 - even * s2, half * s2 + even * c2
+        out = ca.SX(3, 3)
+        out[i, i], out[j, j], out[i, j], out[j, i] = mean + turned, mean - turned, mixed + odd, mixed - odd
+        out[i, k], out[j, k] = self._plane(M[i, k], M[j, k])
+        out[k, i], out[k, j] = self._plane(M[k, i], M[k, j])
+        out[k, k] = M[k, k]
+        return ca.sparsify(out)
+
+    def _plane(self, x: ca.SX, y: ca.SX) -> tuple[ca.SX, ca.SX]:
+        return self.cosine * x - self.sine * y, self.sine * x + self.cosine * y
+
+
+def rotate_inertia(inertia: ca.SX, R: ca.SX, spin: Spin | None) -> ca.SX:
+    """Turn a symmetric 6×6 inertia by ``spin`` and then by ``R``; ``R`` alone where there is no spin."""
+    blocks = [symmetric(inertia[:3, :3]), inertia[:3, 3:], symmetric(inertia[3:, 3:])]
+    if spin is not None:
+        blocks = [spin.matrix(block) for block in blocks]
+    if not (R.is_constant() and np.array_equal(np.array(ca.DM(R)), np.eye(3))):
+        blocks = [R @ block @ R.T for block in blocks]
+    A, B, D = blocks
+    return symmetric(ca.blockcat([[A, B], [B.T, D]]))
+
+
+def shift_inertia(inertia: ca.SX, p: ca.SX) -> ca.SX:
+    """Move a symmetric 6×6 inertia to the origin at ``−p``: ``B' = B − A[p]×, D' = D + [p]×B + B'ᵀ[p]×ᵀ``."""
     P = skew(p)
-    PB = P @ B
-    B_parent = B - A @ P
-    D_parent = D + PB + PB.T - P @ A @ P
-    return symmetric(ca.blockcat([[A, B_parent], [B_parent.T, D_parent]]))
+    A, B, D = inertia[:3, :3], inertia[:3, 3:], inertia[3:, 3:]
+    shifted = B - A @ P
+    # ([p]× B')ᵀ = B'ᵀ [p]×ᵀ
+    return symmetric(ca.blockcat([[A, shifted], [shifted.T, D + P @ B + (P @ shifted).T]]))
 
 
 def symmetric(matrix: ca.SX) -> ca.SX:

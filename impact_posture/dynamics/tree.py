@@ -18,14 +18,15 @@ from impact_posture.dynamics.spatial import (
     constant,
     cross,
     force_to_parent,
-    inertia_to_parent,
     ldl_solve,
     motion_cross_force,
     motion_to_child,
+    rotate_inertia,
+    shift_inertia,
     symmetric,
 )
 
-__all__ = ["ByJoint", "Coupling", "PointOnLink", "Product", "Tree", "Wrench"]
+__all__ = ["ByJoint", "Coupling", "PointOnLink", "Product", "Response", "Tree", "Wrench"]
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,35 @@ class Product:
     right: ByJoint
     scale: float | ca.SX = 1.0
     extra: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What the robot answers to a generalized force and wrenches.
+
+    Attributes:
+        a: ``M⁻¹(τ + Σ Jᵀ w)``, shape (nv,).
+        velocities: Spatial velocity of every link under ``a``, link coordinates.
+        before: The same without the link's own joint, for joints with a parent joint.
+        forces: Spatial force through every joint with a parent joint, on its link.
+        wrenches: What acted.
+    """
+
+    a: ca.SX
+    velocities: ByJoint
+    before: ByJoint
+    forces: ByJoint
+    wrenches: tuple[Wrench, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Factor:
+    """Per joint: ``U = I^A S``, ``D = SᵀU + armature``, ``D⁻¹Uᵀ`` and ``I^a = I^A − U D⁻¹ Uᵀ``."""
+
+    U: ByJoint
+    D: ByJoint
+    gain: ByJoint
+    reduced: ByJoint
 
 
 class Tree(Kinematics):
@@ -120,7 +150,7 @@ class Tree(Kinematics):
                 M[other.v, slot.v] = self._S[j].T @ carried
                 M[slot.v, other.v] = M[other.v, slot.v].T
             if parent:
-                composite[parent] = composite[parent] + inertia_to_parent(self._R[i], self._p[i], composite[i])
+                composite[parent] = composite[parent] + self._inertia_to_parent(i, composite[i])
         return M + ca.diag(ca.SX(self._armature))
 
     def link_force(self, wrench: Wrench) -> ca.SX:
@@ -149,52 +179,82 @@ class Tree(Kinematics):
 
     # ---- articulated body -------------------------------------------------------------------------------------
 
+    def _inertia_to_parent(self, i: int, inertia: ca.SX) -> ca.SX:
+        """Congruence of link i's symmetric 6×6 (articulated) inertia to its parent's coordinates."""
+        spin = self._spin[i]
+        turned = rotate_inertia(inertia, self._R[i] if spin is None else self._rest[i], spin)
+        return shift_inertia(turned, self._p[i])
+
     @cached_property
-    def _factor(self) -> tuple[ByJoint, ByJoint]:
-        """Articulated inertia times ``S`` of every joint, and ``(SᵀI^A S + armature)``."""
+    def _factor(self) -> _Factor:
         articulated = dict(self._inertia)
         U: ByJoint = {}
         D: ByJoint = {}
+        gain: ByJoint = {}
+        reduced: ByJoint = {}
         for slot in reversed(self.chart.slots):
             i, parent = slot.index, self._parents[slot.index]
             U[i] = ca.densify(articulated[i] @ self._S[i])
             D[i] = symmetric(self._S[i].T @ U[i] + ca.diag(ca.SX(self._armature[slot.v])))
             if parent:
-                gain = ldl_solve(D[i], U[i].T) if slot.kind.nv > 1 else U[i].T * (1 / D[i])
-                reduced = symmetric(articulated[i] - U[i] @ gain)
-                articulated[parent] = articulated[parent] + inertia_to_parent(self._R[i], self._p[i], reduced)
-        return U, D
+                gain[i] = U[i].T * (1 / D[i]) if slot.kind.nv == 1 else ldl_solve(D[i], U[i].T)
+                reduced[i] = symmetric(articulated[i] - U[i] @ gain[i])
+                articulated[parent] = articulated[parent] + self._inertia_to_parent(i, reduced[i])
+        return _Factor(U, D, gain, reduced)
 
     def solve(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> tuple[ca.SX, ByJoint]:
-        """``a = M⁻¹(τ + Σ Jᵀ w)`` by the articulated-body factorization, in O(n) and without forming ``M``.
+        """``a = M⁻¹(τ + Σ Jᵀ w)``, shape (nv,), and the spatial velocity of every link under it."""
+        found = self.respond(tau, wrenches)
+        return found.a, found.velocities
 
-        Returns:
-            ``a``, shape (nv,), and the spatial velocity of every link under it.
+    def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
+        """Answer ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization, in O(n) and without forming ``M``.
+
+        The force through joint i is ``f_i = I^a_i v_i⁻ + p^a_i``: the factorization knows the momentum of the whole
+        subtree, so that no sweep has to gather it.
         """
-        U, D = self._factor
+        factor = self._factor
         bias: ByJoint = {i: ca.SX(6, 1) for i in self._R}
         for wrench in wrenches:
             bias[wrench.point.joint] = bias[wrench.point.joint] - self.link_force(wrench)
-        torque: ByJoint = {}
+        drive: ByJoint = {}
+        passed: ByJoint = {}
         for slot in reversed(self.chart.slots):
             i, parent = slot.index, self._parents[slot.index]
             own = tau[slot.v] if tau is not None else ca.SX(slot.kind.nv, 1)
-            torque[i] = ca.densify(ldl_solve(D[i], own - self._S[i].T @ bias[i]))
+            drive[i] = own - self._S[i].T @ bias[i]
             if parent:
-                bias[parent] = bias[parent] + force_to_parent(self._R[i], self._p[i], bias[i] + U[i] @ torque[i])
-        motions: ByJoint = {}
+                passed[i] = bias[i] + factor.gain[i].T @ drive[i]
+                bias[parent] = bias[parent] + force_to_parent(self._R[i], self._p[i], passed[i])
+        velocities: ByJoint = {}
+        before: ByJoint = {}
+        forces: ByJoint = {}
         parts = []
         for slot in self.chart.slots:
             i, parent = slot.index, self._parents[slot.index]
-            rate = torque[i]
+            rate = drive[i] * (1 / factor.D[i]) if slot.kind.nv == 1 else ldl_solve(factor.D[i], drive[i])
             if parent:
-                moved = motion_to_child(self._R[i], self._p[i], motions[parent])
-                rate = rate - ldl_solve(D[i], U[i].T @ moved)
-                motions[i] = moved + self._S[i] @ rate
+                before[i] = motion_to_child(self._R[i], self._p[i], velocities[parent])
+                rate = rate - factor.gain[i] @ before[i]
+                velocities[i] = before[i] + self._S[i] @ rate
+                forces[i] = factor.reduced[i] @ before[i] + passed[i]
             else:
-                motions[i] = ca.densify(self._S[i] @ rate)
+                velocities[i] = ca.densify(self._S[i] @ rate)
             parts.append(rate)
-        return ca.densify(ca.vertcat(*parts)), motions
+        return Response(ca.densify(ca.vertcat(*parts)), velocities, before, forces, tuple(wrenches))
+
+    def pair_gradient(self, x: Response, y: Response) -> ca.SX:
+        """Tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` with all four letters held fixed, shape (nv,).
+
+        ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)`` and the turning of wrenches that stay in the world: all of it from what the
+        two solutions already know.
+        """
+        turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
+        for one, other in ((x, y), (y, x)):
+            for wrench in one.wrenches:
+                self._turn(turning, Coupling(wrench, other.velocities))
+        pairs = [(y.before, x.forces), (x.before, y.forces)]
+        return self._gather(pairs, turning)
 
     # ---- tangent gradients by adjoints ------------------------------------------------------------------------
 
@@ -219,37 +279,51 @@ class Tree(Kinematics):
 
         turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
         for coupling in couplings:
-            point, joint = coupling.wrench.point, coupling.wrench.point.joint
-            force = coupling.scale * self.link_force(coupling.wrench)
+            joint = coupling.wrench.point.joint
             acting = against(coupling.velocities)
-            acting[joint] = acting[joint] + force
-            if not coupling.wrench.in_frame:
-                motion = coupling.velocities[joint]
-                position = ca.SX(point.position)
-                linear = motion[:3] + cross(motion[3:], position)
-                moment = force[3:] - cross(position, force[:3])
-                turning[joint] = turning[joint] + cross(force[:3], linear) + cross(moment, motion[3:])
+            acting[joint] = acting[joint] - coupling.scale * self.link_force(coupling.wrench)
+            self._turn(turning, coupling)
         for product in products:
             inertia = self._inertia if product.extra else self._own_inertia
             for one, other in ((product.left, product.right), (product.right, product.left)):
                 acting = against(one)
                 for i in acting:
-                    acting[i] = acting[i] + product.scale * (inertia[i] @ other[i])
-        return self._gather(sets, [self._accumulate(force) for force in forces], turning)
+                    acting[i] = acting[i] - product.scale * (inertia[i] @ other[i])
+        pairs = [(self._before(v), self._accumulate(f)) for v, f in zip(sets, forces, strict=True)]
+        return self._gather(pairs, turning)
 
-    def _gather(self, sets: list[ByJoint], forces: list[ByJoint], turning: ByJoint) -> ca.SX:
+    def _before(self, velocities: ByJoint) -> ByJoint:
+        """Velocity of every link without its own joint's part; joints with one axis have none along it to lose."""
+        return {
+            slot.index: velocities[slot.index]
+            if slot.kind.nv == 1
+            else motion_to_child(self._R[slot.index], self._p[slot.index], velocities[self._parents[slot.index]])
+            for slot in self.chart.slots
+            if self._parents[slot.index]
+        }
+
+    def _turn(self, turning: ByJoint, coupling: Coupling) -> None:
+        """Add ``f × u + m × ω`` of a wrench that stays in the world while its link turns."""
+        wrench, joint = coupling.wrench, coupling.wrench.point.joint
+        if wrench.in_frame:
+            return
+        force, motion, position = self.link_force(wrench), coupling.velocities[joint], ca.SX(wrench.point.position)
+        linear = motion[:3] + cross(motion[3:], position)
+        moment = force[3:] - cross(position, force[:3])
+        added = cross(force[:3], linear) + cross(moment, motion[3:])
+        turning[joint] = turning[joint] + coupling.scale * added
+
+    def _gather(self, pairs: Sequence[tuple[ByJoint, ByJoint]], turning: ByJoint) -> ca.SX:
+        """``Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning``, with ``F`` what the subtree takes away from the bracket."""
         turning = dict(turning)
-        rows: dict[int, ca.SX] = {}
+        rows: ByJoint = {}
         for slot in reversed(self.chart.slots):
             i, parent = slot.index, self._parents[slot.index]
             row = -(self._S[i][3:, :].T @ turning[i])
             if parent:
                 turning[parent] = turning[parent] + self._R[i] @ turning[i]
-                for velocities, force in zip(sets, forces, strict=True):
-                    before = velocities[i]
-                    if slot.kind.nv > 1:
-                        before = motion_to_child(self._R[i], self._p[i], velocities[parent])
-                    row = row - self._S[i].T @ motion_cross_force(before, force[i])
+                for before, force in pairs:
+                    row = row + self._S[i].T @ motion_cross_force(before[i], force[i])
             rows[i] = row
         return ca.densify(ca.vertcat(*[rows[slot.index] for slot in self.chart.slots]))
 
@@ -257,7 +331,7 @@ class Tree(Kinematics):
         """Tangent gradient of ``cᵀ d(q)`` where the world direction ``d`` turns with the point's link: (nv,)."""
         turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
         turning[point.joint] = -self.to_link(point.joint, cross(direction, covector))
-        return self._gather([], [], turning)
+        return self._gather([], turning)
 
     @cached_property
     def _own_inertia(self) -> ByJoint:

@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.dynamics.tree import ByJoint, Coupling, PointOnLink, Product, Tree, Wrench
+from impact_posture.dynamics.tree import ByJoint, PointOnLink, Product, Response, Tree, Wrench
 from impact_posture.impact.contact import Contact, Support, point_on, support_inertia
 from impact_posture.impact.metric import Metric
 from impact_posture.robot.robot import Robot
@@ -65,40 +65,34 @@ class ImpactKernel:
         return self.tree.rotation(self.point) @ self.n
 
     @cached_property
-    def jump(self) -> tuple[ca.SX, ByJoint]:
-        """``a = M⁻¹Jᵀn`` and its link velocities."""
-        return self.tree.solve(wrenches=[self.blow])
+    def jump(self) -> Response:
+        """The robot's answer to the blow; its ``a`` is ``M⁻¹Jᵀn``."""
+        return self.tree.respond(wrenches=[self.blow])
 
     # ---- H, G and what follows from them ----------------------------------------------------------------------
 
     @cached_property
     def H(self) -> ca.SX:
         """``aᵀWa``: squared jump per squared impulse."""
-        a, velocities = self.jump
-        return ca.dot(a, self._weigh(a, velocities))
+        return ca.dot(self.jump.a, self._weigh(self.jump.a, self.jump.velocities))
 
     @cached_property
     def G(self) -> ca.SX:
         """``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg."""
-        return self._along(self.blow, self.jump[1])
+        return self._along(self.blow, self.jump.velocities)
 
     @cached_property
     def grad_H(self) -> ca.SX:
         """``2 ∂_q[nᵀJb − bᵀMa]`` with ``Mb = Wa`` (plus ``∂_q aᵀMa`` where W = M), shape (nv,)."""
-        a, va = self.jump
         if self.metric.kind == "kinetic" and not self._supported:
             return self.grad_G
-        _, vb = self.tree.solve(tau=self._weigh(a, va))
-        gradient = self.tree.bracket_gradient(
-            [Coupling(self.blow, vb, 2.0)], [Product(va, vb, -2.0), *self._metric_product(va)]
-        )
-        return gradient
+        adjoint = self.tree.respond(tau=self._weigh(self.jump.a, self.jump.velocities))
+        return 2 * self.tree.pair_gradient(self.jump, adjoint) + self._metric_gradient(self.jump.velocities)
 
     @cached_property
     def grad_G(self) -> ca.SX:
         """``∂_q[2nᵀJa − aᵀMa]``, shape (nv,)."""
-        va = self.jump[1]
-        return self.tree.bracket_gradient([Coupling(self.blow, va, 2.0)], [Product(va, va, -1.0)])
+        return self.tree.pair_gradient(self.jump, self.jump)
 
     @cached_property
     def V(self) -> ca.SX:
@@ -123,29 +117,21 @@ class ImpactKernel:
     # ---- three directions: the ellipsoid and sticking ---------------------------------------------------------
 
     @cached_property
-    def _axes(self) -> list[tuple[ca.SX, ByJoint]]:
+    def _axes(self) -> list[Response]:
         """``M⁻¹Jᵀe_k`` of the three world directions."""
         eye = np.eye(3)
-        zero = ca.SX.zeros(3)
-        return [self.tree.solve(wrenches=[Wrench(self.point, ca.SX(eye[k]), zero)]) for k in range(3)]
+        return [self.tree.respond(wrenches=[self._force(ca.SX(eye[k]))]) for k in range(3)]
 
     @cached_property
     def ellipsoid(self) -> ca.SX:
         """``Λ_c = J M⁻¹ W M⁻¹ Jᵀ``, shape (3, 3)."""
-        columns = [self._weigh(a, v) for a, v in self._axes]
-        return ca.blockcat([[ca.dot(self._axes[i][0], columns[j]) for j in range(3)] for i in range(3)])
+        columns = [self._weigh(x.a, x.velocities) for x in self._axes]
+        return ca.blockcat([[ca.dot(self._axes[i].a, columns[j]) for j in range(3)] for i in range(3)])
 
     @cached_property
     def mobility(self) -> ca.SX:
         """``J M⁻¹ Jᵀ``, shape (3, 3), 1/kg."""
-        return ca.horzcat(*[self.tree.point_velocity(self.point, v)[:3] for _, v in self._axes])
-
-    @cached_property
-    def _sticking(self) -> tuple[ca.SX, ca.SX, ByJoint]:
-        """Impulse ``s`` per unit approach speed, jump ``a = M⁻¹Jᵀs`` and its link velocities."""
-        s = self._mobility_inverse @ self.world_normal
-        a = sum((self._axes[k][0] * s[k] for k in range(3)), ca.SX.zeros(self.tree.nv))
-        return s, a, self._combine(s)
+        return ca.horzcat(*[self.tree.point_velocity(self.point, x.velocities)[:3] for x in self._axes])
 
     @cached_property
     def _mobility_inverse(self) -> ca.SX:
@@ -153,31 +139,26 @@ class ImpactKernel:
         frozen = frozen_directions(self.robot, self.point)
         return _inverse3(self.mobility + frozen if frozen.any() else self.mobility)
 
-    def _combine(self, weights: ca.SX) -> ByJoint:
-        """Link velocities of ``M⁻¹Jᵀ weights``."""
-        return {i: sum((self._axes[k][1][i] * weights[k] for k in range(3)), ca.SX(6, 1)) for i in self._axes[0][1]}
+    @cached_property
+    def _sticking(self) -> Response:
+        """The answer to the impulse ``s = (JM⁻¹Jᵀ)⁻¹n`` per unit approach speed."""
+        return self.tree.respond(wrenches=[self._force(self._mobility_inverse @ self.world_normal)])
 
     @cached_property
     def S(self) -> ca.SX:
         """``‖M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹n‖²_W``: as V when the contact point sticks."""
-        _, a, velocities = self._sticking
-        return ca.dot(a, self._weigh(a, velocities))
+        x = self._sticking
+        return ca.dot(x.a, self._weigh(x.a, x.velocities))
 
     @cached_property
     def grad_S(self) -> ca.SX:
         """``2 ∂_q[sᵀJb + rᵀJa − bᵀMa]`` (and ``−2rᵀn(q)`` for a normal that turns with the robot), shape (nv,)."""
-        s, a, va = self._sticking
-        _, free_vb = self.tree.solve(tau=self._weigh(a, va))
-        r = -self._mobility_inverse @ self.tree.point_velocity(self.point, free_vb)[:3]
-        vb = {i: free_vb[i] + added for i, added in self._combine(r).items()}
-        zero = ca.SX.zeros(3)
-        gradient = self.tree.bracket_gradient(
-            [
-                Coupling(Wrench(self.point, s, zero), vb, 2.0),
-                Coupling(Wrench(self.point, r, zero), va, 2.0),
-            ],
-            [Product(va, vb, -2.0), *self._metric_product(va)],
-        )
+        x = self._sticking
+        weighed = self._weigh(x.a, x.velocities)
+        free = self.tree.respond(tau=weighed)
+        r = -self._mobility_inverse @ self.tree.point_velocity(self.point, free.velocities)[:3]
+        adjoint = self.tree.respond(tau=weighed, wrenches=[self._force(r)])
+        gradient = 2 * self.tree.pair_gradient(x, adjoint) + self._metric_gradient(x.velocities)
         if self.contact.normal_frame == "contact":
             gradient = gradient - 2 * self.tree.turning_gradient(self.point, self.world_normal, r)
         return gradient
@@ -191,8 +172,14 @@ class ImpactKernel:
             return a
         return ca.SX(self.metric.diagonal(self.tree.nv)) * a
 
-    def _metric_product(self, va: ByJoint) -> list[Product]:
-        return [Product(va, va, 1.0, extra=False)] if self.metric.kind == "kinetic" else []
+    def _metric_gradient(self, velocities: ByJoint) -> ca.SX:
+        """``∂_q aᵀWa`` with ``a`` held fixed: zero unless W = M."""
+        if self.metric.kind != "kinetic":
+            return ca.SX.zeros(self.tree.nv)
+        return self.tree.bracket_gradient(products=[Product(velocities, velocities, extra=False)])
+
+    def _force(self, impulse: ca.SX) -> Wrench:
+        return Wrench(self.point, impulse, ca.SX.zeros(3))
 
     def _along(self, wrench: Wrench, velocities: ByJoint) -> ca.SX:
         return ca.dot(self.tree.link_force(wrench), velocities[wrench.point.joint])
