@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
@@ -54,7 +55,7 @@ def whole_folder(out: Path, *, force: bool, marks: tuple[str, ...]) -> Iterator[
         beside = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
         beside.chmod(0o777 & ~_umask())
         yield beside
-        _replace(beside, out)
+        _replace(beside, out, force)
         made = []
     except OSError as error:
         words = error.strerror or str(error)
@@ -71,20 +72,29 @@ def whole_folder(out: Path, *, force: bool, marks: tuple[str, ...]) -> Iterator[
                 break
 
 
-def _replace(beside: Path, out: Path) -> None:
-    if not out.exists():
-        os.rename(beside, out)
+def _replace(beside: Path, out: Path, force: bool) -> None:
+    """Put ``beside`` in ``out``'s place; whatever interrupts it, one of the two results is there."""
+    if not force or not out.exists():
+        try:
+            # Atomic; on a folder that somebody filled meanwhile it fails instead of replacing it.
+            os.rename(beside, out)
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                raise OutputError(
+                    "exists", where=str(out), mend="choose another --out, or --force to replace it"
+                ) from None
+            raise
         return
     old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
     os.rename(out, old / out.name)
     try:
         os.rename(beside, out)
-    except OSError:
+    except BaseException:
         os.rename(old / out.name, out)
+        old.rmdir()
         raise
-    finally:
-        # Ours by its marks, and already replaced: not a user's folder.
-        shutil.rmtree(old, ignore_errors=True)
+    # Ours by its marks, and already replaced: not a user's folder.
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def _make_parents(parent: Path) -> list[Path]:

@@ -36,7 +36,7 @@ FACTORIES: dict[str, Factory] = {
     "axis": lambda point, target: HeldOrientation("x", point, target.rotation, AXIS),
     "pose": lambda point, target: HeldPose("x", point, target),
     "pose, spin free": lambda point, target: HeldPose("x", point, target, AXIS),
-    "turn": lambda point, target: HeldTurn(point, target.rotation, 1),
+    "turn": lambda point, target: HeldTurn(point, target.rotation, AXIS, "turn"),
     "center of mass": lambda point, target: CenterOfMassOverFeet(SQUARE, np.full(4, 0.4), 0.01),
 }
 ROBOTS = {

@@ -12,9 +12,9 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.contact import point_on
 from impact_posture.posture.certificate import certify, objective_gradient
+from impact_posture.posture.equalities import equality_jacobian, rank
 from impact_posture.posture.path import null_space_path
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.regular import equality_jacobian, rank
 from impact_posture.posture.settings import (
     ProblemSettings,
     dump_settings,
@@ -284,3 +284,75 @@ def test_settings_know_their_defaults() -> None:
     assert wanted.com_over_feet and wanted.contact_pose == "free" and wanted.base == "free"
     settings = replace(prepare(ProblemSettings(robot="tilthex_arm", normal=(0, 0, 1))).problem.requirements)
     assert settings.base == "level" and settings.contact_pose == "full"
+
+
+# ---- starts and postures that are special by chance ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("more", [{"target_position": (0.4, 0.2, 0.4), "contact_pose": "full"}, {}])
+def test_singular_start_drops_no_equation(more: dict) -> None:
+    """A straight UR5 has dependent rows at its own posture only: everywhere else all of them count."""
+    problem = problem_of("ur5", posture="neutral", **more)
+    assert all(len(problem.carried(i)) == c.rows for i, c in enumerate(problem.constraints))
+    solution = solve(problem, starts=6, jobs=1)
+    assert solution.certified_starts >= 4
+
+
+def test_turns_that_nothing_sees_are_fixed() -> None:
+    """The whole robot may turn about n without changing anything; with an offset the held point is not the pivot."""
+    offset = problem_of("tilthex_arm", contact_pose="position", offset=(0.05, 0, 0))
+    assert "base yaw" in [c.name for c in offset.constraints]
+    sideways = problem_of("hextilt", (1, 0, 0), base="free", contact_pose="free")
+    names = [c.name for c in sideways.constraints]
+    assert {"base position", "base yaw", "base turn about the normal"} <= set(names)
+    solution = solve(sideways, starts=6, jobs=1)
+    assert solution.redundancy == sideways.robot.nv - 5
+
+
+def test_blow_that_moves_nothing_is_refused() -> None:
+    urdf = "example-robot-data:double_pendulum_description/urdf/double_pendulum.urdf"
+    frame = "link2" if "link2" in prepare_frames(urdf) else prepare_frames(urdf)[-1]
+    for objective in ("impulse", "speed"):
+        problem = problem_of(urdf, (1, 0, 0), frame=frame, contact_pose="free", objective=objective)
+        G = problem.objective.oracle.quantities(problem.given).G
+        if G > 1e-12:
+            problem = problem_of(urdf, (0, 1, 0), frame=frame, contact_pose="free", objective=objective)
+        with pytest.raises(InputError, match="cannot move along the normal"):
+            solve(problem, starts=2, jobs=1)
+
+
+def prepare_frames(urdf: str) -> tuple[str, ...]:
+    from impact_posture.robot.loader import load_robot
+
+    return load_robot(urdf).frame_names
+
+
+def test_regularized_answer_minimizes_what_was_asked() -> None:
+    problem = problem_of("tilthex_arm", (1, 0, 0), contact_pose="position", regularization=0.2)
+    solution = solve(problem, starts=12, jobs=1)
+    best = _cost(problem, solution, solution.q)
+    assert all(_cost(problem, solution, optimum.q) >= best - 1e-9 for optimum in solution.optima)
+
+
+@pytest.mark.parametrize(
+    ("text", "over", "expected"),
+    [
+        ('metric = "weighted"\nweights = [1.0]', {"metric": "kinetic"}, {"metric": "kinetic", "weights": None}),
+        ('contact = "ee:1,0,0"', {"normal": (0, 0, 1)}, {"contact": None, "normal": (0, 0, 1)}),
+        ("normal = [0, 0, 1]", {"contact": ("ee:1,0,0",)}, {"normal": None}),
+        ("normal = [0, 0, 1]\nq = [0.0]", {"posture": "home"}, {"q": None, "posture": "home"}),
+    ],
+)
+def test_an_option_replaces_what_the_file_says_in_other_words(
+    text: str, over: dict, expected: dict, tmp_path
+) -> None:
+    file = tmp_path / "problem.toml"
+    file.write_text(f'robot = "tilthex_arm"\n{text}\n')
+    settings = read_settings(file, over)
+    for key, value in expected.items():
+        assert getattr(settings, key) == value
+
+
+def test_listed_weights_need_the_weighted_metric(tmp_path) -> None:
+    with pytest.raises(InputError, match="metric is kinetic"):
+        prepare(make_settings({"robot": "panda", "normal": (0, 0, 1), "metric": "kinetic", "weights": (1.0,) * 9}))

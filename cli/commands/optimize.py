@@ -135,10 +135,6 @@ def _settings(robot: str, given: dict[str, Any]) -> ProblemSettings:
     if "armature" in given:
         given["armature"] = parse_armature(given["armature"])
     if from_file:
-        if "posture" in given:
-            given["q"] = None
-        if "contact" in given:
-            given |= {"frame": None, "normal": None}
         return read_settings(Path(robot), given)
     return make_settings({"robot": robot, **given})
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.posture.equalities import RANK_TOLERANCE, equality_jacobian
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.regular import RANK_TOLERANCE, equality_jacobian
 
 Vector = NDArray[np.float64]
 
@@ -148,7 +148,9 @@ def _distance_gradient(problem: PostureProblem, q: Vector) -> Vector:
         elif slot.kind.family == "planar":
             c, s = np.cos(one[2]), np.sin(one[2])
             d = 2 * (one - other)
-            gradient[slot.v] = c * d[0] + s * d[1], -s * d[0] + c * d[1], d[2]
+            gradient[slot.v] = c * d[0] + s * d[1], -s * d[0] + c * d[1], 2 * np.sin(one[2] - other[2])
+        elif slot.kind.family == "continuous":
+            gradient[slot.v] = 2 * np.sin(one - other)
         else:
             gradient[slot.v] = 2 * (one - other)
     return gradient

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import tempfile
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +23,8 @@ from impact_posture.toolchain import find_compiler, run_compiler
 
 CompileMode = Literal["auto", "always", "never"]
 
-# Measured on small and large robots (tests/benchmarks/compile_pays.py prints them for this machine).
+# From what tests/benchmarks/solve_times.py prints for talos: 170,000 operations take about 20 s to compile, and each
+# start of some 25 iterations is about 30 ms faster for it.  Orders of magnitude are enough to decide.
 _COMPILE_S_PER_OPERATION = 1.2e-4
 _SAVED_S_PER_OPERATION = 6e-9
 _ITERATIONS = 35
@@ -45,7 +47,11 @@ def compiled_solver(
         raise CompilerError("no C compiler found", where="compile", mend="install gcc or clang, or set CC")
     library = cache_folder() / f"{_key(problem)}.so"
     if mode != "never" and library.is_file():
-        return ca.nlpsol("posture", "ipopt", str(library), options), True
+        try:
+            return ca.nlpsol("posture", "ipopt", str(library), options), True
+        except RuntimeError:
+            # Broken, or made by another machine that shares the folder.
+            library.unlink(missing_ok=True)
     solver = ca.nlpsol("posture", "ipopt", symbols, options)
     if mode == "never" or compiler is None or (mode == "auto" and not _pays(solver, starts)):
         return solver, False
@@ -65,6 +71,7 @@ def _key(problem: PostureProblem) -> str:
         __version__,
         _own_source(),
         ca.CasadiMeta.version(),
+        f"{platform.system()} {platform.machine()}",
         problem.robot.model_sha256,
         repr((objective.kind, objective.metric, objective.supports, objective.compliance)),
         repr((objective.contact.frame, objective.contact.offset, objective.contact.normal_frame)),

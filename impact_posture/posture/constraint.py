@@ -186,31 +186,30 @@ class HeldPose(Constraint):
 
 
 class HeldTurn(Constraint):
-    """The base's turn about one of its own axes: one component of ``2 vec(Q*⁻¹ ⊗ Q(q))``.
+    """The base's turn about one axis of its own: ``2 axis·vec(Q*⁻¹ ⊗ Q(q))``.
 
     Args:
         point: The base.
         target: Orientation that counts as no turn, shape (3, 3).
-        component: 0 roll, 1 pitch, 2 yaw.
+        axis: Unit axis in the base, shape (3,).
+        name: Its name.
     """
 
-    NAMES = ("base roll", "base pitch", "base yaw")
-
-    def __init__(self, point: PointOnLink, target: Vector, component: int) -> None:
-        self.name, self.component = self.NAMES[component], component
-        self._whole = HeldOrientation(self.name, point, target)
-        self.parameters = self._whole.parameters
+    def __init__(self, point: PointOnLink, target: Vector, axis: Vector, name: str) -> None:
+        self.name = name
+        self._whole = HeldOrientation(name, point, target)
+        self._axis = np.array(axis, dtype=float)
+        self.parameters = np.concatenate([self._whole.parameters, self._axis])
         self.lower = self.upper = np.zeros(1)
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
         """See :class:`Constraint`."""
-        return self._whole.symbolic(tree, parameters)[self.component]
+        return ca.dot(parameters[8:], self._whole.symbolic(tree, parameters[:8]))
 
     def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
         """See :class:`Constraint`."""
         value, jacobian = self._whole.numeric(numeric)
-        k = self.component
-        return value[k : k + 1], jacobian[k : k + 1]
+        return np.array([self._axis @ value]), (self._axis @ jacobian)[None, :]
 
 
 class CenterOfMassOverFeet(Constraint):

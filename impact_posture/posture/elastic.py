@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.posture.nlp import IPOPT_OPTIONS, distance_squared
+from impact_posture.posture.nlp import IPOPT_OPTIONS, distance_squared, run_solver
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import random_posture
 
@@ -48,7 +48,8 @@ def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAn
     for attempt in range(tries):
         start = problem.given if attempt == 0 else random_posture(problem, chart, rng, near=attempt % 2 == 1)
         x = np.clip(chart.to_x(start), problem.lower, problem.upper)
-        answer = solver(
+        answer = run_solver(
+            solver,
             x0=np.concatenate([x, np.full(2 * rows, 0.1)]),
             p=np.concatenate([chart.to_x(problem.given), *[c.parameters for c in problem.constraints]]),
             lbx=np.concatenate([problem.lower, np.zeros(2 * rows)]),

@@ -97,15 +97,20 @@ class PostureNLP:
         lower[:nx], upper[:nx] = problem.lower, problem.upper
         scale = scale or problem.objective.value(self.chart.to_q(x))
         began = time.perf_counter()
-        answer = self.solver(
-            x0=guess, lbx=lower, ubx=upper, p=parameters(problem, self.chart, scale), **_row_bounds(problem, self)
-        )
+        p = parameters(problem, self.chart, scale)
+        answer = run_solver(self.solver, x0=guess, lbx=lower, ubx=upper, p=p, **_row_bounds(problem, self))
         elapsed = time.perf_counter() - began
         stats = self.solver.stats()
-        if stats["return_status"] == "User_Requested_Stop":
-            raise KeyboardInterrupt
         q = self.chart.to_q(np.array(answer["x"]).reshape(-1)[:nx])
         return SolveRecord(q, str(stats["return_status"]), int(stats["iter_count"]), elapsed)
+
+
+def run_solver(solver: ca.Function, **arguments: Vector) -> dict[str, ca.DM]:
+    """Call an ``nlpsol``; a Ctrl-C that IPOPT caught goes on as one."""
+    answer: dict[str, ca.DM] = solver(**arguments)
+    if solver.stats()["return_status"] == "User_Requested_Stop":
+        raise KeyboardInterrupt
+    return answer
 
 
 def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts: int = 1) -> PostureNLP:
@@ -140,7 +145,7 @@ def program(problem: PostureProblem, chart: Chart) -> dict[str, ca.SX]:
 
 
 def distance_squared(chart: Chart, x: ca.SX, reference: ca.SX) -> ca.SX:
-    """Squared distance of two chart points; quaternions by ``4 (1 − (q·r)²)``, the squared angle to first order."""
+    """Squared distance of two chart points; turns count ``4 (1 − (q·r)²)`` or ``2 (1 − cos Δ)``: about Δ²."""
     total = ca.SX(0)
     for slot in chart.slots:
         one, other = x[slot.x], reference[slot.x]
@@ -148,8 +153,17 @@ def distance_squared(chart: Chart, x: ca.SX, reference: ca.SX) -> ca.SX:
         if slot.kind.family in ("free-flyer", "spherical"):
             total += 4 * (1 - ca.dot(one[width - 4 :], other[width - 4 :]) ** 2)
             one, other = one[: width - 4], other[: width - 4]
+        elif slot.kind.family in ("continuous", "planar"):
+            total += 2 * (1 - ca.cos(one[width - 1] - other[width - 1]))
+            one, other = one[: width - 1], other[: width - 1]
         total += ca.sumsqr(one - other)
     return total
+
+
+def distance_squared_fun(chart: Chart) -> ca.Function:
+    """``(x, reference) → distance_squared``."""
+    x, reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
+    return ca.Function("distance", [x, reference], [distance_squared(chart, x, reference)])
 
 
 def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Vector:

@@ -13,7 +13,6 @@ from scipy.spatial import ConvexHull, QhullError
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import Support, point_on
 from impact_posture.impact.objective import ImpactObjective
@@ -25,7 +24,9 @@ from impact_posture.posture.constraint import (
     HeldPosition,
     PositionBox,
 )
-from impact_posture.posture.regular import pin_undetermined, regularize
+from impact_posture.posture.equalities import base_point
+from impact_posture.posture.gauge import pin_undetermined
+from impact_posture.posture.regular import regularize
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import ContactPose, Vector3
 
@@ -209,14 +210,11 @@ def _contact_constraints(
     return [HeldPosition(f"position of {contact.frame}", point, target.translation)]
 
 
-def _base_point() -> PointOnLink:
-    return PointOnLink(1, np.zeros(3), np.eye(3))
-
-
 def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements) -> list[Constraint]:
     if not robot.floating:
         return []
-    base, placement = _base_point(), numeric.placement(_base_point())
+    base = base_point()
+    placement = numeric.placement(base)
     if requirements.base == "level":
         upright = np.array([0.0, 0.0, 1.0])
         return [HeldOrientation("level base", base, np.eye(3), upright)]

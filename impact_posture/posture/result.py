@@ -31,9 +31,13 @@ def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, 
     """The content of ``result.json``."""
     initial, optimal = evaluations(prepared, solution)
     impact = prepared.impact
+    asked = impact.to_dict()
+    contacts = [{**contact, "normal": [float(v) for v in initial.worst_normal]} for contact in asked["contacts"]]  # type: ignore[attr-defined]
+    warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *_hover_warnings(prepared, solution))
     return {
         "schema": SCHEMA,
-        **impact.to_dict(),
+        **asked,
+        "contacts": contacts,
         "constraints": prepared.problem.describe(),
         "initial": {
             "given_q": [float(v) for v in prepared.problem.given],
@@ -63,7 +67,7 @@ def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, 
             ],
         },
         "notes": list(solution.notes),
-        "warnings": [*impact.warnings, *optimal.warnings, *_hover_warnings(prepared, solution)],
+        "warnings": list(dict.fromkeys(warnings)),
         "versions": versions(),
     }
 

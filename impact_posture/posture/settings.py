@@ -14,9 +14,8 @@ from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.metric import Metric, MetricKind, ObjectiveKind
 from impact_posture.impact.request import ImpactRequest, ResolvedImpact
 from impact_posture.posture.problem import BaseMode, PostureProblem, Requirements, build_problem
-from impact_posture.robot.loader import LoadOptions
+from impact_posture.robot.loader import LoadOptions, names_a_path
 from impact_posture.robot.spec import ContactPose, Root, Vector3, read_toml, validate
-from impact_posture.robot.urdf import EXAMPLE_PREFIX
 
 SCHEMA = "impact-posture/problem/1"
 
@@ -92,11 +91,22 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
         if isinstance(value, str) and (folder / value).is_file():
             data[key] = str(folder / value)
     robot = data.get("robot")
-    if isinstance(robot, str) and not robot.startswith(EXAMPLE_PREFIX) and (folder / robot).is_file():
-        data["robot"] = str(folder / robot)
+    if isinstance(robot, str) and names_a_path(robot, folder):
+        data["robot"] = str(folder / Path(robot).expanduser())
     if isinstance(data.get("package_dir"), list):
         data["package_dir"] = [str(folder / str(p)) for p in data["package_dir"]]  # type: ignore[attr-defined]
-    return validate(ProblemSettings, data | (over or {}), str(path))
+    over = over or {}
+    # What the command line says replaces what the file says of the same thing in other words.
+    if over.get("metric", "weighted") != "weighted" and "weights" not in over:
+        data.pop("weights", None)
+    if "frame" in over or "normal" in over:
+        data.pop("contact", None)
+    if "contact" in over:
+        data.pop("frame", None)
+        data.pop("normal", None)
+    if "posture" in over:
+        data.pop("q", None)
+    return validate(ProblemSettings, data | over, str(path))
 
 
 def make_settings(values: dict[str, object]) -> ProblemSettings:
@@ -122,6 +132,12 @@ def prepare(settings: ProblemSettings) -> Prepared:
             f"a cone of {settings.normal_cone:g}° is asked for",
             where="--normal-cone",
             mend="this version knows the exact normal only: give 0",
+        )
+    if isinstance(settings.weights, tuple) and settings.metric != "weighted":
+        raise InputError(
+            f"weights are listed, but the metric is {settings.metric}",
+            where="weights",
+            mend='remove them or say "weighted"',
         )
     weights = settings.weights if isinstance(settings.weights, str) else None
     request = ImpactRequest(
@@ -197,7 +213,7 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
     """The same problem with every default written out: solved again, it gives the same result."""
     settings, impact, wanted = prepared.settings, prepared.impact, prepared.problem.requirements
     robot = settings.robot
-    if robot.endswith((".urdf", ".xml")) and not robot.startswith(EXAMPLE_PREFIX):
+    if names_a_path(robot, Path()):
         robot = str(Path(robot).expanduser().resolve())
     changes: dict[str, object] = {
         "robot": robot,

@@ -15,13 +15,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.errors import Infeasible, SolverFailed
+from impact_posture.errors import ContactError, Infeasible, MetricError, SolverFailed
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.elastic import elastic
-from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp
+from impact_posture.posture.equalities import equality_jacobian, rank
+from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp, distance_squared_fun
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.regular import equality_jacobian, rank
 from impact_posture.posture.starts import Projector, feasible_start
 
 Vector = NDArray[np.float64]
@@ -98,6 +98,7 @@ class _Run:
     start: Vector | None
     record: SolveRecord | None
     objective: float
+    minimized: float
     certificate: Certificate | None
 
 
@@ -119,19 +120,21 @@ def solve(
     initial = _initial(problem, seed)
     began = time.perf_counter()
     nlp = build_nlp(problem, compile=compile, starts=starts)
-    scale = problem.objective.value(initial)
+    scale = _initial_objective(problem, initial)
     runs = _run_all(nlp, initial, scale, starts, seed, jobs, progress)
     good = [r for r in runs if r.certificate is not None and r.certificate.holds()]
     if not good:
         raise _failure(runs)
     # The first of equally good ones: the answer does not hang on which process was faster.
-    best = min(good, key=lambda r: round(r.objective / scale, 9))
+    best = min(good, key=lambda r: round(r.minimized, 9))
     assert best.record is not None and best.certificate is not None
     q, certificate, notes = best.record.q, best.certificate, []
     numeric = Numeric(problem.robot.model)
     redundancy = problem.robot.nv - rank(equality_jacobian(problem, numeric.at(q)))
-    if redundancy == 0:
+    if redundancy == 0 and best.objective > scale * (1 - 1e-6):
         notes.append("no redundancy left: the constraints alone determine the posture, there is nothing to optimize")
+    elif redundancy == 0:
+        notes.append("no redundancy left: this is the best of separate postures that the constraints allow")
     elif best.objective > scale * (1 - 1e-6):
         notes.append("no better posture found: the initial one is already (locally) optimal for this blow")
     return PostureSolution(
@@ -179,6 +182,23 @@ def _initial(problem: PostureProblem, seed: int) -> Vector:
     return found.q
 
 
+def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
+    """The objective at the start; it scales everything, so it has to exist.
+
+    Raises:
+        ContactError: The contact point cannot move along the normal there.
+    """
+    found = problem.objective.oracle.quantities(initial)
+    mobility = float(np.linalg.eigvalsh(found.mobility)[-1])
+    if not found.G > 1e-12 * mobility:
+        raise ContactError(
+            f"the contact point at '{problem.objective.contact.frame}' cannot move along the normal",
+            where="--normal",
+            mend="choose another frame, normal or posture: a blow along it moves nothing",
+        )
+    return problem.objective.value(initial)
+
+
 def run_start(nlp: PostureNLP, start: Vector, scale: float) -> tuple[SolveRecord, Certificate]:
     """Solve from one feasible start and certify what comes out."""
     record = nlp.solve(start, scale=scale)
@@ -188,9 +208,19 @@ def run_start(nlp: PostureNLP, start: Vector, scale: float) -> tuple[SolveRecord
 def _run(nlp: PostureNLP, initial: Vector, scale: float, index: int, seed: int) -> _Run:
     start = initial if index == 0 else feasible_start(nlp.problem, index, seed)
     if start is None:
-        return _Run(None, None, np.inf, None)
-    record, certificate = run_start(nlp, start, scale)
-    return _Run(start, record, nlp.problem.objective.value(record.q), certificate)
+        return _Run(None, None, np.inf, np.inf, None)
+    try:
+        record, certificate = run_start(nlp, start, scale)
+        objective = nlp.problem.objective.value(record.q)
+    except MetricError:
+        # This start led to a posture where the objective does not exist; the others go on.
+        return _Run(start, None, np.inf, np.inf, None)
+    problem, chart = nlp.problem, nlp.chart
+    minimized = objective / scale
+    if problem.requirements.regularization:
+        distance = distance_squared_fun(chart)(chart.to_x(record.q), chart.to_x(problem.given))
+        minimized += problem.requirements.regularization * float(distance)
+    return _Run(start, record, objective, minimized, certificate)
 
 
 # Worker processes are forked and find the program here: a CasADi solver cannot be sent to them.
@@ -259,6 +289,10 @@ def distinct(problem: PostureProblem, ends: list[tuple[Vector, float]]) -> tuple
 def _failure(runs: list[_Run]) -> SolverFailed:
     solved = [r for r in runs if r.record is not None and r.certificate is not None]
     words = sorted({r.record.status for r in solved if r.record is not None})
+    if not solved:
+        return SolverFailed(
+            "the objective does not exist where the starts ended", where="solver", mend="choose another --objective"
+        )
     nearest = min((r.certificate for r in solved if r.certificate), key=lambda c: c.stationarity)
     return SolverFailed(
         f"none of {len(solved)} feasible starts ended at a certified posture (solver: {', '.join(words)}; best "

@@ -33,7 +33,8 @@ class LoadOptions:
         package_dirs: Where ``package://`` paths lead; dynamics needs none, pictures may.
         srdf: Another SRDF.
         config: Another robot.toml (else one beside the URDF).
-        armature: ``"none"``, a TOML file's path, or values by joint; ``None``: DESIGN's order.
+        armature: ``"none"``, a TOML file's path, or values by joint; ``None``: robot.toml's, else the rotor data of
+            the SRDF, else zero.
         lock: Joints made rigid at the default posture.
     """
 
@@ -103,6 +104,13 @@ def _check_package_dirs(folders: Sequence[str], base: Path, where: str) -> None:
             raise PackageNotFound(folder, siblings, where=where, mend="name an existing folder")
 
 
+def names_a_path(robot: str, folder: Path) -> bool:
+    """Whether ROBOT is a path (from ``folder``) and not a known name or an example-robot-data URI."""
+    if robot.startswith(EXAMPLE_PREFIX) or robot in known_robots():
+        return False
+    return robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or (folder / robot).is_file()
+
+
 def _locate(robot: str, options: LoadOptions) -> tuple[RobotSpec, Path, str, Path, str]:
     """Return spec, URDF file, its printable source, the folder that relative paths start from, and the name."""
     own = robots_data() / robot / "robot.toml"
@@ -112,14 +120,16 @@ def _locate(robot: str, options: LoadOptions) -> tuple[RobotSpec, Path, str, Pat
         source = text if text.startswith(EXAMPLE_PREFIX) else f"impact-posture:{robot}/{text}"
         urdf = resolve_path(text, base)
         if options.config:
-            spec, base = read_spec(Path(options.config)), Path(options.config).parent
-            if spec.model.urdf:
-                urdf = resolve_path(spec.model.urdf, base)
-                source = spec.model.urdf if spec.model.urdf.startswith(EXAMPLE_PREFIX) else str(urdf)
+            # What the user's file does not say stays as the catalogue says it.
+            spec, base = read_spec(Path(options.config), over=own), Path(options.config).parent
+            found = resolve_path(spec.model.urdf or text, base)
+            if found != urdf:
+                urdf = found
+                source = text if (text := spec.model.urdf or "").startswith(EXAMPLE_PREFIX) else str(urdf)
         return spec, urdf, source, base, spec.name or robot
     if robot.startswith(EXAMPLE_PREFIX):
         urdf, source = resolve_path(robot, Path()), robot
-    elif robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or Path(robot).is_file():
+    elif names_a_path(robot, Path()):
         urdf = Path(robot).expanduser()
         source = robot
     else:

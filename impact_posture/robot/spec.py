@@ -175,11 +175,39 @@ def read_toml(path: Path) -> dict[str, object]:
         raise SpecError(f"is not valid TOML ({error})", where=str(path), mend="correct the syntax") from None
 
 
-def read_spec(path: Path) -> RobotSpec:
-    """Read and check a ``robot.toml``."""
+def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
+    """Read and check a ``robot.toml``; what it does not say is taken from ``over``, paths relative to either file.
+
+    A file that names another URDF describes another robot: nothing is taken over then.
+    """
     data = read_toml(path)
+    model = data.get("model", {})
+    if over is not None and not (isinstance(model, dict) and "urdf" in model):
+        data = _overlay(_absolute_paths(read_toml(over), over.parent), data)
     # Before the keys: those of another schema are not misspelt.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
         raise SpecError(f"schema '{schema}'", where=str(path), mend=f'write schema = "{SCHEMA}"')
     return validate(RobotSpec, data, str(path))
+
+
+def _overlay(below: dict[str, object], above: dict[str, object]) -> dict[str, object]:
+    """Merge tables; lists, values and the armature as a whole are replaced."""
+    merged = dict(below)
+    for key, value in above.items():
+        old = merged.get(key)
+        if isinstance(old, dict) and isinstance(value, dict) and key != "armature":
+            merged[key] = _overlay(old, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _absolute_paths(data: dict[str, object], folder: Path) -> dict[str, object]:
+    model = data.get("model")
+    if isinstance(model, dict):
+        for key in ("urdf", "srdf"):
+            text = model.get(key)
+            if isinstance(text, str) and ":" not in text:
+                model[key] = str(folder / text)
+    return data

@@ -11,28 +11,13 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.impact.contact import Contact, Support
-from impact_posture.impact.metric import Metric
-from impact_posture.impact.objective import ImpactObjective
-from impact_posture.posture.problem import PostureProblem, Requirements, build_problem
-from impact_posture.robot.loader import load_robot
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.settings import make_settings, prepare
 
 
 def default_problem(name: str, frame: str, normal: tuple[float, float, float], **more: object) -> PostureProblem:
     """The problem that ``impact-posture optimize NAME --frame F --normal …`` solves."""
-    robot = load_robot(name)
-    supports = tuple(Support.from_spec(s) for s in robot.spec.supports)
-    objective = ImpactObjective(robot, Contact.create(frame, normal), Metric(), "impulse", supports)
-    spec = robot.spec.constraints
-    asked: dict[str, object] = {
-        "contact_pose": robot.contact_pose(frame),
-        "base": "level" if spec.level_base else "free",
-        "hold": spec.hold,
-        "com_over_feet": spec.com_over_feet,
-        "com_margin": spec.com_margin,
-        "limit_margin": spec.limit_margin,
-    }
-    return build_problem(robot, objective, robot.posture(), Requirements(**(asked | more)))  # type: ignore[arg-type]
+    return prepare(make_settings({"robot": name, "frame": frame, "normal": normal, **more})).problem
 
 
 def median_time(call: Callable[[], object], repeats: int = 200) -> float:
