@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -80,12 +80,24 @@ def _base_width(model: pin.Model) -> int:
     return 6 if model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer" else 0
 
 
-def armature_warning(model: pin.Model, source: str) -> tuple[str, ...]:
-    """Return one line where no joint has any armature, else nothing."""
-    joints = np.asarray(model.armature)[_base_width(model) :]
-    if joints.size and not (joints > 0).any():
-        return (
-            f"armature is zero ({source}): geared motors usually have some, and H scales like 1/armature² "
-            "where it dominates; give --armature or robot.toml [armature]",
-        )
-    return ()
+def armature_warning(model: pin.Model, source: str, held: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return one line where joints have no armature, else nothing; joints that are held by default do not count."""
+    first = 2 if _base_width(model) else 1
+    armature = np.asarray(model.armature)
+    joints = [str(model.names[i]) for i in range(first, model.njoints)]
+    bare = [
+        name
+        for i, name in enumerate(joints, first)
+        if name not in held and not (armature[model.idx_vs[i] : model.idx_vs[i] + model.nvs[i]] > 0).any()
+    ]
+    if not bare:
+        return ()
+    which = "" if len(bare) == len([j for j in joints if j not in held]) else f" at {_listed(bare)}"
+    return (
+        f"armature is zero{which} ({source}): geared motors usually have some, and H scales like 1/armature² "
+        "where it dominates; give --armature or robot.toml [armature]",
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

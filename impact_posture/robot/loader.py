@@ -79,7 +79,7 @@ def load_robot(robot: str, options: LoadOptions | None = None) -> Robot:
     if locked:
         model, postures = _lock(model, locked, postures, default, name)
     check_moved_mass(model, source)
-    warnings = (*warnings, *armature_warning(model, armature_source))
+    warnings = (*warnings, *armature_warning(model, armature_source, spec.constraints.hold))
     loaded = Robot(
         name=name,
         source=source,

@@ -1,0 +1,1 @@
+"""Every way of computing an impact's quantities, side by side."""

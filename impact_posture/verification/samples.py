@@ -1,0 +1,61 @@
+"""Random postures and normals to compare at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.robot.robot import Robot
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One place to compare at.
+
+    Attributes:
+        q: Configuration, shape (nq,).
+        normal: Unit vector, shape (3,), in the contact's normal frame.
+    """
+
+    q: Vector
+    normal: Vector
+
+
+def random_samples(robot: Robot, count: int, seed: int, normal: Vector | None = None) -> tuple[Sample, ...]:
+    """Random postures, each with a random normal; the same for the same seed.
+
+    The first has ``normal``, shape (3,), where one is given.
+
+    Joints are uniform within their limits.  Where there is none: angles within ±π, lengths within 1 m of the default
+    posture, orientations uniform.  A limit that is missing on one side lies as far from the default posture.
+    """
+    generator, chart = np.random.default_rng(seed), Chart(robot.model)
+    start = chart.to_x(robot.posture())
+    lower, upper = chart.bounds()
+    reach = np.ones(chart.nx)
+    for slot in chart.slots:
+        if slot.kind.family in ("revolute", "continuous"):
+            reach[slot.x] = np.pi
+        elif slot.kind.family == "planar":
+            reach[slot.x.stop - 1] = np.pi
+    lower = np.where(np.isfinite(lower), lower, np.minimum(start, upper) - reach)
+    upper = np.where(np.isfinite(upper), upper, np.maximum(start, lower) + reach)
+    found = []
+    for k in range(count):
+        x = generator.uniform(lower, upper)
+        for quaternion in chart.quaternion_slices():
+            x[quaternion] = _direction(generator, 4)
+        drawn = _direction(generator, 3)
+        found.append(Sample(chart.to_q(x), drawn if k or normal is None else normal))
+    return tuple(found)
+
+
+def _direction(generator: np.random.Generator, size: int) -> Vector:
+    """A unit vector, uniform on the sphere."""
+    vector = generator.normal(size=size)
+    return np.asarray(vector / np.linalg.norm(vector))
