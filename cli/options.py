@@ -80,6 +80,13 @@ Frame = Annotated[
     str | None,
     _option("--frame", metavar="F", panel=CONTACT, show_default="the robot's", help="Contact frame."),
 ]
+FrameList = Annotated[
+    list[str] | None,
+    _option(
+        "--frame", metavar="F", panel=CONTACT, show_default="the robot's",
+        help="Contact frame; repeatable: several frames in one library.",
+    ),
+]  # fmt: skip
 Offset = Annotated[
     Three | None,
     _option(
@@ -268,6 +275,20 @@ Out = Annotated[
     _option("--out", metavar="DIR", panel=OUTPUT, show_default="./ROBOT-FRAME", help="Result folder."),
 ]
 Force = Annotated[bool, _option("--force", panel=OUTPUT, help="Replace an existing result folder.")]
+Prefix = Annotated[
+    str | None,
+    _option(
+        "--prefix", metavar="NAME", panel=OUTPUT, show_default="ROBOT_FRAME", help="What the C names begin with."
+    ),
+]
+ExportOut = Annotated[
+    str | None,
+    _option("--out", metavar="DIR", panel=OUTPUT, show_default="./PREFIX-c", help="Folder of the C code."),
+]
+Float = Annotated[bool, _option("--float", panel=OUTPUT, help="Compute in float instead of double.")]
+CompileLibrary = Annotated[
+    bool, _option("--compile", panel=OUTPUT, help="Build the shared library and compare it with other libraries.")
+]
 NoCodegen = Annotated[bool, _option("--no-codegen", panel=OUTPUT, help="Leave the C export out.")]
 Json = Annotated[bool, _option("--json", panel=OUTPUT, help="One JSON document on standard output.")]
 Quiet = Annotated[bool, _option("--quiet", "-q", panel=OUTPUT, help="The result alone: no warnings, no progress.")]

@@ -148,6 +148,23 @@ class CompilerError(InputError):
     """The C compiler is missing or failed; carries its words and the command."""
 
 
+class ManifestMismatch(InputError):
+    """A C export was made for another robot than the one in hand; carries what differs, and both values."""
+
+    def __init__(self, key: str, exported: object, found: object, *, where: str = "manifest", mend: str = "") -> None:
+        self.key, self.exported, self.found = key, exported, found
+        super().__init__(
+            f"{key} is {_short(exported)} in the export, {_short(found)} here",
+            where=where,
+            mend=mend or "export again for this robot (impact-posture codegen)",
+        )
+
+
+def _short(value: object) -> str:
+    text = repr(value) if not isinstance(value, float) else f"{value:.9g}"
+    return text if len(text) <= 80 else f"{text[:12]}…"
+
+
 class Infeasible(ImpactPostureError):
     """No posture satisfies the constraints; carries the conflicting ones."""
 

@@ -6,11 +6,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
 from impact_posture.codegen.export import Export, export
-from impact_posture.errors import SpecError
+from impact_posture.errors import CompilerError, SpecError
 from impact_posture.folder import whole_folder
 from impact_posture.plot import PathData, ResultView, draw_all
 from impact_posture.posture.path import NullSpacePath, null_space_path
@@ -32,11 +33,13 @@ class Written:
         out: The folder.
         document: The content of ``result.json``.
         export: The C export, or ``None``.
+        compiler_error: Why the C code could not be built and compared; empty if it was, or no compiler is there.
     """
 
     out: Path
     document: dict[str, object]
     export: Export | None
+    compiler_error: str = ""
 
 
 def default_out(prepared: Prepared) -> Path:
@@ -61,6 +64,7 @@ def write_result(
     document = result_document(prepared, solution)
     path = null_space_path(solution.problem, solution.initial, solution.q)
     made: Export | None = None
+    failure = ""
     with whole_folder(out, force=force, marks=MARKS) as folder:
         _write_json(folder / "result.json", document)
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path))  # type: ignore[arg-type]
@@ -69,8 +73,13 @@ def write_result(
         draw_all(_view(prepared, solution.initial, solution.q, path), folder, formats)
         if codegen:
             (folder / "c").mkdir()
-            made = export(prepared.impact.objective, folder / "c", posture=solution.q)
-    return Written(out, document, made)
+            try:
+                made = export(prepared.impact.objective, folder / "c", posture=solution.q)
+            except CompilerError as error:
+                # The posture is worth keeping whatever the compiler says; the user hears of it.
+                failure = error.line
+                made = export(prepared.impact.objective, folder / "c", posture=solution.q, force=True, check=False)
+    return Written(out, document, made, failure)
 
 
 def _view(prepared: Prepared, initial: np.ndarray, optimal: np.ndarray, path: NullSpacePath) -> ResultView:
@@ -106,10 +115,12 @@ def load_view(folder: Path) -> ResultView:
             path = NullSpacePath(
                 **{key: arrays[f"path_{key}"] for key in ("q", "s", "H", "G", "V", "S", "objective")}
             )
-        initial, optimal = np.array(document["initial"]["q"]), np.array(document["optimal"]["q"])
+        initial, optimal = (np.array(document[key]["q"], dtype=float) for key in ("initial", "optimal"))
         recorded = document["robot"]["model_sha256"]
-    except (ValueError, KeyError, TypeError, OSError) as error:
-        raise SpecError(f"is no whole result ({error})", where=str(folder), mend="run optimize again") from None
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError, EOFError, BadZipFile) as error:
+        raise SpecError(
+            f"is no whole result ({type(error).__name__}: {error})", where=str(folder), mend="run optimize again"
+        ) from None
     if recorded != prepared.impact.robot.model_sha256:
         raise SpecError(
             f"was made with another model of {prepared.impact.robot.name} (sha256 {recorded[:12]}…)",

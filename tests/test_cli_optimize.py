@@ -332,7 +332,11 @@ def test_interrupt_in_mid_solve_leaves_nothing(jobs: int, tmp_path: Path) -> Non
     time.sleep(1.5)
     # As a terminal does: to every process of the group.
     os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
+    try:
+        _, errors = process.communicate(timeout=30)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     untouched(tmp_path)
@@ -352,3 +356,50 @@ def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
     done = run("optimize", "tilthex_arm.urdf", "--normal", 0, 0, 1, "--json", *FAST, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert any("cannot hover" in warning for warning in json.loads(done.stdout)["warnings"])
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--box", 1, 1, 1), ("--base-box", 1, 1, 1), ("--no-com", "--com-margin", 0.1)]
+)
+def test_options_that_would_do_nothing_are_refused(arguments: tuple[object, ...], tmp_path: Path) -> None:
+    done = run("optimize", "solo12", "--normal", 1, 0, 0, *arguments, *FAST, cwd=tmp_path)
+    assert done.returncode == 2 and "does nothing without" in done.stderr
+    untouched(tmp_path)
+
+
+@pytest.mark.parametrize("line", ['starts = "4"', "speed = true", 'impulse = "3"', 'com = "yes"', 'normal = "up"'])
+def test_problem_file_takes_values_of_the_right_type_only(line: str, tmp_path: Path) -> None:
+    normal = "" if line.startswith("normal") else "normal = [0, 0, 1]\n"
+    (tmp_path / "p.toml").write_text(f'robot = "panda"\n{normal}{line}\n')
+    refused(run("optimize", "p.toml", *FAST[2:], cwd=tmp_path), 1, line.split()[0])
+
+
+@pytest.mark.parametrize("scale", ["1e-200", "1e300"])
+def test_normal_of_any_length(scale: str, tmp_path: Path) -> None:
+    done = run("evaluate", "panda", "--normal", scale, scale, 0, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["contacts"][0]["normal"] == pytest.approx([0.5**0.5, 0.5**0.5, 0])
+
+
+def test_failing_compiler_does_not_cost_the_posture(tmp_path: Path) -> None:
+    arguments = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--starts", 2, "--format", "png")
+    done = run(*arguments, cwd=tmp_path, env=os.environ | {"CC": "false"})
+    assert done.returncode == 0
+    assert "could not be built" in done.stderr
+    assert (tmp_path / "tilthex_arm-ee" / "posture.json").is_file()
+    assert list((tmp_path / "tilthex_arm-ee" / "c").glob("*.c"))
+
+
+def test_broken_result_is_refused(result: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(result, broken)
+    (broken / "result.npz").write_bytes(b"")
+    refused(run("plot", broken, cwd=tmp_path), 1, "broken", "no whole result")
+
+
+def test_surface_and_locking_are_warned_about(tmp_path: Path) -> None:
+    """A normal that points into the surface puts the whole robot behind it."""
+    done = run("optimize", "tilthex_arm", "--normal", 0, 0, -1, "--json", *FAST, cwd=tmp_path)
+    assert any("check its sign" in w for w in json.loads(done.stdout)["warnings"])
+    done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--out", "right", "--json", *FAST, cwd=tmp_path)
+    assert not any("surface" in w for w in json.loads(done.stdout)["warnings"])

@@ -25,8 +25,9 @@ from impact_posture.codegen.compiler import (
     oracle_difference,
 )
 from impact_posture.codegen.emitter import _OPERATIONS, c_double, emit_function
-from impact_posture.codegen.export import Export, c_identifier, export
+from impact_posture.codegen.export import Export, export
 from impact_posture.codegen.manifest import sample_postures
+from impact_posture.codegen.naming import c_identifier
 from impact_posture.codegen.source import plain
 from impact_posture.errors import CompilerError, InputError, MetricError, OutputError, PostureError
 from impact_posture.impact.contact import Contact, Support

@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from impact_posture_cli.commands.codegen import codegen
 from impact_posture_cli.commands.evaluate import evaluate
 from impact_posture_cli.commands.inspect import inspect
 from impact_posture_cli.commands.optimize import optimize
 from impact_posture_cli.commands.plot import plot
 from impact_posture_cli.commands.robots import robots
+from impact_posture_cli.commands.verify import verify
 
 COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "robots": robots,
@@ -20,5 +22,7 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "evaluate": evaluate,
     "optimize": optimize,
     "plot": plot,
+    "codegen": codegen,
+    "verify": verify,
 }
 """Name to function, in the order of the help page."""

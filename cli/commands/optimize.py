@@ -78,6 +78,7 @@ def optimize(
     """Find the posture that takes the blow best; write posture, pictures and C code."""
     given = _given(context)
     settings = _settings(robot, given)
+    _refuse_idle(given, settings)
     from impact_posture.folder import check_output
     from impact_posture.job import FORMATS, MARKS, default_out, write_result
     from impact_posture.posture.settings import prepare
@@ -107,6 +108,8 @@ def optimize(
         codegen=not no_codegen,
         formats=[f.value for f in format or ()] or FORMATS,
     )
+    if written.compiler_error:
+        page.warnings([f"the C code in c/ is written but could not be built: {written.compiler_error}"])
     if json:
         print_json(written.document)
         return
@@ -137,6 +140,17 @@ def _settings(robot: str, given: dict[str, Any]) -> ProblemSettings:
     if from_file:
         return read_settings(Path(robot), given)
     return make_settings({"robot": robot, **given})
+
+
+def _refuse_idle(given: dict[str, Any], settings: ProblemSettings) -> None:
+    """Refuse options that would do nothing beside the others."""
+    for name, used, mend in (
+        ("box", settings.contact_pose == "box", "--contact-pose box"),
+        ("base_box", settings.base == "box", "--base box"),
+        ("com_margin", settings.com is not False, "--com"),
+    ):
+        if name in given and not used:
+            raise typer.BadParameter(f"does nothing without {mend}", param_hint=f"'--{name.replace('_', '-')}'")
 
 
 def _announce(page: Page, prepared: Prepared) -> None:
@@ -245,6 +259,8 @@ def _contents(written: Written) -> str:
     names = "posture.json, result.json, pictures"
     if written.export is None:
         return names
+    if written.compiler_error:
+        return f"{names}, C code in c/ (not compiled)"
     if written.export.agreement is None:
         return f"{names}, C code in c/ (no compiler here to try it: install gcc or clang, or set CC)"
     return f"{names}, C code in c/ (compiled, agrees to {written.export.agreement:.0e})"

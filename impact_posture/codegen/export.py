@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.codegen.compiler import compile_and_check
+from impact_posture.codegen.emitter import DOUBLE, Real
 from impact_posture.codegen.manifest import build_manifest
-from impact_posture.codegen.source import build_texts
+from impact_posture.codegen.naming import c_identifier, check_prefix
+from impact_posture.codegen.source import build_code, build_texts
 from impact_posture.errors import InputError, OutputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.toolchain import find_compiler
-
-_IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 @dataclass(frozen=True)
@@ -43,18 +43,13 @@ class Export:
     agreement: float | None
 
 
-def c_identifier(robot: str, frame: str) -> str:
-    """Robot and frame as one C identifier: what is no letter, digit or underscore becomes an underscore."""
-    text = re.sub(r"_{2,}", "_", re.sub(r"[^A-Za-z0-9]", "_", f"{robot}_{frame}")).strip("_")
-    return text if _IDENTIFIER.fullmatch(text) else f"robot_{text}".rstrip("_")
-
-
 def export(
-    objective: ImpactObjective,
+    objective: ImpactObjective | Sequence[ImpactObjective],
     out: Path,
     *,
     prefix: str | None = None,
     posture: NDArray[np.float64] | None = None,
+    real: Real = DOUBLE,
     force: bool = False,
     check: bool = True,
 ) -> Export:
@@ -63,10 +58,12 @@ def export(
     Nothing is written before all of it is made, and each file appears whole or not at all.
 
     Args:
-        objective: What to export.
+        objective: What to export; several of one robot, each at a frame of its own, make one library with
+            functions ``<prefix>_<frame>_eval`` and so on.
         out: An existing folder.
         prefix: What the C names begin with, a C identifier; robot and frame by default.
         posture: A configuration to go along as a constant, shape (nq,).
+        real: The C type to compute in.
         force: Replace files that are there.
         check: Build and compare; ``compiled`` is false without.
 
@@ -76,36 +73,48 @@ def export(
         OutputError: ``out`` is no folder, holds such files already, or cannot be written.
         CompilerError: The compiler failed, or what it made computes other numbers; the files are there.
     """
-    prefix = _checked_prefix(objective, prefix)
+    objectives = _same_robot(objective)
+    robot = objectives[0].robot
+    prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     if not out.is_dir():
         raise OutputError("no such folder", where=str(out), mend="create it first")
     if posture is not None:
         given = np.array(posture, dtype=float)
-        posture = objective.robot.check_posture(given, limits=False)
+        posture = robot.check_posture(given, limits=False)
         # Normalizing what is of unit norm already turns last digits: keep those that result.json has.
         posture = given if np.allclose(given, posture, rtol=0, atol=1e-9) else posture
-    manifest = build_manifest(objective, prefix, posture)
-    texts = build_texts(objective, prefix, manifest)
+    code = build_code(objectives, prefix, real)
+    manifest = build_manifest(objectives, prefix, posture, real, code.stack_bytes)
+    texts = build_texts(objectives, prefix, manifest, code, real)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     _write(texts, out, force)
     files = tuple(out / name for name in texts)
     if not check or find_compiler() is None:
         return Export(prefix, files, manifest, compiled=False, agreement=None)
-    return Export(prefix, files, manifest, compiled=True, agreement=compile_and_check(out, prefix, objective))
+    agreement = compile_and_check(out, prefix, objectives, real=real)
+    return Export(prefix, files, manifest, compiled=True, agreement=agreement)
 
 
-def _checked_prefix(objective: ImpactObjective, prefix: str | None) -> str:
-    if prefix is None:
-        return c_identifier(objective.robot.name, objective.contact.frame)
-    if not _IDENTIFIER.fullmatch(prefix):
-        raise InputError(
-            f"the prefix '{prefix}' is no C identifier",
-            where="--prefix",
-            mend=f"letters, digits and underscores, a letter first, such as {c_identifier(prefix, '')}",
-        )
-    if prefix.lower() == "example":
-        raise InputError("the prefix 'example' is taken by example.c", where="--prefix", mend="choose another")
-    return prefix
+def default_prefix(objectives: Sequence[ImpactObjective]) -> str:
+    """Robot and frame; the robot alone where there are several frames."""
+    name = objectives[0].robot.name
+    return c_identifier(name, objectives[0].contact.frame if len(objectives) == 1 else "")
+
+
+def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple[ImpactObjective, ...]:
+    objectives = (objective,) if isinstance(objective, ImpactObjective) else tuple(objective)
+    if not objectives:
+        raise InputError("no objective is given", where="codegen", mend="give one for each frame")
+    first = objectives[0]
+    shared = (first.robot.model_sha256, first.metric, first.kind, first.supports, first.compliance)
+    for other in objectives[1:]:
+        if (other.robot.model_sha256, other.metric, other.kind, other.supports, other.compliance) != shared:
+            raise InputError(
+                f"'{other.contact.frame}' and '{first.contact.frame}' differ in more than the contact",
+                where="codegen",
+                mend="export them one by one",
+            )
+    return objectives
 
 
 def _write(texts: dict[str, str], out: Path, force: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
@@ -11,14 +12,16 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture import __version__
+from impact_posture.codegen.emitter import DOUBLE, Real
+from impact_posture.codegen.functions import ellipsoid_fun, jump_fun, objective_fun
+from impact_posture.codegen.naming import FUNCTIONS, stems
+from impact_posture.codegen.reader import SCHEMA
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import MetricError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
-
-SCHEMA = "impact-posture/codegen/1"
 
 # A unit vector along no axis, exact in binary to the last digit that matters: no entry of a gradient is idle.
 _NORMAL = (0.48, -0.6, 0.64)
@@ -55,41 +58,65 @@ def sample_postures(robot: Robot, count: int, seed: int) -> list[Vector]:
     return [np.asarray(pin.integrate(robot.model, start, rng.uniform(-0.5, 0.5, robot.nv))) for _ in range(count)]
 
 
-def self_test(objective: ImpactObjective) -> dict[str, Any]:
+def self_test(objective: ImpactObjective, real: Real = DOUBLE) -> dict[str, Any]:
     """Reference values from CasADi's own evaluation at one posture and normal: ``q, n, H, grad, objective, …``.
+
+    Posture and normal are numbers of the export's own type, so that nothing is lost on the way into it.
 
     Raises:
         MetricError: The objective does not exist there.
     """
-    q = sample_postures(objective.robot, 1, 0)[0]
-    H, gradient = objective.metric_fun()(q, ca.DM(_NORMAL))
-    value, objective_gradient = objective.gradient_fun()(q, ca.DM(objective.contact.normal))
-    numbers = np.concatenate([np.array(v, dtype=float).ravel() for v in (H, gradient, value, objective_gradient)])
-    if not np.isfinite(numbers).all():
+    q = real.rounded(sample_postures(objective.robot, 1, 0)[0])
+    n = real.rounded(_NORMAL)
+    H, gradient = objective.metric_fun()(q, n)
+    value, objective_gradient = objective_fun(objective)(q)
+    jump, G, _ = jump_fun(objective)(q, n)
+    numbers = {
+        "H": H,
+        "grad": gradient,
+        "objective": value,
+        "objective_grad": objective_gradient,
+        "jump": jump,
+        "G": G,
+        "V": H / G**2,
+        "ellipsoid": ellipsoid_fun(objective)(q),
+    }
+    found = {key: np.array(v, dtype=float).ravel() for key, v in numbers.items()}
+    if not all(np.isfinite(v).all() for v in found.values()):
         raise MetricError(
             f"objective '{objective.name}' is not finite at a random posture of {objective.robot.name}",
             where="codegen",
             mend="choose another objective or frame",
         )
+    scalars = ("H", "objective", "G", "V")
     return {
         "q": q.tolist(),
-        "n": list(_NORMAL),
-        "H": float(H),
-        "grad": np.array(gradient).ravel().tolist(),
-        "objective": float(value),
-        "objective_grad": np.array(objective_gradient).ravel().tolist(),
+        "n": n.tolist(),
+        **{key: float(v[0]) if key in scalars else v.tolist() for key, v in found.items()},
     }
 
 
-def build_manifest(objective: ImpactObjective, prefix: str, posture: Vector | None) -> dict[str, Any]:
-    """Everything that a reader needs to tell whether the export fits the robot in hand."""
-    robot, contact, metric = objective.robot, objective.contact, objective.metric
-    symbols = {name: f"{prefix}_{name}" for name in ("eval", "objective", "value")}
-    if posture is not None:
-        symbols["posture"] = f"{prefix}_posture"
+def build_manifest(
+    objectives: Sequence[ImpactObjective],
+    prefix: str,
+    posture: Vector | None,
+    real: Real = DOUBLE,
+    stack_bytes: int = 0,
+) -> dict[str, Any]:
+    """Everything that a reader needs to tell whether the export fits the robot in hand.
+
+    What belongs to one frame stands in ``frames``, an entry each; that of the first frame at the top as well.
+    """
+    first = objectives[0]
+    robot, metric = first.robot, first.metric
+    names = stems(prefix, [o.contact.frame for o in objectives])
+    frames = [_frame_block(o, stem, real) for o, stem in zip(objectives, names, strict=True)]
+    symbols = frames[0]["symbols"] | ({} if posture is None else {"posture": f"{prefix}_posture"})
     return {
         "schema": SCHEMA,
         "prefix": prefix,
+        "real": real.name,
+        "stack_bytes": stack_bytes,
         "model_sha256": robot.model_sha256,
         "robot": robot.name,
         "joint_names": list(robot.joint_names),
@@ -98,22 +125,19 @@ def build_manifest(objective: ImpactObjective, prefix: str, posture: Vector | No
         "v_names": list(robot.tangent_names),
         "nq": robot.nq,
         "nv": robot.nv,
-        "frame": contact.frame,
-        "offset": list(contact.offset),
-        "normal": list(contact.normal),
-        "normal_frame": contact.normal_frame,
-        "impulse_bound": contact.impulse,
         "metric": {
             "name": metric.kind,
             "weights": None if metric.weights is None else list(metric.weights),
         },
-        "objective": objective.name,
-        "objective_units": objective.units,
-        "supports": [{"frame": s.frame, "kind": s.kind, "offset": list(s.offset)} for s in objective.supports],
-        "support_compliance": objective.compliance if objective.supports else None,
+        "objective": first.name,
+        "objective_units": first.units,
+        "supports": [{"frame": s.frame, "kind": s.kind, "offset": list(s.offset)} for s in first.supports],
+        "support_compliance": first.compliance if first.supports else None,
         "armature": robot.armature.tolist(),
         "posture": None if posture is None else posture.tolist(),
+        **frames[0],
         "symbols": symbols,
+        "frames": frames,
         "versions": {
             "impact_posture": __version__,
             "casadi": str(ca.CasadiMeta.version()),
@@ -121,5 +145,17 @@ def build_manifest(objective: ImpactObjective, prefix: str, posture: Vector | No
             "numpy": np.__version__,
             "python": platform.python_version(),
         },
-        "self_test": self_test(objective),
+    }
+
+
+def _frame_block(objective: ImpactObjective, stem: str, real: Real) -> dict[str, Any]:
+    contact = objective.contact
+    return {
+        "frame": contact.frame,
+        "offset": list(contact.offset),
+        "normal": list(contact.normal),
+        "normal_frame": contact.normal_frame,
+        "impulse_bound": contact.impulse,
+        "symbols": {name: f"{stem}_{name}" for name in FUNCTIONS},
+        "self_test": self_test(objective, real),
     }

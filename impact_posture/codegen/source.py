@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
-import casadi as ca
-
 from impact_posture import __version__
-from impact_posture.codegen import templates
-from impact_posture.codegen.emitter import c_double, c_vector, emit_function
+from impact_posture.codegen import project, templates
+from impact_posture.codegen.compiler import self_test_tolerance
+from impact_posture.codegen.emitter import Real, c_double, c_vector, count_locals, emit_function
+from impact_posture.codegen.functions import ellipsoid_fun, jump_fun, objective_fun
 from impact_posture.codegen.manifest import unit_slices
+from impact_posture.codegen.naming import stems
 from impact_posture.impact.objective import ImpactObjective
+
+# A compiler that makes vectors of neighboring numbers (-march=native) puts some by in several of them.
+_SPILL = 4
+# Return addresses, saved registers and the small functions' own variables, for the three calls in each other.
+_FRAMES = 1024
 
 _PLAIN = str.maketrans({"·": " ", "²": "^2", "×": "x", "λ": "l", "ε": "eps", "⁻": "^-", "¹": "1"})
 
@@ -33,59 +41,109 @@ def wrapped(words: list[str], indent: str, width: int = 112) -> str:
     return f"\n{indent}".join([*lines, line])
 
 
-def build_texts(objective: ImpactObjective, prefix: str, manifest: dict[str, Any]) -> dict[str, str]:
+@dataclass(frozen=True)
+class Code:
+    """The C of an export's functions.
+
+    Attributes:
+        functions: Text of every function, frame after frame.
+        stack_bytes: Upper bound on the stack that a call takes, the C library's part not counted.
+    """
+
+    functions: str
+    stack_bytes: int
+
+
+def build_code(objectives: Sequence[ImpactObjective], prefix: str, real: Real) -> Code:
+    """Generate the functions of each frame."""
+    names = stems(prefix, [o.contact.frame for o in objectives])
+    texts, largest = [], 0
+    for objective, stem in zip(objectives, names, strict=True):
+        bodies, call = _bodies(objective, prefix, stem, real)
+        largest = max(largest, *(count_locals(body) for body in bodies))
+        nv, nq = objective.robot.nv, objective.robot.nq
+        texts.append(
+            templates.FUNCTIONS.substitute(
+                prefix=prefix, stem=stem, real=real.name, nq=nq, nv=nv, bodies="\n".join(bodies), call=call
+            )
+        )
+    # The body's numbers, and those of the caller that keeps a jump.
+    stack = _SPILL * real.size * (largest + objectives[0].robot.nv) + _FRAMES
+    return Code("".join(texts), -(-stack // 64) * 64)
+
+
+def build_texts(
+    objectives: Sequence[ImpactObjective], prefix: str, manifest: dict[str, Any], code: Code, real: Real
+) -> dict[str, str]:
     """File name → text of everything but the manifest."""
-    facts = _facts(objective, prefix, manifest)
+    facts = _facts(objectives, prefix, manifest, real)
+    each = [
+        facts | _frame_facts(o, stem, alone=len(objectives) == 1)
+        for o, stem in zip(objectives, stems(prefix, [o.contact.frame for o in objectives]), strict=True)
+    ]
+    facts = each[0] | facts
     comment = {key: plain(value) for key, value in facts.items()}
+    comments = [{key: plain(value) for key, value in block.items()} for block in each]
     posture = manifest["posture"]
     declaration = "" if posture is None else templates.POSTURE_DECLARATION.substitute(comment)
     definition = (
-        "" if posture is None else f"\nconst double {prefix}_posture[{facts['nq']}] = {c_vector(posture, '')};\n"
+        ""
+        if posture is None
+        else f"\nconst {real.name} {prefix}_posture[{facts['nq']}] = {c_vector(posture, '', real)};\n"
     )
     row = "" if posture is None else f"| `{prefix}_posture` | the impact-robust posture that was found |\n"
     order = {
         "q_order": wrapped([plain(v) for v in manifest["q_names"]], " *      "),
         "v_order": wrapped([plain(v) for v in manifest["v_names"]], " *      "),
         "convention": comment["convention"].replace("; ", ";\n * "),
+        "contacts": "\n".join(templates.CONTACT_LINE.substitute(block) for block in comments),
+        "declarations": "".join(templates.DECLARATIONS.substitute(block) for block in comments),
     }
-    test = manifest["self_test"]
-    vectors = {key: c_vector(test[key], "") for key in ("q", "n", "grad", "objective_grad")}
-    numbers = {key: c_double(test[key]).strip("()") for key in ("H", "objective")}
     tables = {
         key: "\n".join(f"| {k} | {name} |" for k, name in enumerate(manifest[names]))
         for key, names in (("q_table", "q_names"), ("v_table", "v_names"))
     }
-    bodies, call = _code(objective, prefix)
+    checks = [block | _references(m["self_test"], real) for block, m in zip(each, manifest["frames"], strict=True)]
     return {
         f"{prefix}.h": templates.HEADER.substitute(comment | order, posture=declaration),
         f"{prefix}.c": templates.SOURCE.substitute(
-            comment | {"posture": definition, "units": _unit_checks(objective), "bodies": bodies, "objective": call}
+            comment
+            | {"posture": definition, "unit_checks": _unit_checks(objectives[0], real), "functions": code.functions}
         ),
-        "example.c": templates.EXAMPLE.substitute(facts | vectors | numbers),
-        "Makefile": templates.MAKEFILE.substitute(facts),
-        "CMakeLists.txt": templates.CMAKE.substitute(facts),
-        "README.md": templates.README.substitute(facts | tables, posture=row),
+        "example.c": project.EXAMPLE.substitute(
+            facts,
+            checks="".join(project.EXAMPLE_CHECK.substitute(block) for block in checks),
+            calls="".join(f"  worst = fmax(worst, check_{block['stem']}());\n" for block in each),
+        ),
+        "example.cpp": _eigen(objectives[0], checks[0], manifest["self_test"], real),
+        "Makefile": project.MAKEFILE.substitute(facts),
+        "CMakeLists.txt": project.CMAKE.substitute(facts),
+        "README.md": project.README.substitute(
+            facts | tables, posture=row, rows="".join(project.README_ROWS.substitute(block) for block in each)
+        ),
     }
 
 
-def _facts(objective: ImpactObjective, prefix: str, manifest: dict[str, Any]) -> dict[str, str]:
-    robot, contact, metric = objective.robot, objective.contact, objective.metric
+def _facts(
+    objectives: Sequence[ImpactObjective], prefix: str, manifest: dict[str, Any], real: Real
+) -> dict[str, str]:
+    """What all frames share."""
+    objective = objectives[0]
+    robot, metric = objective.robot, objective.metric
+    frames = [o.contact.frame for o in objectives]
     supports = ", ".join(f"{s.frame} ({s.kind})" for s in objective.supports)
     weights = {"euclidean": "W = I", "kinetic": "W = M", "weighted": f"W diagonal, {metric.source or 'given'}"}
-    units = unit_slices(robot)
     return {
-        "title": f"Impact-robustness metric of {robot.name} at {contact.frame}",
+        "title": f"Impact-robustness metric of {robot.name} at {', '.join(frames)}",
+        "frames_text": ("frame " if len(frames) == 1 else "frames ") + ", ".join(f"`{f}`" for f in frames),
         "version": __version__,
         "prefix": prefix,
         "upper": prefix.upper(),
+        "real": real.name,
+        "stack": str(manifest["stack_bytes"]),
+        "tolerance": f"{self_test_tolerance(objective, real):g}",
         "robot": robot.name,
         "sha": robot.model_sha256,
-        "frame": contact.frame,
-        "offset": ", ".join(f"{v:.9g}" for v in contact.offset),
-        "normal": ", ".join(f"{v:.9g}" for v in contact.normal),
-        "normal_axes": (
-            "world axes" if contact.normal_frame == "world" else f"the axes of contact frame {contact.frame}"
-        ),
         "metric": f"{metric.kind} ({weights[metric.kind]})",
         "objective": objective.name,
         "units": objective.units,
@@ -96,8 +154,8 @@ def _facts(objective: ImpactObjective, prefix: str, manifest: dict[str, Any]) ->
         ),
         "convention": robot.convention,
         "unit_rule": (
-            "a quaternion or a cosine-sine pair in q is not of unit norm (to 1e-6)"
-            if units
+            f"a quaternion or a cosine-sine pair in q is not of unit norm (to {real.unit_tolerance:g})"
+            if unit_slices(robot)
             else "never (this robot's q holds no quaternion and no cosine-sine pair)"
         ),
         "nq": str(manifest["nq"]),
@@ -105,29 +163,52 @@ def _facts(objective: ImpactObjective, prefix: str, manifest: dict[str, Any]) ->
     }
 
 
-def _unit_checks(objective: ImpactObjective) -> str:
+def _frame_facts(objective: ImpactObjective, stem: str, *, alone: bool) -> dict[str, str]:
+    contact = objective.contact
+    return {
+        "stem": stem,
+        "at": "" if alone else f" at {contact.frame}",
+        "stem_note": "" if alone else f": {stem}_...",
+        "frame": contact.frame,
+        "offset": ", ".join(f"{v:.9g}" for v in contact.offset),
+        "normal": ", ".join(f"{v:.9g}" for v in contact.normal),
+        "normal_axes": (
+            "world axes" if contact.normal_frame == "world" else f"the axes of contact frame {contact.frame}"
+        ),
+    }
+
+
+def _unit_checks(objective: ImpactObjective, real: Real) -> str:
     sums = [" + ".join(f"q[{k}] * q[{k}]" for k in range(s.start, s.stop)) for s in unit_slices(objective.robot)]
-    checks = "".join(templates.UNIT_CHECK.substitute(sum=text) for text in sums)
-    return f"  double s;\n{checks}" if checks else ""
+    bounds = [real.literal(float(f"{(1 + sign * real.unit_tolerance) ** 2:.12f}")) for sign in (-1, 1)]
+    checks = "".join(templates.UNIT_CHECK.substitute(sum=text, low=bounds[0], high=bounds[1]) for text in sums)
+    return f"  {real.name} s;\n{checks}" if checks else ""
 
 
-def _code(objective: ImpactObjective, prefix: str) -> tuple[str, str]:
-    """The static functions that hold the numbers' work, and the body of ``<prefix>_objective``."""
-    metric = objective.metric_fun()
-    q, n = metric.sx_in()
-    # The graph of H alone drops what only the gradient needs.
-    H = metric.call([q, n])[0]
+def _references(test: dict[str, Any], real: Real) -> dict[str, str]:
+    """The self-test's numbers: inputs in the export's type and twice, for a batch; references in double."""
+    found = {key: c_vector([*test[key], *test[key]], "  ", real) for key in ("q", "n")}
+    found |= {key: c_vector(test[key]) for key in ("grad", "objective_grad", "jump", "ellipsoid")}
+    return found | {key: c_double(test[key]).strip("()") for key in ("H", "objective", "G", "V")}
+
+
+def _eigen(objective: ImpactObjective, facts: dict[str, str], test: dict[str, Any], real: Real) -> str:
+    world = objective.contact.normal_frame == "world"
+    lists = {f"{key}_list": ", ".join(real.literal(v) for v in test[key]) for key in ("q", "n")}
+    claim = project.EXAMPLE_CPP_CLAIM.substitute(facts) if world else ""
+    return project.EXAMPLE_CPP.substitute(facts | lists, claim=claim)
+
+
+def _bodies(objective: ImpactObjective, prefix: str, stem: str, real: Real) -> tuple[list[str], str]:
+    """The static functions that hold the numbers' work, and the body of ``<stem>_objective``."""
     bodies = [
-        emit_function(f"{prefix}_eval_body", metric),
-        emit_function(f"{prefix}_value_body", ca.Function("value", [q, n], [H], ["q", "n"], ["H"], {"cse": True})),
+        emit_function(f"{stem}_eval_body", objective.metric_fun(), real),
+        emit_function(f"{stem}_jump_body", jump_fun(objective), real),
+        emit_function(f"{stem}_ellipsoid_body", ellipsoid_fun(objective), real),
     ]
-    normal = c_vector(objective.contact.normal)
-    nv = objective.robot.nv
+    names = {"prefix": prefix, "stem": stem, "real": real.name, "nv": objective.robot.nv}
     if objective.name == "impulse":
-        scale = c_double(objective.scale)
-        call = templates.OBJECTIVE_SCALED.substitute(prefix=prefix, nv=nv, normal=normal, scale=scale)
-        return "\n".join(bodies), call
-    fixed = objective.gradient_fun().call([q, ca.DM(objective.contact.normal)])
-    function = ca.Function("objective", [q], fixed, ["q"], ["value", "grad"], {"cse": True})
-    bodies.append(emit_function(f"{prefix}_objective_body", function))
-    return "\n".join(bodies), templates.OBJECTIVE_BODY.substitute(prefix=prefix, nv=nv)
+        normal, scale = c_vector(objective.contact.normal, real=real), real.literal(objective.scale)
+        return bodies, templates.OBJECTIVE_SCALED.substitute(names, normal=normal, scale=scale)
+    bodies.append(emit_function(f"{stem}_objective_body", objective_fun(objective), real))
+    return bodies, templates.OBJECTIVE_BODY.substitute(names)

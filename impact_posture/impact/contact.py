@@ -50,7 +50,7 @@ class Contact:
             ContactError: Zero or non-finite normal, offset or impulse.
         """
         n = np.array(normal, dtype=float)
-        if n.shape != (3,) or not np.isfinite(n).all() or np.linalg.norm(n) < 1e-9:
+        if n.shape != (3,) or not np.isfinite(n).all() or not n.any():
             raise ContactError(
                 f"the normal {tuple(normal)} has no direction",
                 where="--normal",
@@ -60,6 +60,7 @@ class Contact:
             raise ContactError("the offset is not finite", where="--offset", mend="give three numbers")
         if not (np.isfinite(impulse) and impulse > 0):
             raise ContactError(f"the impulse bound is {impulse:g}", where="--impulse", mend="give N·s above zero")
+        n = n / np.abs(n).max()  # first: any length must do, and squares overflow
         n = n / np.linalg.norm(n)
         x, y, z = (float(v) for v in n)
         return Contact(frame, (x, y, z), tuple(float(v) for v in offset), normal_frame, float(impulse))  # type: ignore[arg-type]

@@ -12,7 +12,11 @@ so that every function is linear or quadratic in the auxiliaries and the exact H
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -107,10 +111,34 @@ class PostureNLP:
 
 def run_solver(solver: ca.Function, **arguments: Vector) -> dict[str, ca.DM]:
     """Call an ``nlpsol``; a Ctrl-C that IPOPT caught goes on as one."""
-    answer: dict[str, ca.DM] = solver(**arguments)
-    if solver.stats()["return_status"] == "User_Requested_Stop":
-        raise KeyboardInterrupt
+    with _noticing_interrupts():
+        answer: dict[str, ca.DM] = solver(**arguments)
     return answer
+
+
+@contextmanager
+def _noticing_interrupts() -> Iterator[None]:
+    """Raise a Ctrl-C after the solver where the solver took it for a failed evaluation and went on."""
+    in_charge = (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
+    if not in_charge:
+        yield
+        return
+    seen: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        seen.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if seen:
+        raise KeyboardInterrupt
 
 
 def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts: int = 1) -> PostureNLP:

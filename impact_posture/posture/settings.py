@@ -25,7 +25,8 @@ _FILES = ("srdf", "config")
 class ProblemSettings(BaseModel):
     """The content of a ``problem.toml``; what is ``None`` comes from the robot or is the option's default."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    # Strict: a number in quotes or a true for 1 is a slip, not a value.
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     schema_: Literal["impact-posture/problem/1"] = Field(default="impact-posture/problem/1", alias="schema")
     robot: str
@@ -106,7 +107,11 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
         data.pop("normal", None)
     if "posture" in over:
         data.pop("q", None)
-    return validate(ProblemSettings, data | over, str(path))
+    return validate(ProblemSettings, {key: _tuples(value) for key, value in (data | over).items()}, str(path))
+
+
+def _tuples(value: object) -> object:
+    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
 
 
 def make_settings(values: dict[str, object]) -> ProblemSettings:

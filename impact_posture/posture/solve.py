@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ContactError, Infeasible, MetricError, SolverFailed
 from impact_posture.posture.certificate import Certificate, certify
@@ -29,6 +30,8 @@ Progress = Callable[[int, int], None]
 
 # Optima closer than this in posture (tangent norm) and in objective (relative) are one.
 _SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
+# The share of the initial 1/mass below which a contact counts as locked, and the starts from which one hit is few.
+_LOCKED, _MANY = 0.05, 8
 
 
 @dataclass(frozen=True)
@@ -137,6 +140,8 @@ def solve(
         notes.append("no redundancy left: this is the best of separate postures that the constraints allow")
     elif best.objective > scale * (1 - 1e-6):
         notes.append("no better posture found: the initial one is already (locally) optimal for this blow")
+    optima = distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None])
+    notes += _notes_on_answer(problem, initial, q, optima)
     return PostureSolution(
         problem=problem,
         initial=initial,
@@ -144,7 +149,7 @@ def solve(
         q=q,
         certificate=certificate,
         redundancy=redundancy,
-        optima=distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None]),
+        optima=optima,
         starts=starts,
         feasible_starts=sum(r.start is not None for r in runs),
         certified_starts=len(good),
@@ -278,12 +283,40 @@ def distinct(problem: PostureProblem, ends: list[tuple[Vector, float]]) -> tuple
     for q, objective in sorted(ends, key=lambda end: end[1]):
         for k, known in enumerate(found):
             near = abs(objective - known.objective) <= _SAME_OBJECTIVE * max(abs(known.objective), 1e-300)
-            if near and np.linalg.norm(pin.difference(problem.robot.model, known.q, q)) < _SAME_POSTURE:
+            if near and np.linalg.norm(_wrapped_difference(problem, known.q, q)) < _SAME_POSTURE:
                 found[k] = Optimum(known.q, known.objective, known.hits + 1)
                 break
         else:
             found.append(Optimum(q, objective, 1))
     return tuple(found)
+
+
+def _wrapped_difference(problem: PostureProblem, one: Vector, other: Vector) -> Vector:
+    """``other ⊖ one`` with full turns of revolute joints taken out."""
+    step = np.array(pin.difference(problem.robot.model, one, other))
+    for slot in Chart(problem.robot.model).slots:
+        if slot.kind.family == "revolute":
+            step[slot.v] = (step[slot.v] + np.pi) % (2 * np.pi) - np.pi
+    return step
+
+
+def _notes_on_answer(problem: PostureProblem, initial: Vector, q: Vector, optima: tuple[Optimum, ...]) -> list[str]:
+    """What numbers alone would not tell a user."""
+    notes = []
+    found = problem.objective.oracle
+    before, after = found.quantities(initial).G, found.quantities(q).G
+    if after < _LOCKED * before:
+        notes.append(
+            "the contact is nearly locked along the normal there: its effective mass is "
+            f"{before / max(after, 1e-300):.3g} times that of the start, and so is the impulse at a given approach "
+            "speed; compare V and S, or minimize them (--objective speed, sticking)"
+        )
+    if len(optima) > 1 and optima[0].hits == 1 and sum(o.hits for o in optima) >= _MANY:
+        notes.append(
+            f"the best of {len(optima)} optima was found once in {sum(o.hits for o in optima)} starts: "
+            "more --starts may find a better one"
+        )
+    return notes
 
 
 def _failure(runs: list[_Run]) -> SolverFailed:

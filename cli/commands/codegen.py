@@ -1,0 +1,131 @@
+"""``impact-posture codegen ROBOT --frame F --normal X Y Z`` or ``impact-posture codegen RESULT_DIR``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from impact_posture_cli import options
+from impact_posture_cli.checks import UsageError
+
+if TYPE_CHECKING:
+    from impact_posture.impact.objective import ImpactObjective
+
+# What a result folder leaves to be said.
+_FREE = {"robot", "prefix", "out", "float_", "compile", "force", "json", "quiet"}
+
+RobotOrResult = Annotated[
+    str,
+    typer.Argument(
+        metavar="ROBOT|RESULT_DIR",
+        help="Known name, path to a .urdf, example-robot-data:PATH, or a folder that optimize wrote.",
+    ),
+]
+
+
+def codegen(
+    context: typer.Context,
+    robot: RobotOrResult,
+    frame: options.FrameList = None,
+    normal: options.Normal = None,
+    offset: options.Offset = None,
+    normal_frame: options.NormalAxes = "world",
+    contact: options.ContactText = None,
+    impulse: options.Impulse = 1.0,
+    metric: options.MetricName = "euclidean",
+    weights: options.Weights = None,
+    objective: options.ObjectiveName = "impulse",
+    support: options.SupportList = None,
+    no_support: options.NoSupport = False,
+    lock: options.Lock = None,
+    root: options.Root = None,
+    armature: options.Armature = None,
+    config: options.Config = None,
+    srdf: options.Srdf = None,
+    package_dir: options.PackageDirs = None,
+    prefix: options.Prefix = None,
+    out: options.ExportOut = None,
+    float_: options.Float = False,
+    compile: options.CompileLibrary = False,
+    force: options.Force = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Write the metric and its gradient as C code for a controller."""
+    from_result = (Path(robot) / "result.json").is_file()
+    if from_result:
+        _refuse_options(context)
+    else:
+        options.check_contact(frame[0] if frame else None, normal, contact)
+    supports = options.check_supports(support, no_support)
+    from impact_posture.codegen.folder import write_export
+    from impact_posture_cli.output import Page, print_json
+
+    posture = None
+    objectives: list[ImpactObjective]
+    warnings: tuple[str, ...] = ()
+    if from_result:
+        from impact_posture.job import load_view
+
+        view = load_view(Path(robot))
+        objectives, posture = [view.objective], view.q_optimal
+    else:
+        from impact_posture.impact.request import ImpactRequest
+        from impact_posture_cli.asked import load_options
+
+        load = load_options(
+            root=root, package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock
+        )
+        objectives = []
+        frames: list[str | None] = [*frame] if frame else [None]
+        for one in frames:
+            request = ImpactRequest(
+                robot=robot, load=load, frame=one, normal=normal, offset=offset, normal_frame=normal_frame,
+                contact=contact, impulse=impulse, supports=supports, metric=metric, weights=weights,
+                objective=objective,
+            )  # fmt: skip
+            impact = request.resolve()
+            objectives.append(impact.objective)
+            warnings = impact.warnings
+    written = write_export(
+        objectives,
+        Path(out) if out else None,
+        prefix=prefix,
+        posture=posture,
+        single=float_,
+        build=compile,
+        force=force,
+    )
+    if json:
+        print_json(written.to_dict())
+        return
+    page = Page(quiet=quiet)
+    page.warnings(warnings)
+    where = ", ".join(o.contact.frame for o in objectives)
+    page.title(f"{objectives[0].robot.name} at {where}", f"objective {objectives[0].name}")
+    page.pairs(
+        [
+            ("folder", str(written.out)),
+            ("functions", ", ".join(written.functions)),
+            ("posture", "the result's optimum" if posture is not None else "none"),
+            ("numbers", written.export.manifest["real"]),
+            ("stack", f"at most {written.export.manifest['stack_bytes']} bytes"),
+        ]
+    )
+    page.line(written.verdict)
+
+
+def _refuse_options(context: typer.Context) -> None:
+    """A result folder says what the problem is: options that say it otherwise are a mistake."""
+    given: list[Any] = [
+        name
+        for name in context.params
+        if name not in _FREE
+        and (source := context.get_parameter_source(name)) is not None
+        and source.name == "COMMANDLINE"
+    ]
+    if given:
+        option = f"--{given[0].replace('_', '-')}"
+        raise UsageError(f"{option} contradicts RESULT_DIR, which says what the problem is: leave it out.")

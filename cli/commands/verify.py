@@ -1,0 +1,127 @@
+"""``impact-posture verify ROBOT``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from impact_posture_cli import options
+from impact_posture_cli.checks import Three, direction
+
+if TYPE_CHECKING:
+    from impact_posture.impact.request import ResolvedImpact
+    from impact_posture.verification.report import Row, VerificationReport
+
+NormalOfFirst = Annotated[
+    Three | None,
+    typer.Option(
+        "--normal", metavar="X Y Z", callback=direction, rich_help_panel=options.CONTACT,
+        show_default="0 0 1", help="Normal of the first sample; the others' are random.",
+    ),
+]  # fmt: skip
+Samples = Annotated[
+    int,
+    typer.Option("--samples", min=1, rich_help_panel=options.OUTPUT, help="Random postures and normals."),
+]
+SampleSeed = Annotated[
+    int, typer.Option("--seed", min=0, rich_help_panel=options.OUTPUT, help="Seed of the random samples.")
+]
+
+
+def verify(
+    robot: options.RobotName,
+    frame: options.Frame = None,
+    normal: NormalOfFirst = None,
+    offset: options.Offset = None,
+    normal_frame: options.NormalAxes = "world",
+    contact: options.ContactText = None,
+    metric: options.MetricName = "euclidean",
+    weights: options.Weights = None,
+    support: options.SupportList = None,
+    no_support: options.NoSupport = False,
+    lock: options.Lock = None,
+    root: options.Root = None,
+    armature: options.Armature = None,
+    config: options.Config = None,
+    srdf: options.Srdf = None,
+    package_dir: options.PackageDirs = None,
+    samples: Samples = 10,
+    seed: SampleSeed = 0,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Compute H, G, Λ_c and ∇H in every way there is and compare: pass or fail."""
+    from impact_posture_cli.asked import impact_request
+
+    if contact is None and normal is None:
+        normal = (0.0, 0.0, 1.0)
+    request = impact_request(
+        robot, frame=frame, normal=normal, offset=offset, normal_frame=normal_frame, contact=contact, impulse=1.0,
+        posture=None, support=support, no_support=no_support, metric=metric, weights=weights, objective="impulse",
+        speed=1.0, restitution=0.0, root=root, package_dir=package_dir, srdf=srdf, config=config,
+        armature=armature, lock=lock,
+    )  # fmt: skip
+    from impact_posture.verification.verify import verify as verify_objective
+    from impact_posture_cli.output import Page, print_json
+
+    impact = request.resolve()
+    with _progress(shown=not (quiet or json)) as progress:
+        report = verify_objective(impact.objective, samples, seed, progress)
+    if json:
+        asked = {key: value for key, value in impact.to_dict().items() if key != "metric"}
+        measure = {"name": impact.metric.kind, "weights": impact.metric.weights}
+        document = {"schema": "impact-posture/verification/1", **asked, "metric": measure, **report.to_dict()}
+        print_json(document | {"warnings": list(impact.warnings)})
+    else:
+        page = Page(quiet=quiet)
+        _asked(page.title, impact, report)
+        page.table(
+            ("way", "", "largest error", "allowed", "", "where"),
+            [_cells(row) for row in report.rows],
+            right=(2, 3),
+            fold=5,
+        )
+        page.warnings(impact.warnings)
+    if not report.passed:
+        failed = [row for row in report.rows if row.verdict == "fail"]
+        named = ", ".join(" ".join(filter(None, (row.source, row.quantity))) for row in failed)
+        sys.stderr.write(f"error: {impact.robot.name}: other numbers than Pinocchio's: {named}; please report it\n")
+        raise typer.Exit(1)
+
+
+def _asked(title: Callable[[str, str], None], impact: ResolvedImpact, report: VerificationReport) -> None:
+    feet = f", standing on {len(impact.supports)}" if impact.supports else ""
+    count = len(report.samples)
+    title(
+        f"{impact.robot.name} at {impact.contact.frame}{feet}",
+        f"against Pinocchio at {count} random posture{'s' if count > 1 else ''}, seed {report.seed}",
+    )
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    if row.tolerance is None:
+        return row.source, "", "", "", row.verdict, row.note
+    error = row.note if row.error is None else f"{row.error:.1e}"
+    where = ", ".join(filter(None, (f"sample {row.sample}", row.entry)))
+    return row.source, row.quantity, error, f"{row.tolerance:.0e}", row.verdict, where
+
+
+@contextmanager
+def _progress(*, shown: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """A bar on standard error."""
+    if not shown:
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    bar = Progress(
+        TextColumn("comparing"), BarColumn(), TimeElapsedColumn(), console=Console(stderr=True), transient=True
+    )
+    with bar:
+        task = bar.add_task("comparing", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

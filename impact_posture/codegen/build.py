@@ -1,0 +1,50 @@
+"""An export's shared library: where it is and how it is built.  Needs no CasADi."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from impact_posture.errors import CompilerError, OutputError
+from impact_posture.toolchain import find_compiler, run_compiler
+
+FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared")
+GET_ONE = "install gcc or clang, or set CC"
+
+
+def library_path(folder: Path, prefix: str) -> Path:
+    """``lib<prefix>.so`` in the export's folder."""
+    return folder / f"lib{prefix}.so"
+
+
+def build_library(folder: Path, prefix: str, target: Path | None = None, extra_flags: tuple[str, ...] = ()) -> Path:
+    """Compile ``<prefix>.c`` in ``folder`` into a shared library; it appears whole or not at all.
+
+    Args:
+        folder: The export.
+        prefix: Its prefix.
+        target: Where to; ``lib<prefix>.so`` beside the source by default.
+        extra_flags: For the compiler, after :data:`FLAGS`.
+
+    Raises:
+        CompilerError: No compiler, or it failed: its first error line and the command.
+        OutputError: The library cannot be put there.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise CompilerError("no C compiler found", where="codegen", mend=GET_ONE)
+    target = library_path(folder, prefix) if target is None else target
+    # In the same folder, so that the rename is one step; by process, so that two builds do not meet.
+    beside = target.with_name(f".{target.name}.{os.getpid()}.part")
+    command = [*compiler, *FLAGS, *extra_flags, f"{prefix}.c", "-o", str(beside.absolute()), "-lm"]
+    try:
+        run_compiler(command, folder)
+        os.replace(beside, target)
+    except OSError as error:
+        mend = "check the disk and permissions"
+        raise OutputError(f"cannot be written ({error.strerror})", where=str(target), mend=mend) from None
+    finally:
+        with suppress(OSError):
+            beside.unlink()
+    return target

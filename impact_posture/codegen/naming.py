@@ -1,0 +1,59 @@
+"""What the C names of an export are; needs nothing but the names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from impact_posture.errors import InputError
+
+_IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+FUNCTIONS = ("eval", "objective", "value", "jump", "ellipsoid", "eval_batch")
+"""What each frame of an export has, as ``<stem>_<function>``."""
+
+
+def c_identifier(robot: str, frame: str) -> str:
+    """Robot and frame as one C identifier: what is no letter, digit or underscore becomes an underscore."""
+    text = _plain(f"{robot}_{frame}")
+    return text if _IDENTIFIER.fullmatch(text) else f"robot_{text}".rstrip("_")
+
+
+def check_prefix(prefix: str) -> str:
+    """Return a prefix that C takes.
+
+    Raises:
+        InputError: It is no C identifier, or the example's file name.
+    """
+    if not _IDENTIFIER.fullmatch(prefix):
+        raise InputError(
+            f"the prefix '{prefix}' is no C identifier",
+            where="--prefix",
+            mend=f"letters, digits and underscores, a letter first, such as {c_identifier(prefix, '')}",
+        )
+    if prefix.lower() == "example":
+        raise InputError("the prefix 'example' is taken by example.c", where="--prefix", mend="choose another")
+    return prefix
+
+
+def stems(prefix: str, frames: Sequence[str]) -> tuple[str, ...]:
+    """What the functions of each frame begin with: the prefix alone for one frame, else prefix and frame.
+
+    Raises:
+        InputError: Two frames that are one, or the same as C identifiers.
+    """
+    if len(frames) == 1:
+        return (prefix,)
+    found: dict[str, str] = {}
+    for frame in frames:
+        stem = f"{prefix}_{_plain(frame)}"
+        if stem in found:
+            other = found[stem]
+            what = f"'{frame}' is given twice" if other == frame else f"'{other}' and '{frame}' are one name in C"
+            raise InputError(what, where="--frame", mend="give each frame once, or export one by one")
+        found[stem] = frame
+    return tuple(found)
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"_{2,}", "_", re.sub(r"[^A-Za-z0-9]", "_", text)).strip("_")

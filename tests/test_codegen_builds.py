@@ -1,0 +1,313 @@
+"""The export over joint types, metrics, objectives and number types; its builds by others; its folder and command."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+import subprocess
+import sys
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impact_posture.codegen.compiler import casadi_difference, compiled, oracle_difference, self_test_tolerance
+from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real, count_locals
+from impact_posture.codegen.export import export
+from impact_posture.codegen.folder import write_export
+from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.manifest import sample_postures
+from impact_posture.errors import CompilerError, InputError, OutputError
+from impact_posture.impact.contact import Contact
+from impact_posture.impact.metric import Metric
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.toolchain import find_compiler, run_compiler
+
+COMMAND = Path(sys.executable).parent / "impact-posture"
+STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
+
+JOINTS = [
+    ("revolute", "1 0 0"), ("revolute", "0.6 0 0.8"), ("prismatic", "0 1 0"), ("prismatic", "0 -0.6 0.8"),
+    ("continuous", "0 0 1"), ("continuous", "0.6 0.8 0"), ("planar", "0 0 1"), ("floating", "0 0 1"),
+]  # fmt: skip
+
+
+def chain() -> str:
+    """A robot with every joint that a URDF can have."""
+    inertial = (
+        '<inertial><origin xyz="0.05 0.02 -0.03" rpy="0.1 0.2 0.3"/><mass value="{m}"/>'
+        '<inertia ixx="0.02" ixy="0.001" ixz="0" iyy="0.03" iyz="-0.002" izz="0.025"/></inertial>'
+    )
+    parts = [f'<link name="l0">{inertial.format(m=3)}</link>']
+    for k, (kind, axis) in enumerate(JOINTS):
+        parts.append(f'<link name="l{k + 1}">{inertial.format(m=1.5 - 0.1 * k)}</link>')
+        limit = '<limit lower="-2" upper="2" effort="10" velocity="3"/>' if kind in ("revolute", "prismatic") else ""
+        parts.append(
+            f'<joint name="j{k}" type="{kind}"><parent link="l{k}"/><child link="l{k + 1}"/>'
+            f'<origin xyz="0.1 {0.03 * k} 0.15" rpy="{0.2 * k} 0.1 -0.3"/><axis xyz="{axis}"/>{limit}</joint>'
+        )
+    return f'<robot name="chain">{"".join(parts)}</robot>'
+
+
+def need_compiler() -> list[str]:
+    compiler = find_compiler()
+    if compiler is None:
+        pytest.skip("no C compiler (cc, gcc, clang)")
+    return compiler
+
+
+def need(tool: str) -> str:
+    path = shutil.which(tool)
+    if path is None:
+        pytest.skip(f"no {tool}")
+    return path
+
+
+def run(command: list[str], folder: Path) -> str:
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+GRID = [
+    (metric, kind, ("fixed", "free-flyer")[(i + j) % 2], (DOUBLE, FLOAT)[(i + j // 2) % 2])
+    for (i, metric), (j, kind) in itertools.product(
+        enumerate(("euclidean", "weighted", "kinetic")), enumerate(("impulse", "speed", "sticking", "energy"))
+    )
+]
+
+
+@pytest.mark.parametrize(("metric", "kind", "root", "real"), GRID, ids=lambda v: getattr(v, "name", v))
+def test_every_joint_type_metric_and_objective(tmp_path: Path, metric: Any, kind: Any, root: Any, real: Real) -> None:
+    need_compiler()
+    (tmp_path / "chain.urdf").write_text(chain())
+    robot = load_robot(str(tmp_path / "chain.urdf"), LoadOptions(root=root))
+    families = {robot.model.joints[i].shortname() for i in range(1, robot.model.njoints)}
+    assert len(families) == 8
+    weights = tuple(np.linspace(0.5, 2.0, robot.nv)) if metric == "weighted" else None
+    objective = ImpactObjective(
+        robot, Contact.create("l8", (1.0, 0.3, -0.2), (0.02, 0, 0.1), impulse=1.3), Metric(metric, weights), kind
+    )
+    written = export(objective, tmp_path, prefix="chain", real=real, check=False)
+    with compiled(tmp_path, "chain", robot.nq, robot.nv, ("-O0", *STRICT), real) as library:
+        tolerance = 1e-11 if real is DOUBLE else self_test_tolerance(objective, real)
+        assert casadi_difference(library, objective, 5) <= tolerance
+        assert oracle_difference(library, objective, 5) <= max(tolerance, 1e-10)
+    assert written.manifest["real"] == real.name
+
+
+@pytest.fixture(scope="module")
+def arm() -> ImpactObjective:
+    return ImpactObjective(load_robot("tilthex_arm"), Contact.create("ee", (0, 0.6, 0.8)))
+
+
+@pytest.fixture(scope="module")
+def two(arm: ImpactObjective) -> tuple[ImpactObjective, ImpactObjective]:
+    return arm, ImpactObjective(arm.robot, Contact.create("base_link", (1, 0, 0)), arm.metric)
+
+
+# ---- other people's builds ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda r: r.name)
+def test_several_frames_in_one_library(two: tuple[ImpactObjective, ...], tmp_path: Path, real: Real) -> None:
+    make = need("make")
+    need_compiler()
+    written = export(two, tmp_path, prefix="two", real=real)
+    assert written.compiled
+    assert [b["symbols"]["eval"] for b in written.manifest["frames"]] == ["two_ee_eval", "two_base_link_eval"]
+    run([make, "-s", "CFLAGS=-O1 -Wall -Wextra -Werror"], tmp_path)
+    said = run(["./example"], tmp_path)
+    assert "two_ee: H" in said and "two_base_link: H" in said and "agrees" in said
+    source = (tmp_path / "two.c").read_text()
+    assert ("double" in source) == (real is DOUBLE)
+    assert ("sinf(" in source) == (real is FLOAT)
+
+
+def test_frames_must_differ_in_the_contact_alone(two: tuple[ImpactObjective, ...], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="given twice"):
+        export([two[0], two[0]], tmp_path, prefix="x")
+    other = ImpactObjective(two[0].robot, two[1].contact, Metric("kinetic"))
+    with pytest.raises(InputError, match="differ in more than the contact"):
+        export([two[0], other], tmp_path, prefix="x")
+    with pytest.raises(InputError, match="no objective"):
+        export([], tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda r: r.name)
+def test_stack_stays_below_its_bound(arm: ImpactObjective, tmp_path: Path, real: Real) -> None:
+    compiler = need_compiler()
+    bound = export(arm, tmp_path, prefix="arm", real=real, check=False).manifest["stack_bytes"]
+    assert f"#define ARM_STACK_BYTES {bound}\n" in (tmp_path / "arm.h").read_text()
+    assert f"at most {bound} bytes" in (tmp_path / "README.md").read_text()
+    assert bound > real.size * count_locals((tmp_path / "arm.c").read_text()) / 4
+    for flags in (("-O0",), ("-O2",), ("-O3", "-march=native")):
+        command = [*compiler, "-std=c99", *flags, "-fstack-usage", "-c", "arm.c", "-o", str(tmp_path / "arm.o")]
+        try:
+            run_compiler(command, tmp_path)
+        except CompilerError:
+            pytest.skip(f"{compiler[0]} does not know -fstack-usage or -march=native")
+        rows = [line.split("\t") for line in (tmp_path / "arm.su").read_text().splitlines()]
+        # "dynamic,bounded" is an aligned frame; "dynamic" alone would be an alloca.
+        assert {row[2] for row in rows} <= {"static", "dynamic,bounded"}
+        # The deepest call: a wrapper, what it wraps, its body, the check.
+        assert sum(sorted(int(row[1]) for row in rows)[-2:]) <= bound, flags
+
+
+@pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda r: r.name)
+def test_example_for_eigen(arm: ImpactObjective, tmp_path: Path, real: Real) -> None:
+    make, _ = need("make"), need("g++")
+    need_compiler()
+    spec = util.find_spec("casadi")
+    bundled = Path(spec.origin).parent / "include" / "eigen3" if spec is not None and spec.origin else Path()
+    folders = [p for p in (bundled, Path("/usr/include/eigen3"), Path("/usr/local/include/eigen3")) if p.is_dir()]
+    if not any((p / "Eigen" / "Core").is_file() for p in folders):
+        pytest.skip("no Eigen headers")
+    export(arm, tmp_path, prefix="arm", real=real, check=False)
+    flags = ["CXX=g++", "CXXFLAGS=-O0 -Wall -Wextra -Werror", "CFLAGS=-O0", f"EIGEN={folders[0]}"]
+    run([make, "-s", "example_cpp", *flags], tmp_path)
+    assert "H = " in run(["./example_cpp"], tmp_path)
+
+
+def test_cmake_install_and_find_package(arm: ImpactObjective, tmp_path: Path) -> None:
+    cmake = need("cmake")
+    need_compiler()
+    source, user = tmp_path / "c", tmp_path / "user"
+    source.mkdir(), user.mkdir()
+    export(arm, source, prefix="Arm_C", posture=arm.robot.posture(), check=False)
+    run([cmake, "-S", ".", "-B", "build", f"-DCMAKE_INSTALL_PREFIX={tmp_path / 'there'}"], source)
+    run([cmake, "--build", "build", "--target", "install"], source)
+    (user / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.16)\nproject(controller C)\nfind_package(Arm_C REQUIRED)\n"
+        "add_executable(controller main.c)\ntarget_link_libraries(controller PRIVATE Arm_C::Arm_C)\n"
+    )
+    (user / "main.c").write_text(
+        "#include <Arm_C.h>\n"
+        "int main(void) { double v, g[ARM_C_NV]; return Arm_C_objective(Arm_C_posture, &v, g); }\n"
+    )
+    run([cmake, "-S", ".", "-B", "build", f"-DCMAKE_PREFIX_PATH={tmp_path / 'there'}"], user)
+    run([cmake, "--build", "build"], user)
+    run(["build/controller"], user)
+
+
+@pytest.fixture(scope="module")
+def plain_export(two: tuple[ImpactObjective, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("two")
+    export(two, folder, prefix="two", posture=two[0].robot.posture(), check=False)
+    return folder
+
+
+def test_example_under_valgrind(plain_export: Path, tmp_path: Path) -> None:
+    valgrind, compiler = need("valgrind"), need_compiler()
+    target = tmp_path / "example"
+    run_compiler([*compiler, "-std=c99", "-O0", "-g", "example.c", "two.c", "-o", str(target), "-lm"], plain_export)
+    said = run([valgrind, "--error-exitcode=9", "--leak-check=full", str(target)], tmp_path)
+    assert "ERROR SUMMARY: 0 errors" in said and "total heap usage: 1 allocs" in said  # printf's buffer
+
+
+def test_example_under_sanitizers(plain_export: Path, tmp_path: Path) -> None:
+    compiler, target = need_compiler(), tmp_path / "example"
+    flags = ["-std=c99", "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    try:
+        run_compiler([*compiler, *flags, "example.c", "two.c", "-o", str(target), "-lm"], plain_export)
+    except CompilerError as error:
+        pytest.skip(f"{compiler[0]} has no sanitizers: {error.what}")
+    assert "agrees" in run([str(target)], tmp_path)
+
+
+# ---- the folder ---------------------------------------------------------------------------------------------------
+
+
+def test_folder_is_replaced_only_if_it_is_an_export(arm: ImpactObjective, tmp_path: Path) -> None:
+    out = tmp_path / "project"
+    out.mkdir()
+    # A file called like a manifest makes no export of a folder.
+    (out / "arm.json").write_text('{"name": "mine"}')
+    for force in (False, True):
+        with pytest.raises(OutputError):
+            write_export([arm], out, prefix="arm", force=force)
+    assert [p.name for p in out.iterdir()] == ["arm.json"]
+    ours = tmp_path / "ours"
+    write_export([arm], ours, prefix="first")
+    with pytest.raises(OutputError, match="--force"):
+        write_export([arm], ours, prefix="second")
+    assert (ours / "first.c").is_file()
+    written = write_export([arm], ours, prefix="second", force=True)
+    assert sorted(p.name for p in ours.iterdir()) == sorted(p.name for p in written.export.files)
+
+
+def test_build_in_the_folder(arm: ImpactObjective, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    need_compiler()
+    written = write_export([arm], tmp_path / "c", prefix="arm", build=True, posture=arm.robot.posture())
+    assert written.library is not None and written.library.is_file()
+    q = sample_postures(arm.robot, 1, 31)[0]
+    H, _ = ImpactGradient.load(tmp_path / "c", robot=arm.robot).objective(q)
+    assert pytest.approx(arm.value(q), rel=1e-10) == H
+    monkeypatch.setenv("CC", need("false"))
+    with pytest.raises(CompilerError, match="command: "):
+        write_export([arm], tmp_path / "failed", prefix="arm", build=True)
+    assert (tmp_path / "failed" / "arm.c").is_file()
+    assert not list((tmp_path / "failed").glob("*.so"))
+    monkeypatch.delenv("CC")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    without = write_export([arm], tmp_path / "none", prefix="arm", build=True)
+    assert without.library is None and "install gcc or clang" in without.verdict
+    assert (tmp_path / "none" / "arm.c").is_file()
+
+
+# ---- the command --------------------------------------------------------------------------------------------------
+
+
+def call(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [str(COMMAND), "codegen", *arguments], cwd=folder, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def test_command_for_a_robot(tmp_path: Path) -> None:
+    need_compiler()
+    push = ("tilthex_arm", "--normal", "0", "0", "1", "--frame", "ee", "--frame", "base_link", "--prefix", "two")
+    done = call(tmp_path, *push, "--float", "--compile", "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document["library"] == "libtwo.so" and document["real"] == "float"
+    assert (tmp_path / "two-c" / "libtwo.so").is_file()
+    assert set(document["files"]) == {p.name for p in (tmp_path / "two-c").iterdir()} - {"libtwo.so"}
+    assert "two_ee_eval_batch" in document["functions"]
+    again = call(tmp_path, *push)
+    assert again.returncode == 1 and "exists" in again.stderr and again.stderr.count("\n") == 1
+
+
+def test_command_for_a_result(tmp_path: Path) -> None:
+    solve = ("tilthex_arm", "--normal", "0", "0", "1", "--objective", "speed", "--starts", "1", "--out", "r")
+    quick = ("--no-codegen", "--format", "png", "--compile", "never", "--jobs", "1")
+    run([str(COMMAND), "optimize", *solve, *quick], tmp_path)
+    done = call(tmp_path, "r", "--out", "c", "--quiet")
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "r" / "result.json").read_text())
+    manifest = json.loads(next((tmp_path / "c").glob("*.json")).read_text())
+    assert manifest["posture"] == result["optimal"]["q"]
+    assert manifest["objective"] == "speed"
+    assert manifest["model_sha256"] == result["robot"]["model_sha256"]
+    wrong = call(tmp_path, "r", "--metric", "kinetic")
+    assert wrong.returncode == 2 and "--metric contradicts RESULT_DIR" in wrong.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("tilthex_arm",), 2, "--normal"),
+        (("tilthexarm", "--normal", "0", "0", "1"), 1, "tilthex_arm"),
+        (("tilthex_arm", "--normal", "0", "0", "1", "--frame", "eee"), 1, "no frame 'eee'"),
+        (("tilthex_arm", "--normal", "0", "0", "1", "--prefix", "1x"), 1, "no C identifier"),
+    ],
+)
+def test_command_refuses(tmp_path: Path, arguments: tuple[str, ...], code: int, said: str) -> None:
+    done = call(tmp_path, *arguments)
+    assert done.returncode == code and said in done.stderr
+    assert not list(tmp_path.iterdir())
