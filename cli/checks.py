@@ -46,7 +46,7 @@ def direction(value: Three | None) -> Three | None:
     """Refuse what points nowhere."""
     if value is None:
         return None
-    if not all(math.isfinite(v) for v in value) or not any(value):
+    if not all(math.isfinite(v) for v in value) or max(abs(v) for v in value) < 1e-9:
         raise typer.BadParameter("give three finite numbers, not all zero")
     return value
 

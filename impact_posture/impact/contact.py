@@ -17,6 +17,9 @@ from impact_posture.robot.spec import SupportKind, SupportSpec, Vector3
 Vector = NDArray[np.float64]
 NormalFrame = Literal["world", "contact"]
 
+# A normal shorter than this is what rounding left of zero.
+_DUST = 1e-9
+
 
 @dataclass(frozen=True)
 class Contact:
@@ -50,7 +53,7 @@ class Contact:
             ContactError: Zero or non-finite normal, offset or impulse.
         """
         n = np.array(normal, dtype=float)
-        if n.shape != (3,) or not np.isfinite(n).all() or not n.any():
+        if n.shape != (3,) or not np.isfinite(n).all() or np.abs(n).max() < _DUST:
             raise ContactError(
                 f"the normal {tuple(normal)} has no direction",
                 where="--normal",
