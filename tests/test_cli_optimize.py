@@ -403,3 +403,12 @@ def test_surface_and_locking_are_warned_about(tmp_path: Path) -> None:
     assert any("check its sign" in w for w in json.loads(done.stdout)["warnings"])
     done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--out", "right", "--json", *FAST, cwd=tmp_path)
     assert not any("surface" in w for w in json.loads(done.stdout)["warnings"])
+
+
+def test_knees_below_the_ground_and_a_growing_jump_are_said(tmp_path: Path) -> None:
+    """The best posture of this quadruped folds two knees under its feet, and V rises while H falls."""
+    done = run("optimize", "anymal_c", "--normal", 0, 1, 0, "--json", "--no-codegen", "--format", "png", cwd=tmp_path)
+    document = json.loads(done.stdout)
+    assert document["optimal"]["V"] > document["initial"]["V"]
+    assert any("the jump grows" in note for note in document["notes"])
+    assert any("below the lowest foot" in warning for warning in document["warnings"])

@@ -5,14 +5,12 @@ from __future__ import annotations
 import ctypes
 import json
 import re
-import shutil
 import subprocess
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -24,7 +22,6 @@ from impact_posture.codegen.compiler import (
     compiled,
     oracle_difference,
 )
-from impact_posture.codegen.emitter import _OPERATIONS, c_double, emit_function
 from impact_posture.codegen.export import Export, export
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.naming import c_identifier
@@ -35,6 +32,7 @@ from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.loader import load_robot
 from impact_posture.toolchain import find_compiler, run_compiler
+from tests.tools import need, need_compiler
 
 KINOVA = "example-robot-data:kinova_description/robots/kinova.urdf"
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
@@ -92,20 +90,6 @@ class Built:
     export: Export
     library: CompiledExport
     folder: Path
-
-
-def need_compiler() -> list[str]:
-    compiler = find_compiler()
-    if compiler is None:
-        pytest.skip("no C compiler (cc, gcc, clang)")
-    return compiler
-
-
-def need(tool: str) -> str:
-    path = shutil.which(tool)
-    if path is None:
-        pytest.skip(f"no {tool}")
-    return path
 
 
 @pytest.fixture(scope="module", params=list(CASES))
@@ -498,52 +482,3 @@ def test_bad_folder_and_posture(pendulum: str, tmp_path: Path) -> None:
 
 def test_names_cannot_end_a_comment() -> None:
     assert plain("a*/ int x; /* \\ ??/ \n ü") == "a_/ int x; /_ _ __/ _ _"
-
-
-# ---- the emitter --------------------------------------------------------------------------------------------------
-
-
-def test_every_operation_of_the_emitter(tmp_path: Path) -> None:
-    compiler = need_compiler()
-    x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
-    a, b = x[0], x[1]
-    values = [
-        a + b, a - b, a * b, a / b, -a, a**2, 2 * a, 1 / b, ca.exp(a), ca.log(b), b**a, b**2.5, ca.sqrt(b),
-        ca.sin(a), ca.cos(a), ca.tan(a), ca.asin(x[2]), ca.acos(x[2]), ca.atan(a), ca.atan2(a, b), ca.tanh(a),
-        ca.hypot(a, b), ca.fabs(a), ca.fmin(a, b), ca.fmax(a, b), ca.sign(a), a < b, a <= b, ca.eq(a, b),
-        ca.ne(a, b), ca.logic_not(a < b), ca.logic_and(a < b, b < 1), ca.logic_or(a > b, b > 1),
-        ca.if_else(a > b, a, b), a * -0.1, b + 1e-300, ca.SX(-3.5), ca.SX(0), ca.SX(np.inf),
-    ]  # fmt: skip
-    outputs = ca.sparsify(ca.vertcat(*values))
-    function = ca.Function("f", [x, y], [outputs, ca.sin(a) * b], ["x", "y"], ["out", "extra"])
-    used = {function.instruction_id(k) for k in range(function.n_instructions())}
-    assert set(_OPERATIONS) - used <= {ca.OP_ASSIGN}
-    text = "#include <math.h>\nvoid f(const double *, const double *, double *, double *);\n" + emit_function(
-        "f", function
-    ).removeprefix("static ")
-    (tmp_path / "f.c").write_text(text)
-    library = tmp_path / "f.so"
-    command = [*compiler, "-std=c99", *STRICT, "-O2", "-fPIC", "-shared", "f.c", "-o", str(library), "-lm"]
-    run_compiler(command, tmp_path)
-    call = ctypes.CDLL(str(library)).f
-    for point in ([0.3, 0.7, 0.5], [-0.4, 0.2, -0.9], [2.0, 2.0, 0.0], [1.5, 1.2, 1.0]):
-        found, extra = np.full(len(values), np.nan), np.full(1, np.nan)
-        arrays = [np.array(point), np.zeros(2), found, extra]
-        call(*[v.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for v in arrays])
-        expected = [np.array(v.full(), dtype=float).ravel() for v in function(point, [0, 0])]
-        np.testing.assert_allclose(found, expected[0], rtol=1e-14)
-        np.testing.assert_allclose(extra, expected[1], rtol=1e-14)
-
-
-def test_an_operation_that_has_no_c() -> None:
-    x = ca.SX.sym("x")
-    with pytest.raises(CompilerError, match="no C form"):
-        emit_function("f", ca.Function("f", [x], [ca.erf(x)], ["x"], ["y"]))
-
-
-@pytest.mark.parametrize("value", [0.1, -0.1, 1e-310, 1e22, -1 / 3, 5e-324, 1.7976931348623157e308, 0.0, -0.0])
-def test_literals_read_back_exactly(value: float) -> None:
-    text = c_double(value)
-    assert float(text.strip("()")) == value
-    assert np.signbit(float(text.strip("()"))) == np.signbit(value)
-    assert text.startswith("(") == bool(np.signbit(value))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import shutil
 import subprocess
 import sys
 from importlib import util
@@ -25,7 +24,8 @@ from impact_posture.impact.contact import Contact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.loader import LoadOptions, load_robot
-from impact_posture.toolchain import find_compiler, run_compiler
+from impact_posture.toolchain import run_compiler
+from tests.tools import need, need_compiler
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
@@ -51,20 +51,6 @@ def chain() -> str:
             f'<origin xyz="0.1 {0.03 * k} 0.15" rpy="{0.2 * k} 0.1 -0.3"/><axis xyz="{axis}"/>{limit}</joint>'
         )
     return f'<robot name="chain">{"".join(parts)}</robot>'
-
-
-def need_compiler() -> list[str]:
-    compiler = find_compiler()
-    if compiler is None:
-        pytest.skip("no C compiler (cc, gcc, clang)")
-    return compiler
-
-
-def need(tool: str) -> str:
-    path = shutil.which(tool)
-    if path is None:
-        pytest.skip(f"no {tool}")
-    return path
 
 
 def run(command: list[str], folder: Path) -> str:

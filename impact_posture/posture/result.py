@@ -12,15 +12,12 @@ from numpy.typing import NDArray
 
 from impact_posture import __version__
 from impact_posture.impact.evaluation import Evaluation, evaluate
+from impact_posture.posture.caveats import caveats
 from impact_posture.posture.path import NullSpacePath
 from impact_posture.posture.settings import Prepared
 from impact_posture.posture.solve import PostureSolution
-from impact_posture.robot.actuation import hover
 
 SCHEMA = "impact-posture/result/1"
-
-# A joint further than this behind the contact's plane, meters, is worth a word.
-_BEHIND = 0.01
 
 
 def evaluations(prepared: Prepared, solution: PostureSolution) -> tuple[Evaluation, Evaluation]:
@@ -36,8 +33,7 @@ def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, 
     impact = prepared.impact
     asked = impact.to_dict()
     contacts = [{**contact, "normal": [float(v) for v in initial.worst_normal]} for contact in asked["contacts"]]  # type: ignore[attr-defined]
-    warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *_hover_warnings(prepared, solution))
-    warnings += tuple(_surface_warnings(prepared, solution, initial, optimal))
+    warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *caveats(prepared, solution))
     return {
         "schema": SCHEMA,
         **asked,
@@ -74,62 +70,6 @@ def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, 
         "warnings": list(dict.fromkeys(warnings)),
         "versions": versions(),
     }
-
-
-def _hover_warnings(prepared: Prepared, solution: PostureSolution) -> list[str]:
-    """What keeps an aerial robot from hovering in the optimal posture."""
-    robot = prepared.impact.robot
-    if robot.spec.propulsion is None or not robot.floating:
-        return []
-    violations = hover(robot.model, robot.spec.propulsion, solution.q).violations
-    return [f"the robot cannot hover in the optimal posture: {violation}" for violation in violations]
-
-
-def _surface_warnings(
-    prepared: Prepared, solution: PostureSolution, initial: Evaluation, optimal: Evaluation
-) -> list[str]:
-    """Links whose origin lies behind the contact's plane: nothing keeps the robot on its side of the surface.
-
-    A push (a contact pose that is free) has no surface.
-    """
-    if prepared.problem.requirements.contact_pose == "free":
-        return []
-    behind = [
-        _links_behind(prepared, q, evaluation)
-        for q, evaluation in ((solution.initial, initial), (solution.q, optimal))
-    ]
-    lines = []
-    if behind[0]:
-        lines.append(
-            f"the initial posture has {_named(behind[0])} behind the surface: the normal points out of it, "
-            "towards the robot; check its sign"
-        )
-    new = [name for name in behind[1] if name not in behind[0]]
-    if new:
-        lines.append(
-            f"the optimal posture brings {_named(new)} behind the plane of the surface: it is not kept out of it; "
-            "bound the base or the joints if the surface reaches that far"
-        )
-    return lines
-
-
-def _links_behind(prepared: Prepared, q: NDArray[np.float64], evaluation: Evaluation) -> list[str]:
-    objective = prepared.impact.objective
-    oracle = objective.oracle.at(q)
-    contact = oracle.numeric.placement(oracle.point).translation
-    model = prepared.impact.robot.model
-    names = ["the base" if model.names[i] == "root_joint" else str(model.names[i]) for i in range(1, model.njoints)]
-    origins = [oracle.numeric.data.oMi[i].translation for i in range(1, model.njoints)]
-    # The link that touches reaches to the surface itself.
-    return [
-        name
-        for i, (name, origin) in enumerate(zip(names, origins, strict=True), 1)
-        if i != oracle.point.joint and evaluation.worst_normal @ (origin - contact) < -_BEHIND
-    ]
-
-
-def _named(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more joints" if len(names) > 3 else "")
 
 
 def versions() -> dict[str, str]:

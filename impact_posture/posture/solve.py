@@ -304,7 +304,13 @@ def _notes_on_answer(problem: PostureProblem, initial: Vector, q: Vector, optima
     """What numbers alone would not tell a user."""
     notes = []
     found = problem.objective.oracle
-    before, after = found.quantities(initial).G, found.quantities(q).G
+    start, end = found.quantities(initial), found.quantities(q)
+    before, after = start.G, end.G
+    if problem.objective.kind == "impulse" and end.V > start.V * (1 + 1e-3) and after >= _LOCKED * before:
+        notes.append(
+            f"at a given approach speed without friction the jump grows: V {start.V:.4g} to {end.V:.4g}; "
+            "--objective speed minimizes that"
+        )
     if after < _LOCKED * before:
         notes.append(
             "the contact is nearly locked along the normal there: its effective mass is "
