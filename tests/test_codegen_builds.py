@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from impact_posture.codegen.compiler import casadi_difference, compiled, oracle_difference, self_test_tolerance
-from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real, count_locals
+from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.codegen.folder import write_export
 from impact_posture.codegen.loader import ImpactGradient
@@ -131,7 +131,6 @@ def test_stack_stays_below_its_bound(arm: ImpactObjective, tmp_path: Path, real:
     bound = export(arm, tmp_path, prefix="arm", real=real, check=False).manifest["stack_bytes"]
     assert f"#define ARM_STACK_BYTES {bound}\n" in (tmp_path / "arm.h").read_text()
     assert f"at most {bound} bytes" in (tmp_path / "README.md").read_text()
-    assert bound > real.size * count_locals((tmp_path / "arm.c").read_text()) / 4
     for flags in (("-O0",), ("-O2",), ("-O3", "-march=native")):
         command = [*compiler, "-std=c99", *flags, "-fstack-usage", "-c", "arm.c", "-o", str(tmp_path / "arm.o")]
         try:

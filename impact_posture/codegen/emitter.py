@@ -1,7 +1,8 @@
-"""Straight-line C99 from CasADi's instruction list: one local variable a line, no work array, nothing static.
+"""C99 from a laid-out graph: straight-line blocks of local variables, and work arrays for what blocks hand on.
 
-CasADi's own generator addresses its inputs and a work vector through pointers, takes a memory handle, and brings its
-runtime along; none of it is needed for an expression graph, and compilers keep plain locals in registers better.
+Blocks are not for reading and written tersely: a humanoid has ten thousand operations.
+
+Vectors are the compiler's own (GCC's and Clang's extension): arithmetic is written as for numbers.
 """
 
 from __future__ import annotations
@@ -12,14 +13,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.errors import CompilerError
+from impact_posture.codegen.layout import Block, Layout, is_leaf
+from impact_posture.codegen.program import COSINE, Node
 
+# What a block may be handed, beside the inputs.
+_SHARED = ("s", "c", "w", "w2", "w4")
 _MATH = re.compile(r"\b(exp|log|pow|sqrt|a?sin|a?cos|a?tan|atan2|tanh|hypot|fabs|fmin|fmax)\(")
-_DECLARATION = re.compile(r"^  (?:const )?(?:double|float) \w+ =", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -67,45 +69,6 @@ class Real:
 DOUBLE = Real("double", 8, 1e-6)
 FLOAT = Real("float", 4, 1e-5)
 
-# Operands are names or literals in parentheses where they are negative: none of these needs more parentheses.
-_OPERATIONS = {
-    ca.OP_ASSIGN: "{0}",
-    ca.OP_ADD: "{0} + {1}",
-    ca.OP_SUB: "{0} - {1}",
-    ca.OP_MUL: "{0} * {1}",
-    ca.OP_DIV: "{0} / {1}",
-    ca.OP_NEG: "-{0}",
-    ca.OP_SQ: "{0} * {0}",
-    ca.OP_TWICE: "2.0 * {0}",
-    ca.OP_INV: "1.0 / {0}",
-    ca.OP_EXP: "exp({0})",
-    ca.OP_LOG: "log({0})",
-    ca.OP_POW: "pow({0}, {1})",
-    ca.OP_CONSTPOW: "pow({0}, {1})",
-    ca.OP_SQRT: "sqrt({0})",
-    ca.OP_SIN: "sin({0})",
-    ca.OP_COS: "cos({0})",
-    ca.OP_TAN: "tan({0})",
-    ca.OP_ASIN: "asin({0})",
-    ca.OP_ACOS: "acos({0})",
-    ca.OP_ATAN: "atan({0})",
-    ca.OP_ATAN2: "atan2({0}, {1})",
-    ca.OP_TANH: "tanh({0})",
-    ca.OP_HYPOT: "hypot({0}, {1})",
-    ca.OP_FABS: "fabs({0})",
-    ca.OP_FMIN: "fmin({0}, {1})",
-    ca.OP_FMAX: "fmax({0}, {1})",
-    ca.OP_SIGN: "(double)(({0} > 0.0) - ({0} < 0.0))",
-    ca.OP_LT: "(double)({0} < {1})",
-    ca.OP_LE: "(double)({0} <= {1})",
-    ca.OP_EQ: "(double)({0} == {1})",
-    ca.OP_NE: "(double)({0} != {1})",
-    ca.OP_NOT: "(double)({0} == 0.0)",
-    ca.OP_AND: "(double)({0} != 0.0 && {1} != 0.0)",
-    ca.OP_OR: "(double)({0} != 0.0 || {1} != 0.0)",
-    ca.OP_IF_ELSE_ZERO: "{0} != 0.0 ? {1} : 0.0",
-}
-
 
 def c_double(value: float) -> str:
     """A double literal that reads back exactly; negative ones in parentheses."""
@@ -122,66 +85,191 @@ def c_vector(values: Sequence[float], indent: str = "  ", real: Real = DOUBLE) -
     return "{\n" + ",\n".join(f"{indent}  {row}" for row in rows) + f"\n{indent}}}"
 
 
-def count_locals(text: str) -> int:
-    """Local numbers that the functions of :func:`emit_function` declare: what their frames hold at most."""
-    return len(_DECLARATION.findall(text))
+@dataclass(frozen=True)
+class Dialect:
+    """What the emitted text is about.
+
+    Attributes:
+        prefix: What C names begin with.
+        real: The type of literals.
+        types: Width → C type of such a number or vector.
+        work: What callers call the structure that holds inputs and work arrays; empty where inputs stand alone.
+    """
+
+    prefix: str
+    real: Real
+    types: dict[int, str]
+    work: str = ""
 
 
-def emit_function(name: str, function: ca.Function, real: Real = DOUBLE) -> str:
-    """``static void name(const double *input, ..., double *output, ...)`` with the values of an SX function.
+@dataclass(frozen=True)
+class BlockText:
+    """A block's C.
 
-    Parameters have the function's own input and output names; outputs are dense, column by column.  Every input is
-    read before an output is written, so an output may overlap an input.
+    Attributes:
+        text: The function.
+        call: Its call, with names of the caller's own: inputs, ``m.s``, ``m.w`` and so on.
+        local_bytes: What its variables take at most.
+    """
+
+    text: str
+    call: str
+    local_bytes: int
+
+
+class Constants:
+    """Tables of the numbers in a library's blocks: a number's place is shorter than its seventeen digits.
 
     Args:
-        name: Name in C.
-        function: An SX function whose inputs are dense.
-        real: The C type of every number.
-
-    Raises:
-        CompilerError: An operation that has no C here.
+        prefix: What the tables' names begin with.
+        real: The type of the numbers.
     """
-    function = _dense(function)
-    parameters = [f"const {real.name} *{v}" for v in function.name_in()]
-    parameters += [f"{real.name} *{v}" for v in function.name_out()]
-    loads, body, read = _statements(function, real)
-    unread = [f"(void){v};" for v in function.name_in() if v not in read]
-    lines = [f"  {line}" for line in (*unread, *loads, *body)]
-    return "\n".join([f"static void {name}({', '.join(parameters)})", "{", *lines, "}"]) + "\n"
+
+    def __init__(self, prefix: str, real: Real) -> None:
+        self._prefix, self._real = prefix, real
+        self._tables: dict[int, dict[tuple[float, ...], int]] = {}
+
+    def place(self, node: Node) -> str:
+        """C of a constant: short numbers as they are, others by their place."""
+        if node.width == 1:
+            text = self._real.literal(node.value[0])
+            if len(text) < len(self._prefix) + 6:
+                return text
+        known = self._tables.setdefault(node.width, {})
+        return f"{self._name(node.width)}[{known.setdefault(node.value, len(known))}]"
+
+    def text(self, types: dict[int, str]) -> str:
+        """The tables, of the types for each width."""
+        lines = []
+        for width, known in sorted(self._tables.items()):
+            rows = [", ".join(self._real.literal(v).strip("()") for v in value) for value in known]
+            if width > 1:
+                rows = ["{" + row + "}" for row in rows]
+            body = ",\n".join(f"  {row}" for row in rows)
+            lines.append(f"static const {types[width]} {self._name(width)}[{len(known)}] = {{\n{body}\n}};\n")
+        return "\n".join(lines)
+
+    def _name(self, width: int) -> str:
+        return f"{self._prefix}_k{width if width > 1 else ''}"
 
 
-def _dense(function: ca.Function) -> ca.Function:
-    inputs = function.sx_in()
-    outputs = [ca.densify(value) for value in function.call(inputs)]
-    return ca.Function("dense", inputs, outputs, function.name_in(), function.name_out())
+class Emitter:
+    """The C of one laid-out graph.
 
+    Args:
+        layout: Blocks and what they hand on.
+        dialect: Names and types.
+        size: Bytes of the dialect's type of width one.
+        constants: Where its numbers go.
+    """
 
-def _statements(function: ca.Function, real: Real) -> tuple[list[str], list[str], set[str]]:
-    """Loads of inputs, the rest of the body, and the names of the inputs that are read."""
-    loads: dict[tuple[str, int], str] = {}
-    body: list[str] = []
-    # What a work slot holds is its variable's name, or the constant or input that was put there.
-    held: dict[int, str] = {}
-    declared: set[int] = set()
-    for k in range(function.n_instructions()):
-        operation = function.instruction_id(k)
-        source, target = function.instruction_input(k), function.instruction_output(k)
-        if operation == ca.OP_CONST:
-            held[target[0]] = real.literal(function.instruction_constant(k))
-        elif operation == ca.OP_INPUT:
-            key = (function.name_in(source[0]), int(source[1]))
-            loads[key] = held[target[0]] = f"{key[0]}{key[1]}"
-        elif operation == ca.OP_OUTPUT:
-            body.append(f"{function.name_out(target[0])}[{target[1]}] = {held[source[0]]};")
-        elif operation in _OPERATIONS:
-            value = real.spelled(_OPERATIONS[operation]).format(*[held[s] for s in source])
-            slot = target[0]
-            body.append(f"{'' if slot in declared else f'{real.name} '}w{slot} = {value};")
-            declared.add(slot)
-            held[slot] = f"w{slot}"
+    def __init__(self, layout: Layout, dialect: Dialect, size: int, constants: Constants) -> None:
+        self.layout, self.dialect, self._size, self._constants = layout, dialect, size, constants
+        self._graph = layout.graph
+        at = {k: number for number, block in enumerate(layout.blocks) for k in block.nodes}
+        # What its own block uses again, so that it needs a name there.
+        self._reused: set[int] = set()
+        for k, number in at.items():
+            waiting = list(self._graph.nodes[k].operands)
+            while waiting:
+                a = waiting.pop()
+                a = self._graph.nodes[a].args[0] if self._graph.nodes[a].op == "lane" else a
+                if a in layout.inlined:
+                    waiting += self._graph.nodes[a].operands
+                elif at.get(a) == number:
+                    self._reused.add(a)
+        self.blocks = [self._block(number, block) for number, block in enumerate(layout.blocks)]
+
+    def output(self, k: int, work: str = "m.") -> str:
+        """An output's value after the blocks have run."""
+        node = self._graph.nodes[k]
+        if node.op == "const":
+            return self.dialect.real.literal(node.value[0])
+        if node.op == "lane":
+            return f"{self.output(node.args[0], work)}[{node.args[1]}]"
+        if node.op == "in":
+            return f"{work if self.dialect.work else ''}{self._graph.inputs[node.args[0]]}[{node.args[1]}]"
+        if k in self.layout.trig:
+            return f"{work}{'c' if node.op == COSINE else 's'}[{self.layout.trig[k]}]"
+        return f"{work}{self._slot(k)}"
+
+    # ---- one block --------------------------------------------------------------------------------------------
+
+    def _block(self, number: int, block: Block) -> BlockText:
+        names: dict[int, str] = {}
+        lines: list[str] = []
+        for k in block.nodes:
+            node = self._graph.nodes[k]
+            text = self._expression(k, number, names, lines, top=True)
+            names[k] = f"v{len(names)}"
+            kept = f"{self._slot(k)}=" if k in self.layout.slots else ""
+            if kept and k not in self._reused:
+                lines.append(f"{kept}{text};")
+            elif node.op == "gather":
+                lines.append(f"{self.dialect.types[node.width]} {names[k]}={text};")
+                lines += [f"{kept}{names[k]};"] if kept else []
+            else:
+                lines.append(f"{self.dialect.types[node.width]} {names[k]}={kept}{text};")
+        body = "\n".join(lines)
+        used = set(re.findall(r"\b([a-z]\w*)\[|\((\w) \+", body))
+        present = {name for pair in used for name in pair if name}
+        scalar = self.dialect.types[1]
+        parameters, arguments = [], []
+        for name in self._graph.inputs:
+            if name in present:
+                parameters.append(f"const {scalar} *{name}")
+                arguments.append(f"{self.dialect.work}.{name}" if self.dialect.work else name)
+        for name in _SHARED:
+            if name in present:
+                constant = "const " if name in "sc" else ""
+                kind = self.dialect.types[int(name[1:] or 1)]
+                parameters.append(f"{constant}{kind} *{name}")
+                arguments.append(f"{self.dialect.work or 'm'}.{name}")
+        title = f"{self.dialect.prefix}_block{number}"
+        local = sum(self._graph.nodes[k].width for k in names) * self._size
+        return BlockText(
+            f"static void {title}({', '.join(parameters)})\n{{\n{body}\n}}\n",
+            f"{title}({', '.join(arguments)});",
+            local,
+        )
+
+    def _expression(self, k: int, number: int, names: dict[int, str], lines: list[str], *, top: bool = False) -> str:
+        """C of a node: a name, a place in an array, or the operation itself, in parentheses unless on ``top``."""
+        node = self._graph.nodes[k]
+        if not top and k in names:
+            return names[k]
+        if is_leaf(self._graph, self.layout.trig, k):
+            return self._leaf(k, node, number, names, lines)
+        if not top and k not in self.layout.inlined:
+            return self._slot(k)
+        operands = [self._expression(a, number, names, lines) for a in node.operands]
+        if node.op == "gather":
+            return "{" + ", ".join(operands) + "}"
+        if node.op in ("+", "-", "*", "/"):
+            text = f"{operands[0]}{node.op}{operands[1]}"
+        elif node.op == "neg":
+            text = f"-{operands[0]}"
+        elif node.op == "inv":
+            text = self.dialect.real.spelled("1.0") + f"/{operands[0]}"
         else:
-            raise CompilerError(
-                f"CasADi operation {operation} has no C form", where="codegen", mend="add it to codegen/emitter.py"
-            )
-    lines = [f"const {real.name} {text} = {key[0]}[{key[1]}];" for key, text in sorted(loads.items())]
-    return lines, body, {key[0] for key in loads}
+            return self.dialect.real.spelled(node.op).format(*operands)
+        return text if top else f"({text})"
+
+    def _leaf(self, k: int, node: Node, number: int, names: dict[int, str], lines: list[str]) -> str:
+        if node.op == "const":
+            return self._constants.place(node)
+        if node.op == "in":
+            return f"{self._graph.inputs[node.args[0]]}[{node.args[1]}]"
+        if node.op == "lane":
+            return f"{self._expression(node.args[0], number, names, lines)}[{node.args[1]}]"
+        array = "c" if node.op == COSINE else "s"
+        if node.width == 1:
+            return f"{array}[{self.layout.trig[k]}]"
+        names[k] = f"v{len(names)}"
+        kind = self.dialect.types[node.width]
+        lines.append(f"const {kind} {names[k]} = *(const {kind}u *)({array} + {self.layout.trig[k]});")
+        return names[k]
+
+    def _slot(self, k: int) -> str:
+        width = self._graph.nodes[k].width
+        return f"w{width if width > 1 else ''}[{self.layout.slots[k]}]"

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.codegen.code import build_code
 from impact_posture.codegen.compiler import compile_and_check
 from impact_posture.codegen.emitter import DOUBLE, Real
 from impact_posture.codegen.manifest import build_manifest
-from impact_posture.codegen.naming import c_identifier, check_prefix
-from impact_posture.codegen.source import build_code, build_texts
+from impact_posture.codegen.naming import c_identifier, check_prefix, stems
+from impact_posture.codegen.source import build_texts
 from impact_posture.errors import InputError, OutputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.toolchain import find_compiler
@@ -83,7 +84,7 @@ def export(
         posture = robot.check_posture(given, limits=False)
         # Normalizing what is of unit norm already turns last digits: keep those that result.json has.
         posture = given if np.allclose(given, posture, rtol=0, atol=1e-9) else posture
-    code = build_code(objectives, prefix, real)
+    code = build_code(objectives, stems(prefix, [o.contact.frame for o in objectives]), prefix, real)
     manifest = build_manifest(objectives, prefix, posture, real, code.stack_bytes)
     texts = build_texts(objectives, prefix, manifest, code, real)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False, ensure_ascii=False) + "\n"

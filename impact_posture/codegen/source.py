@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from impact_posture import __version__
 from impact_posture.codegen import project, templates
+from impact_posture.codegen.code import Code
 from impact_posture.codegen.compiler import self_test_tolerance
-from impact_posture.codegen.emitter import Real, c_double, c_vector, count_locals, emit_function
-from impact_posture.codegen.functions import ellipsoid_fun, jump_fun, objective_fun
+from impact_posture.codegen.emitter import Real, c_double, c_vector
 from impact_posture.codegen.manifest import unit_slices
 from impact_posture.codegen.naming import stems
 from impact_posture.impact.objective import ImpactObjective
-
-# A compiler that makes vectors of neighboring numbers (-march=native) puts some by in several of them.
-_SPILL = 4
-# Return addresses, saved registers and the small functions' own variables, for the three calls in each other.
-_FRAMES = 1024
 
 _PLAIN = str.maketrans({"·": " ", "²": "^2", "×": "x", "λ": "l", "ε": "eps", "⁻": "^-", "¹": "1"})
 
@@ -39,37 +33,6 @@ def wrapped(words: list[str], indent: str, width: int = 112) -> str:
             line = ""
         line = f"{line} {piece}" if line else piece
     return f"\n{indent}".join([*lines, line])
-
-
-@dataclass(frozen=True)
-class Code:
-    """The C of an export's functions.
-
-    Attributes:
-        functions: Text of every function, frame after frame.
-        stack_bytes: Upper bound on the stack that a call takes, the C library's part not counted.
-    """
-
-    functions: str
-    stack_bytes: int
-
-
-def build_code(objectives: Sequence[ImpactObjective], prefix: str, real: Real) -> Code:
-    """Generate the functions of each frame."""
-    names = stems(prefix, [o.contact.frame for o in objectives])
-    texts, largest = [], 0
-    for objective, stem in zip(objectives, names, strict=True):
-        bodies, call = _bodies(objective, prefix, stem, real)
-        largest = max(largest, *(count_locals(body) for body in bodies))
-        nv, nq = objective.robot.nv, objective.robot.nq
-        texts.append(
-            templates.FUNCTIONS.substitute(
-                prefix=prefix, stem=stem, real=real.name, nq=nq, nv=nv, bodies="\n".join(bodies), call=call
-            )
-        )
-    # The body's numbers, and those of the caller that keeps a jump.
-    stack = _SPILL * real.size * (largest + objectives[0].robot.nv) + _FRAMES
-    return Code("".join(texts), -(-stack // 64) * 64)
 
 
 def build_texts(
@@ -108,7 +71,12 @@ def build_texts(
         f"{prefix}.h": templates.HEADER.substitute(comment | order, posture=declaration),
         f"{prefix}.c": templates.SOURCE.substitute(
             comment
-            | {"posture": definition, "unit_checks": _unit_checks(objectives[0], real), "functions": code.functions}
+            | {
+                "posture": definition,
+                "unit_checks": _unit_checks(objectives[0], real),
+                "vectors": code.vectors,
+                "functions": code.functions,
+            }
         ),
         "example.c": project.EXAMPLE.substitute(
             facts,
@@ -197,18 +165,3 @@ def _eigen(objective: ImpactObjective, facts: dict[str, str], test: dict[str, An
     lists = {f"{key}_list": ", ".join(real.literal(v) for v in test[key]) for key in ("q", "n")}
     claim = project.EXAMPLE_CPP_CLAIM.substitute(facts) if world else ""
     return project.EXAMPLE_CPP.substitute(facts | lists, claim=claim)
-
-
-def _bodies(objective: ImpactObjective, prefix: str, stem: str, real: Real) -> tuple[list[str], str]:
-    """The static functions that hold the numbers' work, and the body of ``<stem>_objective``."""
-    bodies = [
-        emit_function(f"{stem}_eval_body", objective.metric_fun(), real),
-        emit_function(f"{stem}_jump_body", jump_fun(objective), real),
-        emit_function(f"{stem}_ellipsoid_body", ellipsoid_fun(objective), real),
-    ]
-    names = {"prefix": prefix, "stem": stem, "real": real.name, "nv": objective.robot.nv}
-    if objective.name == "impulse":
-        normal, scale = c_vector(objective.contact.normal, real=real), real.literal(objective.scale)
-        return bodies, templates.OBJECTIVE_SCALED.substitute(names, normal=normal, scale=scale)
-    bodies.append(emit_function(f"{stem}_objective_body", objective_fun(objective), real))
-    return bodies, templates.OBJECTIVE_BODY.substitute(names)

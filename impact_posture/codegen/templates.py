@@ -89,7 +89,9 @@ SOURCE = Template("""\
 #include "$prefix.h"
 
 #include <math.h>
-$posture
+#include <string.h>
+
+$vectors$posture
 static int ${prefix}_finite(const $real *x, int count)
 {
   int i;
@@ -110,81 +112,178 @@ $unit_checks  return 0;
 }
 $functions""")
 
-# H alone has no code of its own: it is what the jump's ends with.
-FUNCTIONS = Template("""
-$bodies
-int ${stem}_eval(const $real q[$nq], const $real n[3], $real *H, $real grad[$nv])
+# What every function begins with: the inputs' check, and what several of them compute.
+BEGIN = Template("""
+/* What functions and their blocks hand each other. */
+typedef struct {
+  $real x[$angles], s[$angles], c[$angles];
+$work} ${prefix}_work;
+
+static int ${prefix}_begin(const $real *q, const $real *n, ${prefix}_work *m)
 {
-  const int code = ${prefix}_check(q);
+$gather  const int code = ${prefix}_check(q);
   if (code != 0) {
     return code;
   }
   if (!${prefix}_finite(n, 3)) {
     return 1;
   }
-  ${stem}_eval_body(q, n, H, grad);
-  return ${prefix}_finite(H, 1) && ${prefix}_finite(grad, $nv) ? 0 : 3;
+$fill  ${prefix}_sincos(m->x, m->s, m->c, $angles);
+  return 0;
 }
+""")
 
+GATHER = Template("""\
+  static const short at_q[$count] = {
+$places
+  };
+  int k;
+""")
+
+FILL = Template("""\
+  for (k = 0; k < $count; ++k) {
+    m->x[k] = q[at_q[k]];
+  }
+""")
+
+FILL_LANES = Template("""\
+    for (i = 0; i < $count; ++i) {
+      ${prefix}_sincos((const $real *)&m->q[at_q[i]], ($real *)&m->s[i], ($real *)&m->c[i], $lanes);
+    }
+""")
+
+CALL_GROUPS = Template("""\
+  for (g = 0; g < groups; ++g) {
+    $call
+  }
+""")
+
+FILL_REST = Template("""\
+  for (; k < $angles; ++k) {
+    m->x[k] = 0;
+  }
+""")
+
+FUNCTION = Template("""
+int ${stem}_$name($parameters)
+{
+  ${prefix}_work m;
+$normal  const int code = ${prefix}_begin(q, n, &m);
+  if (code != 0) {
+    return code;
+  }
+$calls
+$outputs
+  return $finite ? 0 : 3;
+}
+""")
+
+# impulse is a multiple of H: the code is there already.
+OBJECTIVE_SCALED = Template("""
 int ${stem}_objective(const $real q[$nq], $real *value, $real grad[$nv])
 {
-$call}
-
-int ${stem}_value(const $real q[$nq], const $real n[3], $real *H)
-{
-  $real a[$nv], G;
-  const int code = ${prefix}_check(q);
-  if (code != 0) {
-    return code;
+  static const $real n[3] = $normal;
+  const $real scale = $scale;
+  const int code = ${stem}_eval(q, n, value, grad);
+  int i;
+  if (code == 0) {
+    *value *= scale;
+    for (i = 0; i < $nv; ++i) {
+      grad[i] *= scale;
+    }
   }
-  if (!${prefix}_finite(n, 3)) {
-    return 1;
-  }
-  ${stem}_jump_body(q, n, a, &G, H);
-  return ${prefix}_finite(H, 1) ? 0 : 3;
+  return code;
 }
+""")
 
-int ${stem}_jump(const $real q[$nq], const $real n[3], $real a[$nv], $real *G, $real *V)
-{
-  const int code = ${prefix}_check(q);
-  if (code != 0) {
-    return code;
-  }
-  if (!${prefix}_finite(n, 3)) {
-    return 1;
-  }
-  ${stem}_jump_body(q, n, a, G, V);
-  *V /= *G * *G;
-  return ${prefix}_finite(a, $nv) && ${prefix}_finite(G, 1) && ${prefix}_finite(V, 1) ? 0 : 3;
-}
-
-int ${stem}_ellipsoid(const $real q[$nq], $real L[9])
-{
-  const int code = ${prefix}_check(q);
-  if (code != 0) {
-    return code;
-  }
-  ${stem}_ellipsoid_body(q, L);
-  return ${prefix}_finite(L, 9) ? 0 : 3;
-}
-
+# One configuration after the other: what has no vectors.
+BATCH_LOOP = Template("""
 int ${stem}_eval_batch(const $real *q, const $real *n, int count, $real *H, $real *grad)
 {
-  int first = 0;
-  int k, i;
-  for (k = 0; k < count; ++k) {
-    const int code = ${stem}_eval(q, n, H, grad);
+  int first = 0, k, i;
+  for (k = 0; k < count; ++k, q += $nq, n += 3, grad += $nv) {
+    const int code = ${stem}_eval(q, n, H + k, grad);
     if (code != 0) {
       first = first != 0 ? first : code;
-      *H = NAN;
+      H[k] = NAN;
       for (i = 0; i < $nv; ++i) {
         grad[i] = NAN;
       }
     }
-    q += $nq;
-    n += 3;
-    H += 1;
-    grad += $nv;
+  }
+  return first;
+}
+""")
+
+# Lanes beyond the batch, and those whose inputs fail, compute another lane's configuration.  A block is called for
+# all groups before the next is, so that its instructions are read from memory once.
+BATCH = Template("""
+typedef struct {
+  ${prefix}_rn q[$nq], n[3], s[$angles], c[$angles], w[$work];
+} ${stem}_lanes_work;
+
+/* ${upper}_LANES configurations a group, each at the place that at[] says. */
+static void ${stem}_lanes(
+  const $real *q, const $real *n, const int *at, int groups, $real *H, $real *grad)
+{
+$gather  ${stem}_lanes_work work[${upper}_GROUPS];
+  int g, i, j;
+  for (g = 0; g < groups; ++g) {
+    ${stem}_lanes_work *m = work + g;
+    for (j = 0; j < ${upper}_LANES; ++j) {
+      const $real *from_q = q + $nq * (long)at[g * ${upper}_LANES + j];
+      const $real *from_n = n + 3 * (long)at[g * ${upper}_LANES + j];
+      for (i = 0; i < $nq; ++i) {
+        m->q[i][j] = from_q[i];
+      }
+      for (i = 0; i < 3; ++i) {
+        m->n[i][j] = from_n[i];
+      }
+    }
+$fill  }
+$calls
+  for (g = 0; g < groups; ++g) {
+    const ${stem}_lanes_work *m = work + g;
+    for (j = 0; j < ${upper}_LANES; ++j, ++H, grad += $nv) {
+$outputs
+    }
+  }
+}
+
+int ${stem}_eval_batch(const $real *q, const $real *n, int count, $real *H, $real *grad)
+{
+  enum { MOST = ${upper}_LANES * ${upper}_GROUPS };
+  int first = 0, k, i, j;
+  for (k = 0; k < count; k += MOST) {
+    const int lanes = count - k < MOST ? count - k : MOST;
+    const int groups = (lanes + ${upper}_LANES - 1) / ${upper}_LANES;
+    $real found_H[MOST], found_grad[MOST * $nv];
+    int codes[MOST], at[MOST], good = -1;
+    for (j = 0; j < lanes; ++j) {
+      codes[j] = ${prefix}_check(q + $nq * (long)(k + j));
+      if (codes[j] == 0 && !${prefix}_finite(n + 3 * (long)(k + j), 3)) {
+        codes[j] = 1;
+      }
+      good = codes[j] == 0 ? k + j : good;
+    }
+    if (good >= 0) {
+      for (j = 0; j < groups * ${upper}_LANES; ++j) {
+        at[j] = j < lanes && codes[j] == 0 ? k + j : good;
+      }
+      ${stem}_lanes(q, n, at, groups, found_H, found_grad);
+    }
+    for (j = 0; j < lanes; ++j) {
+      const $real *from = found_grad + $nv * j;
+      $real *to = grad + $nv * (long)(k + j);
+      if (codes[j] == 0 && !(${prefix}_finite(found_H + j, 1) && ${prefix}_finite(from, $nv))) {
+        codes[j] = 3;
+      }
+      first = first != 0 ? first : codes[j];
+      H[k + j] = codes[j] == 0 ? found_H[j] : NAN;
+      for (i = 0; i < $nv; ++i) {
+        to[i] = codes[j] == 0 ? from[i] : NAN;
+      }
+    }
   }
   return first;
 }
@@ -196,28 +295,4 @@ UNIT_CHECK = Template("""\
   if (s < $low || s > $high) {
     return 2;
   }
-""")
-
-OBJECTIVE_BODY = Template("""\
-  const int code = ${prefix}_check(q);
-  if (code != 0) {
-    return code;
-  }
-  ${stem}_objective_body(q, value, grad);
-  return ${prefix}_finite(value, 1) && ${prefix}_finite(grad, $nv) ? 0 : 3;
-""")
-
-# impulse is a multiple of H: the code is there already.
-OBJECTIVE_SCALED = Template("""\
-  const $real n[3] = $normal;
-  const $real scale = $scale;
-  const int code = ${stem}_eval(q, n, value, grad);
-  int i;
-  if (code == 0) {
-    *value *= scale;
-    for (i = 0; i < $nv; ++i) {
-      grad[i] *= scale;
-    }
-  }
-  return code;
 """)

@@ -106,7 +106,8 @@ def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
     if kind.family not in ("revolute", "continuous") or abs(kind.axis[axis]) < 1 - 1e-15:
         return None
     cosine, sine = (ca.cos(q[0]), ca.sin(q[0])) if kind.family == "revolute" else (q[0], q[1])
-    return Spin(axis, cosine, float(np.sign(kind.axis[axis])) * sine)
+    sense = float(np.sign(kind.axis[axis]))
+    return Spin(axis, cosine, sense * sine, sense)
 
 
 def axis_rotation(axis: NDArray[np.float64], cosine: ca.SX, sine: ca.SX) -> ca.SX:

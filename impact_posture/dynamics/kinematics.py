@@ -5,18 +5,19 @@ Everything is in link coordinates; world placements are computed only where they
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.joints import joint_quaternion, joint_spin, joint_transform
 from impact_posture.dynamics.spatial import Spin, constant, quaternion_product
+from impact_posture.dynamics.twins import Twins
 
 # Spatial inertias, forces or motions by joint index.
 ByJoint = dict[int, ca.SX]
@@ -46,6 +47,7 @@ class Kinematics:
         chart_x: The chart coordinates that ``q`` was made of; only :attr:`quaternions` needs them.
         extra_inertia: Constant 6×6 matrices in link coordinates added to links in ``M`` (not in ``pin.Model``'s own):
             a foot held with compliance ε is a foot with the point mass 1/ε.
+        twins: Branches whose constants become parameters, so that their expressions are alike.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class Kinematics:
         q: ca.SX,
         chart_x: ca.SX | None = None,
         extra_inertia: Mapping[int, NDArray[np.float64]] | None = None,
+        twins: Twins | None = None,
     ) -> None:
         self.model, self.q = model, q
         self.chart = Chart(model)
@@ -67,18 +70,31 @@ class Kinematics:
         self._spin: dict[int, Spin | None] = {}
         self._S: ByJoint = {}
         self._inertia: ByJoint = {}
+        self.twins = twins
         for slot in self.chart.slots:
             i = slot.index
-            placement = model.jointPlacements[i]
             R, p = joint_transform(slot.kind, q[slot.q])
-            place_R, place_p = constant(placement.rotation), constant(placement.translation)
+            place_R = self._constant(i, "rotation", lambda j: model.jointPlacements[j].rotation)
+            place_p = self._constant(i, "translation", lambda j: model.jointPlacements[j].translation)
             self._R[i] = place_R @ R
             self._rest[i] = place_R
             self._spin[i] = joint_spin(slot.kind, q[slot.q])
             self._p[i] = ca.densify(place_p) + place_R @ p
             self._S[i] = constant(slot.kind.subspace)
-            self._inertia[i] = constant(model.inertias[i].matrix() + self._extra.get(i, 0.0))
-        self._armature = np.array(model.armature, dtype=float)
+            self._inertia[i] = self._constant(
+                i, "inertia", lambda j: model.inertias[j].matrix() + self._extra.get(j, 0.0)
+            )
+        self._armature = self.by_joint("armature", np.array(model.armature, dtype=float))
+
+    def _constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
+        """What a joint has of a kind of constant: numbers, or parameters where its twins have others."""
+        return constant(of(joint)) if self.twins is None else self.twins.constant(joint, tag, of)
+
+    def by_joint(self, tag: str, values: NDArray[np.float64]) -> ca.SX:
+        """Constants of the degrees of freedom, shape (nv,), as an expression."""
+        slots = self.chart.slots
+        parts = [self._constant(s.index, tag, lambda j: values[slots[j - 1].v]) for s in slots]
+        return ca.densify(ca.vertcat(*parts))
 
     @cached_property
     def rotations(self) -> ByJoint:

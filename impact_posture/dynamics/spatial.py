@@ -52,11 +52,15 @@ def motion_cross_force(motion: ca.SX, force: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True)
 class Spin:
-    """A turn about a coordinate axis: ``axis`` 0, 1 or 2, and the angle's cosine and sine."""
+    """A turn about a coordinate axis: ``axis`` 0, 1 or 2, and the angle's cosine and sine.
+
+    ``sense`` is −1 where the joint's axis points the other way; the sine has it already.
+    """
 
     axis: int
     cosine: ca.SX
     sine: ca.SX
+    sense: float = 1.0
 
     @cached_property
     def double(self) -> tuple[ca.SX, ca.SX]:
@@ -76,6 +80,20 @@ class Spin:
         out[k, i], out[k, j] = self._plane(M[k, i], M[k, j])
         out[k, k] = M[k, k]
         return ca.sparsify(out)
+
+    def rate(self, inertia: ca.SX) -> ca.SX:
+        """``K = (S×)ᵀ I + I (S×)`` of a symmetric 6×6 inertia and the axis' motion ``S``: symmetric, 6×6."""
+        i, j, k = (self.axis + 1) % 3, (self.axis + 2) % 3, self.axis
+        out = ca.SX(6, 6)
+        for rows, columns in ((0, 0), (0, 3), (3, 3)):
+            M = inertia[rows : rows + 3, columns : columns + 3]
+            sum_, difference = M[i, j] + M[j, i], M[j, j] - M[i, i]
+            K = ca.SX(3, 3)
+            K[i, i], K[j, j] = sum_, -sum_
+            K[i, j], K[j, i] = difference, difference
+            K[i, k], K[j, k], K[k, i], K[k, j] = M[j, k], -M[i, k], M[k, j], -M[k, i]
+            out[rows : rows + 3, columns : columns + 3] = self.sense * K
+        return symmetric(ca.sparsify(out))
 
     def _plane(self, x: ca.SX, y: ca.SX) -> tuple[ca.SX, ca.SX]:
         return self.cosine * x - self.sine * y, self.sine * x + self.cosine * y

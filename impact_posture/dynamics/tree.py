@@ -74,6 +74,7 @@ class Response:
         velocities: Spatial velocity of every link under ``a``, link coordinates.
         before: The same without the link's own joint, for joints with a parent joint.
         forces: Spatial force through every joint with a parent joint, on its link.
+        passed: The part of it that does not depend on the parent's motion.
         wrenches: What acted.
     """
 
@@ -81,6 +82,7 @@ class Response:
     velocities: ByJoint
     before: ByJoint
     forces: ByJoint
+    passed: ByJoint
     wrenches: tuple[Wrench, ...]
 
 
@@ -126,7 +128,7 @@ class Tree(Kinematics):
 
     def mass_times(self, v: ca.SX) -> ca.SX:
         """``M(q) v`` in O(n), armature included."""
-        return self._project(self.momenta(self.velocities(v))) + ca.SX(self._armature) * v
+        return self._project(self.momenta(self.velocities(v))) + self._armature * v
 
     def _project(self, forces: ByJoint) -> ca.SX:
         rows = [self._S[slot.index].T @ forces[slot.index] for slot in self.chart.slots]
@@ -151,7 +153,7 @@ class Tree(Kinematics):
                 M[slot.v, other.v] = M[other.v, slot.v].T
             if parent:
                 composite[parent] = composite[parent] + self._inertia_to_parent(i, composite[i])
-        return M + ca.diag(ca.SX(self._armature))
+        return M + ca.diag(self._armature)
 
     def link_force(self, wrench: Wrench) -> ca.SX:
         """The wrench as a spatial force on its link, in link coordinates about the link's origin, shape (6,)."""
@@ -241,20 +243,29 @@ class Tree(Kinematics):
             else:
                 velocities[i] = ca.densify(self._S[i] @ rate)
             parts.append(rate)
-        return Response(ca.densify(ca.vertcat(*parts)), velocities, before, forces, tuple(wrenches))
+        return Response(ca.densify(ca.vertcat(*parts)), velocities, before, forces, passed, tuple(wrenches))
 
     def pair_gradient(self, x: Response, y: Response) -> ca.SX:
         """Tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` with all four letters held fixed, shape (nv,).
 
-        ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)`` and the turning of wrenches that stay in the world: all of it from what the
-        two solutions already know.
+        ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)`` and the turning of wrenches that stay in the world: all of it from what
+        the two solutions already know.  With ``f = I^a v⁻ + p^a`` and a joint that turns about a coordinate axis, the
+        part of ``I^a`` is ``v_y⁻ᵀ K v_x⁻``, where ``K`` is how fast ``I^a`` changes as it turns: one product in
+        place of two.
         """
         turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
         for one, other in ((x, y), (y, x)):
             for wrench in one.wrenches:
                 self._turn(turning, Coupling(wrench, other.velocities))
-        pairs = [(y.before, x.forces), (x.before, y.forces)]
-        return self._gather(pairs, turning)
+        rows: ByJoint = {}
+        forces = [dict(x.forces), dict(y.forces)]
+        for i in x.forces:
+            spin = self._spin[i]
+            if spin is not None:
+                rate = spin.rate(self._factor.reduced[i])
+                rows[i] = ca.dot(y.before[i], rate @ x.before[i])
+                forces[0][i], forces[1][i] = x.passed[i], y.passed[i]
+        return self._gather([(y.before, forces[0]), (x.before, forces[1])], turning, rows)
 
     # ---- tangent gradients by adjoints ------------------------------------------------------------------------
 
@@ -313,8 +324,13 @@ class Tree(Kinematics):
         added = cross(force[:3], linear) + cross(moment, motion[3:])
         turning[joint] = turning[joint] + coupling.scale * added
 
-    def _gather(self, pairs: Sequence[tuple[ByJoint, ByJoint]], turning: ByJoint) -> ca.SX:
-        """``Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning``, with ``F`` what the subtree takes away from the bracket."""
+    def _gather(
+        self, pairs: Sequence[tuple[ByJoint, ByJoint]], turning: ByJoint, known: ByJoint | None = None
+    ) -> ca.SX:
+        """``Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning``, with ``F`` what the subtree takes away from the bracket.
+
+        ``known`` is added to the joints' rows.
+        """
         turning = dict(turning)
         rows: ByJoint = {}
         for slot in reversed(self.chart.slots):
@@ -322,6 +338,7 @@ class Tree(Kinematics):
             row = -(self._S[i][3:, :].T @ turning[i])
             if parent:
                 turning[parent] = turning[parent] + self._R[i] @ turning[i]
+                row = row + (known or {}).get(i, ca.SX(1, 1))
                 for before, force in pairs:
                     row = row + self._S[i].T @ motion_cross_force(before[i], force[i])
             rows[i] = row
@@ -335,9 +352,9 @@ class Tree(Kinematics):
 
     @cached_property
     def _own_inertia(self) -> ByJoint:
-        return {i: constant(self.model.inertias[i].matrix()) for i in self._R}
+        return {i: self._constant(i, "own inertia", lambda j: self.model.inertias[j].matrix()) for i in self._R}
 
     def own_mass_times(self, v: ca.SX, velocities: ByJoint) -> ca.SX:
         """``M v`` of the robot alone, without the extra inertias."""
         momenta = self._accumulate({i: self._own_inertia[i] @ velocities[i] for i in velocities})
-        return self._project(momenta) + ca.SX(self._armature) * v
+        return self._project(momenta) + self._armature * v

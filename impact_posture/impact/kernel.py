@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import ByJoint, PointOnLink, Product, Response, Tree, Wrench
+from impact_posture.dynamics.twins import Twins
 from impact_posture.impact.contact import Contact, Support, point_on, support_inertia
 from impact_posture.impact.metric import Metric
 from impact_posture.robot.robot import Robot
@@ -34,6 +35,7 @@ class ImpactKernel:
         compliance: ε of the supports, 1/kg.
         q: Configuration symbols, shape (nq, 1).
         n: Normal symbols, shape (3, 1), in ``contact.normal_frame``.
+        twins: Branches whose expressions are to be alike (:class:`~impact_posture.dynamics.twins.Twins`).
     """
 
     def __init__(
@@ -45,10 +47,11 @@ class ImpactKernel:
         compliance: float,
         q: ca.SX,
         n: ca.SX,
+        twins: Twins | None = None,
     ) -> None:
         self.robot, self.contact, self.metric = robot, contact, metric
         self.q, self.n = q, n
-        self.tree = Tree(robot.model, q, extra_inertia=support_inertia(robot, supports, compliance))
+        self.tree = Tree(robot.model, q, extra_inertia=support_inertia(robot, supports, compliance), twins=twins)
         self.point: PointOnLink = point_on(robot, contact.frame, contact.offset)
         self._supported = bool(supports)
 
@@ -67,7 +70,23 @@ class ImpactKernel:
     @cached_property
     def jump(self) -> Response:
         """The robot's answer to the blow; its ``a`` is ``M⁻¹Jᵀn``."""
-        return self.tree.respond(wrenches=[self.blow])
+        return self.tree.respond(wrenches=self._alike(self.blow))
+
+    def _alike(self, wrench: Wrench) -> list[Wrench]:
+        """The wrench; where its link has twins, it and none on them, in one form for all."""
+        twins, joint = self.tree.twins, wrench.point.joint
+        if twins is None or joint not in twins.places:
+            return [wrench]
+        point = wrench.point
+        return [
+            Wrench(
+                PointOnLink(twin, point.position, point.rotation),
+                wrench.force * (on := twins.indicator(twin, joint)),
+                wrench.moment * on,
+                wrench.in_frame,
+            )
+            for twin in twins.of(joint)
+        ]
 
     # ---- H, G and what follows from them ----------------------------------------------------------------------
 
@@ -120,7 +139,7 @@ class ImpactKernel:
     def _axes(self) -> list[Response]:
         """``M⁻¹Jᵀe_k`` of the three world directions."""
         eye = np.eye(3)
-        return [self.tree.respond(wrenches=[self._force(ca.SX(eye[k]))]) for k in range(3)]
+        return [self.tree.respond(wrenches=self._alike(self._force(ca.SX(eye[k])))) for k in range(3)]
 
     @cached_property
     def ellipsoid(self) -> ca.SX:
@@ -142,7 +161,7 @@ class ImpactKernel:
     @cached_property
     def _sticking(self) -> Response:
         """The answer to the impulse ``s = (JM⁻¹Jᵀ)⁻¹n`` per unit approach speed."""
-        return self.tree.respond(wrenches=[self._force(self._mobility_inverse @ self.world_normal)])
+        return self.tree.respond(wrenches=self._alike(self._force(self._mobility_inverse @ self.world_normal)))
 
     @cached_property
     def S(self) -> ca.SX:
@@ -157,7 +176,7 @@ class ImpactKernel:
         weighed = self._weigh(x.a, x.velocities)
         free = self.tree.respond(tau=weighed)
         r = -self._mobility_inverse @ self.tree.point_velocity(self.point, free.velocities)[:3]
-        adjoint = self.tree.respond(tau=weighed, wrenches=[self._force(r)])
+        adjoint = self.tree.respond(tau=weighed, wrenches=self._alike(self._force(r)))
         gradient = 2 * self.tree.pair_gradient(x, adjoint) + self._metric_gradient(x.velocities)
         if self.contact.normal_frame == "contact":
             gradient = gradient - 2 * self.tree.turning_gradient(self.point, self.world_normal, r)
@@ -170,7 +189,7 @@ class ImpactKernel:
             return self.tree.own_mass_times(a, velocities)
         if self.metric.weights is None:
             return a
-        return ca.SX(self.metric.diagonal(self.tree.nv)) * a
+        return self.tree.by_joint("weight", self.metric.diagonal(self.tree.nv)) * a
 
     def _metric_gradient(self, velocities: ByJoint) -> ca.SX:
         """``∂_q aᵀWa`` with ``a`` held fixed: zero unless W = M."""

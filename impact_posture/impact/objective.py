@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.dynamics.twins import Twins
 from impact_posture.impact.contact import Contact, Support, default_compliance, point_on
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.metric import Metric, ObjectiveKind
@@ -139,11 +140,14 @@ class ImpactObjective:
     @cached_property
     def kernel(self) -> ImpactKernel:
         """The expressions, on fresh symbols q and n."""
-        q, n = ca.SX.sym("q", self.robot.nq), ca.SX.sym("n", 3)
-        return ImpactKernel(self.robot, self.contact, self.metric, self.supports, self.compliance, q, n)
+        return self.kernel_of(ca.SX.sym("q", self.robot.nq), ca.SX.sym("n", 3))
 
-    def _pair(self) -> tuple[ca.SX, ca.SX]:
-        k = self.kernel
+    def kernel_of(self, q: ca.SX, n: ca.SX, twins: Twins | None = None) -> ImpactKernel:
+        """The expressions on given symbols; with ``twins``, alike for twin branches."""
+        return ImpactKernel(self.robot, self.contact, self.metric, self.supports, self.compliance, q, n, twins)
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """Value and tangent gradient (nv) in the symbols of a kernel of this contact, metric and supports."""
         if self.kind == "impulse":
             return self.scale * k.H, self.scale * k.grad_H
         if self.kind == "speed":
@@ -161,8 +165,8 @@ class ImpactObjective:
 
     def gradient_fun(self) -> ca.Function:
         """``(q, n) → value, gradient``: value and tangent gradient (nv); ``n`` in the contact's normal frame."""
-        value, gradient = self._pair()
         k = self.kernel
+        value, gradient = self.expressions(k)
         return ca.Function(
             "gradient", [k.q, k.n], [value, gradient], ["q", "n"], ["value", "gradient"], {"cse": True}
         )

@@ -1,0 +1,183 @@
+"""Divide a graph among C functions: what several exported functions need is computed by blocks that they share."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from impact_posture.codegen.program import ARITHMETIC, COSINE, SINE, Graph
+
+# Statements a block: compilers take more than proportionally longer on long functions.
+_BLOCK = 300
+# Operations that one statement may hold.
+_STATEMENT = 12
+
+
+@dataclass(frozen=True)
+class Block:
+    """One C function's part of the work.
+
+    Attributes:
+        functions: The exported functions that need it, by number.
+        nodes: What it computes, in order, each a statement of its own.
+    """
+
+    functions: frozenset[int]
+    nodes: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Blocks in the order in which they are called, and what they hand on.
+
+    Attributes:
+        graph: The operations.
+        blocks: Where each is computed.
+        inlined: Nodes that are computed within the statement that uses them.
+        slots: Node → its place in the work array of its width.
+        sizes: Width → length of the work array.
+        angles: Inputs whose sine and cosine are taken, in the order of the sines' array.
+        trig: Sine or cosine node → its first place in that array.
+    """
+
+    graph: Graph
+    blocks: tuple[Block, ...]
+    inlined: frozenset[int]
+    slots: Mapping[int, int]
+    sizes: Mapping[int, int]
+    angles: tuple[int, ...]
+    trig: Mapping[int, int]
+
+
+def is_leaf(graph: Graph, trig: Mapping[int, int], k: int) -> bool:
+    """Whether a node needs no statement of its own: it is at hand in every block."""
+    return graph.nodes[k].op in ("const", "in", "lane") or k in trig
+
+
+def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOCK) -> Layout:
+    """Divide a graph.
+
+    Args:
+        graph: The operations.
+        functions: For each exported function the outputs that it gives.
+        block: Statements that a block has at most.
+    """
+    order = _depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
+    angles, trig = _trig(graph, order)
+    needed = _needed(graph, functions, trig)
+    # What only the sines' array is made of has no statement.
+    order = [k for k in order if k in needed]
+    users: dict[int, list[int]] = {}
+    for k in order:
+        for a in set(_sources(graph, trig, k)):
+            users.setdefault(a, []).append(k)
+    outputs = {_source(graph, k) for names in functions for name in names for k in graph.outputs[name]}
+    inlined = _inlined(graph, order, users, outputs, needed, trig)
+    groups: dict[frozenset[int], list[int]] = {}
+    for k in order:
+        if k not in inlined and not is_leaf(graph, trig, k):
+            groups.setdefault(needed[k], []).append(k)
+    blocks = [
+        Block(mask, tuple(nodes[at : at + block]))
+        for mask, nodes in sorted(groups.items(), key=lambda item: (-len(item[0]), sorted(item[0])))
+        for at in range(0, len(nodes), block)
+    ]
+    at = {k: number for number, part in enumerate(blocks) for k in part.nodes}
+
+    def home(k: int) -> int:
+        """The block of the statement that node k is part of."""
+        while k in inlined:
+            (k,) = users[k]
+        return at[k]
+
+    slots: dict[int, int] = {}
+    sizes: dict[int, int] = {}
+    for part in blocks:
+        for k in part.nodes:
+            if k in outputs or any(home(user) != at[k] for user in users.get(k, ())):
+                width = graph.nodes[k].width
+                slots[k] = sizes.get(width, 0)
+                sizes[width] = slots[k] + 1
+    return Layout(graph, tuple(blocks), frozenset(inlined), slots, sizes, angles, trig)
+
+
+def _source(graph: Graph, k: int) -> int:
+    """The node that is computed for the sake of k."""
+    return graph.nodes[k].args[0] if graph.nodes[k].op == "lane" else k
+
+
+def _sources(graph: Graph, trig: Mapping[int, int], k: int) -> list[int]:
+    return [] if is_leaf(graph, trig, k) else [_source(graph, a) for a in graph.nodes[k].operands]
+
+
+def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
+    """What the roots need, operands first, close to where it is used."""
+    seen: set[int] = set()
+    order: list[int] = []
+    for root in roots:
+        stack = [(root, False)]
+        while stack:
+            k, ready = stack.pop()
+            if ready:
+                order.append(k)
+            elif k not in seen:
+                seen.add(k)
+                stack.append((k, True))
+                stack += [(a, False) for a in reversed(graph.nodes[k].operands) if a not in seen]
+    return order
+
+
+def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
+    """Sines and cosines of inputs, vectors first, so that each stands at a multiple of its width."""
+    found = [k for k in order if graph.nodes[k].op in (SINE, COSINE)]
+    starts: dict[int, int] = {}
+    angles: list[int] = []
+    trig: dict[int, int] = {}
+    for k in sorted(found, key=lambda k: -graph.nodes[k].width):
+        argument = graph.nodes[k].args[0]
+        members = graph.nodes[argument].args if graph.nodes[argument].op == "gather" else (argument,)
+        if all(graph.nodes[m].op == "in" for m in members):
+            if argument not in starts:
+                starts[argument] = len(angles)
+                angles += members
+            trig[k] = starts[argument]
+    return tuple(angles), trig
+
+
+def _needed(graph: Graph, functions: Sequence[Sequence[str]], trig: Mapping[int, int]) -> dict[int, frozenset[int]]:
+    found: dict[int, set[int]] = {}
+    for number, names in enumerate(functions):
+        waiting = [_source(graph, k) for name in names for k in graph.outputs[name]]
+        while waiting:
+            k = waiting.pop()
+            if number not in found.setdefault(k, set()):
+                found[k].add(number)
+                waiting += _sources(graph, trig, k)
+    return {k: frozenset(v) for k, v in found.items()}
+
+
+def _inlined(
+    graph: Graph,
+    order: Sequence[int],
+    users: Mapping[int, list[int]],
+    outputs: set[int],
+    needed: Mapping[int, frozenset[int]],
+    trig: Mapping[int, int],
+) -> set[int]:
+    """Arithmetic that one other operation of the same functions uses, once."""
+    size: dict[int, int] = {}
+    inlined: set[int] = set()
+    for k in order:
+        node = graph.nodes[k]
+        if is_leaf(graph, trig, k):
+            continue
+        size[k] = 1 + sum(size[a] for a in node.operands if a in inlined)
+        own = users.get(k, ())
+        if len(own) != 1 or k in outputs or node.op not in ARITHMETIC or size[k] >= _STATEMENT:
+            continue
+        times = Counter(_source(graph, a) for a in graph.nodes[own[0]].operands)[k]
+        direct = k in graph.nodes[own[0]].operands
+        if times == 1 and direct and needed[own[0]] == needed[k] and graph.nodes[own[0]].op in ARITHMETIC:
+            inlined.add(k)
+    return inlined
