@@ -286,6 +286,10 @@ ExportOut = Annotated[
     _option("--out", metavar="DIR", panel=OUTPUT, show_default="./PREFIX-c", help="Folder of the C code."),
 ]
 Float = Annotated[bool, _option("--float", panel=OUTPUT, help="Compute in float instead of double.")]
+Portable = Annotated[
+    bool,
+    _option("--portable", panel=OUTPUT, help="Plain C99 without vectors, for compilers other than GCC and Clang."),
+]
 CompileLibrary = Annotated[
     bool, _option("--compile", panel=OUTPUT, help="Build the shared library and compare it with other libraries.")
 ]

@@ -8,7 +8,7 @@ import re
 import subprocess
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +146,18 @@ def test_gradients_are_those_of_the_values(built: Built) -> None:
         np.testing.assert_allclose(found, expected, atol=1e-6 * max(np.abs(expected).max(), scale), rtol=0)
 
 
+def test_free_beside_standing(built: Built) -> None:
+    """What stands has the free robot's functions too, equal to Pinocchio's without supports."""
+    objective, frame = built.objective, built.export.manifest["frames"][0]
+    assert (frame["free"] is None) == (not objective.supports)
+    if objective.supports:
+        free = replace(objective, supports=())
+        assert oracle_difference(built.library.at(f"{built.export.prefix}_free"), free, 5) <= 1e-10
+        q, n = np.array(frame["self_test"]["q"]), np.array(frame["self_test"]["n"])
+        assert frame["free"]["self_test"]["q"] == frame["self_test"]["q"]
+        assert abs(built.library.eval(q, n)[1] / frame["free"]["self_test"]["H"] - 1) > 1e-3
+
+
 def test_objective_carries_the_impulse_bound(built: Built) -> None:
     if built.objective.kind != "impulse":
         assert built.objective.scale == 1.0
@@ -227,7 +239,9 @@ def test_object_holds_no_writable_data(built: Built, tmp_path: Path) -> None:
     kinds = {line.split()[-2] for line in lines}
     assert not kinds & set("bBdDcCsSgG")
     exported = {line.split()[-1].lstrip("_") for line in lines if line.split()[-2] in "TR"}
-    assert exported == set(built.export.manifest["symbols"].values())
+    free = built.export.manifest["frames"][0]["free"]
+    expected = set(built.export.manifest["symbols"].values()) | set(free["symbols"].values() if free else ())
+    assert exported == expected
 
 
 def test_works_from_several_threads(built: Built) -> None:
@@ -396,7 +410,7 @@ def test_compiler_that_fails(pendulum: str, tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(CompilerError) as caught:
         export(objective, tmp_path, prefix="pend")
     assert "exit code 1" in caught.value.line
-    assert "command: false -std=c99 -O2 -fPIC -shared pend.c" in caught.value.line
+    assert "command: false -std=c99 -O2 -ffp-contract=fast -fPIC -shared pend.c" in caught.value.line
     assert "\n" not in caught.value.line
     assert (tmp_path / "pend.c").is_file()
 

@@ -9,12 +9,35 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from impact_posture.codegen.emitter import _OPERATIONS, c_double, emit_function
+from impact_posture.codegen.emitter import DOUBLE, Constants, Dialect, Emitter, c_double
+from impact_posture.codegen.layout import lay_out
+from impact_posture.codegen.program import CALLS, graph_of
 from impact_posture.errors import CompilerError
 from impact_posture.toolchain import run_compiler
 from tests.tools import need_compiler
 
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
+
+
+def c_function(function: ca.Function) -> str:
+    """``void f(inputs..., outputs...)`` of an SX function."""
+    graph = graph_of(function)
+    layout = lay_out(graph, [function.name_out()], block=10)
+    constants = Constants("f", DOUBLE)
+    emitter = Emitter(layout, Dialect("f", DOUBLE, {1: "double"}), 8, constants)
+    blocks = "\n".join(block.text for block in emitter.blocks)
+    parameters = [f"const double *{v}" for v in graph.inputs] + [f"double *{v}" for v in graph.outputs]
+    angles = len(layout.angles)
+    lines = [f"struct {{ double s[{angles + 1}], c[{angles + 1}], w[{layout.sizes.get(1, 0) + 1}]; }} m;"]
+    for k, node in enumerate(layout.angles):
+        lines += [f"m.s[{k}] = sin({emitter.output(node)});", f"m.c[{k}] = cos({emitter.output(node)});"]
+    lines += [block.call for block in emitter.blocks]
+    for name, nodes in graph.outputs.items():
+        lines += [f"{name}[{k}] = {emitter.output(node)};" for k, node in enumerate(nodes)]
+    lines += [f"(void){name};" for name in graph.inputs]
+    body = "\n  ".join(lines)
+    head = f"#include <math.h>\n{constants.text({1: 'double'})}\n{blocks}"
+    return f"{head}\nvoid f({', '.join(parameters)});\nvoid f({', '.join(parameters)})\n{{\n  {body}\n}}\n"
 
 
 def test_every_operation_of_the_emitter(tmp_path: Path) -> None:
@@ -31,10 +54,8 @@ def test_every_operation_of_the_emitter(tmp_path: Path) -> None:
     outputs = ca.sparsify(ca.vertcat(*values))
     function = ca.Function("f", [x, y], [outputs, ca.sin(a) * b], ["x", "y"], ["out", "extra"])
     used = {function.instruction_id(k) for k in range(function.n_instructions())}
-    assert set(_OPERATIONS) - used <= {ca.OP_ASSIGN}
-    text = "#include <math.h>\nvoid f(const double *, const double *, double *, double *);\n" + emit_function(
-        "f", function
-    ).removeprefix("static ")
+    assert set(CALLS) <= used
+    text = c_function(function)
     (tmp_path / "f.c").write_text(text)
     library = tmp_path / "f.so"
     command = [*compiler, "-std=c99", *STRICT, "-O2", "-fPIC", "-shared", "f.c", "-o", str(library), "-lm"]
@@ -52,7 +73,7 @@ def test_every_operation_of_the_emitter(tmp_path: Path) -> None:
 def test_an_operation_that_has_no_c() -> None:
     x = ca.SX.sym("x")
     with pytest.raises(CompilerError, match="no C form"):
-        emit_function("f", ca.Function("f", [x], [ca.erf(x)], ["x"], ["y"]))
+        graph_of(ca.Function("f", [x], [ca.erf(x)], ["x"], ["y"]))
 
 
 @pytest.mark.parametrize("value", [0.1, -0.1, 1e-310, 1e22, -1 / 3, 5e-324, 1.7976931348623157e308, 0.0, -0.0])

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from impact_posture.impact.objective import ImpactObjective
 
 # What a result folder leaves to be said.
-_FREE = {"robot", "prefix", "out", "float_", "compile", "force", "json", "quiet"}
+_FREE = {"robot", "prefix", "out", "float_", "portable", "compile", "force", "json", "quiet"}
 
 RobotOrResult = Annotated[
     str,
@@ -48,6 +48,7 @@ def codegen(
     prefix: options.Prefix = None,
     out: options.ExportOut = None,
     float_: options.Float = False,
+    portable: options.Portable = False,
     compile: options.CompileLibrary = False,
     force: options.Force = False,
     json: options.Json = False,
@@ -95,6 +96,7 @@ def codegen(
         prefix=prefix,
         posture=posture,
         single=float_,
+        portable=portable,
         build=compile,
         force=force,
     )

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import shlex
 from contextlib import suppress
 from pathlib import Path
 
 from impact_posture.errors import CompilerError, OutputError
 from impact_posture.toolchain import find_compiler, run_compiler
 
-FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared")
+# Strict C forbids fused multiply-adds by default.
+FLAGS = ("-std=c99", "-O2", "-ffp-contract=fast", "-fPIC", "-shared")
 GET_ONE = "install gcc or clang, or set CC"
 
 
@@ -25,7 +27,7 @@ def build_library(folder: Path, prefix: str, target: Path | None = None, extra_f
         folder: The export.
         prefix: Its prefix.
         target: Where to; ``lib<prefix>.so`` beside the source by default.
-        extra_flags: For the compiler, after :data:`FLAGS`.
+        extra_flags: For the compiler, after :data:`FLAGS` and those in ``$CFLAGS``.
 
     Raises:
         CompilerError: No compiler, or it failed: its first error line and the command.
@@ -37,7 +39,8 @@ def build_library(folder: Path, prefix: str, target: Path | None = None, extra_f
     target = library_path(folder, prefix) if target is None else target
     # In the same folder, so that the rename is one step; by process, so that two builds do not meet.
     beside = target.with_name(f".{target.name}.{os.getpid()}.part")
-    command = [*compiler, *FLAGS, *extra_flags, f"{prefix}.c", "-o", str(beside.absolute()), "-lm"]
+    own = shlex.split(os.environ.get("CFLAGS", ""))
+    command = [*compiler, *FLAGS, *own, *extra_flags, f"{prefix}.c", "-o", str(beside.absolute()), "-lm"]
     try:
         run_compiler(command, folder)
         os.replace(beside, target)

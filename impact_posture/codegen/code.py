@@ -11,6 +11,7 @@ from impact_posture.codegen.functions import Exported, Library, library
 from impact_posture.codegen.lanes import packed
 from impact_posture.codegen.layout import Layout, lay_out
 from impact_posture.codegen.program import ARITHMETIC, Graph, graph_of
+from impact_posture.codegen.variants import Variant
 from impact_posture.codegen.vectors import LARGEST_VECTOR, vector_text
 from impact_posture.impact.objective import ImpactObjective
 
@@ -53,18 +54,16 @@ class Code:
     stack_bytes: int
 
 
-def build_code(
-    objectives: Sequence[ImpactObjective], names: Sequence[str], prefix: str, real: Real, *, portable: bool = False
-) -> Code:
+def build_code(exported: Sequence[Variant], prefix: str, real: Real, *, portable: bool = False) -> Code:
     """Generate the functions of each objective.
 
     Args:
-        objectives: What is exported, all of one robot.
-        names: What the C names of each begin with.
+        exported: What is exported, all of one robot.
         prefix: What the names of everything shared begin with.
         real: The C type to compute in.
         portable: Without vectors, for compilers that have none.
     """
+    objectives, names = [v.objective for v in exported], [v.stem for v in exported]
     return _Writer(library(objectives, names), objectives, names, prefix, real, portable).code()
 
 

@@ -17,8 +17,9 @@ from impact_posture.codegen.code import build_code
 from impact_posture.codegen.compiler import compile_and_check
 from impact_posture.codegen.emitter import DOUBLE, Real
 from impact_posture.codegen.manifest import build_manifest
-from impact_posture.codegen.naming import c_identifier, check_prefix, stems
+from impact_posture.codegen.naming import c_identifier, check_prefix
 from impact_posture.codegen.source import build_texts
+from impact_posture.codegen.variants import variants
 from impact_posture.errors import InputError, OutputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.toolchain import find_compiler
@@ -51,6 +52,7 @@ def export(
     prefix: str | None = None,
     posture: NDArray[np.float64] | None = None,
     real: Real = DOUBLE,
+    portable: bool = False,
     force: bool = False,
     check: bool = True,
 ) -> Export:
@@ -65,6 +67,7 @@ def export(
         prefix: What the C names begin with, a C identifier; robot and frame by default.
         posture: A configuration to go along as a constant, shape (nq,).
         real: The C type to compute in.
+        portable: Plain C99, for compilers without the vectors of GCC and Clang.
         force: Replace files that are there.
         check: Build and compare; ``compiled`` is false without.
 
@@ -84,9 +87,10 @@ def export(
         posture = robot.check_posture(given, limits=False)
         # Normalizing what is of unit norm already turns last digits: keep those that result.json has.
         posture = given if np.allclose(given, posture, rtol=0, atol=1e-9) else posture
-    code = build_code(objectives, stems(prefix, [o.contact.frame for o in objectives]), prefix, real)
+    exported = variants(objectives, prefix)
+    code = build_code(exported, prefix, real, portable=portable)
     manifest = build_manifest(objectives, prefix, posture, real, code.stack_bytes)
-    texts = build_texts(objectives, prefix, manifest, code, real)
+    texts = build_texts(exported, prefix, manifest, code, real)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     _write(texts, out, force)
     files = tuple(out / name for name in texts)

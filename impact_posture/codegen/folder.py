@@ -43,7 +43,13 @@ class WrittenExport:
     @property
     def functions(self) -> list[str]:
         """Names of the C functions."""
-        return [name for block in self.export.manifest["frames"] for name in block["symbols"].values()]
+        return [
+            name
+            for frame in self.export.manifest["frames"]
+            for block in (frame, frame["free"])
+            if block is not None
+            for name in block["symbols"].values()
+        ]
 
     @property
     def verdict(self) -> str:
@@ -77,6 +83,7 @@ def write_export(
     prefix: str | None = None,
     posture: NDArray[np.float64] | None = None,
     single: bool = False,
+    portable: bool = False,
     build: bool = False,
     force: bool = False,
 ) -> WrittenExport:
@@ -88,6 +95,7 @@ def write_export(
         prefix: What the C names begin with; robot and frame by default.
         posture: A configuration to go along, shape (nq,).
         single: Compute in ``float``.
+        portable: Plain C99, for compilers without the vectors of GCC and Clang.
         build: Leave ``lib<prefix>.so`` in the folder.  Without a compiler there is none, and no error.
         force: Replace an earlier export.
 
@@ -102,7 +110,7 @@ def write_export(
     # A folder is ours by a manifest in it, whatever that is called: not by any .json.
     marks = tuple(glob.escape(path.name) for path in sorted(out.glob("*.json")) if is_manifest(path))
     with whole_folder(out, force=force, marks=marks) as folder:
-        made = export(objectives, folder, prefix=prefix, posture=posture, real=real, check=False)
+        made = export(objectives, folder, prefix=prefix, posture=posture, real=real, portable=portable, check=False)
     made = replace(made, files=tuple(out / path.name for path in made.files))
     if not build or find_compiler() is None:
         return WrittenExport(out, made, None, build)

@@ -35,21 +35,27 @@ class ImpactGradient:
     Attributes:
         manifest: The content of ``<prefix>.json``.
         frame: The contact frame that this object is about.
+        free: Whether it leaves the supports away.
         nq: Numbers in a configuration.
         nv: Numbers in a gradient.
     """
 
     manifest: Mapping[str, Any]
     frame: str
+    free: bool
     nq: int
     nv: int
 
-    def __init__(self, library: ctypes.CDLL, manifest: Mapping[str, Any], frame: str | None = None) -> None:
+    def __init__(
+        self, library: ctypes.CDLL, manifest: Mapping[str, Any], frame: str | None = None, *, free: bool = False
+    ) -> None:
         """Bind a loaded library; use :meth:`load`."""
         block = frame_block(manifest, frame)
-        self.manifest, self.frame = manifest, str(block["frame"])
+        self.manifest, self.frame, self.free = manifest, str(block["frame"]), free
         self.nq, self.nv = int(manifest["nq"]), int(manifest["nv"])
-        self._library, self._symbols = library, block["symbols"]
+        # A robot without supports is free as it is.
+        self._block = (block.get("free") if free else None) or block
+        self._library, self._symbols = library, self._block["symbols"]
         self._real = _TYPES[manifest["real"]]
         self.dtype = np.dtype(self._real)
         buffers = {"q": self.nq, "n": 3, "grad": self.nv, "own": self.nv, "jump": self.nv, "L": 9}
@@ -68,7 +74,9 @@ class ImpactGradient:
         self._batch = self._function("eval_batch")
 
     @classmethod
-    def load(cls, path: str | Path, *, robot: Robot | None = None, frame: str | None = None) -> ImpactGradient:
+    def load(
+        cls, path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
+    ) -> ImpactGradient:
         """Load an export.
 
         ``lib<prefix>.so`` beside the manifest is used; where there is none **it is built there** with the user's
@@ -78,6 +86,7 @@ class ImpactGradient:
             path: The export's folder, or its ``<prefix>.json``.
             robot: The robot in hand; the export must be of this very model.
             frame: Which contact frame of an export with several; the first by default.
+            free: The robot without its supports, where the export has some.
 
         Raises:
             SpecError: No export there, or a broken one.
@@ -94,7 +103,7 @@ class ImpactGradient:
         if not target.is_file():
             build_library(folder, prefix)
         try:
-            found = cls(ctypes.CDLL(str(target.absolute())), manifest, frame)
+            found = cls(ctypes.CDLL(str(target.absolute())), manifest, frame, free=free)
         except (OSError, AttributeError) as error:
             raise SpecError(
                 f"cannot be loaded ({error})", where=str(target), mend="delete it: it is built again"
@@ -104,7 +113,7 @@ class ImpactGradient:
 
     def copy(self) -> ImpactGradient:
         """The same functions with buffers of their own, for another thread."""
-        return ImpactGradient(self._library, self.manifest, self.frame)
+        return ImpactGradient(self._library, self.manifest, self.frame, free=self.free)
 
     # ---- one configuration ------------------------------------------------------------------------------------
 
@@ -222,7 +231,7 @@ class ImpactGradient:
         return function
 
     def _self_test(self, where: str) -> None:
-        test = frame_block(self.manifest, self.frame)["self_test"]
+        test = self._block["self_test"]
         H, grad = self.value_and_gradient(test["q"], test["n"])
         found, expected = np.array([H, *grad]), np.array([test["H"], *test["grad"]])
         difference = float(np.abs(found - expected).max() / np.abs(expected).max())

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from impact_posture import __version__
 from impact_posture.codegen.emitter import DOUBLE, Real
 from impact_posture.codegen.functions import ellipsoid_fun, jump_fun, objective_fun
-from impact_posture.codegen.naming import FUNCTIONS, stems
+from impact_posture.codegen.naming import FUNCTIONS
 from impact_posture.codegen.reader import SCHEMA
+from impact_posture.codegen.variants import variants
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import MetricError
 from impact_posture.impact.objective import ImpactObjective
@@ -105,12 +106,18 @@ def build_manifest(
 ) -> dict[str, Any]:
     """Everything that a reader needs to tell whether the export fits the robot in hand.
 
-    What belongs to one frame stands in ``frames``, an entry each; that of the first frame at the top as well.
+    What belongs to one frame stands in ``frames``, an entry each; that of the first frame at the top as well.  An
+    entry's ``free`` has the symbols and the reference of the robot without its supports; null where it has none.
     """
     first = objectives[0]
     robot, metric = first.robot, first.metric
-    names = stems(prefix, [o.contact.frame for o in objectives])
-    frames = [_frame_block(o, stem, real) for o, stem in zip(objectives, names, strict=True)]
+    frames: list[dict[str, Any]] = []
+    for variant in variants(objectives, prefix):
+        block = _frame_block(variant.objective, variant.stem, real)
+        if variant.free:
+            frames[-1]["free"] = {key: block[key] for key in ("symbols", "self_test")}
+        else:
+            frames.append(block | {"free": None})
     symbols = frames[0]["symbols"] | ({} if posture is None else {"posture": f"{prefix}_posture"})
     return {
         "schema": SCHEMA,

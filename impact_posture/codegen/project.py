@@ -146,7 +146,8 @@ CXX ?= c++
 CFLAGS ?= -O2 -Wall -Wextra
 CXXFLAGS ?= -O2 -Wall -Wextra
 EIGEN ?= /usr/include/eigen3
-ALL_CFLAGS = -std=c99 -pedantic -fPIC $$(CFLAGS)
+# Strict C forbids fused multiply-adds by default.  For this very machine: CFLAGS="-O3 -march=native".
+ALL_CFLAGS = -std=c99 -pedantic -ffp-contract=fast -fPIC $$(CFLAGS)
 
 all: example
 

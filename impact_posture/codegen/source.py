@@ -12,7 +12,7 @@ from impact_posture.codegen.code import Code
 from impact_posture.codegen.compiler import self_test_tolerance
 from impact_posture.codegen.emitter import Real, c_double, c_vector
 from impact_posture.codegen.manifest import unit_slices
-from impact_posture.codegen.naming import stems
+from impact_posture.codegen.variants import Variant
 from impact_posture.impact.objective import ImpactObjective
 
 _PLAIN = str.maketrans({"·": " ", "²": "^2", "×": "x", "λ": "l", "ε": "eps", "⁻": "^-", "¹": "1"})
@@ -36,14 +36,12 @@ def wrapped(words: list[str], indent: str, width: int = 112) -> str:
 
 
 def build_texts(
-    objectives: Sequence[ImpactObjective], prefix: str, manifest: dict[str, Any], code: Code, real: Real
+    exported: Sequence[Variant], prefix: str, manifest: dict[str, Any], code: Code, real: Real
 ) -> dict[str, str]:
     """File name → text of everything but the manifest."""
+    objectives = [v.objective for v in exported if not v.free]
     facts = _facts(objectives, prefix, manifest, real)
-    each = [
-        facts | _frame_facts(o, stem, alone=len(objectives) == 1)
-        for o, stem in zip(objectives, stems(prefix, [o.contact.frame for o in objectives]), strict=True)
-    ]
+    each = [facts | _frame_facts(v, alone=len(objectives) == 1) for v in exported]
     facts = each[0] | facts
     comment = {key: plain(value) for key, value in facts.items()}
     comments = [{key: plain(value) for key, value in block.items()} for block in each]
@@ -59,14 +57,15 @@ def build_texts(
         "q_order": wrapped([plain(v) for v in manifest["q_names"]], " *      "),
         "v_order": wrapped([plain(v) for v in manifest["v_names"]], " *      "),
         "convention": comment["convention"].replace("; ", ";\n * "),
-        "contacts": "\n".join(templates.CONTACT_LINE.substitute(block) for block in comments),
+        "contacts": "\n".join(templates.CONTACT_LINE.substitute(block) for block in comments if not block["free"]),
         "declarations": "".join(templates.DECLARATIONS.substitute(block) for block in comments),
     }
     tables = {
         key: "\n".join(f"| {k} | {name} |" for k, name in enumerate(manifest[names]))
         for key, names in (("q_table", "q_names"), ("v_table", "v_names"))
     }
-    checks = [block | _references(m["self_test"], real) for block, m in zip(each, manifest["frames"], strict=True)]
+    blocks = [b for frame in manifest["frames"] for b in (frame, frame["free"]) if b is not None]
+    checks = [block | _references(m["self_test"], real) for block, m in zip(each, blocks, strict=True)]
     return {
         f"{prefix}.h": templates.HEADER.substitute(comment | order, posture=declaration),
         f"{prefix}.c": templates.SOURCE.substitute(
@@ -131,11 +130,13 @@ def _facts(
     }
 
 
-def _frame_facts(objective: ImpactObjective, stem: str, *, alone: bool) -> dict[str, str]:
-    contact = objective.contact
+def _frame_facts(variant: Variant, *, alone: bool) -> dict[str, str]:
+    contact, stem = variant.objective.contact, variant.stem
+    where = ("" if alone else f" at {contact.frame}") + (", the robot without its supports" if variant.free else "")
     return {
         "stem": stem,
-        "at": "" if alone else f" at {contact.frame}",
+        "free": "free" if variant.free else "",
+        "at": where,
         "stem_note": "" if alone else f": {stem}_...",
         "frame": contact.frame,
         "offset": ", ".join(f"{v:.9g}" for v in contact.offset),

@@ -87,7 +87,9 @@ class Twins:
                 entries = [d[i, j] for d in dense]
                 if len(set(entries)) > 1:
                     row, column = (min(i, j), max(i, j)) if symmetric else (i, j)
-                    found[i, j] = self._parameter(place, f"{place.position}.{tag}.{row}.{column}", float(own[i, j]))
+                    # With all values: another kernel's constants of the same kind may be others.
+                    name = f"{place.position}.{tag}.{row}.{column}.{entries}"
+                    found[i, j] = self._parameter(place, name, float(own[i, j]))
                 elif entries[0] != 0.0:
                     found[i, j] = entries[0]
         return found
