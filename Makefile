@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test lint types docs bench regression clean
+.PHONY: help demo test lint types docs bench study-impacts regression clean
 
 help:
 	@echo "make demo        install into .venv, optimize a real robot, leave pictures and C code in demo/"
@@ -12,6 +12,7 @@ help:
 	@echo "make lint types  ruff; mypy"
 	@echo "make docs        the documentation site in docs/_build/html"
 	@echo "make bench       solve times on this machine"
+	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make clean       remove what make made"
 
@@ -56,6 +57,9 @@ docs: $(VENV)/.installed-docs
 
 bench: $(VENV)/.installed
 	$(BIN)/python -m tests.benchmarks.solve_times
+
+study-impacts: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks.impact_bench --write
 
 regression: $(VENV)/.installed
 	$(BIN)/python -m tests.regression.make

@@ -112,7 +112,14 @@ def _sources(graph: Graph, trig: Mapping[int, int], k: int) -> list[int]:
 
 
 def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
-    """What the roots need, operands first, close to where it is used."""
+    """What the roots need, operands first, close to where it is used.
+
+    Of an operation's operands the one that takes the longest chain comes first: the others wait for less time.
+    """
+    depth: list[int] = []
+    for node in graph.nodes:
+        own = 1 if node.op in ARITHMETIC else 0
+        depth.append(own + max((depth[a] for a in node.operands), default=0))
     seen: set[int] = set()
     order: list[int] = []
     for root in roots:
@@ -124,7 +131,9 @@ def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
             elif k not in seen:
                 seen.add(k)
                 stack.append((k, True))
-                stack += [(a, False) for a in reversed(graph.nodes[k].operands) if a not in seen]
+                stack += [
+                    (a, False) for a in sorted(graph.nodes[k].operands, key=lambda a: -depth[a]) if a not in seen
+                ]
     return order
 
 

@@ -1,0 +1,1 @@
+"""One impact in MuJoCo, measured, beside what the objectives predict of it."""

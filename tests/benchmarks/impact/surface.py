@@ -1,0 +1,208 @@
+"""A robot in one posture meets a plane in MuJoCo; the jump of its velocity is measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.mjcf import import_mujoco, write_mjcf
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.objective import ImpactObjective
+from tests.benchmarks.impact.world import BALL, with_surface
+
+Vector = NDArray[np.float64]
+
+# Steps of physics in one time constant of the contact, and the constants after which a contact counts as endless.
+_FINE, _PATIENCE = 50, 40
+# Rate at which friction and supports take a velocity to zero, over that of the contact.
+_GRIP = 10.0
+# MuJoCo's friction coefficient where nothing shall slide.
+_STICKY = 10.0
+# Iterations on Coulomb's law within one step.
+_INNER = 20
+# Steps without a force after which the contact is over.
+_QUIET = 5
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What the robot meets, and how fast.
+
+    The contact is MuJoCo's spring and damper, scaled by the mass that it feels: ``r'' = −2ζ r'/T − r/T²`` while it
+    pushes.
+
+    Attributes:
+        friction: Coulomb coefficient; 0 for none at all, infinite for a contact point that sticks.
+        convex: MuJoCo's own friction also between the two.  It is convex and lifts a sliding contact off the
+            surface, which looks like rebound; therefore Coulomb's law is else written out here.  What sticks is
+            always MuJoCo's own, with a coefficient of 10.
+        speed: Approach speed v_n, m/s.
+        damping: ζ: 2 rebounds with e = 0.05, 0.3 with 0.4, 0.1 with 0.7.
+        time: T in seconds; the contact lasts 1.5 T to 3 T.
+    """
+
+    friction: float = 0.0
+    speed: float = 1.0
+    damping: float = 2.0
+    time: float = 1e-4
+    convex: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """One impact as it happened.
+
+    Attributes:
+        jump: ``Δν`` in Pinocchio's coordinates, shape (nv,).
+        restitution: Normal speed after over before.
+        slip: Tangential speed of the contact point after over ``v_n`` (it is 0 before).
+        impulse: What the surface gave along n, N·s.
+        loss: Kinetic energy lost, J.
+        duration: Seconds from touch to the last force.
+        feet: Largest speed of a support after, over ``v_n``.
+    """
+
+    jump: Vector
+    restitution: float
+    slip: float
+    impulse: float
+    loss: float
+    duration: float
+    feet: float
+
+    @property
+    def size(self) -> float:
+        """``‖Δν‖``."""
+        return float(np.linalg.norm(self.jump))
+
+
+class NoImpact(Exception):
+    """The contact never came about, or did not end; the message says which."""
+
+
+class Scene:
+    """One posture of a robot, its contact point a hair above the plane.
+
+    Gravity, motors and joint limits are off; armature is on.  Supports are equality constraints to the world, where
+    the feet are: ``connect`` for a point, ``weld`` for a surface.
+
+    Raises:
+        NoImpact: The contact point cannot move along the normal alone.
+    """
+
+    def __init__(self, objective: ImpactObjective, q: Vector) -> None:
+        self._mujoco = import_mujoco()
+        self._robot, self._q = objective.robot, q
+        # The oracle is shared and moves on: keep what it says of this posture.
+        oracle = objective.oracle.at(q)
+        self._M, self._J, self._Js, self._n = (np.array(x) for x in (oracle.M, oracle.J, oracle.Js, oracle.n))
+        self._mobility = self._J @ oracle.solve(self._J.T)
+        self._point, self._feet = oracle.point, oracle.feet
+        written = write_mjcf(self._robot.model)
+        self._layout = written.layout
+        self._model = with_surface(written, objective, q).compile()
+        self._ball_body = int(self._model.geom("ball").bodyid[0])
+        self.approach = self._approach()
+
+    def _approach(self) -> Vector:
+        """``ν⁻`` per unit approach speed: ``Jν = −n``, ``J_sν = 0``.
+
+        A robot that flies moves as one body along ``−n``; others by the smallest velocity of base and joints.
+        """
+        if self._robot.floating and not self._feet:
+            found = np.zeros(self._robot.nv)
+            found[:3] = -pin.Quaternion(np.array(self._q[3:7])).matrix().T @ self._n
+            return found
+        J = np.vstack([self._J, self._Js])
+        wanted = np.concatenate([-self._n, np.zeros(len(self._Js))])
+        found = np.linalg.pinv(J, rcond=1e-9) @ wanted
+        if np.abs(J @ found - wanted).max() > 1e-6:
+            raise NoImpact("cannot move along the normal alone")
+        return np.asarray(found)
+
+    def hit(self, surface: Surface) -> Measured:
+        """Fly into the surface and out again.
+
+        Raises:
+            NoImpact: No contact, or no end of it.
+        """
+        mujoco, model = self._mujoco, self._model
+        self._set(surface)
+        data = mujoco.MjData(model)
+        before = surface.speed * self.approach
+        data.qpos[:], data.qvel[:] = self._layout.qpos(self._q), self._layout.qvel(self._q, before)
+        coulomb = 0 < surface.friction < np.inf and not surface.convex
+        impulse, touched, last, rubbing = 0.0, 0, 0, np.zeros(3)
+        for step in range(1, _PATIENCE * _FINE):
+            if coulomb:
+                rubbing = self._rub(data, rubbing, surface.friction)
+            mujoco.mj_step(model, data)
+            # Of the step just taken.
+            pushed = self._normal_force(data)
+            impulse += pushed * model.opt.timestep
+            if pushed > 0:
+                touched, last = touched or step, step
+            elif touched and step - last >= _QUIET:
+                return self._measure(data, surface.speed, before, impulse, (last - touched + 1) * model.opt.timestep)
+        raise NoImpact(f"in contact for longer than {_PATIENCE} T" if touched else "does not touch")
+
+    def _normal_force(self, data: Any) -> float:
+        force, total = np.zeros(6), 0.0
+        for k in range(data.ncon):
+            self._mujoco.mj_contactForce(self._model, data, k, force)
+            total += float(force[0])
+        return total
+
+    def _rub(self, data: Any, rubbing: Vector, friction: float) -> Vector:
+        """Apply Coulomb's friction for the next step and return it: at most ``μ f_n``, against the sliding.
+
+        ``f ← P(f − r v)`` with P the projection on the disc of radius ``μ f_n`` and v the sliding velocity at the end
+        of the step: at rest f is what keeps the point there, in motion it points against v.  While f changes, the
+        contact's spring and damper hold the normal acceleration.
+        """
+        self._mujoco.mj_forward(self._model, data)
+        step, center, n = self._model.opt.timestep, data.geom("ball").xpos, self._n
+        J = np.zeros((3, self._model.nv))
+        self._mujoco.mj_jac(self._model, data, J, None, center - BALL * n, self._ball_body)
+        sliding, pushed = J @ (data.qvel + step * data.qacc), self._normal_force(data)
+        sliding -= (n @ sliding) * n
+        across = self._mobility @ n
+        along = (self._mobility - np.outer(across, across) / (n @ across)) * step
+        rate, found = 1 / float(np.linalg.eigvalsh(along)[-1]), rubbing
+        for _ in range(_INNER):
+            change = found - rubbing
+            wanted = found - rate * (sliding + along @ change)
+            size, most = float(np.linalg.norm(wanted)), friction * (pushed - across @ change / (n @ across))
+            found = wanted * (min(1.0, max(most, 0.0) / size) if size > 0 else 0.0)
+        data.qfrc_applied[:] = J.T @ found
+        return np.asarray(found)
+
+    def _set(self, surface: Surface) -> None:
+        model, T = self._model, surface.time
+        model.opt.timestep = T / _FINE
+        # Negative numbers: stiffness and damping themselves.
+        model.pair_solref[:] = -1 / T**2, -2 * surface.damping / T
+        model.pair_solreffriction[:] = -1 / T**2, -_GRIP / T
+        model.eq_solref[:] = -((_GRIP / 2 / T) ** 2), -_GRIP / T
+        model.pair_dim[:] = 3 if np.isinf(surface.friction) or surface.convex else 1
+        model.pair_friction[:, :2] = min(surface.friction, _STICKY)
+
+    def _measure(self, data: Any, speed: float, before: Vector, impulse: float, duration: float) -> Measured:
+        after = self._layout.v(data.qpos, data.qvel)
+        numeric = Numeric(self._robot.model).at(self._layout.q(data.qpos))
+        moved = numeric.jacobian(self._point)[:3] @ after
+        normal = float(self._n @ moved)
+        feet = [np.abs(numeric.jacobian(point)[:rows] @ after).max() for point, rows in self._feet]
+        return Measured(
+            jump=after - before,
+            restitution=normal / speed,
+            slip=float(np.linalg.norm(moved - normal * self._n)) / speed,
+            impulse=impulse,
+            loss=float(before @ self._M @ before - after @ numeric.mass_matrix() @ after) / 2,
+            duration=duration,
+            feet=float(max(feet, default=0.0)) / speed,
+        )
