@@ -11,6 +11,7 @@ from impact_posture.codegen.functions import Exported, Library, library
 from impact_posture.codegen.lanes import packed
 from impact_posture.codegen.layout import Layout, lay_out
 from impact_posture.codegen.program import ARITHMETIC, Graph, graph_of
+from impact_posture.codegen.sums import rebuilt
 from impact_posture.codegen.variants import Variant
 from impact_posture.codegen.vectors import LARGEST_VECTOR, vector_text
 from impact_posture.impact.objective import ImpactObjective
@@ -84,6 +85,8 @@ class _Writer:
         if not portable:
             separate = graph_of(found.function)
             graph = packed(separate, found.seeds, {"constants": list(found.constants)})
+        # One configuration at a time waits for results more than for units; a batch has other lanes to go on with.
+        graph = rebuilt(graph)
         types = {1: real.name, 2: f"{prefix}_r2", 4: f"{prefix}_r4"}
         self._layout = lay_out(graph, [f.outputs for f in found.functions])
         # Short, as it stands in thousands of places.

@@ -125,27 +125,33 @@ def symmetric(matrix: ca.SX) -> ca.SX:
 
 
 def ldl_solve(matrix: ca.SX, rhs: ca.SX) -> ca.SX:
-    """Solve ``matrix x = rhs`` for a small symmetric positive definite matrix by ``LDLᵀ``, without pivots."""
+    """Solve ``matrix x = rhs`` for a small symmetric positive definite matrix by ``LDLᵀ``, without pivots.
+
+    Right-looking, and with ``L⁻¹`` written out: of all orders the one in which an operation waits for the fewest
+    others.
+    """
     n = matrix.shape[0]
+    rest = [[matrix[i, j] for j in range(i + 1)] for i in range(n)]
     L = [[ca.SX(0)] * n for _ in range(n)]
-    d = [ca.SX(0)] * n
     inverse = [ca.SX(0)] * n
     for j in range(n):
-        d[j] = matrix[j, j] - sum((L[j][k] * L[j][k] * d[k] for k in range(j)), ca.SX(0))
-        inverse[j] = 1 / d[j]
+        inverse[j] = 1 / rest[j][j]
         for i in range(j + 1, n):
-            dot = sum((L[i][k] * L[j][k] * d[k] for k in range(j)), ca.SX(0))
-            L[i][j] = (matrix[i, j] - dot) * inverse[j]
+            L[i][j] = rest[i][j] * inverse[j]
+        for i in range(j + 1, n):
+            for k in range(j + 1, i + 1):
+                rest[i][k] = rest[i][k] - L[i][j] * rest[k][j]
+    # -L⁻¹, row by row: its rows need those above.
+    N = [[ca.SX(0)] * n for _ in range(n)]
+    for i in range(n):
+        for j in range(i):
+            N[i][j] = sum((L[i][k] * N[k][j] for k in range(j + 1, i)), L[i][j])
+            N[i][j] = -N[i][j]
     columns = []
     for c in range(rhs.shape[1]):
-        y = [rhs[i, c] for i in range(n)]
-        for i in range(n):
-            for k in range(i):
-                y[i] = y[i] - L[i][k] * y[k]
-        x = [y[i] * inverse[i] for i in range(n)]
-        for i in reversed(range(n)):
-            for k in range(i + 1, n):
-                x[i] = x[i] - L[k][i] * x[k]
+        y = [rhs[i, c] + sum((N[i][k] * rhs[k, c] for k in range(i)), ca.SX(0)) for i in range(n)]
+        y = [y[i] * inverse[i] for i in range(n)]
+        x = [y[i] + sum((N[k][i] * y[k] for k in range(i + 1, n)), ca.SX(0)) for i in range(n)]
         columns.append(ca.vertcat(*x))
     return ca.horzcat(*columns)
 
