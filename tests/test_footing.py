@@ -1,0 +1,113 @@
+"""Whether feet lift or slip, against statics that can be done by hand and against Pinocchio's impulse dynamics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.footing import footing
+from impact_posture.impact.metric import Metric
+from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.robot.robot import Robot
+from tests.helpers import frame_jacobian, mass_matrix, robot
+
+FEET = {"solo8": 4, "solo12": 4, "talos": 2}
+
+
+def standing(name: str) -> tuple[Robot, tuple[Support, ...]]:
+    found = robot(name)
+    return found, tuple(Support.from_spec(s) for s in found.spec.supports)
+
+
+def oracle_of(name: str, normal: tuple[float, float, float], frame: str = "base_link") -> ImpactOracle:
+    found, supports = standing(name)
+    return ImpactOracle(found, Contact.create(frame, normal), Metric(), supports, 1e-6)
+
+
+@pytest.mark.parametrize("name", ["solo8", "solo12"])
+def test_a_blow_from_above_presses_all_feet(name: str) -> None:
+    """Down on the base: every foot pushes up; together less than the blow, for knees that no motor stiffens give."""
+    found, supports = standing(name)
+    q = found.posture()
+    result = footing(oracle_of(name, (0.0, 0.0, -1.0)), supports, q)
+    assert result.friction is not None and 0 <= result.friction < 3
+    assert len(result.feet) == FEET[name]
+    assert not any(foot.lifts for foot in result.feet)
+    total = sum(foot.impulse[2] for foot in result.feet)
+    assert 0.0 < total < 1.0
+    for foot in result.feet:
+        assert np.linalg.norm(foot.impulse[:2]) <= (result.friction + 1e-3) * foot.impulse[2] + 1e-6
+
+
+@pytest.mark.parametrize("name", ["solo8", "solo12"])
+def test_a_blow_from_below_lifts(name: str) -> None:
+    found, supports = standing(name)
+    result = footing(oracle_of(name, (0.0, 0.0, 1.0)), supports, found.posture())
+    assert result.friction is None
+    assert any(foot.lifts for foot in result.feet)
+    assert "lifts" in result.line and result.to_dict()["stays"] is False
+
+
+def test_blows_are_mirrored_in_the_feet() -> None:
+    """What one direction presses the opposite one lifts: the set of impulses is the other's, negated."""
+    found, supports = standing("solo12")
+    q = found.posture()
+    down = footing(oracle_of("solo12", (0.0, 0.0, -1.0)), supports, q)
+    up = footing(oracle_of("solo12", (0.0, 0.0, 1.0)), supports, q)
+    assert down.freedom == up.freedom
+    if down.freedom == 0:
+        for one, other in zip(down.feet, up.feet, strict=True):
+            np.testing.assert_allclose(one.impulse, -other.impulse, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "normal"), [("solo12", (0.3, 0.2, -1.0)), ("talos", (1.0, 0.2, -0.4))])
+def test_impulses_are_those_of_impulse_dynamics(name: str, normal: tuple[float, float, float]) -> None:
+    """Where the feet's impulses are unique they are Pinocchio's, from its rigid impulse dynamics."""
+    found, supports = standing(name)
+    frame = "base_link"
+    q = np.asarray(pin.integrate(found.model, found.posture(), 0.05 * np.random.default_rng(0).normal(size=found.nv)))
+    oracle = ImpactOracle(found, Contact.create(frame, normal), Metric(), supports, 1e-9)
+    result = footing(oracle, supports, q)
+    assert result.freedom == 0
+    Js = np.vstack([frame_jacobian(found.model, q, found.frame_id(s.frame), s.offset)[: s.rows] for s in supports])
+    n = np.array(normal) / np.linalg.norm(normal)
+    J = frame_jacobian(found.model, q, found.frame_id(frame))[:3]
+    free = np.linalg.solve(mass_matrix(found.model, q), J.T @ n)
+    data = found.model.createData()
+    after = np.array(pin.impulseDynamics(found.model, data, q, free, Js, 0.0, 1e-12))
+    np.testing.assert_allclose(after, oracle.quantities(q).jump, atol=1e-5 * np.abs(after).max())
+    expected = np.linalg.lstsq(Js.T, mass_matrix(found.model, q) @ (after - free), rcond=None)[0]
+    own = np.concatenate(
+        [np.concatenate([f.impulse, f.moment])[: s.rows] for f, s in zip(result.feet, supports, strict=True)]
+    )
+    np.testing.assert_allclose(own, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_the_set_matters_where_the_rank_drops() -> None:
+    """solo8's planar legs: feet can press against each other, and the impulses that pull least pull less."""
+    found, supports = standing("solo8")
+    q = found.posture()
+    oracle = oracle_of("solo8", (0.0, 1.0, -0.6))
+    result = footing(oracle, supports, q)
+    assert result.freedom > 0
+    own = oracle.quantities(q).support_impulse.reshape(-1, 3)
+    before = max(0.0, float(-own[:, 2].min()))
+    after = max(0.0, float(-min(foot.impulse[2] for foot in result.feet)))
+    assert after <= before + 1e-9
+    total = np.concatenate([foot.impulse for foot in result.feet])
+    np.testing.assert_allclose(oracle.Js.T @ total, oracle.Js.T @ own.ravel(), atol=1e-6 * np.abs(own).max())
+
+
+def test_soles_tip_over_their_edges() -> None:
+    """A blow high up on talos' torso turns the soles: with smaller soles more friction never helps."""
+    found, supports = standing("talos")
+    q = found.posture()
+    frame = "torso_2_link"
+    oracle = ImpactOracle(found, Contact.create(frame, (1.0, 0.0, -0.2)), Metric(), supports, 1e-6)
+    wide = tuple(Support(s.frame, "surface", s.offset, (5.0, 5.0)) for s in supports)
+    narrow = tuple(Support(s.frame, "surface", s.offset, (1e-4, 1e-4)) for s in supports)
+    assert footing(oracle, narrow, q).friction is None
+    large = footing(oracle, wide, q)
+    assert any(foot.lifts for foot in large.feet) or large.friction is not None
