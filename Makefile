@@ -11,7 +11,7 @@ help:
 	@echo "make test        install with the test extras and run the whole suite"
 	@echo "make lint types  ruff; mypy"
 	@echo "make docs        the documentation site in docs/_build/html"
-	@echo "make bench       solve times on this machine"
+	@echo "make bench       solve times, and the exported kernel beside its peers, on this machine"
 	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make clean       remove what make made"
@@ -57,6 +57,7 @@ docs: $(VENV)/.installed-docs
 
 bench: $(VENV)/.installed
 	$(BIN)/python -m tests.benchmarks.solve_times
+	$(BIN)/impact-posture bench
 
 study-impacts: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks.impact_bench --write

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from impact_posture_cli.commands.bench import bench
 from impact_posture_cli.commands.codegen import codegen
 from impact_posture_cli.commands.evaluate import evaluate
 from impact_posture_cli.commands.inspect import inspect
@@ -24,5 +25,6 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "plot": plot,
     "codegen": codegen,
     "verify": verify,
+    "bench": bench,
 }
 """Name to function, in the order of the help page."""

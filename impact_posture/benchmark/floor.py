@@ -20,8 +20,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.benchmark.count import Operations
 from impact_posture.robot.robot import Robot
-from tests.benchmarks.kernel.count import Operations
 
 Pattern = NDArray[np.bool_]
 
@@ -94,7 +94,7 @@ class _Joint:
     @property
     def row(self) -> int:
         """Of a spatial vector, the number along the axis."""
-        return self.axis + 3 * self.revolute
+        return self.axis + (3 if self.revolute else 0)
 
     def vector(self, count: _Count, v: Pattern, inward: bool) -> Pattern:
         """A 3-vector's rotation."""
@@ -139,7 +139,10 @@ class _Joint:
 
 
 def floor(robot: Robot, contact: int) -> Operations:
-    """Operations of H and ∇H of one robot with the contact on joint ``contact``'s link."""
+    """Operations of H and ∇H of one robot with the contact on joint ``contact``'s link.
+
+    Every joint has one degree of freedom, but for a free-flyer at the root.
+    """
     model, count = robot.model, _Count()
     joints = {i: _Joint(model, i) for i in range(1, model.njoints) if model.nvs[i] == 1}
     based = [i for i in range(1, model.njoints) if i not in joints]

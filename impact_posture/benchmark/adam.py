@@ -13,40 +13,46 @@ import contextlib
 import io
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from impact_posture.robot.loader import robots_data
-from impact_posture.robot.urdf import resolve_path
-from tests.benchmarks.kernel.build import Absent
-from tests.benchmarks.kernel.case import Case
-from tests.benchmarks.kernel.dense import solved
-from tests.benchmarks.kernel.generated import base_rotation, c_source, compiled, function_of
-from tests.benchmarks.kernel.peer import Peer
+from impact_posture.benchmark.case import Case
+from impact_posture.benchmark.dense import solved
+from impact_posture.benchmark.generated import base_rotation, c_source, compiled, function_of
+from impact_posture.benchmark.peer import Peer
+from impact_posture.benchmark.workbench import Absent, Workbench
+from impact_posture.robot.urdf import resolve_path, robots_data
 
 
-def peers(case: Case, notes: list[str]) -> list[Peer]:
+def peers(case: Case, bench: Workbench) -> list[Peer]:
     """ADAM's C.
 
     Raises:
-        Absent: ADAM is not installed.
+        Absent: ADAM is not installed, or cannot do this robot.
     """
     try:
         from adam import Representations
         from adam.casadi import KinDynComputations
     except ImportError as missing:
         raise Absent(f"{missing} (pip install adam-robotics)") from None
+    if not case.plain:
+        raise Absent("has no joints of several coordinates")
     robot = case.robot
-    # Its URDF reader prints what it does not know.
-    with contextlib.redirect_stderr(io.StringIO()), _mended_prismatic(notes):
-        kinematics = KinDynComputations(_urdf(case), list(robot.joint_names))
-        kinematics.set_frame_velocity_representation(Representations.BODY_FIXED_REPRESENTATION)
-        functions = (
-            kinematics.mass_matrix_fun(),
-            kinematics.jacobian_fun(case.frame),
-            kinematics.forward_kinematics_fun(case.frame),
-        )
+    try:
+        # Its URDF reader prints what it does not know.
+        with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()), _mended(bench):
+            kinematics = KinDynComputations(_urdf(case), list(robot.joint_names))
+            kinematics.set_frame_velocity_representation(Representations.BODY_FIXED_REPRESENTATION)
+            functions = (
+                kinematics.mass_matrix_fun(),
+                kinematics.jacobian_fun(case.frame),
+                kinematics.forward_kinematics_fun(case.frame),
+            )
+    except Exception as failed:  # whatever its URDF reader raises
+        raise Absent(f"cannot read this robot ({type(failed).__name__}: {failed})") from None
     q, n, step = ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3), ca.SX.sym("step", robot.nv)
     floating = robot.floating
     joints = q[7:] + step[6:] if floating else q + step
@@ -58,13 +64,16 @@ def peers(case: Case, notes: list[str]) -> list[Peer]:
     M, J, axes = M[first:, first:], J[:3, first:], axes[:3, :3]
     force = J.T @ (axes.T @ n)
     H = solved(M + ca.diag(ca.SX(np.array(robot.armature))), force)
-    return compiled("ADAM, reverse AD", c_source(function_of(q, n, step, H)), notes)
+    source = c_source(function_of(q, n, step, H))
+    return compiled("ADAM", "adam", "its M and J, LDLᵀ, CasADi's reverse mode and C", source, bench)
 
 
 def _urdf(case: Case) -> str:
     """The robot's URDF with an ``<origin>`` in every ``<inertial>``: ADAM's reader fails without."""
-    base = robots_data() / case.robot.name
-    root = ET.parse(resolve_path(case.robot.spec.model.urdf, base)).getroot()
+    own = "impact-posture:"
+    source = case.robot.source
+    path = robots_data() / source.removeprefix(own) if source.startswith(own) else resolve_path(source, Path())
+    root = ET.parse(path).getroot()
     for inertial in root.iter("inertial"):
         if inertial.find("origin") is None:
             ET.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
@@ -72,18 +81,18 @@ def _urdf(case: Case) -> str:
 
 
 @contextlib.contextmanager
-def _mended_prismatic(notes: list[str]) -> Iterator[None]:
+def _mended(bench: Workbench) -> Iterator[None]:
     """ADAM 0.5 gives a prismatic joint a motion subspace of twelve rows, which fails in its mass matrix."""
     from adam.model.std_factories.std_joint import StdJoint
 
     original = StdJoint.motion_subspace
 
-    def mended(joint: StdJoint) -> object:
+    def mended(joint: Any) -> Any:
         found = original(joint)
         if found.array.shape[0] == 6:
             return found
         note = "ADAM: motion subspace of prismatic joints cut from twelve rows to six"
-        notes.extend([note] if note not in notes else [])
+        bench.notes.extend([note] if note not in bench.notes else [])
         axis = np.array(ca.DM(joint.axis.array)).ravel()
         return joint.math.vertcat(*[joint.math.asarray(float(v)) for v in (*axis, 0.0, 0.0, 0.0)])
 

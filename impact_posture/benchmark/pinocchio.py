@@ -7,13 +7,15 @@ import os
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
-from tests.benchmarks.kernel.build import HERE, Absent, build, find, symbol
-from tests.benchmarks.kernel.case import Case
-from tests.benchmarks.kernel.peer import Peer
+from impact_posture.benchmark.case import Case, Vector
+from impact_posture.benchmark.peer import Peer
+from impact_posture.benchmark.workbench import CONTRACT, HERE, Absent, Workbench, cxx_compiler
 
 # Boost.MPL's preprocessed headers stop below the number of Pinocchio's joint types.
 DEFINITIONS = (
@@ -24,20 +26,20 @@ DEFINITIONS = (
     "FUSION_MAX_VECTOR_SIZE=12",
     "NDEBUG",
 )
-FLAGS = ("-std=c++17", "-O3", "-march=native")
-# Templates over every joint type: a minute on a quiet machine.
-LIMIT_S = 900.0
+FLAGS = ("-std=c++17", "-O3", "-march=native", CONTRACT)
 
+# The first is Pinocchio's own derivative algorithms; the others are by hand in part or whole.
+DERIVATIVES = "Pinocchio derivatives"
 FORMULATIONS = {
-    "Pinocchio rnea": ("crba + cholesky + computeRNEADerivatives", "peer_eval_rnea", "peer_value_chol"),
-    "Pinocchio chol": ("crba + cholesky, sweeps by hand", "peer_eval_chol", "peer_value_chol"),
-    "Pinocchio aba": ("aba(), the rest by hand", "peer_eval_aba", "peer_value_aba"),
-    "Pinocchio hand": ("all by hand on its spatial types", "peer_eval_hand", "peer_value_hand"),
+    DERIVATIVES: ("crba, its Cholesky, computeRNEADerivatives", "peer_eval_rnea", "peer_value_chol"),
+    "Pinocchio Cholesky": ("crba, its Cholesky, the sweeps by hand", "peer_eval_chol", "peer_value_chol"),
+    "Pinocchio ABA": ("aba, the rest by hand", "peer_eval_aba", "peer_value_aba"),
+    "Pinocchio by hand": ("all by hand on its spatial types", "peer_eval_hand", "peer_value_hand"),
 }
 _REASONS = {1: "a joint of several degrees of freedom", 2: "armature on the free-flyer"}
 
 
-def peers(case: Case, notes: list[str]) -> list[Peer]:
+def peers(case: Case, bench: Workbench) -> list[Peer]:
     """Every formulation; they share one library and one loaded model, so use one case at a time.
 
     Raises:
@@ -45,16 +47,18 @@ def peers(case: Case, notes: list[str]) -> list[Peer]:
     """
     include, eigen = pinocchio_headers(), eigen_headers()
     flags = [*FLAGS, *[f"-D{d}" for d in DEFINITIONS], "-isystem", str(include), "-isystem", str(eigen)]
-    compiler = find(os.environ.get("CXX", ""), "g++", "clang++", "c++")
     sources = {name: (HERE / name).read_text() for name in ("pinocchio_peer.cpp", "pinocchio_peer.hpp")}
-    built = build(sources, compiler, flags, [], LIMIT_S)
-    load(built.library, case)
+    arrays = _model_arrays(case)
+    built = bench.build("Pinocchio C++, once for all robots", sources, cxx_compiler(), flags, ())
+    _load(built.library, case, arrays)
     return [
         Peer(
-            f"{name} ({what})",
-            symbol(built.library, of_eval),
-            symbol(built.library, of_value),
-            built.command,
+            name,
+            "pinocchio",
+            what,
+            built.symbol(of_eval),
+            built.symbol(of_value),
+            built.flags,
             built.compile_s,
             built.library,
         )
@@ -63,6 +67,11 @@ def peers(case: Case, notes: list[str]) -> list[Peer]:
 
 
 def pinocchio_headers() -> Path:
+    """Beside the ``pin`` wheel.
+
+    Raises:
+        Absent: They are not there.
+    """
     own = find_spec("pinocchio")
     root = Path(str(own.origin)).parents[4] if own and own.origin else Path()
     for folder in (root / "include", *(p / "include" for p in _prefixes())):
@@ -72,7 +81,11 @@ def pinocchio_headers() -> Path:
 
 
 def eigen_headers() -> Path:
-    """``$EIGEN3_INCLUDE_DIR``, the wheel cmeel-eigen, the distribution, or what CasADi's wheel brings."""
+    """``$EIGEN3_INCLUDE_DIR``, the wheel cmeel-eigen, the distribution, or what CasADi's wheel brings.
+
+    Raises:
+        Absent: None of them.
+    """
     casadi = find_spec("casadi")
     candidates = [
         Path(os.environ.get("EIGEN3_INCLUDE_DIR") or "/nonexistent"),
@@ -91,8 +104,8 @@ def _prefixes() -> list[Path]:
     return [Path(folder) / "cmeel.prefix" for folder in sys.path if (Path(folder) / "cmeel.prefix").is_dir()]
 
 
-def load(library: ctypes.CDLL, case: Case) -> None:
-    """Give the C++ side a copy of the model: parents, joints, placements, inertias, armature."""
+def _model_arrays(case: Case) -> list[NDArray[Any]]:
+    """Parents, joints, axes, placements, inertias, armature, as ``peer_load`` takes them."""
     model = case.robot.model
     count = model.njoints - 1
     parents = np.array([model.parents[i] for i in range(1, count + 1)], dtype=np.int32)
@@ -103,16 +116,20 @@ def load(library: ctypes.CDLL, case: Case) -> None:
         kinds[k], axes[k] = _kind(joint)
         placements[k] = [*at.translation, *at.rotation.T.ravel()]
         inertias[k] = [body.mass, *body.lever, *body.inertia.T.ravel()]
-    armature = np.ascontiguousarray(model.armature, dtype=float)
+    return [parents, kinds, axes, placements, inertias, np.ascontiguousarray(model.armature, dtype=float)]
+
+
+def _load(library: ctypes.CDLL, case: Case, arrays: list[NDArray[Any]]) -> None:
+    """Give the C++ side a copy of the model."""
     joint, position = case.point
     library.peer_load.argtypes = [ctypes.c_int] + [ctypes.c_void_p] * 6 + [ctypes.c_int, ctypes.c_void_p]
-    arrays = [parents, kinds, axes, placements, inertias, armature]
-    code = library.peer_load(count, *[a.ctypes.data for a in arrays], joint, position.ctypes.data)
+    pointers = [a.ctypes.data for a in arrays]
+    code = library.peer_load(len(arrays[0]), *pointers, joint, position.ctypes.data)
     if code:
         raise Absent(f"{case.robot.name} has {_REASONS.get(code, 'something new')}")
 
 
-def _kind(joint: pin.JointModel) -> tuple[int, np.ndarray]:
+def _kind(joint: pin.JointModel) -> tuple[int, Vector]:
     name = joint.shortname().replace("JointModel", "")
     if name == "FreeFlyer":
         return 8, np.zeros(3)
@@ -123,4 +140,4 @@ def _kind(joint: pin.JointModel) -> tuple[int, np.ndarray]:
         joint.calc(data, np.zeros(1))
         S = np.asarray(data.S).ravel()
         return (3, S[3:]) if name[0] == "R" else (7, S[:3])
-    raise Absent(f"joint type {name}")
+    raise Absent(f"joints of type {name} are not in the C++ peer")

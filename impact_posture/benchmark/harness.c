@@ -18,24 +18,23 @@ static double now(void)
 }
 
 /* Seconds a call of one pass; calls that return no zero add up in *failed. */
-double time_eval(eval_t f, const double *q, const double *n, int nq, int count, double *grad, int *failed)
+double time_eval(eval_t f, const double *q, const double *n, int nq, int nv, int count, double *H, double *grad,
+                 int *failed)
 {
-  double H = 0.0;
   const double began = now();
   int k;
   for (k = 0; k < count; ++k) {
-    *failed += f(q + k * nq, n + 3 * k, &H, grad) != 0;
+    *failed += f(q + k * nq, n + 3 * k, H + k, grad + k * nv) != 0;
   }
   return (now() - began) / count;
 }
 
-double time_value(value_t f, const double *q, const double *n, int nq, int count, int *failed)
+double time_value(value_t f, const double *q, const double *n, int nq, int count, double *H, int *failed)
 {
-  double H = 0.0;
   const double began = now();
   int k;
   for (k = 0; k < count; ++k) {
-    *failed += f(q + k * nq, n + 3 * k, &H) != 0;
+    *failed += f(q + k * nq, n + 3 * k, H + k) != 0;
   }
   return (now() - began) / count;
 }
@@ -46,5 +45,26 @@ double time_batch(batch_t f, const double *q, const double *n, int count, double
 {
   const double began = now();
   *failed += f(q, n, count, H, grad) != 0;
+  return (now() - began) / count;
+}
+
+/* H and its gradient by central differences: at each configuration a call at q and two for each direction, the moved
+ * configurations made before; seconds a configuration.
+ */
+double time_differences(value_t f, const double *moved, const double *n, int nq, int nv, int count, double step,
+                        double *H, double *grad, int *failed)
+{
+  const double began = now();
+  int k, i;
+  for (k = 0; k < count; ++k) {
+    *failed += f(moved, n + 3 * k, H + k) != 0;
+    moved += nq;
+    for (i = 0; i < nv; ++i, moved += 2 * nq) {
+      double ahead = 0.0, behind = 0.0;
+      *failed += f(moved, n + 3 * k, &ahead) != 0;
+      *failed += f(moved + nq, n + 3 * k, &behind) != 0;
+      grad[k * nv + i] = (ahead - behind) / (2.0 * step);
+    }
+  }
   return (now() - began) / count;
 }

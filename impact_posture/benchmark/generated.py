@@ -7,9 +7,9 @@ from pathlib import Path
 
 import casadi as ca
 
-from tests.benchmarks.kernel.build import Absent, build, c_compiler, symbol
-from tests.benchmarks.kernel.count import count_operations, reachable_kb
-from tests.benchmarks.kernel.peer import Peer
+from impact_posture.benchmark.count import count_operations, reachable_kb
+from impact_posture.benchmark.peer import Group, Peer
+from impact_posture.benchmark.workbench import CONTRACT, Absent, Workbench, c_compiler
 
 _WRAPPER = """
 int kernel_eval(const double *q, const double *n, double *H, double *grad)
@@ -25,8 +25,8 @@ int kernel_eval(const double *q, const double *n, double *H, double *grad)
   return eval(arg, res, iw, w, 0);
 }}
 """
-# Where -O2 took longer than this, -O3 is not tried.
-_PATIENCE_S = 120.0
+# -O3 takes up to this many times what -O2 takes.
+_LONGER = 2.0
 
 
 def base_rotation(q: ca.SX) -> ca.SX:
@@ -59,29 +59,47 @@ def c_source(function: ca.Function) -> str:
     return text + _WRAPPER.format(**{key: max(1, size) for key, size in sizes.items()})
 
 
-def compiled(label: str, source: str, notes: list[str]) -> list[Peer]:
+def compiled(label: str, group: Group, what: str, source: str, bench: Workbench) -> list[Peer]:
     """The source at -O2, at -O1 where that is too slow, and at -O3 -march=native where that is not.
 
     Raises:
         Absent: No compiler, or none of them ended in time.
     """
     found: list[Peer] = []
+    compiler = c_compiler()
     operations = count_operations(source, "kernel_eval")
     for flags in (["-O2"], ["-O1"], ["-O3", "-march=native"]):
+        name = f"{label} {' '.join(flags).replace('-march=', '')}"
         if flags == ["-O1"] and found:
             continue
-        if "-O3" in flags and (not found or found[0].compile_s > _PATIENCE_S or "-O1" in found[0].flags):
-            notes.append(f"{label}: -O3 -march=native not tried, the compiler is too slow on it")
+        if "-O3" in flags and not (found and found[0].compile_s * _LONGER < bench.patience_s):
+            bench.skip(name, "not tried, as the compiler took too long at less" + _longer(found))
             continue
         try:
-            built = build({"peer.c": source}, c_compiler(), flags, ["-lm"])
+            # GNU C: what CasADi writes is compiled as people compile it.
+            built = bench.build(f"{name}: {what}", {"peer.c": source}, compiler, [*flags, CONTRACT])
         except Absent as absent:
-            notes.append(f"{label} {' '.join(flags)}: {absent}")
+            bench.skip(name, absent)
             continue
-        name = f"{label} {' '.join(flags).replace('-march=', '')}"
-        kb = (len(source.encode()) / 1e3, reachable_kb(source, "kernel_eval"))
-        address = symbol(built.library, "kernel_eval")
-        found.append(Peer(name, address, None, built.command, built.compile_s, built.library, None, operations, kb))
-    if not found:
-        raise Absent("no compilation ended")
+        address = built.symbol("kernel_eval")
+        sizes = len(source.encode()) / 1e3, reachable_kb(source, "kernel_eval")
+        found.append(
+            Peer(
+                name,
+                group,
+                what,
+                address,
+                None,
+                built.flags,
+                built.compile_s,
+                built.library,
+                None,
+                operations,
+                *sizes,
+            )
+        )
     return found
+
+
+def _longer(found: list[Peer]) -> str:
+    return f" ({found[0].compile_s:.0f} s); see --patience" if found else "; see --patience"

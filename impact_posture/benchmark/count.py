@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 _COMMENT = re.compile(r"/\*.*?\*/|//[^\n]*|^\s*#[^\n]*(?:\\\n[^\n]*)*", re.S | re.M)
 _TOKEN = re.compile(
@@ -15,18 +15,33 @@ _TYPES = frozenset("double float int void char long unsigned const restrict casa
 
 @dataclass(frozen=True)
 class Operations:
-    """Additions and subtractions, multiplications, divisions, sines and cosines, sign changes."""
+    """Arithmetic on single numbers.
+
+    Attributes:
+        add: Additions and subtractions.
+        mul: Multiplications.
+        div: Divisions.
+        trig: Sines and cosines.
+        neg: Sign changes.
+        packed: Of the whole, how many operations it is once vectors do several numbers at a time; ``None``: no
+            vectors in the source.
+    """
 
     add: int = 0
     mul: int = 0
     div: int = 0
     trig: int = 0
     neg: int = 0
+    packed: int | None = None
 
     @property
     def total(self) -> int:
         """All but sign changes, which compilers fold."""
         return self.add + self.mul + self.div + self.trig
+
+    def to_dict(self) -> dict[str, int | None]:
+        """For a JSON document."""
+        return {"total": self.total, **asdict(self)}
 
     def __add__(self, other: Operations) -> Operations:
         return Operations(
