@@ -172,6 +172,16 @@ def _frame_facts(objective: ImpactObjective, stem: str, *, alone: bool) -> dict[
         "frame": contact.frame,
         "offset": ", ".join(f"{v:.9g}" for v in contact.offset),
         "normal": ", ".join(f"{v:.9g}" for v in contact.normal),
+        "cone": (
+            f"the worst normal within {objective.normal_cone_deg:g} degrees of"
+            if objective.normal_cone_deg
+            else "the normal"
+        ),
+        "cone_note": (
+            "; where several are as bad, grad is a subgradient, that at one of them"
+            if objective.normal_cone_deg
+            else ""
+        ),
         "normal_axes": (
             "world axes" if contact.normal_frame == "world" else f"the axes of contact frame {contact.frame}"
         ),
@@ -207,7 +217,7 @@ def _bodies(objective: ImpactObjective, prefix: str, stem: str, real: Real) -> t
         emit_function(f"{stem}_ellipsoid_body", ellipsoid_fun(objective), real),
     ]
     names = {"prefix": prefix, "stem": stem, "real": real.name, "nv": objective.robot.nv}
-    if objective.name == "impulse":
+    if objective.name == "impulse" and not objective.normal_cone_deg:
         normal, scale = c_vector(objective.contact.normal, real=real), real.literal(objective.scale)
         return bodies, templates.OBJECTIVE_SCALED.substitute(names, normal=normal, scale=scale)
     bodies.append(emit_function(f"{stem}_objective_body", objective_fun(objective), real))
