@@ -1,7 +1,7 @@
 """Whether the feet stay where they are: does any support impulse that the blow allows lie in the friction cones?
 
 The metric holds the feet by force, pulling if need be.  At rank-deficient postures the impulses that hold them are
-not unique, so the question is about a set: ``f + N z`` with ``N`` a basis of ``{f: J_sᵀ f = 0}``, forces that the feet
+not unique, so the question is about a set: ``f + N z`` with ``N`` a basis of ``{f: J_sᵀ f = 0}``, forces that feet
 press against each other with.  Weight does not count: within an impact it is nothing.
 """
 
