@@ -57,6 +57,7 @@ def impact_request(
     metric: MetricKind,
     weights: str | None,
     objective: ObjectiveKind,
+    normal_cone: float,
     speed: float,
     restitution: float,
     root: RootKind | None,
@@ -89,6 +90,7 @@ def impact_request(
         metric=metric,
         weights=weights,
         objective=objective,
+        normal_cone=normal_cone,
         speed=speed,
         restitution=restitution,
     )

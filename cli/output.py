@@ -104,3 +104,11 @@ def vector(values: Iterable[Any]) -> str:
     """A unit vector; right-aligned, its numbers stand below each other."""
     # Adding zero turns -0.0 into 0.0.
     return " ".join(f"{round(float(v), 3) + 0.0:6.3f}" for v in values).strip()
+
+
+def worst_normal(block: dict[str, Any], normal: Iterable[Any]) -> str:
+    """Where in the cone the worst normal lies, from an evaluation's ``cone`` block."""
+    others = len(block["normals"]) - 1
+    tied = f", tied: {vector(block['normals'][1])} is as bad" if others else ""
+    more = f", and {others - 1} more" if others > 1 else ""
+    return f"{vector(normal)} (world), {block['angle_deg']:.3g}° from n{tied}{more}"

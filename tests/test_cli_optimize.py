@@ -195,7 +195,6 @@ def test_wrong_posture(q: list[float], words: tuple[str, ...], tmp_path: Path) -
         (("--package-dir", "nowhere"), ("nowhere",)),
         (("--config", "nowhere.toml"), ("nowhere.toml",)),
         (("--weights", "velocity-limits"), ("--metric weighted",)),
-        (("--normal-cone", "10"), ("cone",)),
         (("--armature", "elbow=-1"), ("elbow",)),
     ],
 )

@@ -145,12 +145,12 @@ def test_lifted_form(name: str) -> None:
         for kind in KINDS:
             objective = ImpactObjective(found, contact, metric, kind, supports)
             q, n = ca.SX.sym("q", found.nq), ca.SX.sym("n", 3)
-            lifted = objective.lift(Tree(found.model, q), n)
+            lifted = objective.lift(Tree(found.model, q), n, ca.SX(1))
             assert lifted.variables.shape == lifted.residual.shape
             lifted_fun = ca.Function("lifted", [q, n, lifted.variables], [lifted.residual, lifted.value])
             where = f"{kind}, {describe(contact, metric, supports)}"
             (at,) = random_configurations(found.model, 1, name, where)
-            guess = objective.guess(at)
+            guess = objective.guess(at, 1.0).values
             residual, value = (np.array(o) for o in lifted_fun(at, contact.normal, guess))
             assert np.abs(residual).max() < 1e-9 * max(1.0, np.abs(guess).max()), where
             assert_close(value, objective.value(at), VALUE, where)

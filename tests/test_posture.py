@@ -11,7 +11,7 @@ import pytest
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.contact import point_on
-from impact_posture.posture.certificate import certify, objective_gradient
+from impact_posture.posture.certificate import certify, objective_gradients
 from impact_posture.posture.equalities import equality_jacobian, rank
 from impact_posture.posture.path import null_space_path
 from impact_posture.posture.problem import PostureProblem
@@ -146,7 +146,7 @@ def test_objective_gradient_with_regularization_is_that_of_the_programme() -> No
     rng = np.random.default_rng(1)
     q = pin.integrate(problem.robot.model, problem.given, rng.normal(size=38) * 0.2)
     solution = type("S", (), {"initial": problem.given})()
-    gradient = objective_gradient(problem, q, problem.objective.value(problem.given))
+    (gradient,), _ = objective_gradients(problem, q, problem.objective.value(problem.given))
     for k in (0, 3, 5, 8, 20, 37):
         v = np.eye(38)[k]
         ahead, behind = (pin.integrate(problem.robot.model, q, s * 1e-5 * v) for s in (1, -1))
@@ -260,7 +260,7 @@ def test_command_line_wins_over_the_file(tmp_path) -> None:
     [
         ({"com": True}, "feet"),
         ({"contact": ("ee:0,0,1", "ee:1,0,0")}, "one contact"),
-        ({"normal_cone": 10.0}, "cone"),
+        ({"normal_cone": 90.0}, "half angle"),
         ({"hold": ("elbwo",)}, "elbow"),
         ({"keep": ("eee",)}, "ee"),
         ({"limit_margin": 5.0}, "no room"),

@@ -37,6 +37,7 @@ def codegen(
     metric: options.MetricName = "euclidean",
     weights: options.Weights = None,
     objective: options.ObjectiveName = "impulse",
+    normal_cone: options.NormalCone = 0.0,
     support: options.SupportList = None,
     no_support: options.NoSupport = False,
     lock: options.Lock = None,
@@ -85,7 +86,7 @@ def codegen(
             request = ImpactRequest(
                 robot=robot, load=load, frame=one, normal=normal, offset=offset, normal_frame=normal_frame,
                 contact=contact, impulse=impulse, supports=supports, metric=metric, weights=weights,
-                objective=objective,
+                objective=objective, normal_cone=normal_cone,
             )  # fmt: skip
             impact = request.resolve()
             objectives.append(impact.objective)

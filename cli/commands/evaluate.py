@@ -26,6 +26,7 @@ def evaluate(
     metric: options.MetricName = "euclidean",
     weights: options.Weights = None,
     objective: options.ObjectiveName = "impulse",
+    normal_cone: options.NormalCone = 0.0,
     posture: options.Posture = None,
     support: options.SupportList = None,
     no_support: options.NoSupport = False,
@@ -44,8 +45,8 @@ def evaluate(
     request = impact_request(
         robot, frame=frame, normal=normal, offset=offset, normal_frame=normal_frame, contact=contact,
         impulse=impulse, posture=posture, support=support, no_support=no_support, metric=metric, weights=weights,
-        objective=objective, speed=speed, restitution=restitution, root=root, package_dir=package_dir, srdf=srdf,
-        config=config, armature=armature, lock=lock,
+        objective=objective, normal_cone=normal_cone, speed=speed, restitution=restitution, root=root,
+        package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock,
     )  # fmt: skip
     from impact_posture.impact.classical import classical_ellipsoids
     from impact_posture.impact.evaluation import evaluate as evaluate_impact
@@ -74,14 +75,16 @@ def evaluate(
 
 
 def _asked(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
-    from impact_posture_cli.output import vector
+    from impact_posture_cli.output import vector, worst_normal
 
     contact, metric = impact.contact, impact.metric
     turned = ", given in the contact frame" if contact.normal_frame == "contact" else ""
     rows = [
         ("posture", impact.posture),
-        ("normal", f"{vector(found.worst_normal)} (world{turned})"),
+        ("normal", f"{vector(found.normal)} (world{turned})"),
     ]
+    if found.cone is not None:
+        rows.append(("worst normal", worst_normal(found.cone.to_dict(), found.worst_normal)))
     if any(contact.offset):
         offset = ", ".join(f"{v:g}" for v in contact.offset)
         rows.append(("contact point", f"{offset} m from {contact.frame}, in its axes"))
@@ -121,7 +124,8 @@ def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     page.table(("", *values, "unit", "meaning"), rows, right=tuple(range(1, 1 + len(values))))
     letters = {"impulse": f"λ̄²H, λ̄ = {impact.contact.impulse:g} N·s", "speed": "V", "sticking": "S", "energy": "E"}
     kind = impact.objective.kind
-    page.line(f"  objective {kind} ({letters[kind]}): {number(found.objective)}")
+    worst = f", worst within {cone:g}° of n" if (cone := impact.objective.normal_cone_deg) else ""
+    page.line(f"  objective {kind} ({letters[kind]}{worst}): {number(found.objective)}")
     if not kinetic:
         weighed = "weighted" if impact.metric.kind == "weighted" else "alike"
         page.line(f"  jump: ‖Δν‖, m/s and rad/s {weighed} in one norm", style="dim")

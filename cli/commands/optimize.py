@@ -161,10 +161,12 @@ def _announce(page: Page, prepared: Prepared) -> None:
     impact, problem = prepared.impact, prepared.problem
     page.title(f"{impact.robot.name} at {impact.contact.frame}", f"objective {impact.objective.kind}")
     axes = "world" if impact.contact.normal_frame == "world" else "contact frame"
+    degrees = impact.objective.normal_cone_deg
+    cone = f", the worst within {degrees:g}° of it" if degrees else ""
     feet = ", ".join(s.frame for s in impact.supports) or "none"
     page.pairs(
         [
-            ("normal", f"{vector(impact.contact.normal)} ({axes})"),
+            ("normal", f"{vector(impact.contact.normal)} ({axes}){cone}"),
             ("metric", impact.metric.kind),
             ("supports", feet),
             ("armature from", impact.robot.armature_source),
@@ -205,7 +207,7 @@ def _progress(*, shown: bool) -> Iterator[Callable[[int, int], None] | None]:
 
 
 def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, written: Written) -> None:
-    from impact_posture_cli.output import number
+    from impact_posture_cli.output import number, worst_normal
 
     document: dict[str, Any] = written.document
     initial, optimal = document["initial"], document["optimal"]
@@ -221,6 +223,9 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, writte
         rows.append((f"  {key}", number(initial[key]), number(optimal[key]), unit, words))
     page.table(("", "before", "after", "unit", "meaning"), rows, right=(1, 2))
     page.gap()
+    for when, block in (("before", initial), ("after", optimal)):
+        if "cone" in block:
+            page.line(f"worst normal {when}: {worst_normal(block['cone'], block['worst_normal'])}")
     page.line(f"reduction {solution.reduction:.1%}; {_redundancy(solution.redundancy)} left by the constraints")
     for note in solution.notes[len(prepared.problem.notes) :]:
         page.line(note)

@@ -62,7 +62,7 @@ def verify(
     request = impact_request(
         robot, frame=frame, normal=normal, offset=offset, normal_frame=normal_frame, contact=contact, impulse=1.0,
         posture=None, support=support, no_support=no_support, metric=metric, weights=weights, objective="impulse",
-        speed=1.0, restitution=0.0, root=root, package_dir=package_dir, srdf=srdf, config=config,
+        normal_cone=0.0, speed=1.0, restitution=0.0, root=root, package_dir=package_dir, srdf=srdf, config=config,
         armature=armature, lock=lock,
     )  # fmt: skip
     from impact_posture.verification.verify import verify as verify_objective

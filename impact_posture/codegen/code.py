@@ -103,7 +103,7 @@ class _Writer:
         for number, function in enumerate(self._library.functions):
             texts.append(self._function(number, function))
         for objective, stem in zip(self._objectives, self._names, strict=True):
-            if objective.kind == "impulse":
+            if objective.kind == "impulse" and not objective.normal_cone_deg:
                 texts.append(
                     templates.OBJECTIVE_SCALED.substitute(
                         self._common,

@@ -111,15 +111,20 @@ def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple
     if not objectives:
         raise InputError("no objective is given", where="codegen", mend="give one for each frame")
     first = objectives[0]
-    shared = (first.robot.model_sha256, first.metric, first.kind, first.supports, first.compliance)
+    shared = _what(first)
     for other in objectives[1:]:
-        if (other.robot.model_sha256, other.metric, other.kind, other.supports, other.compliance) != shared:
+        if _what(other) != shared:
             raise InputError(
                 f"'{other.contact.frame}' and '{first.contact.frame}' differ in more than the contact",
                 where="codegen",
                 mend="export them one by one",
             )
     return objectives
+
+
+def _what(o: ImpactObjective) -> tuple[object, ...]:
+    """Everything but the contact."""
+    return o.robot.model_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg
 
 
 def _write(texts: dict[str, str], out: Path, force: bool) -> None:

@@ -79,7 +79,7 @@ def library(objectives: Sequence[ImpactObjective], stems: Sequence[str]) -> Libr
         k = objective.kernel_of(q, n, twins)
         found = {"H": k.H, "grad": k.grad_H, "a": k.jump.a, "G": k.G, "L": k.ellipsoid}
         parts = {"eval": ("H", "grad"), "value": ("H",), "jump": ("a", "G", "H"), "ellipsoid": ("L",)}
-        if objective.kind != "impulse":
+        if objective.kind != "impulse" or objective.normal_cone_deg:
             found["value"], found["gradient"] = objective.expressions(k)
             parts["objective"] = ("value", "gradient")
         names += [f"o{number}_{name}" for name in found]

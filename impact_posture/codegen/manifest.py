@@ -138,6 +138,7 @@ def build_manifest(
         },
         "objective": first.name,
         "objective_units": first.units,
+        "normal_cone_deg": first.normal_cone_deg,
         "supports": [{"frame": s.frame, "kind": s.kind, "offset": list(s.offset)} for s in first.supports],
         "support_compliance": first.compliance if first.supports else None,
         "armature": robot.armature.tolist(),

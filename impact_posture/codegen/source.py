@@ -131,7 +131,8 @@ def _facts(
 
 
 def _frame_facts(variant: Variant, *, alone: bool) -> dict[str, str]:
-    contact, stem = variant.objective.contact, variant.stem
+    objective, stem = variant.objective, variant.stem
+    contact = objective.contact
     where = ("" if alone else f" at {contact.frame}") + (", the robot without its supports" if variant.free else "")
     return {
         "stem": stem,
@@ -141,6 +142,16 @@ def _frame_facts(variant: Variant, *, alone: bool) -> dict[str, str]:
         "frame": contact.frame,
         "offset": ", ".join(f"{v:.9g}" for v in contact.offset),
         "normal": ", ".join(f"{v:.9g}" for v in contact.normal),
+        "cone": (
+            f"the worst normal within {objective.normal_cone_deg:g} degrees of"
+            if objective.normal_cone_deg
+            else "the normal"
+        ),
+        "cone_note": (
+            "; where several are as bad, grad is a subgradient, that at one of them"
+            if objective.normal_cone_deg
+            else ""
+        ),
         "normal_axes": (
             "world axes" if contact.normal_frame == "world" else f"the axes of contact frame {contact.frame}"
         ),

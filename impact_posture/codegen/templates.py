@@ -57,8 +57,8 @@ DECLARATIONS = Template("""
 /* H and its tangent gradient$at. */
 int ${stem}_eval(const $real q[$nq], const $real n[3], $real *H, $real grad[$nv]);
 
-/* The exported problem's own objective and its tangent gradient, at the normal ($normal)
- * in $normal_axes. */
+/* The exported problem's own objective and its tangent gradient, at $cone ($normal)
+ * in $normal_axes$cone_note. */
 int ${stem}_objective(const $real q[$nq], $real *value, $real grad[$nv]);
 
 /* H alone. */

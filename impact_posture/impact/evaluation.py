@@ -8,12 +8,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.classical import Ellipsoid, ellipsoid_of
+from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.jump import Dominance, Jump, find_dominance, weighed_jump
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
+from impact_posture.impact.uncertain import worst_in_world
 
 Vector = NDArray[np.float64]
 
@@ -69,7 +71,9 @@ class Evaluation:
         objective: The objective's value, λ̄² included; ``None`` where it does not exist.
         gradient: Tangent gradient of H, shape (nv,).
         objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` where it does not exist.
-        worst_normal: World unit normal that the numbers hold for, shape (3,).
+        normal: World unit normal that H, G, V, S, E and the jumps hold for, shape (3,).
+        worst_normal: World unit normal that the objective holds for: ``normal``, or the worst of the cone around it.
+        cone: More about the worst normal, world; ``None`` without a cone, or where the objective does not exist.
         ellipsoid: Dynamic impact ellipsoid ``Λ_c``.
         pose: World placement of the contact frame.
         speed: Approach speed of the predicted jumps, m/s.
@@ -88,7 +92,9 @@ class Evaluation:
     objective: float | None
     gradient: Vector
     objective_gradient: Vector | None
+    normal: Vector
     worst_normal: Vector
+    cone: WorstNormal | None
     ellipsoid: Ellipsoid
     pose: pin.SE3
     speed: float
@@ -125,6 +131,8 @@ class Evaluation:
             },
             "dominance": self.dominance.to_dict(),
         }
+        if self.cone is not None:
+            block["cone"] = self.cone.to_dict()
         if self.free is not None:
             block |= {"free": self.free.to_dict(), "compliance_effect": self.compliance_effect}
         return block
@@ -154,13 +162,16 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
     scalars = Scalars.of(found)
     rebound = (1 + restitution) * speed
     free, effect = _without_supports(objective, q, found.H)
+    cone = _worst(objective, q)
     return Evaluation(
         q=np.array(q, dtype=float),
         scalars=scalars,
-        objective=_objective_value(objective, scalars),
+        objective=_objective_value(objective, q, scalars, cone),
         gradient=oracle.gradient_H(q),
         objective_gradient=_objective_gradient(objective, q, found),
-        worst_normal=found.normal,
+        normal=found.normal,
+        worst_normal=found.normal if cone is None else cone.normal,
+        cone=cone,
         ellipsoid=ellipsoid_of(found.ellipsoid),
         pose=oracle.numeric.at(q).placement(point_on(robot, objective.contact.frame)),
         speed=speed,
@@ -185,16 +196,32 @@ def _blocked(found: ImpactQuantities) -> bool:
     return found.G <= _BLOCKED * float(np.linalg.eigvalsh(found.mobility)[-1])
 
 
-def _objective_value(objective: ImpactObjective, scalars: Scalars) -> float | None:
+def _worst(objective: ImpactObjective, q: Vector) -> WorstNormal | None:
+    if not objective.normal_cone_deg:
+        return None
+    try:
+        return worst_in_world(objective, q)
+    except MetricError:
+        return None
+
+
+def _objective_value(
+    objective: ImpactObjective, q: Vector, scalars: Scalars, worst: WorstNormal | None
+) -> float | None:
+    if objective.normal_cone_deg:
+        value = np.inf if worst is None else objective.value(q)
+        return value if np.isfinite(value) else None
     values = {"impulse": scalars.H, "speed": scalars.V, "sticking": scalars.S, "energy": scalars.E}
-    value = values[objective.kind]
-    return None if value is None else objective.scale * value
+    alone = values[objective.kind]
+    return None if alone is None else objective.scale * alone
 
 
 def _objective_gradient(objective: ImpactObjective, q: Vector, found: ImpactQuantities) -> Vector | None:
     values = np.linalg.eigvalsh(found.mobility)
     if objective.kind == "sticking" and values[0] <= _SINGULAR * values[-1]:
         return None
+    if objective.normal_cone_deg:
+        return objective.gradient(q) if np.isfinite(objective.value(q)) else None
     if objective.kind in ("speed", "energy") and _blocked(found):
         return None
     return objective.gradient(q)

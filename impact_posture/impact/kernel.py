@@ -159,6 +159,11 @@ class ImpactKernel:
         return _inverse3(self.mobility + frozen if frozen.any() else self.mobility)
 
     @cached_property
+    def sticking_form(self) -> ca.SX:
+        """``(JM⁻¹Jᵀ)⁻¹Λ_c(JM⁻¹Jᵀ)⁻¹``, shape (3, 3): ``S`` as a quadratic form of the world normal."""
+        return self._mobility_inverse.T @ self.ellipsoid @ self._mobility_inverse
+
+    @cached_property
     def _sticking(self) -> Response:
         """The answer to the impulse ``s = (JM⁻¹Jᵀ)⁻¹n`` per unit approach speed."""
         return self.tree.respond(wrenches=self._alike(self._force(self._mobility_inverse @ self.world_normal)))

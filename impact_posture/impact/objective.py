@@ -13,30 +13,24 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.dynamics.tree import Tree
 from impact_posture.dynamics.twins import Twins
-from impact_posture.impact.contact import Contact, Support, default_compliance, point_on
+from impact_posture.impact.contact import Contact, Support, default_compliance
 from impact_posture.impact.kernel import ImpactKernel
+from impact_posture.impact.lifted import CONE_ATTEMPTS, Guess, Lifted, guess_cone, guess_plain, lift_cone, lift_plain
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.oracle import ImpactOracle, no_sticking
+from impact_posture.impact.uncertain import (
+    Subgradients,
+    check_cone,
+    worst_gradient,
+    worst_normal_expression,
+    worst_subgradients,
+    worst_value,
+)
 from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Lifted:
-    """An objective with its inner linear solve left to the program.
-
-    Attributes:
-        variables: Auxiliary unknowns, shape (k, 1).
-        residual: Equations that fix them, ``= 0``, shape (k, 1).
-        value: The objective in terms of configuration and auxiliaries.
-    """
-
-    variables: ca.SX
-    residual: ca.SX
-    value: ca.SX
 
 
 class Objective(Protocol):
@@ -62,12 +56,17 @@ class Objective(Protocol):
         """``(q, n) → value, tangent gradient (nv)``."""
         ...
 
-    def lift(self, tree: Tree, n: ca.SX) -> Lifted:
-        """The value as a quadratic in auxiliaries that solve linear equations at ``tree.q``."""
+    def lift(self, tree: Tree, n: ca.SX, scale: ca.SX) -> Lifted:
+        """The value in terms of auxiliaries and equations at ``tree.q``; ``scale`` is a typical value of it."""
         ...
 
-    def guess(self, q: Vector) -> Vector:
-        """The lifted form's auxiliaries at ``q``."""
+    @property
+    def attempts(self) -> int:
+        """From how many guesses the lifted form may be tried."""
+        ...
+
+    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
+        """Where the lifted form's auxiliaries start at ``q``, and their bounds."""
         ...
 
     def value(self, q: Vector) -> float:
@@ -75,7 +74,11 @@ class Objective(Protocol):
         ...
 
     def gradient(self, q: Vector) -> Vector:
-        """The tangent gradient from Pinocchio's numbers, shape (nv,)."""
+        """The tangent gradient (where there is none: a subgradient) from Pinocchio's numbers, shape (nv,)."""
+        ...
+
+    def subgradients(self, q: Vector) -> Subgradients:
+        """What spans the subdifferential at ``q``, from Pinocchio's numbers; one gradient where it is smooth."""
         ...
 
 
@@ -98,6 +101,7 @@ class ImpactObjective:
         kind: Which of the four.
         supports: Feet that stay.
         compliance: ε of the supports, 1/kg.
+        normal_cone_deg: Half angle of the cone of normals that the worst is taken of, degrees; 0: the one normal.
     """
 
     robot: Robot
@@ -106,8 +110,10 @@ class ImpactObjective:
     kind: ObjectiveKind = "impulse"
     supports: tuple[Support, ...] = ()
     compliance: float = 0.0
+    normal_cone_deg: float = 0.0
 
     def __post_init__(self) -> None:
+        check_cone(self)
         if self.compliance <= 0:
             object.__setattr__(self, "compliance", default_compliance(self.robot))
 
@@ -148,92 +154,54 @@ class ImpactObjective:
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Value and tangent gradient (nv) in the symbols of a kernel of this contact, metric and supports."""
+        worst = self._worst(k)
+        gradients = {"speed": lambda: worst.grad_V, "energy": lambda: worst.grad_E, "sticking": lambda: worst.grad_S}
+        gradient = self.scale * worst.grad_H if self.kind == "impulse" else gradients[self.kind]()
+        return self._value(worst), gradient
+
+    def _worst(self, k: ImpactKernel) -> ImpactKernel:
+        """The kernel at the worst normal of the cone; its gradients hold that fixed (Danskin)."""
+        if not self.normal_cone_deg:
+            return k
+        return self.kernel_of(k.q, worst_normal_expression(self, k), k.tree.twins)
+
+    def _value(self, k: ImpactKernel) -> ca.SX:
         if self.kind == "impulse":
-            return self.scale * k.H, self.scale * k.grad_H
-        if self.kind == "speed":
-            return k.V, k.grad_V
-        if self.kind == "energy":
-            return k.E, k.grad_E
-        return k.S, k.grad_S
+            return self.scale * k.H
+        return {"speed": lambda: k.V, "energy": lambda: k.E, "sticking": lambda: k.S}[self.kind]()
 
     def value_fun(self) -> ca.Function:
         """``(q, n) → value``; ``n`` in the contact's normal frame."""
         k = self.kernel
-        value = {"impulse": self.scale * k.H, "speed": k.V, "energy": k.E}
-        expression = value[self.kind] if self.kind in value else k.S
-        return ca.Function("value", [k.q, k.n], [expression], ["q", "n"], ["value"], {"cse": True})
+        return ca.Function("value", [k.q, k.n], [self._value(self._worst(k))], ["q", "n"], ["value"], {"cse": True})
 
     def gradient_fun(self) -> ca.Function:
-        """``(q, n) → value, gradient``: value and tangent gradient (nv); ``n`` in the contact's normal frame."""
+        """``(q, n) → value, gradient``: value and tangent gradient (nv); ``n`` in the contact's normal frame.
+
+        With a cone, ``n`` is its axis, and both hold for the worst normal in it.
+        """
         k = self.kernel
         value, gradient = self.expressions(k)
-        return ca.Function(
-            "gradient", [k.q, k.n], [value, gradient], ["q", "n"], ["value", "gradient"], {"cse": True}
-        )
+        names = ["q", "n"], ["value", "gradient"]
+        return ca.Function("gradient", [k.q, k.n], [value, gradient], *names, {"cse": True})
 
     def metric_fun(self) -> ca.Function:
         """``(q, n) → H, grad``: the impact-robustness metric and its tangent gradient, whatever the objective."""
         k = self.kernel
         return ca.Function("eval", [k.q, k.n], [k.H, k.grad_H], ["q", "n"], ["H", "grad"], {"cse": True})
 
-    def lift(self, tree: Tree, n: ca.SX) -> Lifted:
-        """The objective with ``a``, the supports' impulses and (for ratios) the contact's impulse as unknowns.
+    def lift(self, tree: Tree, n: ca.SX, scale: ca.SX) -> Lifted:
+        """The objective with its linear solves as equations of the program."""
+        return lift_cone(self, tree, n, scale) if self.normal_cone_deg else lift_plain(self, tree, n)
 
-        ``M a − J_sᵀf − Jᵀs = 0`` and ``J_s a + εf = 0``, with ``s = n`` (impulse), ``s = λn, nᵀJa = 1`` (speed,
-        energy), or ``s`` free, ``Ja = n`` (sticking).  The value is ``aᵀWa`` or ``λ/2``.
-        """
-        point = point_on(self.robot, self.contact.frame, self.contact.offset)
-        in_frame = self.contact.normal_frame == "contact"
-        zero = ca.SX.zeros(3)
-        a = ca.SX.sym("a", tree.nv)
-        velocities = tree.velocities(a)
-        wrenches, held, f = [], [], ca.SX(0, 1)
-        for k, support in enumerate(self.supports):
-            foot = point_on(self.robot, support.frame, support.offset)
-            f_k = ca.SX.sym(f"f{k}", support.rows)
-            full = ca.vertcat(f_k, ca.SX.zeros(6 - support.rows))
-            wrenches.append(Wrench(foot, full[:3], full[3:]))
-            held.append(tree.point_velocity(foot, velocities)[: support.rows] + self.compliance * f_k)
-            f = ca.vertcat(f, f_k)
-        world_n = tree.rotation(point) @ n if in_frame else n
-        contact_velocity = tree.point_velocity(point, velocities)[:3]
-        if self.kind == "impulse":
-            unknown, fixing = ca.SX(0, 1), ca.SX(0, 1)
-            blow = Wrench(point, n, zero, in_frame=in_frame)
-        elif self.kind == "sticking":
-            unknown = ca.SX.sym("s", 3)
-            fixing = contact_velocity - world_n
-            blow = Wrench(point, unknown, zero)
-        else:
-            unknown = ca.SX.sym("lam")
-            fixing = ca.dot(world_n, contact_velocity) - 1
-            blow = Wrench(point, n * unknown, zero, in_frame=in_frame)
-        mass_a = tree.mass_times(a)
-        momentum = mass_a - tree.generalized_force([*wrenches, blow])
-        if self.kind == "energy":
-            value = unknown / 2
-        elif self.metric.kind == "kinetic":
-            # Not sᵀJa − ε|f|², equal on the equations: stiff feet make that a small difference of large numbers.
-            value = ca.dot(a, mass_a)
-        else:
-            value = ca.dot(a, ca.SX(self.metric.diagonal(tree.nv)) * a)
-        variables = ca.vertcat(a, f, unknown)
-        residual = ca.vertcat(momentum, *held, fixing)
-        return Lifted(variables, residual, self.scale * value)
+    @property
+    def attempts(self) -> int:
+        """Guesses that :meth:`guess` knows: one where its equations are linear in what it guesses."""
+        return CONE_ATTEMPTS if self.normal_cone_deg else 1
 
-    def guess(self, q: Vector) -> Vector:
+    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
         """The auxiliaries of :meth:`lift` that solve its equations at ``q``."""
-        quantities = self.oracle.quantities(q)
-        if self.kind == "impulse":
-            a, unknown = quantities.jump, np.zeros(0)
-        elif self.kind == "sticking":
-            if quantities.sticking_jump is None or quantities.sticking_impulse is None:
-                a, unknown = quantities.jump / quantities.G, quantities.normal / quantities.G
-            else:
-                a, unknown = quantities.sticking_jump, quantities.sticking_impulse
-        else:
-            a, unknown = quantities.jump / quantities.G, np.array([1 / quantities.G])
-        return np.concatenate([a, -self.oracle.Js @ a / self.compliance, unknown])
+        return guess_cone(self, q, scale, attempt) if self.normal_cone_deg else guess_plain(self, q)
 
     # ---- numeric ----------------------------------------------------------------------------------------------
 
@@ -248,6 +216,8 @@ class ImpactObjective:
         Raises:
             MetricError: ``sticking`` where S does not exist.
         """
+        if self.normal_cone_deg:
+            return worst_value(self, q)
         found = self.oracle.quantities(q)
         if self.kind == "impulse":
             return self.scale * found.H
@@ -260,7 +230,9 @@ class ImpactObjective:
         return found.S
 
     def gradient(self, q: Vector) -> Vector:
-        """The objective's tangent gradient at ``q`` from Pinocchio's numbers, shape (nv,)."""
+        """The tangent gradient at ``q`` from Pinocchio's numbers, shape (nv,); a subgradient where tied."""
+        if self.normal_cone_deg:
+            return worst_gradient(self, q)
         oracle = self.oracle
         if self.kind == "impulse":
             return self.scale * oracle.gradient_H(q)
@@ -270,3 +242,9 @@ class ImpactObjective:
         if self.kind == "energy":
             return -oracle.gradient_G(q) / (2 * found.G**2)
         return oracle.gradient_H(q) / found.G**2 - 2 * found.H / found.G**3 * oracle.gradient_G(q)
+
+    def subgradients(self, q: Vector) -> Subgradients:
+        """The gradient, or those at all tied worst normals of a cone."""
+        if self.normal_cone_deg:
+            return worst_subgradients(self, q)
+        return Subgradients(self.gradient(q)[None, :], np.zeros(1))

@@ -87,8 +87,7 @@ class ImpactOracle:
         rows, nv = self.Js.shape
         kkt = np.block([[self.M, -self.Js.T], [self.Js, self.compliance * np.eye(rows)]])
         self._lu = scipy.linalg.lu_factor(kkt)
-        n = np.array(self.contact.normal)
-        self.n = n if self.contact.normal_frame == "world" else num.placement(self.point).rotation @ n
+        self.n = self._normals(None)[1]
         self._nv = nv
         return self
 
@@ -131,23 +130,24 @@ class ImpactOracle:
 
     # ---- gradients --------------------------------------------------------------------------------------------
 
-    def gradient_H(self, q: Vector) -> Vector:
-        """Tangent gradient of H, shape (nv,)."""
+    def gradient_H(self, q: Vector, normal: Vector | None = None) -> Vector:
+        """Tangent gradient of H, shape (nv,); along another ``normal`` than the contact's if given, in its axes."""
         self.at(q)
-        a = self.solve(self.J.T @ self.n)
+        own, n = self._normals(normal)
+        a = self.solve(self.J.T @ n)
         b = self.solve(self.weigh(a))
-        in_frame = self.contact.normal_frame == "contact"
-        gradient = 2 * (self._coupling(self.n, b, in_frame) - self._inertial(b, a))
+        gradient = 2 * (self._coupling(own, b, self._in_frame) - self._inertial(b, a))
         return gradient + self._metric_gradient(a)
 
-    def gradient_G(self, q: Vector) -> Vector:
-        """Tangent gradient of G, shape (nv,)."""
+    def gradient_G(self, q: Vector, normal: Vector | None = None) -> Vector:
+        """Tangent gradient of G, shape (nv,); ``normal`` as for H."""
         self.at(q)
-        a = self.solve(self.J.T @ self.n)
-        return 2 * self._coupling(self.n, a, self.contact.normal_frame == "contact") - self._inertial(a, a)
+        own, n = self._normals(normal)
+        a = self.solve(self.J.T @ n)
+        return 2 * self._coupling(own, a, self._in_frame) - self._inertial(a, a)
 
-    def gradient_S(self, q: Vector) -> Vector:
-        """Tangent gradient of S, shape (nv,).
+    def gradient_S(self, q: Vector, normal: Vector | None = None) -> Vector:
+        """Tangent gradient of S, shape (nv,); ``normal`` as for H.
 
         Where ``JM⁻¹Jᵀ`` is singular its pseudo-inverse stands for the inverse: right where the directions that the
         contact can move in stay the same, as in a planar robot.
@@ -156,9 +156,10 @@ class ImpactOracle:
             MetricError: S does not exist here.
         """
         self.at(q)
+        _, n = self._normals(normal)
         A = self.solve(self.J.T)
         inverse = _Inverse.of(self.J @ A)
-        s = inverse.solve(self.n)
+        s = inverse.solve(n)
         if s is None:
             raise no_sticking()
         a = A @ s
@@ -166,12 +167,20 @@ class ImpactOracle:
         r = -inverse.matrix @ (self.J @ free)
         b = free + A @ r
         gradient = 2 * (self._coupling(s, b, False) + self._coupling(r, a, False) - self._inertial(b, a))
-        if self.contact.normal_frame == "contact":
-            gradient = gradient - 2 * self.numeric.turning_gradient(self.point, self.n, r)
+        if self._in_frame:
+            gradient = gradient - 2 * self.numeric.turning_gradient(self.point, n, r)
         return gradient + self._metric_gradient(a)
 
-    def _coupling(self, world: Vector, v: Vector, in_frame: bool) -> Vector:
-        direction = np.array(self.contact.normal) if in_frame else world
+    @property
+    def _in_frame(self) -> bool:
+        return self.contact.normal_frame == "contact"
+
+    def _normals(self, given: Vector | None) -> tuple[Vector, Vector]:
+        """A normal (the contact's own if none is given) in the axes that it is given in, and in world axes."""
+        own = np.array(self.contact.normal) if given is None else given
+        return own, self.numeric.placement(self.point).rotation @ own if self._in_frame else own
+
+    def _coupling(self, direction: Vector, v: Vector, in_frame: bool) -> Vector:
         wrench = np.concatenate([direction, np.zeros(3)])
         return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)
 

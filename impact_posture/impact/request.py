@@ -46,6 +46,7 @@ class ImpactRequest:
         speed: Approach speed, m/s.
         restitution: Coefficient of restitution.
         compliance: ε of the supports, 1/kg.
+        normal_cone: Half angle of the cone of normals whose worst is meant, degrees.
     """
 
     robot: str
@@ -64,6 +65,7 @@ class ImpactRequest:
     speed: float = 1.0
     restitution: float = 0.0
     compliance: float | None = None
+    normal_cone: float = 0.0
 
     def resolve(self) -> ResolvedImpact:
         """Load the robot and check everything against it.
@@ -81,9 +83,9 @@ class ImpactRequest:
                 f"the compliance is {self.compliance:g}", where="support_compliance", mend="give 1/kg above zero"
             )
         metric = build_metric(robot, self.metric, self.weights)
-        objective = ImpactObjective(robot, contact, metric, self.objective, supports, self.compliance or 0.0)
-        posture = self.posture or robot.default_posture
-        return ResolvedImpact(objective, q, posture, self.speed, self.restitution)
+        compliance, cone = self.compliance or 0.0, self.normal_cone
+        objective = ImpactObjective(robot, contact, metric, self.objective, supports, compliance, cone)
+        return ResolvedImpact(objective, q, self.posture or robot.default_posture, self.speed, self.restitution)
 
     def _contact(self, robot: Robot) -> Contact:
         if self.contact is not None:
@@ -170,7 +172,7 @@ class ResolvedImpact:
                 "name": self.metric.kind,
                 "objective": self.objective.kind,
                 "weights": None if self.metric.weights is None else list(self.metric.weights),
-                "normal_cone_deg": 0.0,
+                "normal_cone_deg": self.objective.normal_cone_deg,
                 "speed": self.speed,
                 "restitution": self.restitution,
             },

@@ -95,24 +95,23 @@ class Certificate:
 def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
     """Certify ``q``; ``scale`` is the initial objective f₀."""
     numeric = Numeric(problem.robot.model)
-    gradient = objective_gradient(problem, q, scale)
+    gradients, gaps = objective_gradients(problem, q, scale)
     numeric.at(q)
     errors = [c.pose_error(numeric) for c in problem.constraints]
     near, violation = _inequalities(problem, numeric)
     limits, limit_violation = _limits(problem, q)
     near += limits
-    multipliers, residual = _multipliers(
-        gradient, equality_jacobian(problem, numeric), np.array([row.outward for row in near])
+    weights, multipliers, residual = _multipliers(
+        gradients, equality_jacobian(problem, numeric), np.array([row.outward for row in near])
     )
+    products = [abs(float(m) * row.slack) for row, m in zip(near, multipliers, strict=True)]
     active = tuple(
         Active(row.name, row.side, float(m)) for row, m in zip(near, multipliers, strict=True) if m > _MULTIPLIER
     )
     return Certificate(
         stationarity=float(np.abs(residual).max()),
         primal=max(violation, limit_violation),
-        complementarity=max(
-            (abs(float(m) * row.slack) for row, m in zip(near, multipliers, strict=True)), default=0.0
-        ),
+        complementarity=max([*products, float(weights @ gaps)]),
         pose_error_m=max((e[0] for e in errors), default=0.0),
         pose_error_rad=max((e[1] for e in errors), default=0.0),
         limits=limit_violation,
@@ -121,13 +120,18 @@ def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
     )
 
 
-def objective_gradient(problem: PostureProblem, q: Vector, scale: float) -> Vector:
-    """Tangent gradient of what the program minimizes: objective/scale plus the regularization, shape (nv,)."""
-    gradient = problem.objective.gradient(q) / scale
+def objective_gradients(problem: PostureProblem, q: Vector, scale: float) -> tuple[Vector, Vector]:
+    """What the program minimizes, objective/scale plus the regularization: what spans its subdifferential.
+
+    Returns:
+        Tangent gradients, shape (k, nv), one where it is smooth; how far each one's own value lies below, shape (k,).
+    """
+    found = problem.objective.subgradients(q)
+    gradients = found.gradients / scale
     weight = problem.requirements.regularization
     if weight:
-        gradient = gradient + weight * _distance_gradient(problem, q)
-    return np.asarray(gradient)
+        gradients = gradients + weight * _distance_gradient(problem, q)
+    return gradients, found.gaps / scale
 
 
 def _distance_gradient(problem: PostureProblem, q: Vector) -> Vector:
@@ -208,17 +212,29 @@ def _limits(problem: PostureProblem, q: Vector) -> tuple[list[_Near], float]:
     return near, float(worst)
 
 
-def _multipliers(gradient: Vector, equalities: Vector, inequalities: Vector) -> tuple[Vector, Vector]:
-    """Nonnegative multipliers of the inequalities that best balance the gradient, and what stays unbalanced.
+def _multipliers(gradients: Vector, equalities: Vector, inequalities: Vector) -> tuple[Vector, Vector, Vector]:
+    """Weights of the gradients (≥ 0, sum 1) and multipliers of the inequalities (≥ 0) that best balance each other.
 
     Equalities' multipliers are free: everything is projected onto their null space, whose rank may be deficient.
+
+    Returns:
+        Weights, multipliers, and what stays unbalanced.
     """
+    count = len(gradients)
     if len(equalities):
         free = scipy.linalg.null_space(equalities, rcond=RANK_TOLERANCE)
     else:
-        free = np.eye(len(gradient))
-    reduced = free.T @ gradient
-    if not len(inequalities) or not free.shape[1]:
-        return np.zeros(len(inequalities)), free @ reduced
-    multipliers, _ = scipy.optimize.nnls((inequalities @ free).T, -reduced)
-    return multipliers, free @ (reduced + (inequalities @ free).T @ multipliers)
+        free = np.eye(gradients.shape[1])
+    reduced = gradients @ free
+    if not free.shape[1] or (count == 1 and not len(inequalities)):
+        return np.eye(count)[0], np.zeros(len(inequalities)), free @ reduced[0]
+    bounds = inequalities @ free if len(inequalities) else np.zeros((0, free.shape[1]))
+    if count == 1:
+        multipliers, _ = scipy.optimize.nnls(bounds.T, -reduced[0])
+        return np.ones(1), multipliers, free @ (reduced[0] + bounds.T @ multipliers)
+    # A row that asks for sum 1 scales the least residual's direction and does not turn it.
+    system = np.hstack([np.vstack([reduced.T, np.ones(count)]), np.vstack([bounds.T, np.zeros(len(bounds))])])
+    found, _ = scipy.optimize.nnls(system, np.eye(len(system))[-1])
+    found = found / found[:count].sum()
+    weights, multipliers = found[:count], found[count:]
+    return weights, multipliers, free @ (reduced.T @ weights + bounds.T @ multipliers)

@@ -74,6 +74,7 @@ def _key(problem: PostureProblem) -> str:
         f"{platform.system()} {platform.machine()}",
         problem.robot.model_sha256,
         repr((objective.kind, objective.metric, objective.supports, objective.compliance)),
+        repr(objective.normal_cone_deg),
         repr((objective.contact.frame, objective.contact.offset, objective.contact.normal_frame)),
         repr(objective.scale),
         *[f"{c.structure}:{problem.carried(i)}" for i, c in enumerate(problem.constraints)],

@@ -7,7 +7,7 @@ Formulation (the "lifted" one): the impact's linear solve is left to IPOPT::
                           c(q) within bounds,  |quaternions| = 1,  limits,
 
 so that every function is linear or quadratic in the auxiliaries and the exact Hessian stays small
-(``tests/benchmarks/formulations.py`` measures both forms).
+(``tests/benchmarks/formulations.py`` measures both forms).  A cone of normals adds its dual (``impact/lifted.py``).
 """
 
 from __future__ import annotations
@@ -47,6 +47,8 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "calc_lam_p": False,
     "error_on_fail": False,
 }
+# The equations of a cone's dual are quadratic: steps that break them badly to gain in the objective never come back.
+_CONE_OPTIONS = {"ipopt.theta_max_fact": 1.0}
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -92,17 +94,21 @@ class PostureNLP:
     build_time_s: float
     compiled: bool
 
-    def solve(self, start: Vector, *, scale: float | None = None) -> SolveRecord:
-        """Solve from ``start``; the objective is divided by ``scale``, its value there unless given."""
+    def solve(self, start: Vector, *, scale: float | None = None, attempt: int = 0) -> SolveRecord:
+        """Solve from ``start``; the objective is divided by ``scale``, its value there unless given.
+
+        ``attempt``: which of the objective's guesses to begin with.
+        """
         problem, nx = self.problem, self.chart.nx
         x = np.clip(self.chart.to_x(start), problem.lower, problem.upper)
-        guess = np.concatenate([x, problem.objective.guess(self.chart.to_q(x))])
-        lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
-        lower[:nx], upper[:nx] = problem.lower, problem.upper
         scale = scale or problem.objective.value(self.chart.to_q(x))
+        guess = problem.objective.guess(self.chart.to_q(x), scale, attempt)
+        lower, upper = np.concatenate([problem.lower, guess.lower]), np.full(self.size, np.inf)
+        upper[:nx] = problem.upper
         began = time.perf_counter()
         p = parameters(problem, self.chart, scale)
-        answer = run_solver(self.solver, x0=guess, lbx=lower, ubx=upper, p=p, **_row_bounds(problem, self))
+        x0 = np.concatenate([x, guess.values])
+        answer = run_solver(self.solver, x0=x0, lbx=lower, ubx=upper, p=p, **_row_bounds(problem, self))
         elapsed = time.perf_counter() - began
         stats = self.solver.stats()
         q = self.chart.to_q(np.array(answer["x"]).reshape(-1)[:nx])
@@ -146,7 +152,8 @@ def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts:
     began = time.perf_counter()
     chart = Chart(problem.robot.model)
     symbols = program(problem, chart)
-    solver, compiled = compiled_solver(problem, symbols, IPOPT_OPTIONS, compile, starts)
+    options = IPOPT_OPTIONS | (_CONE_OPTIONS if problem.objective.normal_cone_deg else {})
+    solver, compiled = compiled_solver(problem, symbols, options, compile, starts)
     return PostureNLP(problem, chart, solver, int(symbols["x"].numel()), time.perf_counter() - began, compiled)
 
 
@@ -156,7 +163,7 @@ def program(problem: PostureProblem, chart: Chart) -> dict[str, ca.SX]:
     n, scale, weight = ca.SX.sym("n", 3), ca.SX.sym("scale"), ca.SX.sym("weight")
     reference = ca.SX.sym("reference", chart.nx)
     tree = Tree(problem.robot.model, chart.configuration(x), x)
-    lifted = problem.objective.lift(tree, n)
+    lifted = problem.objective.lift(tree, n, scale)
     rows, targets = [chart.norms(x)], []
     for index, constraint in enumerate(problem.constraints):
         p = ca.SX.sym(f"p{index}", len(constraint.parameters))
@@ -208,9 +215,9 @@ def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Vector:
 
 def _row_bounds(problem: PostureProblem, nlp: PostureNLP) -> dict[str, Vector]:
     norms = np.zeros(len(nlp.chart.quaternion_slices()))
-    lifted = np.zeros(nlp.size - nlp.chart.nx)
     rows = list(enumerate(problem.constraints))
-    return {
-        "lbg": np.concatenate([norms, *[c.lower[problem.carried(i)] for i, c in rows], lifted]),
-        "ubg": np.concatenate([norms, *[c.upper[problem.carried(i)] for i, c in rows], lifted]),
-    }
+    lower = np.concatenate([norms, *[c.lower[problem.carried(i)] for i, c in rows]])
+    upper = np.concatenate([norms, *[c.upper[problem.carried(i)] for i, c in rows]])
+    # The rest are the objective's equations: fewer than its auxiliaries where it has an inner dual.
+    lifted = np.zeros(nlp.solver.size1_in("lbg") - len(lower))
+    return {"lbg": np.concatenate([lower, lifted]), "ubg": np.concatenate([upper, lifted])}

@@ -32,7 +32,7 @@ def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, 
     initial, optimal = evaluations(prepared, solution)
     impact = prepared.impact
     asked = impact.to_dict()
-    contacts = [{**contact, "normal": [float(v) for v in initial.worst_normal]} for contact in asked["contacts"]]  # type: ignore[attr-defined]
+    contacts = [{**contact, "normal": [float(v) for v in initial.normal]} for contact in asked["contacts"]]  # type: ignore[attr-defined]
     warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *caveats(prepared, solution))
     return {
         "schema": SCHEMA,

@@ -132,12 +132,6 @@ def prepare(settings: ProblemSettings) -> Prepared:
             where="--contact",
             mend="this version optimizes one contact at a time",
         )
-    if settings.normal_cone:
-        raise InputError(
-            f"a cone of {settings.normal_cone:g}° is asked for",
-            where="--normal-cone",
-            mend="this version knows the exact normal only: give 0",
-        )
     if isinstance(settings.weights, tuple) and settings.metric != "weighted":
         raise InputError(
             f"weights are listed, but the metric is {settings.metric}",
@@ -169,6 +163,7 @@ def prepare(settings: ProblemSettings) -> Prepared:
         speed=settings.speed,
         restitution=settings.restitution,
         compliance=settings.support_compliance,
+        normal_cone=settings.normal_cone,
     )
     impact = request.resolve()
     if isinstance(settings.weights, tuple):

@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.pool import Pool
 
 import numpy as np
@@ -193,9 +193,13 @@ def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
     Raises:
         ContactError: The contact point cannot move along the normal there.
     """
-    found = problem.objective.oracle.quantities(initial)
-    mobility = float(np.linalg.eigvalsh(found.mobility)[-1])
-    if not found.G > 1e-12 * mobility:
+    if problem.objective.normal_cone_deg:
+        value = problem.objective.value(initial)
+        blocked = not (np.isfinite(value) and value > 0)
+    else:
+        found = problem.objective.oracle.quantities(initial)
+        blocked = not found.G > 1e-12 * float(np.linalg.eigvalsh(found.mobility)[-1])
+    if blocked:
         raise ContactError(
             f"the contact point at '{problem.objective.contact.frame}' cannot move along the normal",
             where="--normal",
@@ -205,9 +209,16 @@ def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
 
 
 def run_start(nlp: PostureNLP, start: Vector, scale: float) -> tuple[SolveRecord, Certificate]:
-    """Solve from one feasible start and certify what comes out."""
+    """Solve from one feasible start and certify what comes out; try the objective's other guesses if it does not."""
     record = nlp.solve(start, scale=scale)
-    return record, certify(nlp.problem, record.q, scale)
+    certificate = certify(nlp.problem, record.q, scale)
+    for attempt in range(1, nlp.problem.objective.attempts):
+        if certificate.holds():
+            break
+        again = nlp.solve(start, scale=scale, attempt=attempt)
+        certificate = certify(nlp.problem, again.q, scale)
+        record = replace(again, iterations=record.iterations + again.iterations, time_s=record.time_s + again.time_s)
+    return record, certificate
 
 
 def _run(nlp: PostureNLP, initial: Vector, scale: float, index: int, seed: int) -> _Run:

@@ -1,0 +1,185 @@
+"""The worst normal of a cone: ``max nᵀAn`` over ``∠(n, n₀) ≤ α``, exactly, with the multiplier that proves it.
+
+A quadratic on a cap of the sphere has its maximum at an eigenvector inside the cap or on the cap's edge, where it is
+a trigonometric polynomial of degree two.  ``bound = λ_max(A + μ(n₀n₀ᵀ − cos²α I)) ≥ nᵀAn`` for every normal of the
+cone and any ``μ ≥ 0``; at the right ``μ`` it is attained (S-lemma).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+# Values closer than this are tied: relative to the size of A and to sin α, by which they can differ in the cone.
+TIED = 1e-6
+# Worst normals closer than this share of sin α are one.
+_APART = 1e-2
+# Values that differ by less, relative to the size of A, are in no order.
+_EQUAL = 1e-14
+_SMALL = float(np.finfo(float).tiny)
+_POLISH = 20
+_GRID = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+
+
+@dataclass(frozen=True, eq=False)
+class WorstNormal:
+    """The maximum of ``nᵀAn`` over a cone of normals.
+
+    Attributes:
+        value: The maximum.
+        normal: Where it is attained, shape (3,); one of ``normals``.
+        normals: All of the tied ones that stand apart, shape (k, 3); of a whole arc or circle a few.
+        angle_deg: Angle of ``normal`` from the cone's axis, degrees.
+        multiplier: ``μ ≥ 0`` of the dual; zero where the cone's edge does not matter.
+        bound: ``λ_max(A + μ(n₀n₀ᵀ − cos²α I))``: no normal of the cone has more.
+    """
+
+    value: float
+    normal: Vector
+    normals: Vector
+    angle_deg: float
+    multiplier: float
+    bound: float
+
+    @property
+    def tied(self) -> bool:
+        """Whether another normal is as bad: the value then has a kink here, and no gradient."""
+        return len(self.normals) > 1
+
+    def turned(self, R: Vector) -> WorstNormal:
+        """The same with its normals in other axes."""
+        return replace(self, normal=R @ self.normal, normals=self.normals @ R.T)
+
+    def to_dict(self) -> dict[str, object]:
+        """The ``cone`` block of an evaluation."""
+        return {
+            "angle_deg": self.angle_deg,
+            "tied": self.tied,
+            "normals": [[float(v) for v in n] for n in self.normals],
+            "multiplier": self.multiplier,
+        }
+
+
+def cone_axes(n: Vector) -> Vector:
+    """Orthonormal axes with ``n`` as first column, shape (3, 3), without a branch near any ``n``."""
+    x, y, z = (float(v) for v in n)
+    side = 1.0 if z >= 0 else -1.0
+    # Duff et al., "Building an orthonormal basis, revisited", JCGT 6 (2017).
+    a = -1 / (side + z)
+    b = x * y * a
+    return np.array([[x, 1 + side * x * x * a, b], [y, side * b, side + y * y * a], [z, -side * x, -y]])
+
+
+def worst_normal(A: Vector, axis: Vector, cone_deg: float) -> WorstNormal:
+    """Maximize ``nᵀAn`` over the unit vectors within ``cone_deg`` of ``axis``.
+
+    Args:
+        A: Symmetric, shape (3, 3); of either sign.
+        axis: Unit vector, shape (3,).
+        cone_deg: Half angle of the cone, 0 < α < 90 degrees.
+    """
+    alpha = np.deg2rad(cone_deg)
+    c, s = float(np.cos(alpha)), float(np.sin(alpha))
+    axes = cone_axes(axis)
+    P = axes.T @ A @ axes
+    size = max(float(np.abs(P).max()), _SMALL)
+    found = np.vstack([_inside(P, c, s * size), _on_edge(P, c, s, size)])
+    values = np.einsum("ki,ij,kj->k", found, P, found)
+    best = float(values.max())
+    # The named one must not hang on rounding: ties go by the coordinates.
+    near = [k for k in range(len(found)) if values[k] >= best - TIED * s * size]
+    near.sort(key=lambda k: (round((best - values[k]) / (_EQUAL * size)), *(-found[k])))
+    apart: list[Vector] = []
+    for k in near:
+        if all(np.linalg.norm(found[k] - other) > _APART * s for other in apart):
+            apart.append(found[k])
+    multiplier = _multiplier(P, apart[0], c, s)
+    shifted = P + multiplier * np.diag([s * s, -c * c, -c * c])
+    normals = np.array(apart) @ axes.T
+    return WorstNormal(
+        value=float(normals[0] @ A @ normals[0]),
+        normal=normals[0],
+        normals=normals,
+        angle_deg=float(np.rad2deg(np.arctan2(np.linalg.norm(apart[0][1:]), apart[0][0]))),
+        multiplier=multiplier,
+        bound=float(np.linalg.eigvalsh(shifted)[-1]),
+    )
+
+
+def tied_normals(A: Vector, axis: Vector, cone_deg: float, worst: WorstNormal, tolerance: float) -> Vector:
+    """Normals of the cone whose value is within ``tolerance · |A|`` of the worst, that one first, shape (k, 3).
+
+    Finitely many for finitely many; of an arc, a circle or a cap of tied ones a sample dense enough for its hull.
+    """
+    alpha = np.deg2rad(cone_deg)
+    size = float(np.abs(A).max())
+    axes = cone_axes(axis)
+    circle = np.stack([np.cos(_GRID), np.sin(_GRID)])
+    values, vectors = np.linalg.eigh(A)
+    top = vectors[:, values >= values[-1] - tolerance * size]
+    # A plane of top eigenvectors cuts the cap in an arc; where all are, every normal of the cap is as bad.
+    tilts = alpha * (np.linspace(0, 1, 9) if top.shape[1] == 3 else np.ones(1))
+    rings = [np.vstack([np.full_like(_GRID, np.cos(tilt)), np.sin(tilt) * circle]) for tilt in tilts]
+    planes = [top[:, [i, j]] @ circle for i in range(top.shape[1]) for j in range(i)]
+    more = np.hstack([*[axes @ ring for ring in rings], *planes]).T
+    more = more[more @ axis >= np.cos(alpha) * (1 - 1e-12)]
+    heights = np.einsum("ki,ij,kj->k", more, A, more)
+    return np.vstack([worst.normals, more[heights >= worst.value - tolerance * size]])
+
+
+def _multiplier(P: Vector, n: Vector, c: float, s: float) -> float:
+    """``μ`` of ``(P + μ diag(s², −c², −c²)) n = t n``, whose first row is free of cancellation in this form."""
+    if n[0] > c * (1 + 1e-12):
+        return 0.0
+    w = n[1:] / np.linalg.norm(n[1:])
+    return max(0.0, float((2 * c * c - 1) / (c * s) * (P[0, 1:] @ w) + w @ P[1:, 1:] @ w - P[0, 0]))
+
+
+def _inside(P: Vector, c: float, size: float) -> Vector:
+    """Top eigenvectors within the cap, in the cone's axes; of a multiple eigenvalue also the one nearest the axis."""
+    values, vectors = np.linalg.eigh(P)
+    top = vectors[:, values >= values[-1] - TIED * size]
+    candidates = [*top.T]
+    nearest = top @ top[0]
+    if np.linalg.norm(nearest) > 0:
+        candidates.append(nearest / np.linalg.norm(nearest))
+    turned = np.array([v if v[0] >= 0 else -v for v in candidates])
+    return turned[turned[:, 0] >= c]
+
+
+def _on_edge(P: Vector, c: float, s: float, size: float) -> Vector:
+    """Maxima on the cap's edge ``n = (c, s cos φ, s sin φ)``; where it is flat, three of its points."""
+    b1, b2 = float(P[0, 1]), float(P[0, 2])
+    h, k = float(P[1, 1] - P[2, 2]) / 2, float(P[1, 2])
+
+    def slope(x: Vector) -> Vector:
+        return np.asarray(c * (b2 * np.cos(x) - b1 * np.sin(x)) + s * (k * np.cos(2 * x) - h * np.sin(2 * x)))
+
+    def bend(x: Vector) -> Vector:
+        return np.asarray(-c * (b2 * np.sin(x) + b1 * np.cos(x)) - 2 * s * (k * np.sin(2 * x) + h * np.cos(2 * x)))
+
+    def height(x: Vector) -> Vector:
+        return np.asarray(2 * c * (b1 * np.cos(x) + b2 * np.sin(x)) + s * (h * np.cos(2 * x) + k * np.sin(2 * x)))
+
+    # The slope's zeros as roots z = exp(iφ); on the unit circle or not, their angles are where to look.
+    roots = np.roots([s * complex(k, h), c * complex(b2, b1), 0, c * complex(b2, -b1), s * complex(k, -h)])
+    phi = np.concatenate([np.angle(roots), _GRID[[int(height(_GRID).argmax())]]])
+    swing = max(c * np.hypot(b1, b2) + s * np.hypot(h, k), _SMALL)
+    for _ in range(_POLISH):
+        curved = bend(phi) < 0
+        step = np.where(curved, slope(phi) / np.minimum(bend(phi), -1e-8 * swing), 0.0)
+        phi = phi - np.clip(step, -0.2, 0.2)
+        if np.abs(step).max() < 1e-15:
+            break
+    kept = (bend(phi) < 0) & (np.abs(slope(phi)) <= 1e-10 * swing)
+    # A maximum that is flat to third order is no simple root: then what is highest is near enough.
+    highest = int(height(phi).argmax())
+    kept[highest] |= not (height(phi)[kept] >= height(phi)[highest] - _EQUAL * swing).any()
+    phi = phi[kept]
+    if 4 * swing <= TIED * size:
+        phi = np.concatenate([phi, 2 * np.pi / 3 * np.arange(3)])
+    return np.stack([np.full_like(phi, c), s * np.cos(phi), s * np.sin(phi)], axis=1)
