@@ -209,8 +209,9 @@ class _Writer:
         for target, output in zip(("*H", "grad[{}]"), outputs, strict=True):
             for k, node in enumerate(layout.graph.outputs[output]):
                 text = emitter.output(node, "m->")
-                lane = "" if layout.graph.nodes[node].op == "const" else "[j]"
-                lines.append(f"      {target.format(k)} = {text}{lane};")
+                if layout.graph.nodes[node].op != "const":
+                    text = f"{self._prefix.upper()}_AT({text}, j)"
+                lines.append(f"      {target.format(k)} = {text};")
         calls = [templates.CALL_GROUPS.substitute(call=block.call) for block in emitter.blocks]
         return "\n".join(block.text for block in emitter.blocks) + templates.BATCH.substitute(
             self._common,

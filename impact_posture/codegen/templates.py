@@ -148,7 +148,7 @@ FILL = Template("""\
 
 FILL_LANES = Template("""\
     for (i = 0; i < $count; ++i) {
-      ${prefix}_sincos((const $real *)&m->q[at_q[i]], ($real *)&m->s[i], ($real *)&m->c[i], $lanes);
+      ${prefix}_sincos_lanes((const $real *)&m->q[at_q[i]], ($real *)&m->s[i], ($real *)&m->c[i], $lanes);
     }
 """)
 
@@ -234,10 +234,10 @@ $gather  ${stem}_lanes_work work[${upper}_GROUPS];
       const $real *from_q = q + $nq * (long)at[g * ${upper}_LANES + j];
       const $real *from_n = n + 3 * (long)at[g * ${upper}_LANES + j];
       for (i = 0; i < $nq; ++i) {
-        m->q[i][j] = from_q[i];
+        (($real *)&m->q[i])[j] = from_q[i];
       }
       for (i = 0; i < 3; ++i) {
-        m->n[i][j] = from_n[i];
+        (($real *)&m->n[i])[j] = from_n[i];
       }
     }
 $fill  }

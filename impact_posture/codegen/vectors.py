@@ -69,6 +69,10 @@ _TEXT = Template("""\
 #error "needs the vectors of GCC or Clang; generate with --portable for other compilers"
 #endif
 /* Bytes of a vector, and how many of them a batch takes at once: what suits the instructions and the caches. */
+/* Numbers that stand side by side by chance: making vectors of them costs more than it saves. */
+#if !defined(__clang__)
+#pragma GCC optimize("no-tree-slp-vectorize")
+#endif
 #if defined(__AVX512F__)
 #define ${upper}_VECTOR 64
 #define ${upper}_GROUPS 1
@@ -80,6 +84,10 @@ _TEXT = Template("""\
 #define ${upper}_GROUPS 4
 #endif
 #define ${upper}_LANES (${upper}_VECTOR / (int)sizeof($real))
+/* One number of a vector in memory. */
+#define ${upper}_AT(vector, lane) (((const $real *)&(vector))[lane])
+/* A single call waits less for two narrow vectors than for one wide one. */
+#define ${upper}_TURNS (${upper}_VECTOR < 32 ? ${upper}_VECTOR : 32)
 /* Numbers of several twin branches (r2, r4; u for those at any address), or of several configurations. */
 typedef $real ${prefix}_r2 __attribute__((vector_size($two)));
 typedef $real ${prefix}_r4 __attribute__((vector_size($four)));
@@ -88,8 +96,13 @@ typedef $real ${prefix}_r4u __attribute__((vector_size($four), aligned($one), ma
 typedef $real ${prefix}_rn __attribute__((vector_size(${upper}_VECTOR)));
 typedef $integer ${prefix}_in __attribute__((vector_size(${upper}_VECTOR)));
 
-/* Sines and cosines of count angles, a multiple of ${upper}_LANES; all arrays apart from each other. */
-static void ${prefix}_sincos(const $real *angle, $real *sine, $real *cosine, int count)
+typedef $real ${prefix}_rt __attribute__((vector_size(${upper}_TURNS)));
+typedef $integer ${prefix}_it __attribute__((vector_size(${upper}_TURNS)));
+""")
+
+_SINCOS = Template("""\
+/* Sines and cosines of count angles, a multiple of the vectors' lanes; all arrays apart from each other. */
+__attribute__((unused)) static void ${prefix}_${name}(const $real *angle, $real *sine, $real *cosine, int count)
 {
   int k, i, far = 0;
   for (k = 0; k < count; ++k) {
@@ -102,10 +115,10 @@ static void ${prefix}_sincos(const $real *angle, $real *sine, $real *cosine, int
     }
     return;
   }
-  for (k = 0; k < count; k += ${upper}_LANES) {
+  for (k = 0; k < count; k += (int)(sizeof(${prefix}_$vector) / sizeof($real))) {
     /* The nearest multiple of pi/2 is in the last bits of a number as large as this. */
-    ${prefix}_rn x, turns, z, s, c;
-    ${prefix}_in bits, odd, a, b;
+    ${prefix}_$vector x, turns, z, s, c;
+    ${prefix}_$bits bits, odd, a, b;
     memcpy(&x, angle + k, sizeof x);
     turns = x * $two_over_pi + $round;
     memcpy(&bits, &turns, sizeof bits);
@@ -118,7 +131,7 @@ static void ${prefix}_sincos(const $real *angle, $real *sine, $real *cosine, int
     memcpy(&a, &s, sizeof a);
     memcpy(&b, &c, sizeof b);
     for (i = 0; i < 2; ++i) {
-      const ${prefix}_in found = (i == 0 ? (a & ~odd) | (b & odd) : (b & ~odd) | (a & odd))
+      const ${prefix}_$bits found = (i == 0 ? (a & ~odd) | (b & odd) : (b & ~odd) | (a & odd))
         ^ (((bits + i) & 2) << $sign);
       memcpy((i == 0 ? sine : cosine) + k, &found, sizeof found);
     }
@@ -133,7 +146,7 @@ def vector_text(prefix: str, real: Real, *, portable: bool = False) -> str:
         sine, cosine = (real.spelled(f"{name}(").rstrip("(") for name in ("sin", "cos"))
         return _PORTABLE.substitute(prefix=prefix, real=real.name, sin=sine, cos=cosine)
     numbers = _DOUBLE if real.name == "double" else _FLOAT
-    return _TEXT.substitute(
+    facts = dict(
         prefix=prefix,
         upper=prefix.upper(),
         real=real.name,
@@ -152,6 +165,14 @@ def vector_text(prefix: str, real: Real, *, portable: bool = False) -> str:
         round=numbers.round,
         two_over_pi=numbers.two_over_pi,
         **{f"part{k}": part for k, part in enumerate(numbers.part)},
+    )
+    single = _SINCOS.substitute(facts, name="sincos", vector="rt", bits="it")
+    return (
+        _TEXT.substitute(facts)
+        + "\n"
+        + single
+        + "\n"
+        + _SINCOS.substitute(facts, name="sincos_lanes", vector="rn", bits="in")
     )
 
 
