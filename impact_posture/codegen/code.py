@@ -22,7 +22,7 @@ _FRAMES = 2048
 _SPILL = 2
 
 # Statements a block of the batch: few enough to stay in the processor's first cache from group to group.
-_BATCH_BLOCK = 150
+_BATCH_BLOCK = 60
 
 _PARAMETERS = {
     "eval": "const {r} q[{nq}], const {r} n[3], {r} *H, {r} grad[{nv}]",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -91,15 +92,34 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
             (k,) = users[k]
         return at[k]
 
+    last = {k: len(blocks) if k in outputs else max((home(u) for u in users.get(k, ())), default=-1) for k in at}
+    slots, sizes = _slots(graph, blocks, last)
+    return Layout(graph, tuple(blocks), frozenset(inlined), slots, sizes, angles, trig)
+
+
+def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
+    """Places in the work arrays for what later blocks use, until the ``last`` that does; and the arrays' lengths.
+
+    Every function calls its blocks in one order, so a place is free for the blocks after its value's last.
+    """
     slots: dict[int, int] = {}
     sizes: dict[int, int] = {}
-    for part in blocks:
-        for k in part.nodes:
-            if k in outputs or any(home(user) != at[k] for user in users.get(k, ())):
-                width = graph.nodes[k].width
+    free: dict[int, list[int]] = {}
+    ending: dict[int, list[int]] = {}
+    for number, block in enumerate(blocks):
+        for k in ending.pop(number - 1, ()):
+            heapq.heappush(free.setdefault(graph.nodes[k].width, []), slots[k])
+        for k in block.nodes:
+            if last[k] <= number:
+                continue
+            width = graph.nodes[k].width
+            if free.get(width):
+                slots[k] = heapq.heappop(free[width])
+            else:
                 slots[k] = sizes.get(width, 0)
                 sizes[width] = slots[k] + 1
-    return Layout(graph, tuple(blocks), frozenset(inlined), slots, sizes, angles, trig)
+            ending.setdefault(last[k], []).append(k)
+    return slots, sizes
 
 
 def _source(graph: Graph, k: int) -> int:
