@@ -248,6 +248,12 @@ ComOverFeet = Annotated[
         "--com/--no-com", panel=TASK, show_default="robot.toml's", help="Keep the center of mass above the feet."
     ),
 ]
+KeepContacts = Annotated[
+    bool, _option("--keep-contacts", panel=TASK, help="The blow must neither lift nor slide a foot.")
+]
+Friction = Annotated[
+    float, _option("--friction", panel=TASK, callback=not_negative, help="Friction coefficient for --keep-contacts.")
+]
 ComMargin = Annotated[
     float | None,
     _option(

@@ -120,11 +120,14 @@ def test_free_values_stand_beside_the_supported_ones() -> None:
     for key in ("H", "G", "V", "S", "E"):
         assert_close(found.free.to_dict()[key], expected[key], 1e-10, key)  # type: ignore[arg-type]
     assert found.to_dict()["free"] == found.free.to_dict()
+    assert found.footing is not None
+    assert found.to_dict()["footing"] == found.footing.to_dict()
     # Two flat feet have full rank: their compliance hardly matters.
     assert found.compliance_effect is not None and 0 < found.compliance_effect < 1e-2
     without = ImpactRequest("talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0), supports=()).resolve()
     alone = evaluate(without.objective, without.q)
     assert alone.free is None and "free" not in alone.to_dict()
+    assert alone.footing is None and "footing" not in alone.to_dict()
     assert alone.scalars.H == pytest.approx(found.free.H, rel=1e-14)
 
 

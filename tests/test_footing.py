@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.footing import footing
 from impact_posture.impact.metric import Metric
+from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.posture.feet import KeptFeet
+from impact_posture.posture.settings import make_settings, prepare
+from impact_posture.posture.solve import solve
 from impact_posture.robot.robot import Robot
-from tests.helpers import frame_jacobian, mass_matrix, robot
+from tests.helpers import assert_close, central_gradient, frame_jacobian, mass_matrix, robot
 
 FEET = {"solo8": 4, "solo12": 4, "talos": 2}
 
@@ -111,3 +122,69 @@ def test_soles_tip_over_their_edges() -> None:
     assert footing(oracle, narrow, q).friction is None
     large = footing(oracle, wide, q)
     assert any(foot.lifts for foot in large.feet) or large.friction is not None
+
+
+# ---- as a constraint ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "frame"), [("solo12", "base_link"), ("solo8", "base_link"), ("talos", "torso_2_link")]
+)
+def test_kept_feet_say_the_same_twice(name: str, frame: str) -> None:
+    """Expression, Pinocchio's numbers and finite differences."""
+    found, supports = standing(name)
+    contact = Contact.create(frame, (0.3, -0.2, -1.0))
+    objective = ImpactObjective(found, contact, supports=supports, compliance=1e-2 / found.mass)
+    numeric = Numeric(found.model)
+    kept = KeptFeet(objective, numeric.at(found.posture()), 0.7)
+    q_symbol, n_symbol = ca.SX.sym("q", found.nq), ca.SX.sym("n", 3)
+    symbolic = ca.Function("rows", [q_symbol, n_symbol], [kept.symbolic(Tree(found.model, q_symbol), n_symbol)])
+    generator = np.random.default_rng(3)
+    for _ in range(2):
+        q = np.asarray(pin.integrate(found.model, found.posture(), 0.2 * generator.normal(size=found.nv)))
+        values, jacobian = kept.numeric(numeric.at(q))
+        assert values.shape == kept.upper.shape and len({kept.row_name(k) for k in range(kept.rows)}) >= 2
+        assert_close(np.array(symbolic(q, contact.normal)).ravel(), values, 1e-7, "expression")
+        expected = central_gradient(lambda x: kept.numeric(numeric.at(x))[0], found.model, q, 1e-4)
+        assert_close(jacobian, expected, 1e-5, "Jacobian")
+
+
+def test_kept_feet_change_the_optimum() -> None:
+    """Without them the optimum pulls at the ground; with them a friction of the asked size is enough."""
+    values = {"robot": "solo12", "frame": "base_link", "normal": (0.0, 0.0, -1.0)}
+    free = prepare(make_settings(dict(values)))
+    kept = prepare(make_settings({**values, "keep_contacts": True, "friction": 1.0}))
+    assert any(isinstance(c, KeptFeet) for c in kept.problem.constraints)
+    supports = free.problem.objective.supports
+    without = solve(free.problem, starts=2, jobs=1)
+    found = solve(kept.problem, starts=2, jobs=1)
+    assert found.certificate.holds()
+    oracle = kept.problem.objective.oracle
+    before, after = footing(oracle, supports, without.q), footing(oracle, supports, found.q)
+    assert before.friction is None or before.friction > 1.0
+    assert after.friction is not None and after.friction <= 1.02
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("tilthex_arm", "--normal", "0", "0", "1", "--keep-contacts"), "no feet to keep"),
+        (("solo12", "--normal", "0", "0", "1", "--friction", "0.5"), "does nothing without --keep-contacts"),
+        (("solo12", "--normal", "0", "0", "1", "--keep-contacts", "--friction", "0"), "above zero"),
+    ],
+)
+def test_refusals(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
+    command = Path(sys.executable).parent / "impact-posture"
+    done = subprocess.run(
+        [command, "optimize", *arguments], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode in (1, 2)
+    assert said in done.stderr and "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_line_stands_in_evaluate(tmp_path: Path) -> None:
+    command = Path(sys.executable).parent / "impact-posture"
+    arguments = ["evaluate", "solo12", "--frame", "base_link", "--normal", "0", "0", "1"]
+    done = subprocess.run([command, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "the blow lifts" in done.stdout

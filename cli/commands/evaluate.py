@@ -71,6 +71,8 @@ def evaluate(
     _jumps(page, impact, found)
     page.gap()
     page.line(found.dominance.line)
+    if found.footing is not None:
+        page.line(f"feet: {found.footing.line}")
     page.warnings(warnings)
 
 

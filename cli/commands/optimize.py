@@ -56,6 +56,8 @@ def optimize(
     base_box: options.BaseBox = None,
     com: options.ComOverFeet = None,
     com_margin: options.ComMargin = None,
+    keep_contacts: options.KeepContacts = False,
+    friction: options.Friction = 0.7,
     limit_margin: options.LimitMargin = None,
     regularization: options.Regularization = 0.0,
     lock: options.Lock = None,
@@ -148,6 +150,7 @@ def _refuse_idle(given: dict[str, Any], settings: ProblemSettings) -> None:
         ("box", settings.contact_pose == "box", "--contact-pose box"),
         ("base_box", settings.base == "box", "--base box"),
         ("com_margin", settings.com is not False, "--com"),
+        ("friction", settings.keep_contacts, "--keep-contacts"),
     ):
         if name in given and not used:
             raise typer.BadParameter(f"does nothing without {mend}", param_hint=f"'--{name.replace('_', '-')}'")
@@ -226,6 +229,9 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, writte
     for when, block in (("before", initial), ("after", optimal)):
         if "cone" in block:
             page.line(f"worst normal {when}: {worst_normal(block['cone'], block['worst_normal'])}")
+    for when, block in (("before", initial), ("after", optimal)):
+        if "footing" in block:
+            page.line(f"feet {when}: {block['footing']['verdict']}")
     page.line(f"reduction {solution.reduction:.1%}; {_redundancy(solution.redundancy)} left by the constraints")
     for note in solution.notes[len(prepared.problem.notes) :]:
         page.line(note)

@@ -82,9 +82,14 @@ class Numeric:
         if not in_frame:
             local = pin.getJointJacobian(self.model, self.data, point.joint, pin.LOCAL)
             angular = np.asarray(local).reshape(6, -1)[3:]
-            gradient = gradient + angular.T @ (np.cross(linear, force) + np.cross(motion.angular, moment))
+            gradient = gradient + angular.T @ (_cross(linear, force) + _cross(motion.angular, moment))
         return np.asarray(gradient)
 
     def turning_gradient(self, point: PointOnLink, direction: Vector, covector: Vector) -> Vector:
         """Tangent gradient of ``cᵀ d(q)`` where the world direction ``d`` turns with the point's link: (nv,)."""
-        return np.asarray(self.jacobian(point)[3:].T @ np.cross(direction, covector))
+        return np.asarray(self.jacobian(point)[3:].T @ _cross(direction, covector))
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    """``a × b``; numpy's own takes twenty times as long on three numbers."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

@@ -12,6 +12,7 @@ from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.classical import Ellipsoid, ellipsoid_of
 from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import point_on
+from impact_posture.impact.footing import Footing, footing
 from impact_posture.impact.jump import Dominance, Jump, find_dominance, weighed_jump
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
@@ -84,6 +85,7 @@ class Evaluation:
         dominance: Whether one light joint makes up most of H.
         free: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
         compliance_effect: Relative change of H when the supports' compliance is a tenth; ``None`` without supports.
+        footing: Whether the feet stay under the blow; ``None`` without supports.
         warnings: What limits these numbers, one line each.
     """
 
@@ -105,6 +107,7 @@ class Evaluation:
     dominance: Dominance
     free: Scalars | None
     compliance_effect: float | None
+    footing: Footing | None
     warnings: tuple[str, ...]
 
     def to_dict(self) -> dict[str, object]:
@@ -135,6 +138,8 @@ class Evaluation:
             block["cone"] = self.cone.to_dict()
         if self.free is not None:
             block |= {"free": self.free.to_dict(), "compliance_effect": self.compliance_effect}
+        if self.footing is not None:
+            block["footing"] = self.footing.to_dict()
         return block
 
 
@@ -188,6 +193,7 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
         dominance=find_dominance(objective, found),
         free=free,
         compliance_effect=effect,
+        footing=footing(oracle, objective.supports, q) if objective.supports else None,
         warnings=_warnings(scalars, effect),
     )  # fmt: skip
 

@@ -7,14 +7,14 @@ press against each other with.  Weight does not count: within an impact it is no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from impact_posture.dynamics.numeric import Numeric
-from impact_posture.impact.contact import Support, point_on
+from impact_posture.impact.contact import Support
 from impact_posture.impact.oracle import ImpactOracle
 
 Vector = NDArray[np.float64]
@@ -106,7 +106,7 @@ def footing(oracle: ImpactOracle, supports: tuple[Support, ...], q: Vector) -> F
     particular = oracle.quantities(q).support_impulse
     values, vectors = np.linalg.eigh(oracle.Js @ oracle.Js.T)
     basis = vectors[:, values <= _RANK**2 * max(float(values[-1]), 1e-300)]
-    rows = _Rows(supports, oracle.numeric, oracle)
+    rows = FrictionCones(supports, [oracle.numeric.placement(p).rotation for p, _ in oracle.feet])
     lifting = rows.least_pull(particular, basis)
     scale = max(float(np.abs(particular).max(initial=0.0)), 1e-300)
     if lifting.pull > _NONE * scale:
@@ -130,15 +130,29 @@ class _Pull:
     impulse: Vector
 
 
-class _Rows:
-    """The cones as inequalities ``A f ≤ 0`` on the stacked impulses."""
+class FrictionCones:
+    """The cones as inequalities ``A f ≤ 0`` on the stacked impulses.
 
-    def __init__(self, supports: tuple[Support, ...], numeric: Numeric, oracle: ImpactOracle) -> None:
+    Args:
+        supports: The feet.
+        axes: World axes of each foot's frame, shape (3, 3); what a sole's size is along.
+    """
+
+    def __init__(self, supports: tuple[Support, ...], axes: Sequence[Vector]) -> None:
         self._supports = supports
         self._starts = np.concatenate([[0], np.cumsum([s.rows for s in supports])]).astype(int)
         self._size = int(self._starts[-1])
-        axes = [numeric.placement(point_on(oracle.robot, s.frame, s.offset)).rotation for s in supports]
         self._axes = [np.asarray(a) for a in axes]
+
+    def matrix(self, friction: float) -> tuple[Vector, list[str]]:
+        """``A``, shape (rows, impulses), for a friction coefficient, and what each row says."""
+        soles, slopes = self._soles(), self._slopes(friction)
+        frames = [s.frame for s in self._supports]
+        wide = [s.frame for s in self._supports if s.kind == "surface" and min(s.size) > 0]
+        names = [f"{frame} lifts" for frame in frames] + [f"{frame} tips" for frame in wide for _ in range(4)]
+        for frame in frames:
+            names += [f"{frame} slides"] * _SIDES + [f"{frame} turns"] * (2 if frame in wide else 0)
+        return np.vstack([self._up(), *soles, *slopes]), names
 
     def _up(self) -> Vector:
         rows = np.zeros((len(self._supports), self._size))
@@ -190,7 +204,7 @@ class _Rows:
 
     def within(self, particular: Vector, basis: Vector, friction: float) -> Vector | None:
         """Impulses within the cones, the smallest by their largest entry, or ``None``."""
-        A = np.vstack([self._up(), *self._soles(), *self._slopes(friction)])
+        A, _ = self.matrix(friction)
         slack = 1e-9 * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
         if not basis.shape[1]:
             return particular if (A @ particular <= _NONE * np.abs(particular).max(initial=1e-300)).all() else None

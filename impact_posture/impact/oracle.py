@@ -180,6 +180,30 @@ class ImpactOracle:
         own = np.array(self.contact.normal) if given is None else given
         return own, self.numeric.placement(self.point).rotation @ own if self._in_frame else own
 
+    def support_gradient(self, q: Vector) -> Vector:
+        """Tangent Jacobian of the supports' impulses ``f = −J_s a/ε``, shape (rows, nv)."""
+        self.at(q)
+        a = self.solve(self.J.T @ self.n)
+        responses = self.solve(self.Js.T)
+        in_frame = self.contact.normal_frame == "contact"
+        # ∂(J_s a) with a held fixed: by rows, once for all.
+        held = [
+            self.numeric.coupling_gradient(point, np.eye(6)[k], a) for point, count in self.feet for k in range(count)
+        ]
+        moved = np.array(held).reshape(len(self.Js), self._nv)
+        rows = []
+        for k, b in enumerate(responses.T):
+            feet = self.Js @ b / self.compliance
+            inertial = self.numeric.inertial_gradient(b, a) + feet @ moved
+            first = 0
+            for point, count in self.feet:
+                wrench = np.zeros(6)
+                wrench[:count] = self.Js[first : first + count] @ a / self.compliance
+                inertial = inertial + self.numeric.coupling_gradient(point, wrench, b)
+                first += count
+            rows.append(-(moved[k] + self._coupling(self.n, b, in_frame) - inertial) / self.compliance)
+        return np.array(rows).reshape(len(self.Js), self._nv)
+
     def _coupling(self, direction: Vector, v: Vector, in_frame: bool) -> Vector:
         wrench = np.concatenate([direction, np.zeros(3)])
         return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)

@@ -25,6 +25,7 @@ from impact_posture.posture.constraint import (
     PositionBox,
 )
 from impact_posture.posture.equalities import base_point
+from impact_posture.posture.feet import KeptFeet
 from impact_posture.posture.gauge import pin_undetermined
 from impact_posture.posture.regular import regularize
 from impact_posture.robot.robot import Robot
@@ -49,6 +50,8 @@ class Requirements:
         hold: Joints kept at their initial value.
         com_over_feet: Keep the center of mass above the support polygon.
         com_margin: Distance from the polygon's edges, meters.
+        keep_contacts: The blow must neither lift nor slide a foot.
+        friction: Coefficient for that.
         limit_margin: Distance from the joint limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
     """
@@ -63,6 +66,8 @@ class Requirements:
     hold: tuple[str, ...] = ()
     com_over_feet: bool = False
     com_margin: float = 0.0
+    keep_contacts: bool = False
+    friction: float = 0.7
     limit_margin: float = 0.0
     regularization: float = 0.0
 
@@ -129,6 +134,8 @@ def build_problem(
     constraints += _base_constraints(robot, numeric, requirements)
     if requirements.com_over_feet:
         constraints.append(_com_constraint(robot, objective.supports, numeric, requirements.com_margin))
+    if requirements.keep_contacts:
+        constraints.append(KeptFeet(objective, numeric, requirements.friction))
     lower, upper = _bounds(robot, chart, given, requirements)
     more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
     problem = PostureProblem(
@@ -154,6 +161,8 @@ def _check(robot: Robot, requirements: Requirements) -> None:
     ):
         if not (np.isfinite(value) and value >= 0):
             raise InputError(f"is {value:g}", where=name, mend="give a number ≥ 0")
+    if not (np.isfinite(requirements.friction) and requirements.friction > 0):
+        raise InputError(f"is {requirements.friction:g}", where="friction", mend="give a coefficient above zero")
     quaternion = requirements.target_quaternion
     if quaternion is not None and not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
         raise InputError(
@@ -274,6 +283,8 @@ def _describe(constraint: Constraint) -> str:
         detail = " (" + " × ".join(f"±{v:g}" for v in constraint.upper) + " m)"
     elif isinstance(constraint, CenterOfMassOverFeet):
         return f"{constraint.name}, {-constraint.upper[0]:g} m inside the support polygon"
+    elif isinstance(constraint, KeptFeet):
+        return f"{constraint.name}: the blow neither lifts nor slides one"
     elif isinstance(constraint, HeldPose) and constraint.rows == 5:
         detail = " (position and normal; spin free)"
     return f"{constraint.name} {kind}{detail}"

@@ -58,6 +58,8 @@ class ProblemSettings(BaseModel):
     base_box: Vector3 = (0.2, 0.2, 0.2)
     com: bool | None = None
     com_margin: float | None = None
+    keep_contacts: bool = False
+    friction: float = 0.7
     limit_margin: float | None = None
     regularization: float = 0.0
     metric: MetricKind = "euclidean"
@@ -193,6 +195,8 @@ def _requirements(settings: ProblemSettings, impact: ResolvedImpact) -> Requirem
         raise InputError(
             "there are no feet to keep the center of mass over", where="--com", mend="add --support or --no-com"
         )
+    if settings.keep_contacts and not impact.supports:
+        raise InputError("there are no feet to keep", where="--keep-contacts", mend="add --support or leave it out")
     return Requirements(
         contact_pose=settings.contact_pose or robot.contact_pose(frame),
         target_position=settings.target_position,
@@ -204,6 +208,8 @@ def _requirements(settings: ProblemSettings, impact: ResolvedImpact) -> Requirem
         hold=free if settings.hold is None else settings.hold,
         com_over_feet=com,
         com_margin=spec.com_margin if settings.com_margin is None else settings.com_margin,
+        keep_contacts=settings.keep_contacts,
+        friction=settings.friction,
         limit_margin=spec.limit_margin if settings.limit_margin is None else settings.limit_margin,
         regularization=settings.regularization,
     )

@@ -1,0 +1,72 @@
+"""Feet that the blow must neither lift nor slide: their impulses stay in the friction cones."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.impact.contact import point_on, support_inertia
+from impact_posture.impact.footing import FrictionCones
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.constraint import Constraint
+
+Vector = NDArray[np.float64]
+
+
+class KeptFeet(Constraint):
+    """``A f(q) ≤ 0`` of the supports' impulses ``f = −J_s a/ε`` per unit blow, as parts of the largest at the start.
+
+    These are the impulses of feet at compliance ε, one of the set that :mod:`impact_posture.impact.footing` asks
+    about: sufficient for the feet to stay, and where the set has more than one member, more than necessary.
+
+    Args:
+        objective: Whose blow, along the contact's normal, and whose feet.
+        numeric: At the given posture: soles keep their axes, for the feet are held.
+        friction: Coefficient.
+    """
+
+    def __init__(self, objective: ImpactObjective, numeric: Numeric, friction: float) -> None:
+        self.name = "feet that stay"
+        self._robot, self._supports = objective.robot, objective.supports
+        self._objective = replace(objective, normal_cone_deg=0.0)
+        self._feet = [(point_on(objective.robot, s.frame, s.offset), s.rows) for s in objective.supports]
+        axes = [np.asarray(numeric.placement(point).rotation) for point, _ in self._feet]
+        matrix, self._names = FrictionCones(objective.supports, axes).matrix(friction)
+        size = np.abs(self._objective.oracle.quantities(numeric.q).support_impulse).max(initial=1e-300)
+        self._matrix = matrix / size
+        self.parameters = np.array(objective.contact.normal)
+        self.lower = np.full(len(matrix), -np.inf)
+        self.upper = np.zeros(len(matrix))
+
+    @property
+    def structure(self) -> str:
+        """See :class:`Constraint`."""
+        digest = hashlib.sha256(self._matrix.tobytes()).hexdigest()[:16]
+        return f"{super().structure}:{digest}:{self._objective.compliance!r}"
+
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        """See :class:`Constraint`."""
+        contact, compliance = self._objective.contact, self._objective.compliance
+        extra = support_inertia(self._robot, self._supports, compliance)
+        heavy = Tree(self._robot.model, tree.q, extra_inertia=extra)
+        point = point_on(self._robot, contact.frame, contact.offset)
+        in_frame = contact.normal_frame == "contact"
+        found = heavy.respond(wrenches=[Wrench(point, parameters, ca.SX.zeros(3), in_frame)])
+        parts = [-heavy.point_velocity(foot, found.velocities)[:rows] / compliance for foot, rows in self._feet]
+        return ca.densify(ca.SX(self._matrix) @ ca.vertcat(*parts))
+
+    def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
+        """See :class:`Constraint`."""
+        oracle = self._objective.oracle
+        impulse = oracle.quantities(numeric.q).support_impulse
+        return self._matrix @ impulse, self._matrix @ oracle.support_gradient(numeric.q)
+
+    def row_name(self, row: int) -> str:
+        """See :class:`Constraint`."""
+        return self._names[row]
