@@ -29,6 +29,7 @@ from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.toolchain import run_compiler
 from tests.helpers import assert_close, random_configurations, rng, robot, unit
 from tests.tools import need_compiler
 
@@ -289,3 +290,23 @@ def test_a_branch_with_another_axis_is_no_twin() -> None:
         j = model.addJoint(0, joint, pin.SE3(np.eye(3), np.array([0.0, 0.1 * k, 0.0])), f"j{k}")
         model.appendBodyToJoint(j, inertia, pin.SE3.Identity())
     assert Twins(model).groups == (((1,), (3,)),)
+
+
+def test_two_exports_in_one_unit(tmp_path: Path) -> None:
+    """A unity build puts both files into one: nothing of the first may stand in the second's way."""
+    compiler = need_compiler()
+    for name, frame in (("solo8", "base_link"), ("panda", "panda_hand_tcp")):
+        (tmp_path / name).mkdir()
+        objective = ImpactObjective(robot(name), Contact.create(frame, (0.0, 0.6, 0.8)))
+        export(objective, tmp_path / name, prefix=name, check=False)
+    (tmp_path / "both.c").write_text('#include "solo8/solo8.c"\n#include "panda/panda.c"\n')
+    strict = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror")
+    run_compiler([*compiler, *strict, "-O1", "-c", "both.c", "-o", "both.o"], tmp_path)
+
+
+def test_the_prefix_costs_no_room(tmp_path: Path) -> None:
+    """The source of a humanoid, by whatever name: what the names of thousands of operations are made of is short."""
+    objective = ImpactObjective(robot("talos"), Contact.create("gripper_right_base_link", (0.0, 0.6, 0.8)))
+    export(objective, tmp_path, check=False)
+    (source,) = tmp_path.glob("talos*.c")
+    assert source.stat().st_size <= 350_000

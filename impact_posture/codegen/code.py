@@ -87,9 +87,9 @@ class _Writer:
             graph = packed(separate, found.seeds, {"constants": list(found.constants)})
         # One configuration at a time waits for results more than for units; a batch has other lanes to go on with.
         graph = rebuilt(graph)
-        types = {1: real.name, 2: f"{prefix}_r2", 4: f"{prefix}_r4"}
+        # Short: they stand in thousands of places.  The text takes the names back at its end.
+        types = {1: real.name, 2: "V2", 4: "V4"}
         self._layout = lay_out(graph, [f.outputs for f in found.functions])
-        # Short, as it stands in thousands of places.
         self._constants = Constants(prefix, real)
         self._emitter = Emitter(self._layout, Dialect(prefix, real, types), real.size, self._constants)
         robot = objectives[0].robot
@@ -192,9 +192,8 @@ class _Writer:
         layout = lay_out(self._scalars, [outputs], _BATCH_BLOCK)
         if self._portable or not _vectorizable(layout):
             return templates.BATCH_LOOP.substitute(self._common, stem=stem)
-        vector = f"{self._prefix}_rn"
         emitter = Emitter(
-            layout, Dialect(f"{stem}_lanes", self._real, {1: vector}, "work[g]"), LARGEST_VECTOR, self._constants
+            layout, Dialect(f"{stem}_lanes", self._real, {1: "VN"}, "work[g]"), LARGEST_VECTOR, self._constants
         )
         angles, work = max(1, len(layout.angles)), layout.sizes.get(1, 1)
         frame = max((block.local_bytes for block in emitter.blocks), default=0)

@@ -19,6 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 from impact_posture.codegen.layout import Block, Layout, is_leaf
 from impact_posture.codegen.program import COSINE, Node
 
+# Characters of a constant's place, about.
+_PLACE = 7
+SHORT_NAMES = ("K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
+"""Macros of the emitted text, for its end to take back."""
+
 # What a block may be handed, beside the inputs.
 _SHARED = ("s", "c", "w", "w2", "w4")
 _MATH = re.compile(r"\b(exp|log|pow|sqrt|a?sin|a?cos|a?tan|atan2|tanh|hypot|fabs|fmin|fmax)\(")
@@ -133,24 +138,27 @@ class Constants:
         """C of a constant: short numbers as they are, others by their place."""
         if node.width == 1:
             text = self._real.literal(node.value[0])
-            if len(text) < len(self._prefix) + 6:
+            if len(text) < _PLACE:
                 return text
         known = self._tables.setdefault(node.width, {})
-        return f"{self._name(node.width)}[{known.setdefault(node.value, len(known))}]"
+        return f"{_short(node.width)}[{known.setdefault(node.value, len(known))}]"
 
     def text(self, types: dict[int, str]) -> str:
-        """The tables, of the types for each width."""
+        """The tables, of the types for each width, and their short names."""
         lines = []
         for width, known in sorted(self._tables.items()):
             rows = [", ".join(self._real.literal(v).strip("()") for v in value) for value in known]
             if width > 1:
                 rows = ["{" + row + "}" for row in rows]
             body = ",\n".join(f"  {row}" for row in rows)
-            lines.append(f"static const {types[width]} {self._name(width)}[{len(known)}] = {{\n{body}\n}};\n")
-        return "\n".join(lines)
+            name = f"{self._prefix}_{_short(width).lower()}"
+            lines.append(f"static const {types[width]} {name}[{len(known)}] = {{\n{body}\n}};")
+            lines.append(f"#define {_short(width)} {name}")
+        return "\n".join([*lines, ""])
 
-    def _name(self, width: int) -> str:
-        return f"{self._prefix}_k{width if width > 1 else ''}"
+
+def _short(width: int) -> str:
+    return f"K{width if width > 1 else ''}"
 
 
 class Emitter:

@@ -10,7 +10,7 @@ from impact_posture import __version__
 from impact_posture.codegen import project, templates
 from impact_posture.codegen.code import Code
 from impact_posture.codegen.compiler import self_test_tolerance
-from impact_posture.codegen.emitter import Real, c_double, c_vector
+from impact_posture.codegen.emitter import SHORT_NAMES, Real, c_double, c_vector
 from impact_posture.codegen.manifest import unit_slices
 from impact_posture.codegen.variants import Variant
 from impact_posture.impact.objective import ImpactObjective
@@ -75,6 +75,7 @@ def build_texts(
                 "unit_checks": _unit_checks(objectives[0], real),
                 "vectors": code.vectors,
                 "functions": code.functions,
+                "undefined": "\n".join(f"#undef {name}" for name in SHORT_NAMES),
             }
         ),
         "example.c": project.EXAMPLE.substitute(

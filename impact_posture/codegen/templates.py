@@ -110,7 +110,10 @@ static int ${prefix}_check(const $real *q)
   }
 $unit_checks  return 0;
 }
-$functions""")
+$functions
+/* Another file may come after this one in the same unit. */
+$undefined
+""")
 
 # What every function begins with: the inputs' check, and what several of them compute.
 BEGIN = Template("""

@@ -96,6 +96,11 @@ typedef $real ${prefix}_r4u __attribute__((vector_size($four), aligned($one), ma
 typedef $real ${prefix}_rn __attribute__((vector_size(${upper}_VECTOR)));
 typedef $integer ${prefix}_in __attribute__((vector_size(${upper}_VECTOR)));
 
+#define V2 ${prefix}_r2
+#define V2u ${prefix}_r2u
+#define V4 ${prefix}_r4
+#define V4u ${prefix}_r4u
+#define VN ${prefix}_rn
 typedef $real ${prefix}_rt __attribute__((vector_size(${upper}_TURNS)));
 typedef $integer ${prefix}_it __attribute__((vector_size(${upper}_TURNS)));
 """)
