@@ -65,7 +65,9 @@ def build_code(exported: Sequence[Variant], prefix: str, real: Real, *, portable
         portable: Without vectors, for compilers that have none.
     """
     objectives, names = [v.objective for v in exported], [v.stem for v in exported]
-    return _Writer(library(objectives, names), objectives, names, prefix, real, portable).code()
+    # The free robot beside one that stands goes without lanes: its batch would be another third of the source.
+    looped = {v.stem for v in exported if v.free}
+    return _Writer(library(objectives, names), objectives, names, prefix, real, portable, looped).code()
 
 
 class _Writer:
@@ -77,9 +79,10 @@ class _Writer:
         prefix: str,
         real: Real,
         portable: bool,
+        looped: set[str],
     ) -> None:
         self._library, self._objectives, self._names = found, objectives, names
-        self._prefix, self._real, self._portable = prefix, real, portable
+        self._prefix, self._real, self._portable, self._looped = prefix, real, portable, looped
         self._scalars = graph_of(found.function, {"constants": found.constants})
         graph = self._scalars
         if not portable:
@@ -190,7 +193,7 @@ class _Writer:
     def _batch(self, stem: str) -> str:
         outputs = next(f.outputs for f in self._library.functions if (f.stem, f.name) == (stem, "eval"))
         layout = lay_out(self._scalars, [outputs], _BATCH_BLOCK)
-        if self._portable or not _vectorizable(layout):
+        if self._portable or stem in self._looped or not _vectorizable(layout):
             return templates.BATCH_LOOP.substitute(self._common, stem=stem)
         emitter = Emitter(
             layout, Dialect(f"{stem}_lanes", self._real, {1: "VN"}, "work[g]"), LARGEST_VECTOR, self._constants
