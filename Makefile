@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test lint types docs bench study-impacts regression clean
+.PHONY: help demo test lint types docs bench study-impacts calibration regression pictures clean
 
 help:
 	@echo "make demo        install into .venv, optimize a real robot, leave pictures and C code in demo/"
@@ -13,7 +13,9 @@ help:
 	@echo "make docs        the documentation site in docs/_build/html"
 	@echo "make bench       solve times, and the exported kernel beside its peers, on this machine"
 	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
+	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
+	@echo "make pictures    draw the pictures that the documentation shows"
 	@echo "make clean       remove what make made"
 
 $(BIN)/python:
@@ -57,13 +59,21 @@ docs: $(VENV)/.installed-docs
 
 bench: $(VENV)/.installed
 	$(BIN)/python -m tests.benchmarks.solve_times
+	$(BIN)/python -m tests.benchmarks.tsid_ticks
+	$(BIN)/python -m tests.benchmarks.extended_times
 	$(BIN)/impact-posture bench
 
 study-impacts: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks.impact_bench --write
 
+calibration: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks.restitution --write
+
 regression: $(VENV)/.installed
 	$(BIN)/python -m tests.regression.make
+
+pictures: $(VENV)/.installed
+	$(BIN)/python docs/pictures.py
 
 clean:
 	rm -rf $(VENV) demo docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

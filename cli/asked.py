@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from impact_posture_cli.checks import Three
+from impact_posture_cli.checks import Three, Two
 from impact_posture_cli.options import (
     MetricKind,
     NormalFrame,
@@ -29,7 +29,7 @@ def load_options(
     lock: list[str] | None,
 ) -> LoadOptions:
     """How to load the robot."""
-    from impact_posture.impact.request import parse_armature
+    from impact_posture.impact.texts import parse_armature
     from impact_posture.robot.loader import LoadOptions
 
     return LoadOptions(
@@ -49,7 +49,7 @@ def impact_request(
     normal: Three | None,
     offset: Three | None,
     normal_frame: NormalFrame,
-    contact: str | None,
+    contact: list[str] | None,
     impulse: float,
     posture: str | None,
     support: list[str] | None,
@@ -58,6 +58,9 @@ def impact_request(
     weights: str | None,
     objective: ObjectiveKind,
     normal_cone: float,
+    bilateral: bool = False,
+    armature_range: Two | None = None,
+    payload: list[str] | None = None,
     speed: float,
     restitution: float,
     root: RootKind | None,
@@ -75,6 +78,7 @@ def impact_request(
     check_contact(frame, normal, contact)
     supports = check_supports(support, no_support)
     from impact_posture.impact.request import ImpactRequest
+    from impact_posture.impact.texts import parse_payload
 
     return ImpactRequest(
         robot=robot,
@@ -83,7 +87,8 @@ def impact_request(
         normal=normal,
         offset=offset,
         normal_frame=normal_frame,
-        contact=contact,
+        contacts=tuple(contact or ()),
+        bilateral=bilateral,
         impulse=impulse,
         posture=posture,
         supports=supports,
@@ -91,6 +96,8 @@ def impact_request(
         weights=weights,
         objective=objective,
         normal_cone=normal_cone,
+        armature_range=armature_range,
+        payloads=tuple(parse_payload(text) for text in payload or ()),
         speed=speed,
         restitution=restitution,
     )

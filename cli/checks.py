@@ -6,6 +6,7 @@ import math
 
 import typer
 
+Two = tuple[float, float]
 Three = tuple[float, float, float]
 Four = tuple[float, float, float, float]
 
@@ -71,7 +72,7 @@ def contact(value: str | None) -> str | None:
         return None
     from impact_posture.errors import ImpactPostureError
     from impact_posture.impact.contact import Contact
-    from impact_posture.impact.request import parse_contact
+    from impact_posture.impact.texts import parse_contact
 
     try:
         frame, normal, impulse = parse_contact(value)
@@ -79,6 +80,26 @@ def contact(value: str | None) -> str | None:
     except ImpactPostureError as error:
         raise typer.BadParameter(f"{error.what}; {error.mend}") from None
     return value
+
+
+def factors(value: Two | None) -> Two | None:
+    """Refuse what is no range of factors."""
+    if value is not None and not 0 < value[0] <= value[1] < float("inf"):
+        raise typer.BadParameter("give two factors above zero, the lower first, such as 0.5 2")
+    return value
+
+
+def payloads(values: list[str] | None) -> list[str] | None:
+    """Refuse what is no frame and mass."""
+    from impact_posture.errors import ImpactPostureError
+    from impact_posture.impact.texts import parse_payload
+
+    for value in values or ():
+        try:
+            parse_payload(value)
+        except ImpactPostureError as error:
+            raise typer.BadParameter(f"{error.what}; {error.mend}") from None
+    return values
 
 
 def contacts(values: list[str] | None) -> list[str] | None:

@@ -9,6 +9,7 @@ import typer
 
 from impact_posture_cli.boundary import run
 from impact_posture_cli.commands import COMMANDS
+from impact_posture_cli.words import put_right
 
 app = typer.Typer(
     name="impact-posture",
@@ -43,4 +44,4 @@ for name, command in COMMANDS.items():
 
 def main() -> None:
     """Run the command line and exit with its code."""
-    sys.exit(run(typer.main.get_command(app), sys.argv[1:]))
+    sys.exit(run(typer.main.get_command(app), put_right(sys.argv[1:])))

@@ -10,13 +10,16 @@ import typer
 from impact_posture_cli.checks import (
     Four,
     Three,
+    Two,
     UsageError,
     cone,
     contact,
     contacts,
     direction,
+    factors,
     finite,
     not_negative,
+    payloads,
     positive,
     positives,
     unit_share,
@@ -40,18 +43,22 @@ class PictureFormat(StrEnum):
     pdf = "pdf"
 
 
+# Distances of --tradeoff without a number.
+TRADEOFF_POINTS = 16
+
+
 CONTACT, ROBOT, TASK, METRIC, OUTPUT = "Contact", "Robot", "Task", "Measure", "Output"
 
 
-def check_contact(frame: str | None, normal: Three | None, contact: str | None) -> None:
+def check_contact(frame: object, normal: object, contact: object) -> None:
     """Ask for ``--normal`` or ``--contact``, and not for both.
 
     Raises:
         UsageError: Exit code 2.
     """
-    if contact is None and normal is None:
+    if not contact and normal is None:
         raise UsageError("Missing option '--normal X Y Z': the direction out of the surface, towards the robot.")
-    if contact is not None and (frame is not None or normal is not None):
+    if contact and (frame is not None or normal is not None):
         raise UsageError("--contact stands instead of --frame and --normal: give one of the two.")
 
 
@@ -111,6 +118,16 @@ ContactText = Annotated[
         help="Instead of --frame and --normal.",
     ),
 ]  # fmt: skip
+ContactList = Annotated[
+    list[str] | None,
+    _option(
+        "--contact", metavar="FRAME:NX,NY,NZ[:IMPULSE]", panel=CONTACT, callback=contacts,
+        help="Instead of --frame and --normal; repeatable: up to 6 contacts at once.",
+    ),
+]  # fmt: skip
+Bilateral = Annotated[
+    bool, _option("--bilateral", panel=CONTACT, help="Several contacts can pull as well as push (grasps).")
+]
 Impulse = Annotated[float, _option("--impulse", panel=CONTACT, callback=positive, help="Bound on the impulse, N·s.")]
 Speed = Annotated[float, _option("--speed", panel=CONTACT, callback=not_negative, help="Approach speed, m/s.")]
 Restitution = Annotated[
@@ -187,6 +204,20 @@ PackageDirs = Annotated[
     list[str] | None,
     _option("--package-dir", metavar="DIR", panel=ROBOT, help="Where package:// leads; repeatable."),
 ]
+ArmatureRange = Annotated[
+    Two | None,
+    _option(
+        "--armature-range", metavar="LOW HIGH", panel=METRIC, callback=factors, show_default="as stated",
+        help="Factors on the armature, lowest and highest, whose worst counts.",
+    ),
+]  # fmt: skip
+PayloadList = Annotated[
+    list[str] | None,
+    _option(
+        "--payload", metavar="FRAME MASS", panel=METRIC, callback=payloads,
+        help="Mass in kg that the robot may or may not carry there; repeatable; the worst counts.",
+    ),
+]  # fmt: skip
 
 # ---- task -------------------------------------------------------------------------------------------------------
 
@@ -272,6 +303,15 @@ Regularization = Annotated[
     float, _option("--regularization", panel=TASK, callback=not_negative, help="Weight of staying near the start.")
 ]
 
+Tradeoff = Annotated[
+    int,
+    _option(
+        "--tradeoff", metavar="[K]", panel=TASK, min=0,
+        help="What a smaller change would buy: the best objective within each of K distances from the start, "
+        f"{TRADEOFF_POINTS} if K is left out; 0: none.",
+    ),
+]  # fmt: skip
+
 # ---- search and output ------------------------------------------------------------------------------------------
 
 Starts = Annotated[int, _option("--starts", panel=OUTPUT, min=1, help="Starting points of the search.")]
@@ -308,10 +348,3 @@ Formats = Annotated[
     list[PictureFormat] | None,
     _option("--format", panel=OUTPUT, show_default="png svg pdf", help="Of the pictures; repeatable."),
 ]
-ContactList = Annotated[
-    list[str] | None,
-    _option(
-        "--contact", metavar="FRAME:NX,NY,NZ[:IMPULSE]", panel=CONTACT, callback=contacts,
-        help="Instead of --frame and --normal.",
-    ),
-]  # fmt: skip

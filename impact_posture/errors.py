@@ -94,6 +94,12 @@ class PostureNotFound(NameNotFound):
     kind = "posture"
 
 
+class ScenarioNotFound(NameNotFound):
+    """No experiment of that name is shipped."""
+
+    kind = "scenario"
+
+
 class PackageNotFound(NameNotFound):
     """A ``package://`` or ``example-robot-data:`` path leads nowhere."""
 
@@ -184,3 +190,15 @@ class SolverFailed(ImpactPostureError):
     """The solver did not converge from any start, or its answer failed the certificate."""
 
     exit_code = 4
+
+
+class SimulationDiverged(ImpactPostureError):
+    """A simulation's state ran away; carries the time."""
+
+    def __init__(self, time: float, *, where: str = "simulation") -> None:
+        self.time = time
+        super().__init__(
+            f"the state ran away at t = {time:.4g} s",
+            where=where,
+            mend="lower the time step or the controller's gains, or soften the contact",
+        )

@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -13,11 +14,13 @@ import numpy as np
 from impact_posture.codegen.export import Export, export
 from impact_posture.errors import CompilerError, SpecError
 from impact_posture.folder import whole_folder
-from impact_posture.plot import PathData, ResultView, draw_all
+from impact_posture.plot import PathData, ResultView, TradeOffData, draw_all
 from impact_posture.posture.path import NullSpacePath, null_space_path
 from impact_posture.posture.result import result_arrays, result_document
+from impact_posture.posture.robustness import Robustness
 from impact_posture.posture.settings import Prepared, dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.solve import PostureSolution
+from impact_posture.posture.tradeoff import TradeOff
 from impact_posture.robot.postures import write_posture
 
 # What makes a folder an earlier result, which --force may replace.
@@ -52,6 +55,8 @@ def write_result(
     solution: PostureSolution,
     out: Path,
     *,
+    robustness: Robustness | None = None,
+    tradeoff: TradeOff | None = None,
     force: bool = False,
     codegen: bool = True,
     formats: Sequence[str] = FORMATS,
@@ -61,16 +66,16 @@ def write_result(
     Raises:
         OutputError: It exists without ``force``, or cannot be written.
     """
-    document = result_document(prepared, solution)
+    document = result_document(prepared, solution, robustness, tradeoff)
     path = null_space_path(solution.problem, solution.initial, solution.q)
     made: Export | None = None
     failure = ""
     with whole_folder(out, force=force, marks=MARKS) as folder:
         _write_json(folder / "result.json", document)
-        np.savez_compressed(folder / "result.npz", **result_arrays(solution, path))  # type: ignore[arg-type]
+        np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff))  # type: ignore[arg-type]
         _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
         (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
-        draw_all(_view(prepared, solution.initial, solution.q, path), folder, formats)
+        draw_all(_view(prepared, solution.initial, solution.q, path, document), folder, formats)
         if codegen:
             (folder / "c").mkdir()
             try:
@@ -82,7 +87,13 @@ def write_result(
     return Written(out, document, made, failure)
 
 
-def _view(prepared: Prepared, initial: np.ndarray, optimal: np.ndarray, path: NullSpacePath) -> ResultView:
+def _view(
+    prepared: Prepared,
+    initial: np.ndarray,
+    optimal: np.ndarray,
+    path: NullSpacePath,
+    document: dict[str, Any],
+) -> ResultView:
     impact = prepared.impact
     return ResultView(
         robot=impact.robot,
@@ -92,7 +103,18 @@ def _view(prepared: Prepared, initial: np.ndarray, optimal: np.ndarray, path: Nu
         speed=impact.speed,
         restitution=impact.restitution,
         path=PathData(s=path.s, H=path.H, G=path.G, V=path.V, S=path.S),
+        tradeoff=_tradeoff_data(document.get("tradeoff", [])),
     )
+
+
+def _tradeoff_data(points: Sequence[dict[str, Any]]) -> TradeOffData | None:
+    """``tradeoff`` of a ``result.json`` as it is drawn; ``None`` where there is nothing to trade."""
+    if len(points) < 2:
+        return None
+    keys = ("within", "distance", "objective", "H", "G", "V", "S")
+    columns = {key: np.array([np.nan if p[key] is None else p[key] for p in points], dtype=float) for key in keys}
+    knee = next((k for k, p in enumerate(points) if p["knee"]), None)
+    return TradeOffData(**columns, certified=np.array([bool(p["certified"]) for p in points]), knee=knee)
 
 
 def _write_json(path: Path, document: dict[str, object]) -> None:
@@ -117,6 +139,7 @@ def load_view(folder: Path) -> ResultView:
             )
         initial, optimal = (np.array(document[key]["q"], dtype=float) for key in ("initial", "optimal"))
         recorded = document["robot"]["model_sha256"]
+        view = _view(prepared, initial, optimal, path, document)
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError, EOFError, BadZipFile) as error:
         raise SpecError(
             f"is no whole result ({type(error).__name__}: {error})", where=str(folder), mend="run optimize again"
@@ -127,4 +150,4 @@ def load_view(folder: Path) -> ResultView:
             where=str(folder),
             mend="run optimize again, or use the URDF and armature of then",
         )
-    return _view(prepared, initial, optimal, path)
+    return view

@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
+import signal
 import subprocess
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from impact_posture.errors import CompilerError
@@ -26,17 +29,59 @@ def run_compiler(command: list[str], folder: Path) -> None:
     Raises:
         CompilerError: With the compiler's first error line and the command.
     """
+    run_compilers([command], folder)
+
+
+def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
+    """Run compilers' commands in ``folder``, as many at once as there are cores, in this order.
+
+    Raises:
+        CompilerError: With the first error line of the first one that failed, and its command.
+    """
+    waiting, running = list(commands), list[tuple[list[str], subprocess.Popen[str]]]()
     try:
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace", check=False)
+        while waiting or running:
+            while waiting and len(running) < (os.cpu_count() or 1):
+                command = waiting.pop(0)
+                running.append((command, _start(command, folder)))
+            command, process = running[0]
+            said = "".join(reversed(process.communicate()))
+            running.pop(0)
+            _check(command, folder, process.returncode, said)
+    finally:
+        # After an error or Ctrl-C: none is left behind, nor what it has started itself.
+        for _, process in running:
+            _kill(process)
+
+
+def _kill(process: subprocess.Popen[str]) -> None:
+    with suppress(ProcessLookupError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+    process.communicate()
+
+
+def _start(command: list[str], folder: Path) -> subprocess.Popen[str]:
+    pipe = subprocess.PIPE
+    try:
+        # In a session of its own, as a whole to be killed: a compiler is several processes.
+        return subprocess.Popen(
+            command, cwd=folder, stdout=pipe, stderr=pipe, text=True, errors="replace", start_new_session=True
+        )
     except OSError as error:
         raise CompilerError(f"{error.strerror} ({shlex.join(command)})", where="C compiler", mend="set CC") from None
-    output = Path(command[command.index("-o") + 1])
-    if done.returncode == 0 and (folder / output).is_file():
+
+
+def _check(command: list[str], folder: Path, code: int, output: str) -> None:
+    """Refuse what failed: ``output`` is standard error, then standard output."""
+    if code == 0 and (folder / command[command.index("-o") + 1]).is_file():
         return
-    said = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
+    said = [line for line in output.splitlines() if line.strip()]
     first = next((line for line in said if "error" in line.lower()), said[0] if said else None)
     raise CompilerError(
-        f"{first or f'it said nothing, exit code {done.returncode}'} (command: {shlex.join(command)}, in {folder})",
+        f"{first or f'it said nothing, exit code {code}'} (command: {shlex.join(command)}, in {folder})",
         where="the C compiler failed",
         mend="check the compiler or set CC to another",
     )

@@ -40,6 +40,9 @@ def test_main_job_leaves_everything(result: Path) -> None:
     for figure in ("ellipsoid", "postures", "jump", "nullspace"):
         for suffix in ("png", "svg", "pdf"):
             assert (result / f"{figure}.{suffix}").stat().st_size > 3000
+    # Only where it is asked for.
+    assert not (result / "tradeoff.png").exists()
+    assert "tradeoff" not in json.loads((result / "result.json").read_text())
     assert any((result / "c").glob("*.c")) and any((result / "c").glob("*.h"))
     assert not [p for p in result.parent.iterdir() if p.name.startswith(".")]
 

@@ -14,10 +14,12 @@ import typer.main
 from pydantic import BaseModel
 
 from impact_posture.posture.certificate import Certificate
+from impact_posture.posture.follow import trade_off
 from impact_posture.posture.result import result_document
 from impact_posture.posture.settings import ProblemSettings, make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.spec import ContactPose, RobotSpec
+from impact_posture.simulation.scenario_file import ScenarioFile
 from impact_posture_cli.main import app
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -105,6 +107,14 @@ def test_every_problem_toml_key_has_its_row() -> None:
             assert shown == shown_default(value), f"default of {key}"
 
 
+def test_every_scenario_toml_key_has_its_row() -> None:
+    expected, found = keys(ScenarioFile), rows(DOCS / "reference" / "scenario-toml.md")
+    assert set(found) == set(expected)
+    for key, value in expected.items():
+        assert found[key][1] == shown_default(value), f"default of {key}"
+        assert len(found[key][2]) > 3, f"{key} is not explained"
+
+
 def test_every_option_is_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reference reads signatures, the parser is Typer's: what one has the other must have."""
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
@@ -145,6 +155,13 @@ def test_result_keys_have_their_rows() -> None:
             assert not {f"{key}.{inner}" for inner in value} - shown
         else:
             assert key in shown, f"no row for {key}"
+
+
+def test_tradeoff_keys_are_in_their_row() -> None:
+    solution = solve(prepare(make_settings({"robot": "panda", "normal": (0, 0, 1)})).problem, starts=1, jobs=1)
+    (row,) = rows(DOCS / "reference" / "result-json.md")["tradeoff"]
+    for key in trade_off(solution, 1).to_list()[0]:
+        assert f"`{key}`" in row, key
 
 
 def test_certificate_tolerances_are_those_of_the_theory_page() -> None:

@@ -14,7 +14,8 @@ from impact_posture.impact.contact import Support, default_compliance
 from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.impact.jump import tangent_units
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.request import ImpactRequest, parse_armature, parse_contact
+from impact_posture.impact.request import ImpactRequest
+from impact_posture.impact.texts import parse_armature, parse_contact
 from impact_posture.robot.robot import Robot
 from tests.helpers import (
     assert_close,
@@ -180,7 +181,7 @@ def test_the_block_has_the_keys_of_result_json() -> None:
     assert set(block["pose"]) == {"position", "quaternion_xyzw"}  # type: ignore[call-overload]
     assert len(block["gradient"]) == 9 and len(block["q"]) == 9  # type: ignore[arg-type]
     asked = impact.to_dict()
-    assert set(asked) == {"robot", "contacts", "supports", "support_compliance", "metric"}
+    assert set(asked) == {"robot", "contacts", "scenarios", "supports", "support_compliance", "metric"}
     robot_keys = "name source model_sha256 nq nv joint_names root convention armature locked"
     assert set(asked["robot"]) >= set(robot_keys.split())  # type: ignore[call-overload]
 
@@ -322,7 +323,7 @@ def test_a_robot_without_a_default_frame_names_some(planar: str) -> None:
 
 
 def test_impulse_of_the_contact_text_and_the_default_offset() -> None:
-    assert ImpactRequest("panda", contact="panda_hand_tcp:0,0,2:4").resolve().contact.impulse == 4.0
-    assert ImpactRequest("panda", contact="panda_hand_tcp:0,0,2", impulse=5.0).resolve().contact.impulse == 5.0
+    assert ImpactRequest("panda", contacts=("panda_hand_tcp:0,0,2:4",)).resolve().contact.impulse == 4.0
+    assert ImpactRequest("panda", contacts=("panda_hand_tcp:0,0,2",), impulse=5.0).resolve().contact.impulse == 5.0
     with pytest.raises(ContactError, match="instead of"):
-        ImpactRequest("panda", contact="panda_hand_tcp:0,0,2", normal=(0.0, 0.0, 1.0)).resolve()
+        ImpactRequest("panda", contacts=("panda_hand_tcp:0,0,2",), normal=(0.0, 0.0, 1.0)).resolve()

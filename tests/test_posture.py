@@ -259,7 +259,11 @@ def test_command_line_wins_over_the_file(tmp_path) -> None:
     ("more", "words"),
     [
         ({"com": True}, "feet"),
-        ({"contact": ("ee:0,0,1", "ee:1,0,0")}, "one contact"),
+        ({"contact": ("ee:0,0,1", "ee:0,0,2")}, "given twice"),
+        ({"contact": ("ee:0,0,1", "ee:1,0,0"), "target_position": (0, 0, 0)}, "several contacts"),
+        ({"bilateral": True}, "one contact"),
+        ({"armature_range": (2.0, 1.0)}, "range"),
+        ({"payload": (("ee", -1.0),)}, "mass"),
         ({"normal_cone": 90.0}, "half angle"),
         ({"hold": ("elbwo",)}, "elbow"),
         ({"keep": ("eee",)}, "ee"),

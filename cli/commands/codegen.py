@@ -32,12 +32,15 @@ def codegen(
     normal: options.Normal = None,
     offset: options.Offset = None,
     normal_frame: options.NormalAxes = "world",
-    contact: options.ContactText = None,
+    contact: options.ContactList = None,
+    bilateral: options.Bilateral = False,
     impulse: options.Impulse = 1.0,
     metric: options.MetricName = "euclidean",
     weights: options.Weights = None,
     objective: options.ObjectiveName = "impulse",
     normal_cone: options.NormalCone = 0.0,
+    armature_range: options.ArmatureRange = None,
+    payload: options.PayloadList = None,
     support: options.SupportList = None,
     no_support: options.NoSupport = False,
     lock: options.Lock = None,
@@ -75,6 +78,7 @@ def codegen(
         objectives, posture = [view.objective], view.q_optimal
     else:
         from impact_posture.impact.request import ImpactRequest
+        from impact_posture.impact.texts import parse_payload
         from impact_posture_cli.asked import load_options
 
         load = load_options(
@@ -85,8 +89,10 @@ def codegen(
         for one in frames:
             request = ImpactRequest(
                 robot=robot, load=load, frame=one, normal=normal, offset=offset, normal_frame=normal_frame,
-                contact=contact, impulse=impulse, supports=supports, metric=metric, weights=weights,
-                objective=objective, normal_cone=normal_cone,
+                contacts=tuple(contact or ()), bilateral=bilateral, impulse=impulse, supports=supports,
+                metric=metric, weights=weights,
+                objective=objective, normal_cone=normal_cone, armature_range=armature_range,
+                payloads=tuple(parse_payload(text) for text in payload or ()),
             )  # fmt: skip
             impact = request.resolve()
             objectives.append(impact.objective)
@@ -106,7 +112,7 @@ def codegen(
         return
     page = Page(quiet=quiet)
     page.warnings(warnings)
-    where = ", ".join(o.contact.frame for o in objectives)
+    where = ", ".join(contact.frame for o in objectives for contact in o.contacts)
     page.title(f"{objectives[0].robot.name} at {where}", f"objective {objectives[0].name}")
     page.pairs(
         [

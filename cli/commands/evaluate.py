@@ -19,7 +19,8 @@ def evaluate(
     normal: options.Normal = None,
     offset: options.Offset = None,
     normal_frame: options.NormalAxes = "world",
-    contact: options.ContactText = None,
+    contact: options.ContactList = None,
+    bilateral: options.Bilateral = False,
     impulse: options.Impulse = 1.0,
     speed: options.Speed = 1.0,
     restitution: options.Restitution = 0.0,
@@ -27,6 +28,8 @@ def evaluate(
     weights: options.Weights = None,
     objective: options.ObjectiveName = "impulse",
     normal_cone: options.NormalCone = 0.0,
+    armature_range: options.ArmatureRange = None,
+    payload: options.PayloadList = None,
     posture: options.Posture = None,
     support: options.SupportList = None,
     no_support: options.NoSupport = False,
@@ -46,11 +49,13 @@ def evaluate(
         robot, frame=frame, normal=normal, offset=offset, normal_frame=normal_frame, contact=contact,
         impulse=impulse, posture=posture, support=support, no_support=no_support, metric=metric, weights=weights,
         objective=objective, normal_cone=normal_cone, speed=speed, restitution=restitution, root=root,
-        package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock,
+        package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock, bilateral=bilateral,
+        armature_range=armature_range, payload=payload,
     )  # fmt: skip
     from impact_posture.impact.classical import classical_ellipsoids
     from impact_posture.impact.evaluation import evaluate as evaluate_impact
     from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.worst import alone_line, contact_names, contacts_table, impulses_line, scenarios_table
 
     impact = request.resolve()
     found = evaluate_impact(impact.objective, impact.q, impact.speed, impact.restitution)
@@ -64,27 +69,47 @@ def evaluate(
         print_json(document)
         return
     page = Page(quiet=quiet)
+    frames = contact_names(impact.objective.contacts)
     _asked(page, impact, found)
     _scalars(page, impact, found)
+    if found.contacts:
+        alone_line(page, frames)
     _ellipsoids(page, impact, {"impact Λ_c": found.ellipsoid, **classical})
     _gradient(page, impact, found)
     _jumps(page, impact, found)
+    block = found.to_dict()
+    if found.contacts:
+        contacts_table(page, frames, block["by_contact"])  # type: ignore[arg-type]
+    if found.scenarios:
+        scenarios_table(page, [block], ["value"])
     page.gap()
     page.line(found.dominance.line)
-    if found.footing is not None:
-        page.line(f"feet: {found.footing.line}")
+    if found.impulses is not None:
+        page.line(f"worst impulses: {impulses_line(frames, found.impulses.to_dict())}")
+    for name, one in zip(frames, found.contacts or (found,), strict=True):
+        if one.footing is not None:
+            page.line(f"feet{f' (blow at {name})' if found.contacts else ''}: {one.footing.line}")
     page.warnings(warnings)
 
 
 def _asked(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     from impact_posture_cli.output import vector, worst_normal
+    from impact_posture_cli.worst import contact_names
 
     contact, metric = impact.contact, impact.metric
     turned = ", given in the contact frame" if contact.normal_frame == "contact" else ""
     rows = [
         ("posture", impact.posture),
-        ("normal", f"{vector(found.normal)} (world{turned})"),
-    ]
+        *[
+            (f"normal at {name}" if found.contacts else "normal",
+             f"{vector(evaluation.normal)} (world{turned})"
+             + (f", up to {one.impulse:g} N·s" if found.contacts else ""))
+            for name, one, evaluation in zip(
+                contact_names(impact.objective.contacts), impact.objective.contacts,
+                found.contacts or (found,), strict=True,
+            )
+        ],
+    ]  # fmt: skip
     if found.cone is not None:
         rows.append(("worst normal", worst_normal(found.cone.to_dict(), found.worst_normal)))
     if any(contact.offset):
@@ -97,7 +122,7 @@ def _asked(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
         rows.append(("supports", "none"))
     rows.append(("metric", f"{metric.kind} ({metric.source})" if metric.source else metric.kind))
     rows.append(("armature from", impact.robot.armature_source))
-    page.title(f"{impact.robot.name} at {contact.frame}")
+    page.title(f"{impact.robot.name} at {', '.join(c.frame for c in impact.objective.contacts)}")
     page.pairs(rows)
 
 
@@ -126,7 +151,11 @@ def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     page.table(("", *values, "unit", "meaning"), rows, right=tuple(range(1, 1 + len(values))))
     letters = {"impulse": f"λ̄²H, λ̄ = {impact.contact.impulse:g} N·s", "speed": "V", "sticking": "S", "energy": "E"}
     kind = impact.objective.kind
+    if impact.objective.others:
+        letters["impulse"] = "the largest ‖Δν‖² within the bounds on the impulses"
     worst = f", worst within {cone:g}° of n" if (cone := impact.objective.normal_cone_deg) else ""
+    if count := len(found.scenarios):
+        worst += f", worst of {count} scenarios"
     page.line(f"  objective {kind} ({letters[kind]}{worst}): {number(found.objective)}")
     if not kinetic:
         weighed = "weighted" if impact.metric.kind == "weighted" else "alike"

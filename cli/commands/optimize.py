@@ -36,6 +36,7 @@ def optimize(
     offset: options.Offset = None,
     normal_frame: options.NormalAxes = "world",
     contact: options.ContactList = None,
+    bilateral: options.Bilateral = False,
     impulse: options.Impulse = 1.0,
     speed: options.Speed = 1.0,
     restitution: options.Restitution = 0.0,
@@ -43,6 +44,8 @@ def optimize(
     weights: options.Weights = None,
     objective: options.ObjectiveName = "impulse",
     normal_cone: options.NormalCone = 0.0,
+    armature_range: options.ArmatureRange = None,
+    payload: options.PayloadList = None,
     posture: options.Posture = None,
     target_position: options.TargetPosition = None,
     target_quaternion: options.TargetQuaternion = None,
@@ -60,6 +63,7 @@ def optimize(
     friction: options.Friction = 0.7,
     limit_margin: options.LimitMargin = None,
     regularization: options.Regularization = 0.0,
+    tradeoff: options.Tradeoff = 0,
     lock: options.Lock = None,
     root: options.Root = None,
     armature: options.Armature = None,
@@ -83,8 +87,9 @@ def optimize(
     _refuse_idle(given, settings)
     from impact_posture.folder import check_output
     from impact_posture.job import FORMATS, MARKS, default_out, write_result
+    from impact_posture.posture.follow import trade_off
+    from impact_posture.posture.robustness import solve_robustly
     from impact_posture.posture.settings import prepare
-    from impact_posture.posture.solve import solve
     from impact_posture_cli.output import Page, print_json
 
     page = Page(quiet=quiet or json)
@@ -93,8 +98,9 @@ def optimize(
     check_output(folder, force=force, marks=MARKS)
     if not json:
         _announce(page, prepared)
-    with _progress(shown=not (quiet or json)) as progress:
-        solution = solve(
+    with _progress("starts", shown=not (quiet or json)) as progress:
+        # With each scenario alone beside it: how far the optimum moves with the model.
+        found = solve_robustly(
             prepared.problem,
             starts=settings.starts,
             seed=settings.seed,
@@ -102,10 +108,17 @@ def optimize(
             compile=compile,
             progress=progress,
         )
+    solution, robustness = found.solution, found.robustness
+    curve = None
+    if settings.tradeoff:
+        with _progress("points", shown=not (quiet or json)) as progress:
+            curve = trade_off(solution, settings.tradeoff, compile=compile, progress=progress)
     written = write_result(
         prepared,
         solution,
         folder,
+        robustness=robustness,
+        tradeoff=curve,
         force=force,
         codegen=not no_codegen,
         formats=[f.value for f in format or ()] or FORMATS,
@@ -133,12 +146,15 @@ def _settings(robot: str, given: dict[str, Any]) -> ProblemSettings:
     from_file = robot.endswith(".toml")
     contacts = given.get("contact")
     if not from_file or "contact" in given:
-        options.check_contact(given.get("frame"), given.get("normal"), contacts[0] if contacts else None)
-    from impact_posture.impact.request import parse_armature
+        options.check_contact(given.get("frame"), given.get("normal"), contacts)
+    from impact_posture.impact.texts import parse_armature, parse_payload
     from impact_posture.posture.settings import make_settings, read_settings
 
     if "armature" in given:
         given["armature"] = parse_armature(given["armature"])
+    if "payload" in given:
+        found = [parse_payload(text) for text in given["payload"]]
+        given["payload"] = tuple((payload.frame, payload.mass) for payload in found)
     if from_file:
         return read_settings(Path(robot), given)
     return make_settings({"robot": robot, **given})
@@ -158,18 +174,31 @@ def _refuse_idle(given: dict[str, Any], settings: ProblemSettings) -> None:
 
 def _announce(page: Page, prepared: Prepared) -> None:
     from impact_posture_cli.output import vector
+    from impact_posture_cli.worst import contact_names
 
     if page.quiet:
         return
     impact, problem = prepared.impact, prepared.problem
-    page.title(f"{impact.robot.name} at {impact.contact.frame}", f"objective {impact.objective.kind}")
+    contacts = impact.objective.contacts
+    page.title(f"{impact.robot.name} at {', '.join(c.frame for c in contacts)}", f"objective {impact.objective.kind}")
     axes = "world" if impact.contact.normal_frame == "world" else "contact frame"
     degrees = impact.objective.normal_cone_deg
     cone = f", the worst within {degrees:g}° of it" if degrees else ""
     feet = ", ".join(s.frame for s in impact.supports) or "none"
     page.pairs(
         [
-            ("normal", f"{vector(impact.contact.normal)} ({axes}){cone}"),
+            *[
+                (f"normal at {name}", f"{vector(c.normal)} ({axes}), up to {c.impulse:g} N·s")
+                if impact.objective.others
+                else ("normal", f"{vector(c.normal)} ({axes}){cone}")
+                for name, c in zip(contact_names(contacts), contacts, strict=True)
+            ],
+            *([("pull", "as well as push")] if impact.objective.bilateral else []),
+            *(
+                [("scenarios", "; ".join(s.name for s in scenarios))]
+                if (scenarios := impact.objective.scenarios)
+                else []
+            ),
             ("metric", impact.metric.kind),
             ("supports", feet),
             ("armature from", impact.robot.armature_source),
@@ -186,15 +215,15 @@ def _announce(page: Page, prepared: Prepared) -> None:
 
 
 @contextmanager
-def _progress(*, shown: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """A bar on standard error while the starts are solved."""
+def _progress(what: str, *, shown: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """A bar on standard error while starts, or points of a curve, are solved."""
     if not shown:
         yield None
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("solving"), BarColumn(), MofNCompleteColumn(), TextColumn("starts"), TimeElapsedColumn())
+    columns = (TextColumn("solving"), BarColumn(), MofNCompleteColumn(), TextColumn(what), TimeElapsedColumn())
     # The bar starts with the first result: worker processes are forked before its thread runs.
     bar = Progress(*columns, console=Console(stderr=True), transient=True)
     task = bar.add_task("solving", total=None)
@@ -211,6 +240,7 @@ def _progress(*, shown: bool) -> Iterator[Callable[[int, int], None] | None]:
 
 def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, written: Written) -> None:
     from impact_posture_cli.output import number, worst_normal
+    from impact_posture_cli.worst import contact_names, contacts_table, impulses_line, scenarios_table
 
     document: dict[str, Any] = written.document
     initial, optimal = document["initial"], document["optimal"]
@@ -225,14 +255,24 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, writte
     ):
         rows.append((f"  {key}", number(initial[key]), number(optimal[key]), unit, words))
     page.table(("", "before", "after", "unit", "meaning"), rows, right=(1, 2))
+    frames = contact_names(prepared.impact.objective.contacts)
+    if len(frames) > 1:
+        page.line(f"  (H, G, V, S, E: of a blow at {frames[0]} alone)", style="dim")
+        contacts_table(page, frames, optimal["by_contact"])
+    if "by_scenario" in optimal:
+        scenarios_table(page, [initial, optimal], ["before", "after"])
     page.gap()
     for when, block in (("before", initial), ("after", optimal)):
         if "cone" in block:
             page.line(f"worst normal {when}: {worst_normal(block['cone'], block['worst_normal'])}")
+        if "worst_impulses" in block:
+            page.line(f"worst impulses {when}: {impulses_line(frames, block['worst_impulses'])}")
     for when, block in (("before", initial), ("after", optimal)):
-        if "footing" in block:
-            page.line(f"feet {when}: {block['footing']['verdict']}")
+        for name, feet in _footings(frames, block):
+            page.line(f"feet {when}{name}: {feet['verdict']}")
     page.line(f"reduction {solution.reduction:.1%}; {_redundancy(solution.redundancy)} left by the constraints")
+    if "robustness" in document:
+        page.line(document["robustness"]["line"])
     for note in solution.notes[len(prepared.problem.notes) :]:
         page.line(note)
     if solution.moved > 1e-6:
@@ -250,11 +290,40 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, writte
         f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
         f"optima: {optima}{more}"
     )
+    if "tradeoff" in document:
+        _tradeoff(page, document["tradeoff"], [n for n in document["notes"] if n.startswith("trade-off:")])
     # Those of the robot stood above the solving.
     page.warnings(document["warnings"][len(prepared.impact.warnings) :])
     if not page.quiet:
         page.gap()
         page.line(f"written to {written.out}: {_contents(written)}")
+
+
+def _footings(frames: list[str], block: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Whether the feet stay, under each of several blows by name."""
+    if "by_contact" not in block:
+        return [("", block["footing"])] if "footing" in block else []
+    pairs = zip(frames, block["by_contact"], strict=True)
+    return [(f" (blow at {frame})", one["footing"]) for frame, one in pairs if "footing" in one]
+
+
+def _tradeoff(page: Page, points: list[dict[str, Any]], notes: list[str]) -> None:
+    """What a smaller change would buy."""
+    from impact_posture_cli.output import number
+
+    page.gap()
+    page.line("trade-off: the best posture within a distance from the initial one (rad, mixed with m)")
+    first, last = points[0]["objective"], points[-1]["objective"]
+    rows = []
+    for point in points:
+        gain = f"{(first - point['objective']) / (first - last):.1%}" if last < first else ""
+        marks = (["knee"] if point["knee"] else []) + ([] if point["certified"] else ["not certified"])
+        keys = ("objective", "H", "G", "V", "S")
+        rows.append((f"  {point['within']:.3f}", gain, *(number(point[key]) for key in keys), ", ".join(marks)))
+    head = ("  within", "gain", "objective", "H", "G", "V", "S", "")
+    page.table(head, rows, right=range(7))
+    for note in notes:
+        page.line(note)
 
 
 def _redundancy(count: int) -> str:

@@ -13,7 +13,9 @@ ResultFolder = Annotated[str, typer.Argument(metavar="RESULT_DIR", help="A folde
 Figures = Annotated[
     list[str] | None,
     typer.Option(
-        "--figure", help="ellipsoid, postures, jump, nullspace or classical; repeatable.", show_default="all"
+        "--figure",
+        help="ellipsoid, postures, jump, nullspace, classical or tradeoff; repeatable.",
+        show_default="all",
     ),
 ]
 PictureOut = Annotated[

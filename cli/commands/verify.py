@@ -59,8 +59,9 @@ def verify(
 
     if contact is None and normal is None:
         normal = (0.0, 0.0, 1.0)
+    contacts = [contact] if contact else None
     request = impact_request(
-        robot, frame=frame, normal=normal, offset=offset, normal_frame=normal_frame, contact=contact, impulse=1.0,
+        robot, frame=frame, normal=normal, offset=offset, normal_frame=normal_frame, contact=contacts, impulse=1.0,
         posture=None, support=support, no_support=no_support, metric=metric, weights=weights, objective="impulse",
         normal_cone=0.0, speed=1.0, restitution=0.0, root=root, package_dir=package_dir, srdf=srdf, config=config,
         armature=armature, lock=lock,

@@ -64,10 +64,12 @@ def build_code(exported: Sequence[Variant], prefix: str, real: Real, *, portable
         real: The C type to compute in.
         portable: Without vectors, for compilers that have none.
     """
-    objectives, names = [v.objective for v in exported], [v.stem for v in exported]
+    single = [v for v in exported if not v.joint]
+    joint = next(((v.objective, v.stem) for v in exported if v.joint), None)
+    objectives, names = [v.objective for v in single], [v.stem for v in single]
     # The free robot beside one that stands goes without lanes: its batch would be another third of the source.
     looped = {v.stem for v in exported if v.free}
-    return _Writer(library(objectives, names), objectives, names, prefix, real, portable, looped).code()
+    return _Writer(library(objectives, names, joint), objectives, names, prefix, real, portable, looped).code()
 
 
 class _Writer:
@@ -106,7 +108,7 @@ class _Writer:
         for number, function in enumerate(self._library.functions):
             texts.append(self._function(number, function))
         for objective, stem in zip(self._objectives, self._names, strict=True):
-            if objective.kind == "impulse" and not objective.normal_cone_deg:
+            if objective.is_multiple_of_H:
                 texts.append(
                     templates.OBJECTIVE_SCALED.substitute(
                         self._common,
@@ -175,7 +177,9 @@ class _Writer:
             lines.append("  *V /= *G * *G;")
         normal = ""
         if function.name in ("objective", "ellipsoid"):
-            contact = self._objectives[self._names.index(function.stem)].contact
+            # Of several contacts at once it is the leading one's; the others' are constants within.
+            of = dict(zip(self._names, self._objectives, strict=True))
+            contact = of.get(function.stem, self._objectives[0]).contact
             normal = f"  static const {self._real.name} n[3] = {c_vector(contact.normal, real=self._real)};\n"
         return templates.FUNCTION.substitute(
             self._common,

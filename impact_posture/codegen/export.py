@@ -101,9 +101,10 @@ def export(
 
 
 def default_prefix(objectives: Sequence[ImpactObjective]) -> str:
-    """Robot and frame; the robot alone where there are several frames."""
-    name = objectives[0].robot.name
-    return c_identifier(name, objectives[0].contact.frame if len(objectives) == 1 else "")
+    """Robot and frame; the robot alone where there are several."""
+    first = objectives[0]
+    alone = len(objectives) == 1 and not first.others
+    return c_identifier(first.robot.name, first.contact.frame if alone else "")
 
 
 def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple[ImpactObjective, ...]:
@@ -124,7 +125,8 @@ def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple
 
 def _what(o: ImpactObjective) -> tuple[object, ...]:
     """Everything but the contact."""
-    return o.robot.model_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg
+    scenarios = tuple(scenario.robot.model_sha256 for scenario in o.scenarios)
+    return o.robot.model_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg, scenarios
 
 
 def _write(texts: dict[str, str], out: Path, force: bool) -> None:

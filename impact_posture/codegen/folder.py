@@ -43,10 +43,11 @@ class WrittenExport:
     @property
     def functions(self) -> list[str]:
         """Names of the C functions."""
+        manifest = self.export.manifest
+        blocks = [block for frame in manifest["frames"] for block in (frame, frame["free"])]
         return [
             name
-            for frame in self.export.manifest["frames"]
-            for block in (frame, frame["free"])
+            for block in (*blocks, manifest["several"])
             if block is not None
             for name in block["symbols"].values()
         ]

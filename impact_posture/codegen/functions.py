@@ -65,8 +65,10 @@ class Library:
     functions: tuple[Exported, ...]
 
 
-def library(objectives: Sequence[ImpactObjective], stems: Sequence[str]) -> Library:
-    """The functions of objectives of one robot.
+def library(
+    objectives: Sequence[ImpactObjective], stems: Sequence[str], joint: tuple[ImpactObjective, str] | None = None
+) -> Library:
+    """The functions of objectives of one robot, and of one that is of several contacts at once, with its stem.
 
     ``objective`` is left out where it is a multiple of H, and so is what only ``V`` needs: C has it from ``H, G``.
     """
@@ -79,7 +81,7 @@ def library(objectives: Sequence[ImpactObjective], stems: Sequence[str]) -> Libr
         k = objective.kernel_of(q, n, twins)
         found = {"H": k.H, "grad": k.grad_H, "a": k.jump.a, "G": k.G, "L": k.ellipsoid}
         parts = {"eval": ("H", "grad"), "value": ("H",), "jump": ("a", "G", "H"), "ellipsoid": ("L",)}
-        if objective.kind != "impulse" or objective.normal_cone_deg:
+        if not objective.is_multiple_of_H:
             found["value"], found["gradient"] = objective.expressions(k)
             parts["objective"] = ("value", "gradient")
         names += [f"o{number}_{name}" for name in found]
@@ -88,6 +90,11 @@ def library(objectives: Sequence[ImpactObjective], stems: Sequence[str]) -> Libr
             Exported(stem, name, tuple(f"o{number}_{output}" for output in outputs))
             for name, outputs in parts.items()
         ]
+    if joint is not None:
+        objective, stem = joint
+        values += objective.expressions(objective.kernel_of(q, n, twins))
+        names += ["joint_value", "joint_gradient"]
+        functions.append(Exported(stem, "objective", ("joint_value", "joint_gradient")))
     constants = ca.vertcat(ca.SX(0, 1), *twins.parameters)
     inputs = ["q", "n", "constants"]
     function = ca.Function("library", [q, n, constants], values, inputs, names, {"cse": True})

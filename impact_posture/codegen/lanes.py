@@ -55,52 +55,60 @@ def packed(graph: Graph, seeds: Mapping[tuple[str, int], Seed], values: Mapping[
 
 
 def _bundles(graph: Graph, places: Mapping[int, Seed], widths: Mapping[int, int]) -> dict[int, tuple[int, ...]]:
-    """Node → the nodes that one vector holds, itself among them."""
-    alone: set[int] = set()
-    while True:
-        keys, lanes = _keys(graph, places, alone)
+    """Node → the nodes that one vector holds, itself among them.
+
+    Level by level from the inputs: operations with one key lie equally deep, so whether all lanes have one is known
+    before anything is built on them.  Where a lane lacks it, or has it twice, they are shared nodes like any other.
+    """
+    bundles: dict[int, tuple[int, ...]] = {}
+    lanes: dict[int, tuple[int, int]] = {}
+    # What stands for a node in the keys of others: its own number, or that of the first of its bundle.
+    short = list(range(len(graph.nodes)))
+    for level in _levels(graph):
         found: dict[Key, dict[int, list[int]]] = {}
-        for k, (_, lane) in lanes.items():
-            found.setdefault(keys[k], {}).setdefault(lane, []).append(k)
-        broken = set()
+        for k in level:
+            if (place := _place(graph, k, places, lanes, short)) is not None:
+                key, lanes[k] = place
+                found.setdefault(key, {}).setdefault(lanes[k][1], []).append(k)
         for by_lane in found.values():
             members = [k for nodes in by_lane.values() for k in nodes]
-            if not len(members) == len(by_lane) == widths[lanes[members[0]][0]]:
-                broken.update(members)
-        if not broken:
-            bundles = [tuple(by_lane[lane][0] for lane in sorted(by_lane)) for by_lane in found.values()]
-            return {k: bundle for bundle in bundles for k in bundle}
-        # What is built on a broken node may be whole again once that one counts as shared.
-        doubtful: set[int] = set()
-        for k, node in enumerate(graph.nodes):
-            if not doubtful.isdisjoint(node.operands):
-                doubtful.add(k)
-            elif k in broken:
-                doubtful.add(k)
-                alone.add(k)
+            if len(members) == len(by_lane) == widths[lanes[members[0]][0]]:
+                bundle = tuple(by_lane[lane][0] for lane in sorted(by_lane))
+                for k in bundle:
+                    bundles[k], short[k] = bundle, bundle[0]
+            else:
+                for k in members:
+                    del lanes[k]
+    return bundles
 
 
-def _keys(graph: Graph, places: Mapping[int, Seed], alone: set[int]) -> tuple[list[Key], dict[int, tuple[int, int]]]:
-    """Each node's key, and the group and lane of those that are in one."""
-    numbers: dict[Key, int] = {}
-    keys: list[Key] = []
-    lanes: dict[int, tuple[int, int]] = {}
-    short: list[int] = []
+def _levels(graph: Graph) -> list[list[int]]:
+    """Nodes by the length of the longest way to them from an input or a constant."""
+    depth: list[int] = []
+    levels: list[list[int]] = []
     for k, node in enumerate(graph.nodes):
-        key: Key = ("own", k)
-        if k not in alone:
-            if k in places:
-                place = places[k]
-                key, lanes[k] = ("seed", place.group, place.name), (place.group, place.lane)
-            elif node.op in ARITHMETIC or _of_input(graph, node):
-                inside = {lanes[a] for a in node.operands if a in lanes}
-                if len(inside) == 1:
-                    lanes[k] = inside.pop()
-                    operands = [short[a] for a in node.operands]
-                    key = (node.op, lanes[k][0], *(sorted(operands) if node.op in "+*" else operands))
-        keys.append(key)
-        short.append(numbers.setdefault(key, len(numbers)))
-    return keys, lanes
+        depth.append(max((depth[a] + 1 for a in node.operands), default=0))
+        while len(levels) <= depth[k]:
+            levels.append([])
+        levels[depth[k]].append(k)
+    return levels
+
+
+def _place(
+    graph: Graph, k: int, places: Mapping[int, Seed], lanes: Mapping[int, tuple[int, int]], short: list[int]
+) -> tuple[Key, tuple[int, int]] | None:
+    """A node's key with its group and lane; ``None`` where it is in none."""
+    node = graph.nodes[k]
+    if k in places:
+        place = places[k]
+        return ("seed", place.group, place.name), (place.group, place.lane)
+    if node.op in ARITHMETIC or _of_input(graph, node):
+        inside = {lanes[a] for a in node.operands if a in lanes}
+        if len(inside) == 1:
+            own = inside.pop()
+            operands = [short[a] for a in node.operands]
+            return (node.op, own[0], *(sorted(operands) if node.op in "+*" else operands)), own
+    return None
 
 
 def _of_input(graph: Graph, node: Node) -> bool:

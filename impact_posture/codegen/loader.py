@@ -55,7 +55,10 @@ class ImpactGradient:
         self.nq, self.nv = int(manifest["nq"]), int(manifest["nv"])
         # A robot without supports is free as it is.
         self._block = (block.get("free") if free else None) or block
-        self._library, self._symbols = library, self._block["symbols"]
+        self._library, self._symbols = library, dict(self._block["symbols"])
+        if manifest.get("several") and not free:
+            # The problem's own objective is that of all contacts at once, whichever frame is asked about.
+            self._symbols |= manifest["several"]["symbols"]
         self._real = _TYPES[manifest["real"]]
         self.dtype = np.dtype(self._real)
         buffers = {"q": self.nq, "n": 3, "grad": self.nv, "own": self.nv, "jump": self.nv, "L": 9}

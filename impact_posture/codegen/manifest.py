@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import casadi as ca
@@ -83,12 +83,7 @@ def self_test(objective: ImpactObjective, real: Real = DOUBLE) -> dict[str, Any]
         "ellipsoid": ellipsoid_fun(objective)(q),
     }
     found = {key: np.array(v, dtype=float).ravel() for key, v in numbers.items()}
-    if not all(np.isfinite(v).all() for v in found.values()):
-        raise MetricError(
-            f"objective '{objective.name}' is not finite at a random posture of {objective.robot.name}",
-            where="codegen",
-            mend="choose another objective or frame",
-        )
+    _refuse_infinite(objective, found.values())
     scalars = ("H", "objective", "G", "V")
     return {
         "q": q.tolist(),
@@ -108,17 +103,24 @@ def build_manifest(
 
     What belongs to one frame stands in ``frames``, an entry each; that of the first frame at the top as well.  An
     entry's ``free`` has the symbols and the reference of the robot without its supports; null where it has none.
+    ``several`` has those of the objective of several contacts at once.
     """
     first = objectives[0]
     robot, metric = first.robot, first.metric
     frames: list[dict[str, Any]] = []
+    joint: dict[str, Any] | None = None
     for variant in variants(objectives, prefix):
+        if variant.joint:
+            joint = _joint_block(variant.objective, variant.stem, real)
+            continue
         block = _frame_block(variant.objective, variant.stem, real)
         if variant.free:
             frames[-1]["free"] = {key: block[key] for key in ("symbols", "self_test")}
         else:
             frames.append(block | {"free": None})
     symbols = frames[0]["symbols"] | ({} if posture is None else {"posture": f"{prefix}_posture"})
+    if joint is not None:
+        symbols |= joint["symbols"]
     return {
         "schema": SCHEMA,
         "prefix": prefix,
@@ -139,6 +141,8 @@ def build_manifest(
         "objective": first.name,
         "objective_units": first.units,
         "normal_cone_deg": first.normal_cone_deg,
+        "scenarios": [scenario.to_dict() for scenario in first.scenarios],
+        "several": joint,
         "supports": [{"frame": s.frame, "kind": s.kind, "offset": list(s.offset)} for s in first.supports],
         "support_compliance": first.compliance if first.supports else None,
         "armature": robot.armature.tolist(),
@@ -154,6 +158,30 @@ def build_manifest(
             "python": platform.python_version(),
         },
     }
+
+
+def _joint_block(objective: ImpactObjective, stem: str, real: Real) -> dict[str, Any]:
+    q = real.rounded(sample_postures(objective.robot, 1, 0)[0])
+    value, gradient = (np.array(v, dtype=float).ravel() for v in objective_fun(objective)(q))
+    _refuse_infinite(objective, (value, gradient))
+    return {
+        "contacts": [
+            {"frame": c.frame, "normal": list(c.normal), "normal_frame": c.normal_frame, "impulse_bound": c.impulse}
+            for c in objective.contacts
+        ],
+        "bilateral": objective.bilateral,
+        "symbols": {"objective": f"{stem}_objective"},
+        "self_test": {"q": q.tolist(), "objective": float(value[0]), "objective_grad": gradient.tolist()},
+    }
+
+
+def _refuse_infinite(objective: ImpactObjective, values: Iterable[Vector]) -> None:
+    if not all(np.isfinite(v).all() for v in values):
+        raise MetricError(
+            f"objective '{objective.name}' is not finite at a random posture of {objective.robot.name}",
+            where="codegen",
+            mend="choose another objective or frame",
+        )
 
 
 def _frame_block(objective: ImpactObjective, stem: str, real: Real) -> dict[str, Any]:

@@ -36,6 +36,23 @@ $calls  printf("%s: largest relative difference %.3g\\n", worst <= $tolerance ? 
 }
 """)
 
+EXAMPLE_CHECK_SEVERAL = Template("""
+/* All contacts at once. */
+static double check_${stem}_together(void)
+{
+  static const $real q[$nq] = $q;
+  static const double objective_reference = $objective_value;
+  static const double objective_grad_reference[$nv] = $objective_grad;
+  $real value, grad[$nv];
+  double worst;
+  int code = ${stem}_objective(q, &value, grad);
+  worst = difference(&value, &objective_reference, 1, 0.0);
+  worst = fmax(worst, difference(grad, objective_grad_reference, $nv, 1e-3 * fabs(objective_reference)));
+  printf("$stem: objective of all contacts = %.9g\\n", (double)value);
+  return code != 0 ? INFINITY : worst;
+}
+""")
+
 EXAMPLE_CHECK = Template("""
 /* Everything at $frame. */
 static double check_$stem(void)
@@ -247,6 +264,10 @@ $q_table
 | index | gradient: derivative along |
 |---|---|
 $v_table
+""")
+
+README_ROW_SEVERAL = Template("""\
+| `${stem}_objective(q, &value, grad)` | the exported problem's own: all contacts at once, $box: $several_line |
 """)
 
 README_ROWS = Template("""\

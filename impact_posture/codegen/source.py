@@ -39,10 +39,16 @@ def build_texts(
     exported: Sequence[Variant], prefix: str, manifest: dict[str, Any], code: Code, real: Real
 ) -> dict[str, str]:
     """File name → text of everything but the manifest."""
+    joint = next((v for v in exported if v.joint), None)
+    exported = [v for v in exported if not v.joint]
     objectives = [v.objective for v in exported if not v.free]
     facts = _facts(objectives, prefix, manifest, real)
-    each = [facts | _frame_facts(v, alone=len(objectives) == 1) for v in exported]
+    each = [
+        facts | _frame_facts(v, alone=len(objectives) == 1 and joint is None, together=joint is not None)
+        for v in exported
+    ]
     facts = each[0] | facts
+    together = _joint_texts(joint, facts, manifest, real)
     comment = {key: plain(value) for key, value in facts.items()}
     comments = [{key: plain(value) for key, value in block.items()} for block in each]
     posture = manifest["posture"]
@@ -58,7 +64,7 @@ def build_texts(
         "v_order": wrapped([plain(v) for v in manifest["v_names"]], " *      "),
         "convention": comment["convention"].replace("; ", ";\n * "),
         "contacts": "\n".join(templates.CONTACT_LINE.substitute(block) for block in comments if not block["free"]),
-        "declarations": "".join(templates.DECLARATIONS.substitute(block) for block in comments),
+        "declarations": "".join(templates.DECLARATIONS.substitute(block) for block in comments) + together["header"],
     }
     tables = {
         key: "\n".join(f"| {k} | {name} |" for k, name in enumerate(manifest[names]))
@@ -80,15 +86,48 @@ def build_texts(
         ),
         "example.c": project.EXAMPLE.substitute(
             facts,
-            checks="".join(project.EXAMPLE_CHECK.substitute(block) for block in checks),
-            calls="".join(f"  worst = fmax(worst, check_{block['stem']}());\n" for block in each),
+            checks="".join(project.EXAMPLE_CHECK.substitute(block) for block in checks) + together["check"],
+            calls="".join(f"  worst = fmax(worst, check_{block['stem']}());\n" for block in each) + together["call"],
         ),
         "example.cpp": _eigen(objectives[0], checks[0], manifest["self_test"], real),
         "Makefile": project.MAKEFILE.substitute(facts),
         "CMakeLists.txt": project.CMAKE.substitute(facts),
         "README.md": project.README.substitute(
-            facts | tables, posture=row, rows="".join(project.README_ROWS.substitute(block) for block in each)
+            facts | tables,
+            posture=row,
+            rows="".join(project.README_ROWS.substitute(block) for block in each) + together["row"],
         ),
+    }
+
+
+def _joint_texts(
+    joint: Variant | None, facts: dict[str, str], manifest: dict[str, Any], real: Real
+) -> dict[str, str]:
+    """What several contacts at once add to each text."""
+    if joint is None:
+        return dict.fromkeys(("header", "check", "call", "row"), "")
+    test, objective = manifest["several"]["self_test"], joint.objective
+    box = "|impulse| up to" if objective.bilateral else "impulses from 0 to"
+    contacts = [
+        f"{c.frame} ({', '.join(f'{v:.9g}' for v in c.normal)}) {c.impulse:g} N s" for c in objective.contacts
+    ]
+    names = [plain(f"({scenario.name})") for scenario in objective.scenarios]
+    models = wrapped(["The worst of the models", *names], "") if names else ""
+    own = facts | {
+        "stem": joint.stem,
+        "box": box,
+        "several": wrapped([plain(text) for text in contacts], " * "),
+        "several_line": ", ".join(contacts),
+        "models": "".join(f"\n * {line}" for line in models.splitlines()),
+        "objective_value": c_double(test["objective"]).strip("()"),
+        "objective_grad": c_vector(test["objective_grad"]),
+        "q": c_vector(test["q"], "  ", real),
+    }
+    return {
+        "header": templates.DECLARATION_SEVERAL.substitute(own),
+        "check": project.EXAMPLE_CHECK_SEVERAL.substitute(own),
+        "call": f"  worst = fmax(worst, check_{joint.stem}_together());\n",
+        "row": project.README_ROW_SEVERAL.substitute(own),
     }
 
 
@@ -131,7 +170,17 @@ def _facts(
     }
 
 
-def _frame_facts(variant: Variant, *, alone: bool) -> dict[str, str]:
+def _worst_note(objective: ImpactObjective) -> str:
+    """What the objective is the worst of, and what the gradient is where several are as bad."""
+    note = ""
+    if objective.scenarios:
+        note = "; the worst of " + "; ".join(scenario.name for scenario in objective.scenarios)
+    if objective.normal_cone_deg or objective.scenarios:
+        note += "; where several are as bad, grad is a subgradient, that at one of them"
+    return note
+
+
+def _frame_facts(variant: Variant, *, alone: bool, together: bool) -> dict[str, str]:
     objective, stem = variant.objective, variant.stem
     contact = objective.contact
     where = ("" if alone else f" at {contact.frame}") + (", the robot without its supports" if variant.free else "")
@@ -148,11 +197,8 @@ def _frame_facts(variant: Variant, *, alone: bool) -> dict[str, str]:
             if objective.normal_cone_deg
             else "the normal"
         ),
-        "cone_note": (
-            "; where several are as bad, grad is a subgradient, that at one of them"
-            if objective.normal_cone_deg
-            else ""
-        ),
+        "own": "The objective of this contact alone" if together else "The exported problem's own objective",
+        "cone_note": _worst_note(objective),
         "normal_axes": (
             "world axes" if contact.normal_frame == "world" else f"the axes of contact frame {contact.frame}"
         ),

@@ -57,7 +57,7 @@ DECLARATIONS = Template("""
 /* H and its tangent gradient$at. */
 int ${stem}_eval(const $real q[$nq], const $real n[3], $real *H, $real grad[$nv]);
 
-/* The exported problem's own objective and its tangent gradient, at $cone ($normal)
+/* $own and its tangent gradient, at $cone ($normal)
  * in $normal_axes$cone_note. */
 int ${stem}_objective(const $real q[$nq], $real *value, $real grad[$nv]);
 
@@ -75,6 +75,13 @@ int ${stem}_ellipsoid(const $real q[$nq], $real L[9]);
  * side by side.  Returns the code of the first that fails, else 0; the others are done, and where one fails H and
  * grad are NaN. */
 int ${stem}_eval_batch(const $real *q, const $real *n, int count, $real *H, $real *grad);
+""")
+
+DECLARATION_SEVERAL = Template("""
+/* The exported problem's own objective: the largest squared jump of $box
+ * $several
+ * at once, and its tangent gradient; where several corners of that box are as bad, that at one of them.$models */
+int ${stem}_objective(const $real q[$nq], $real *value, $real grad[$nv]);
 """)
 
 POSTURE_DECLARATION = Template("""

@@ -1,7 +1,7 @@
 """MuJoCo's model written out of a ``pin.Model``: the same bodies, joints, inertias and armature, nothing read twice.
 
 A URDF read by MuJoCo itself would lose package paths, the floating base and the armature, and order joints its own
-way.  The model has no geometry: who simulates contact adds it to the bodies by name.
+way.  The model has no geometry: who simulates contact adds it (:mod:`impact_posture.dynamics.mjcf_additions`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart, JointSlot
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
+from impact_posture.dynamics.mjcf_text import numbers, pose
 from impact_posture.errors import InputError, UnsupportedJoint
 
 Vector = NDArray[np.float64]
@@ -47,6 +48,7 @@ class Mjcf:
         xml: The MJCF document.
         layout: Conversions of coordinates.
         bodies: Name of the body of each joint of Pinocchio's, by joint index.
+        joints: Names of the joints that make up each joint of Pinocchio's, by joint index.
         sites: Name of the site of each frame, by frame index; a frame whose name another one has is left out.
         moments: Principal moments, kg·m², shape (3,), by body, that break the triangle inequality and so cannot stand
             in the XML: it has the nearest moments that hold it, and :meth:`compile` sets these.
@@ -55,6 +57,7 @@ class Mjcf:
     xml: str
     layout: MjcfLayout
     bodies: dict[int, str]
+    joints: dict[int, tuple[str, ...]]
     sites: dict[int, str]
     moments: dict[str, Vector]
 
@@ -113,15 +116,16 @@ def write_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
     free = frozenset(i for i in order if _is_free(model, slots[i]))
     root = ET.Element("mujoco", model=name)
     ET.SubElement(root, "compiler", _COMPILER)
-    ET.SubElement(root, "option", gravity=_text(model.gravity.linear))
+    ET.SubElement(root, "option", gravity=numbers(model.gravity.linear))
     elements = {0: ET.SubElement(root, "worldbody")}
-    bodies, moments = {}, {}
+    bodies, joints, moments = {}, {}, {}
     taken, joint_names = {"world"}, set[str]()
     for i in order:
         place = model.jointPlacements[i]
         bodies[i] = _unique(_link_name(model, i), taken)
-        body = ET.SubElement(elements[int(model.parents[i])], "body", {"name": bodies[i], **_pose(place)})
+        body = ET.SubElement(elements[int(model.parents[i])], "body", {"name": bodies[i], **pose(place)})
         _add_joint(body, model, slots[i], i in free, joint_names)
+        joints[i] = tuple(str(joint.get("name")) for joint in body.findall("joint"))
         exact = _add_inertia(body, model.inertias[i])
         if exact is not None:
             moments[bodies[i]] = exact
@@ -129,7 +133,7 @@ def write_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
     sites = _add_sites(elements, model)
     ET.indent(root)
     xml = ET.tostring(root, encoding="unicode") + "\n"
-    return Mjcf(xml, MjcfLayout(model, order, free), bodies, sites, moments)
+    return Mjcf(xml, MjcfLayout(model, order, free), bodies, joints, sites, moments)
 
 
 def _depth_first(model: pin.Model) -> list[int]:
@@ -179,14 +183,14 @@ def _add_joint(body: ET.Element, model: pin.Model, slot: JointSlot, free: bool, 
     def add(kind: str, suffix: str, value: float, axis: Iterable[float] = (), limits: bool = False) -> None:
         joint = ET.SubElement(body, "joint", name=_unique(slot.name + suffix, taken), type=kind)
         if axis:
-            joint.set("axis", _text(axis))
+            joint.set("axis", numbers(axis))
         if value:
             joint.set("armature", repr(float(value)))
         if limits:
             k = slot.q.start + "xyz".find(suffix[1:]) if suffix else slot.q.start
             low, high = float(model.lowerPositionLimit[k]), float(model.upperPositionLimit[k])
             if low < high and max(-low, high) < _ENDLESS:
-                joint.set("range", _text((low, high)))
+                joint.set("range", numbers((low, high)))
 
     eye = np.eye(3)
     slides = [(f".{letter}", tuple(eye[k])) for k, letter in enumerate("xyz")]
@@ -238,7 +242,7 @@ def _add_inertia(body: ET.Element, inertia: pin.Inertia) -> Vector | None:
     written[2] = max(min(written[2], written[0] + written[1]), written[1])
     placement = pin.SE3(axes, np.array(inertia.lever))
     mass = repr(max(float(inertia.mass), _LEAST))
-    ET.SubElement(body, "inertial", {**_pose(placement, always=True), "mass": mass, "diaginertia": _text(written)})
+    ET.SubElement(body, "inertial", {**pose(placement, always=True), "mass": mass, "diaginertia": numbers(written)})
     return moments if np.abs(written - moments).max() > 2 * _LEAST else None
 
 
@@ -251,21 +255,5 @@ def _add_sites(elements: dict[int, ET.Element], model: pin.Model) -> dict[int, s
             continue
         sites[k] = str(frame.name)
         element = elements[int(frame.parentJoint)]
-        ET.SubElement(element, "site", {"name": sites[k], **_pose(frame.placement)})
+        ET.SubElement(element, "site", {"name": sites[k], **pose(frame.placement)})
     return sites
-
-
-def _pose(placement: pin.SE3, *, always: bool = False) -> dict[str, str]:
-    """``pos`` and ``quat`` (w x y z); nothing for the identity unless asked."""
-    found = {}
-    if always or np.any(placement.translation):
-        found["pos"] = _text(placement.translation)
-    if always or not np.array_equal(placement.rotation, np.eye(3)):
-        quaternion = pin.Quaternion(np.array(placement.rotation)).normalized()
-        found["quat"] = _text((quaternion.w, quaternion.x, quaternion.y, quaternion.z))
-    return found
-
-
-def _text(values: Iterable[float]) -> str:
-    """Numbers with every digit that a double has."""
-    return " ".join(repr(float(v)) for v in values)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -50,6 +51,11 @@ class MjcfSlot:
     free: bool
     placement: pin.SE3
 
+    @cached_property
+    def moved(self) -> bool:
+        """Whether the rest frame is not its parent's."""
+        return not self.placement.isIdentity(0.0)
+
 
 class MjcfLayout:
     """Conversions between Pinocchio's and MuJoCo's coordinates of one model.
@@ -73,11 +79,23 @@ class MjcfLayout:
             self.slots.append(MjcfSlot(joint, slice(q, q + width), slice(v, v + rates), i in free, place))
             q, v = q + width, v + rates
         self.nqpos, self.nv, self.nq = q, v, int(model.nq)
+        # A simulation converts at every tick: what is one number on both sides goes by index, all at once.
+        plain = [slot for slot in self.slots if slot.joint.kind.family in ("revolute", "prismatic")]
+        self._plain_q = np.array([slot.joint.q.start for slot in plain], dtype=int)
+        self._plain_qpos = np.array([slot.qpos.start for slot in plain], dtype=int)
+        self._others = [slot for slot in self.slots if slot.joint.kind.family not in ("revolute", "prismatic")]
+        self._turning = [slot for slot in self.slots if slot.joint.kind.family in ("free-flyer", "planar")]
+        # qvel[k] = v[_from[k]], turned where something turns.
+        self._from = np.concatenate(
+            [np.arange(s.joint.v.start, s.joint.v.stop) for s in self.slots] or [np.arange(0)]
+        )
+        self._back = np.argsort(self._from)
 
     def qpos(self, q: Vector) -> Vector:
         """MuJoCo's ``qpos``, shape (nqpos,), of a configuration, shape (nq,)."""
         found = np.zeros(self.nqpos)
-        for slot in self.slots:
+        found[self._plain_qpos] = q[self._plain_q]
+        for slot in self._others:
             piece, family = q[slot.joint.q], slot.joint.kind.family
             if family == "continuous":
                 value: Vector = np.array([np.arctan2(piece[1], piece[0])])
@@ -100,7 +118,8 @@ class MjcfLayout:
     def q(self, qpos: Vector) -> Vector:
         """Pinocchio's configuration, shape (nq,), of a ``qpos``; quaternions normalized."""
         found = np.zeros(self.nq)
-        for slot in self.slots:
+        found[self._plain_q] = qpos[self._plain_qpos]
+        for slot in self._others:
             piece, family = qpos[slot.qpos], slot.joint.kind.family
             if family == "continuous":
                 value: Vector = np.array([np.cos(piece[0]), np.sin(piece[0])])
@@ -109,12 +128,10 @@ class MjcfLayout:
             elif family == "spherical":
                 value = _scalar_last(piece)
             elif family == "free-flyer":
-                position, quaternion = piece[:3], pin.Quaternion(_scalar_last(piece[3:]))
-                if slot.free:
-                    back = slot.placement.inverse()
-                    position = back.act(np.array(position))
-                    quaternion = pin.Quaternion(back.rotation) * quaternion
-                value = np.concatenate([position, quaternion.coeffs()])
+                value = np.concatenate([piece[:3], _scalar_last(piece[3:])])
+                if slot.free and slot.moved:
+                    pose = slot.placement.actInv(pin.XYZQUATToSE3(value))
+                    value = pin.SE3ToXYZQUAT(pose)
             else:
                 value = piece
             found[slot.joint.q] = value
@@ -135,11 +152,25 @@ class MjcfLayout:
 
     def qvel(self, q: Vector, v: Vector) -> Vector:
         """MuJoCo's ``qvel`` of a velocity, shape (nv,)."""
-        return np.asarray(self.velocity_map(q) @ v)
+        found: Vector = np.asarray(v, dtype=float)[self._from]
+        for slot in self._turning:
+            turn = _turn(slot, q[slot.joint.q])
+            rows = slice(slot.qvel.start, slot.qvel.start + len(turn))
+            found[rows] = turn @ found[rows]
+        return found
 
     def v(self, qpos: Vector, qvel: Vector) -> Vector:
         """Pinocchio's velocity of a ``qvel``, shape (nv,)."""
-        return np.asarray(self.velocity_map(self.q(qpos)).T @ qvel)
+        return self.state(qpos, qvel)[1]
+
+    def state(self, qpos: Vector, qvel: Vector) -> tuple[Vector, Vector]:
+        """Pinocchio's configuration and velocity, shapes (nq,) and (nv,), together."""
+        q, found = self.q(qpos), np.array(qvel, dtype=float)
+        for slot in self._turning:
+            turn = _turn(slot, q[slot.joint.q])
+            rows = slice(slot.qvel.start, slot.qvel.start + len(turn))
+            found[rows] = turn.T @ found[rows]
+        return q, np.asarray(found[self._back])
 
     def qacc(self, q: Vector, v: Vector, a: Vector) -> Vector:
         """MuJoCo's ``qacc = T a + Ṫ v``, shape (nv,): linear parts turn with their body."""
@@ -150,7 +181,7 @@ class MjcfLayout:
                 turning[slot.joint.v.start : slot.joint.v.start + 3] = np.cross(piece[3:], piece[:3])
             elif slot.joint.kind.family == "planar":
                 turning[slot.joint.v.start : slot.joint.v.start + 2] = -piece[2] * piece[1], piece[2] * piece[0]
-        return np.asarray(self.velocity_map(q) @ (a + turning))
+        return self.qvel(q, a + turning)
 
 
 def _turn(slot: MjcfSlot, piece: Vector) -> Vector:
@@ -158,15 +189,15 @@ def _turn(slot: MjcfSlot, piece: Vector) -> Vector:
     family = slot.joint.kind.family
     if family == "free-flyer":
         R = pin.Quaternion(np.array(piece[3:])).matrix()
-        return np.asarray(slot.placement.rotation @ R if slot.free else R)
+        return np.asarray(slot.placement.rotation @ R if slot.free and slot.moved else R)
     if family == "planar":
         return np.array([[piece[2], -piece[3]], [piece[3], piece[2]]])
     return np.zeros((0, 0))
 
 
 def _scalar_first(xyzw: Vector) -> Vector:
-    return np.asarray(np.roll(xyzw, 1))
+    return np.asarray(xyzw[[3, 0, 1, 2]])
 
 
 def _scalar_last(wxyz: Vector) -> Vector:
-    return np.asarray(np.roll(wxyz, -1) / np.linalg.norm(wxyz))
+    return np.asarray(wxyz[[1, 2, 3, 0]] / np.linalg.norm(wxyz))

@@ -19,6 +19,8 @@ NormalFrame = Literal["world", "contact"]
 
 # A normal shorter than this is what rounding left of zero.
 _DUST = 1e-9
+# Compliance times the robot's mass: what is taken unless told, and the least that leaves digits enough.
+_DEFAULT_COMPLIANCE, _LEAST_COMPLIANCE = 1e-4, 1e-6
 
 
 @dataclass(frozen=True)
@@ -117,10 +119,25 @@ def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> Poi
 def default_compliance(robot: Robot) -> float:
     """Support compliance ε in 1/kg: a foot held as if it weighed 10⁴ robots.
 
-    ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0, and moves a quantity along a direction
-    that the feet hold by about ``ε m``, here 1e-4 of itself.
+    ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  Of what exactly held feet do to the
+    jump it leaves out at most ``ε/(σ + ε)``, with σ the least eigenvalue of ``J_sM⁻¹J_sᵀ`` above zero: 1e-4 where the
+    feet bear on the robot's mass, more near a posture where the rank of ``J_s`` drops.
     """
-    return 1e-4 / robot.mass
+    return _DEFAULT_COMPLIANCE / robot.mass
+
+
+def least_compliance(robot: Robot) -> float:
+    """The stiffest feet that the symbolic kernel and the C export are good for, ε in 1/kg.
+
+    Both add ``1/ε`` to the feet's inertia and take it away again on the way to the base, which costs as many digits
+    as ``ε`` has zeros; here some eight are left.
+    """
+    return _LEAST_COMPLIANCE / robot.mass
+
+
+def heavy_feet_rounding(robot: Robot, compliance: float) -> float:
+    """How many times more ``M + J_sᵀJ_s/ε`` rounds than at the default compliance: its condition goes as ``1/ε``."""
+    return max(1.0, default_compliance(robot) / compliance)
 
 
 def support_inertia(robot: Robot, supports: tuple[Support, ...], compliance: float) -> dict[int, Vector]:

@@ -15,51 +15,22 @@ from impact_posture.impact.contact import point_on
 from impact_posture.impact.footing import Footing, footing
 from impact_posture.impact.jump import Dominance, Jump, find_dominance, weighed_jump
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
+from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.impact.scalars import (
+    Scalars,
+    ScenarioValue,
+    objective_gradient,
+    objective_value,
+    scenario_values,
+    worst_member,
+)
+from impact_posture.impact.several import BoxOfImpulses, WorstImpulses
 from impact_posture.impact.uncertain import worst_in_world
 
 Vector = NDArray[np.float64]
 
-# Below this share of the largest mobility the contact counts as blocked along n, and JM⁻¹Jᵀ as singular.
-_BLOCKED = 1e-12
-_SINGULAR = 1e-9
 # A relative change of H above this, when the supports are made ten times stiffer, is worth a warning.
 _SOFT = 0.01
-
-
-@dataclass(frozen=True)
-class Scalars:
-    """The five numbers of an impact; ``None`` where one does not exist.
-
-    Attributes:
-        H: Squared jump per squared impulse.
-        G: Inverse effective mass along the normal, 1/kg.
-        V: Squared jump per squared approach speed, frictionless, e = 0.
-        S: The same when the contact point sticks.
-        E: Energy dissipated per squared approach speed, e = 0: half the effective mass, kg.
-    """
-
-    H: float
-    G: float
-    V: float | None
-    S: float | None
-    E: float | None
-
-    @staticmethod
-    def of(found: ImpactQuantities) -> Scalars:
-        """Read them off; ``V`` and ``E`` do not exist where the contact cannot move along the normal."""
-        if _blocked(found):
-            return Scalars(found.H, found.G, None, found.S, None)
-        return Scalars(found.H, found.G, found.V, found.S, found.E)
-
-    @property
-    def effective_mass(self) -> float | None:
-        """``1/G``, kg; ``None`` where unbounded."""
-        return None if self.E is None else 1 / self.G
-
-    def to_dict(self) -> dict[str, float | None]:
-        """JSON content."""
-        return {"H": self.H, "G": self.G, "V": self.V, "S": self.S, "E": self.E}
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +57,9 @@ class Evaluation:
         free: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
         compliance_effect: Relative change of H when the supports' compliance is a tenth; ``None`` without supports.
         footing: Whether the feet stay under the blow; ``None`` without supports.
+        contacts: Of several contacts each one's own evaluation, as if it were alone, the leading one's first.
+        impulses: The worst impulses of several contacts; ``None`` of one.
+        scenarios: The objective and the scalars in each scenario; empty without any.
         warnings: What limits these numbers, one line each.
     """
 
@@ -108,6 +82,9 @@ class Evaluation:
     free: Scalars | None
     compliance_effect: float | None
     footing: Footing | None
+    contacts: tuple[Evaluation, ...]
+    impulses: WorstImpulses | None
+    scenarios: tuple[ScenarioValue, ...]
     warnings: tuple[str, ...]
 
     def to_dict(self) -> dict[str, object]:
@@ -140,7 +117,22 @@ class Evaluation:
             block |= {"free": self.free.to_dict(), "compliance_effect": self.compliance_effect}
         if self.footing is not None:
             block["footing"] = self.footing.to_dict()
+        if self.impulses is not None:
+            block["worst_impulses"] = self.impulses.to_dict()
+            block["by_contact"] = [_contact_block(one.to_dict()) for one in self.contacts]
+        if self.scenarios:
+            worst = max(self.scenarios, key=lambda s: np.inf if s.objective is None else s.objective)
+            block["by_scenario"] = [scenario.to_dict() for scenario in self.scenarios]
+            block["worst_scenario"] = worst.name
         return block
+
+
+# Of a contact among several: what is its own, and not the posture's or the objective's.
+_OWN = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pose", "free", "footing")
+
+
+def _contact_block(block: dict[str, object]) -> dict[str, object]:
+    return {key: block[key] for key in _OWN if key in block}
 
 
 def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitution: float = 0.0) -> Evaluation:
@@ -167,13 +159,17 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
     scalars = Scalars.of(found)
     rebound = (1 + restitution) * speed
     free, effect = _without_supports(objective, q, found.H)
-    cone = _worst(objective, q)
+    scenarios = scenario_values(objective, q)
+    member = worst_member(objective, scenarios)
+    value = objective_value(member, q)
+    cone = _worst(member, q)
+    singles = objective.singles if objective.others else ()
     return Evaluation(
         q=np.array(q, dtype=float),
         scalars=scalars,
-        objective=_objective_value(objective, q, scalars, cone),
+        objective=value,
         gradient=oracle.gradient_H(q),
-        objective_gradient=_objective_gradient(objective, q, found),
+        objective_gradient=objective_gradient(member, q, value),
         normal=found.normal,
         worst_normal=found.normal if cone is None else cone.normal,
         cone=cone,
@@ -194,12 +190,11 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
         free=free,
         compliance_effect=effect,
         footing=footing(oracle, objective.supports, q) if objective.supports else None,
+        contacts=tuple(evaluate(single, q, speed, restitution) for single in singles),
+        impulses=member.inner.worst(q) if isinstance(member.inner, BoxOfImpulses) else None,
+        scenarios=scenarios,
         warnings=_warnings(scalars, effect),
     )  # fmt: skip
-
-
-def _blocked(found: ImpactQuantities) -> bool:
-    return found.G <= _BLOCKED * float(np.linalg.eigvalsh(found.mobility)[-1])
 
 
 def _worst(objective: ImpactObjective, q: Vector) -> WorstNormal | None:
@@ -209,28 +204,6 @@ def _worst(objective: ImpactObjective, q: Vector) -> WorstNormal | None:
         return worst_in_world(objective, q)
     except MetricError:
         return None
-
-
-def _objective_value(
-    objective: ImpactObjective, q: Vector, scalars: Scalars, worst: WorstNormal | None
-) -> float | None:
-    if objective.normal_cone_deg:
-        value = np.inf if worst is None else objective.value(q)
-        return value if np.isfinite(value) else None
-    values = {"impulse": scalars.H, "speed": scalars.V, "sticking": scalars.S, "energy": scalars.E}
-    alone = values[objective.kind]
-    return None if alone is None else objective.scale * alone
-
-
-def _objective_gradient(objective: ImpactObjective, q: Vector, found: ImpactQuantities) -> Vector | None:
-    values = np.linalg.eigvalsh(found.mobility)
-    if objective.kind == "sticking" and values[0] <= _SINGULAR * values[-1]:
-        return None
-    if objective.normal_cone_deg:
-        return objective.gradient(q) if np.isfinite(objective.value(q)) else None
-    if objective.kind in ("speed", "energy") and _blocked(found):
-        return None
-    return objective.gradient(q)
 
 
 def _without_supports(objective: ImpactObjective, q: Vector, H: float) -> tuple[Scalars | None, float | None]:

@@ -6,6 +6,7 @@ feet carry the point mass 1/ε.  So there is one code path, free or standing.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import casadi as ca
@@ -70,7 +71,7 @@ class ImpactKernel:
     @cached_property
     def jump(self) -> Response:
         """The robot's answer to the blow; its ``a`` is ``M⁻¹Jᵀn``."""
-        return self.tree.respond(wrenches=self._alike(self.blow))
+        return self.answer([self.blow])
 
     def _alike(self, wrench: Wrench) -> list[Wrench]:
         """The wrench; where its link has twins, it and none on them, in one form for all."""
@@ -103,10 +104,22 @@ class ImpactKernel:
     @cached_property
     def grad_H(self) -> ca.SX:
         """``2 ∂_q[nᵀJb − bᵀMa]`` with ``Mb = Wa`` (plus ``∂_q aᵀMa`` where W = M), shape (nv,)."""
+        return self.grad_G if self.metric.kind == "kinetic" and not self._supported else self.size_gradient(self.jump)
+
+    def answer(self, blows: Sequence[Wrench]) -> Response:
+        """The robot's answer to several impulses at once, wherever they act."""
+        return self.tree.respond(wrenches=[part for blow in blows for part in self._alike(blow)])
+
+    def product(self, one: Response, other: Response) -> ca.SX:
+        """``a₁ᵀWa₂`` of two answers."""
+        return ca.dot(one.a, self._weigh(other.a, other.velocities))
+
+    def size_gradient(self, jump: Response) -> ca.SX:
+        """Tangent gradient of ``aᵀWa`` of an answer, what acts held fixed, shape (nv,)."""
         if self.metric.kind == "kinetic" and not self._supported:
-            return self.grad_G
-        adjoint = self.tree.respond(tau=self._weigh(self.jump.a, self.jump.velocities))
-        return 2 * self.tree.pair_gradient(self.jump, adjoint) + self._metric_gradient(self.jump.velocities)
+            return self.tree.pair_gradient(jump, jump)
+        adjoint = self.tree.respond(tau=self._weigh(jump.a, jump.velocities))
+        return 2 * self.tree.pair_gradient(jump, adjoint) + self._metric_gradient(jump.velocities)
 
     @cached_property
     def grad_G(self) -> ca.SX:

@@ -1,11 +1,12 @@
 """The one ``Objective`` protocol: what the program, the C export, the certificate and TSID see of an impact.
 
-An objective is a metric × a kind × supports × one contact; none of the combinations is a class of its own.
+An objective is a metric × a kind × supports × contacts × a cone × scenarios; none of the combinations is a class of
+its own: what they ask of the inner maximum is (:mod:`impact_posture.impact.inner`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -16,19 +17,18 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.tree import Tree
 from impact_posture.dynamics.twins import Twins
 from impact_posture.impact.contact import Contact, Support, default_compliance
+from impact_posture.impact.inner import InnerMaximum, Subgradients
 from impact_posture.impact.kernel import ImpactKernel
-from impact_posture.impact.lifted import CONE_ATTEMPTS, Guess, Lifted, guess_cone, guess_plain, lift_cone, lift_plain
+from impact_posture.impact.lifted import Guess, Lifted
+from impact_posture.impact.lifted_cone import ConeOfNormals
 from impact_posture.impact.metric import Metric, ObjectiveKind
-from impact_posture.impact.oracle import ImpactOracle, no_sticking
-from impact_posture.impact.uncertain import (
-    Subgradients,
-    check_cone,
-    worst_gradient,
-    worst_normal_expression,
-    worst_subgradients,
-    worst_value,
-)
+from impact_posture.impact.one_blow import OneBlow
+from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.impact.scenarios import FewModels
+from impact_posture.impact.several import BoxOfImpulses, check_contacts
+from impact_posture.impact.uncertain import check_cone
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.scenario import Scenario
 
 Vector = NDArray[np.float64]
 
@@ -77,8 +77,11 @@ class Objective(Protocol):
         """The tangent gradient (where there is none: a subgradient) from Pinocchio's numbers, shape (nv,)."""
         ...
 
-    def subgradients(self, q: Vector) -> Subgradients:
-        """What spans the subdifferential at ``q``, from Pinocchio's numbers; one gradient where it is smooth."""
+    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+        """What spans the subdifferential at ``q``, from Pinocchio's numbers; one gradient where it is smooth.
+
+        Of a maximum, members at most ``within`` below it count as well.
+        """
         ...
 
 
@@ -102,6 +105,9 @@ class ImpactObjective:
         supports: Feet that stay.
         compliance: ε of the supports, 1/kg.
         normal_cone_deg: Half angle of the cone of normals that the worst is taken of, degrees; 0: the one normal.
+        others: More contacts at the same time, each with its own bound on its impulse.
+        bilateral: Whether several contacts can pull as well as push.
+        scenarios: Models that the worst is taken of, the robot's own first; empty: that one alone.
     """
 
     robot: Robot
@@ -111,9 +117,13 @@ class ImpactObjective:
     supports: tuple[Support, ...] = ()
     compliance: float = 0.0
     normal_cone_deg: float = 0.0
+    others: tuple[Contact, ...] = ()
+    bilateral: bool = False
+    scenarios: tuple[Scenario, ...] = ()
 
     def __post_init__(self) -> None:
         check_cone(self)
+        check_contacts(self)
         if self.compliance <= 0:
             object.__setattr__(self, "compliance", default_compliance(self.robot))
 
@@ -141,6 +151,34 @@ class ImpactObjective:
             return ("with the kinetic metric 'impulse' is G = 1/m_eff: it only maximizes the effective mass",)
         return ()
 
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """All contacts, the leading one first."""
+        return (self.contact, *self.others)
+
+    @cached_property
+    def singles(self) -> tuple[ImpactObjective, ...]:
+        """The objective of each contact alone, on the robot as modeled."""
+        if not self.others:
+            return (replace(self, scenarios=()) if self.scenarios else self,)
+        return tuple(
+            replace(self, contact=contact, others=(), bilateral=False, scenarios=()) for contact in self.contacts
+        )
+
+    @cached_property
+    def inner(self) -> InnerMaximum:
+        """What the worst is taken over."""
+        if self.scenarios:
+            return FewModels(self)
+        if self.others:
+            return BoxOfImpulses(self)
+        return ConeOfNormals(self) if self.normal_cone_deg else OneBlow(self)
+
+    @property
+    def is_multiple_of_H(self) -> bool:
+        """Whether it is ``λ̄²H`` of the leading contact."""
+        return self.kind == "impulse" and isinstance(self.inner, OneBlow)
+
     # ---- symbolic ---------------------------------------------------------------------------------------------
 
     @cached_property
@@ -154,31 +192,19 @@ class ImpactObjective:
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Value and tangent gradient (nv) in the symbols of a kernel of this contact, metric and supports."""
-        worst = self._worst(k)
-        gradients = {"speed": lambda: worst.grad_V, "energy": lambda: worst.grad_E, "sticking": lambda: worst.grad_S}
-        gradient = self.scale * worst.grad_H if self.kind == "impulse" else gradients[self.kind]()
-        return self._value(worst), gradient
-
-    def _worst(self, k: ImpactKernel) -> ImpactKernel:
-        """The kernel at the worst normal of the cone; its gradients hold that fixed (Danskin)."""
-        if not self.normal_cone_deg:
-            return k
-        return self.kernel_of(k.q, worst_normal_expression(self, k), k.tree.twins)
-
-    def _value(self, k: ImpactKernel) -> ca.SX:
-        if self.kind == "impulse":
-            return self.scale * k.H
-        return {"speed": lambda: k.V, "energy": lambda: k.E, "sticking": lambda: k.S}[self.kind]()
+        return self.inner.expressions(k)
 
     def value_fun(self) -> ca.Function:
-        """``(q, n) → value``; ``n`` in the contact's normal frame."""
-        k = self.kernel
-        return ca.Function("value", [k.q, k.n], [self._value(self._worst(k))], ["q", "n"], ["value"], {"cse": True})
+        """``(q, n) → value``; ``n`` in the contact's normal frame, as in :meth:`gradient_fun`."""
+        general = self.gradient_fun()
+        q, n = general.sx_in()
+        return ca.Function("value", [q, n], [general(q, n)[0]], ["q", "n"], ["value"], {"cse": True})
 
     def gradient_fun(self) -> ca.Function:
         """``(q, n) → value, gradient``: value and tangent gradient (nv); ``n`` in the contact's normal frame.
 
-        With a cone, ``n`` is its axis, and both hold for the worst normal in it.
+        With a cone, ``n`` is its axis; with several contacts, the leading one's.  Where the maximum within is tied,
+        the gradient is a subgradient.
         """
         k = self.kernel
         value, gradient = self.expressions(k)
@@ -192,22 +218,22 @@ class ImpactObjective:
 
     def lift(self, tree: Tree, n: ca.SX, scale: ca.SX) -> Lifted:
         """The objective with its linear solves as equations of the program."""
-        return lift_cone(self, tree, n, scale) if self.normal_cone_deg else lift_plain(self, tree, n)
+        return self.inner.lift(tree, n, scale)
 
     @property
     def attempts(self) -> int:
         """Guesses that :meth:`guess` knows: one where its equations are linear in what it guesses."""
-        return CONE_ATTEMPTS if self.normal_cone_deg else 1
+        return self.inner.attempts
 
     def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
         """The auxiliaries of :meth:`lift` that solve its equations at ``q``."""
-        return guess_cone(self, q, scale, attempt) if self.normal_cone_deg else guess_plain(self, q)
+        return self.inner.guess(q, scale, attempt)
 
     # ---- numeric ----------------------------------------------------------------------------------------------
 
     @cached_property
     def oracle(self) -> ImpactOracle:
-        """Pinocchio's numbers for the same contact, metric and supports."""
+        """Pinocchio's numbers for the leading contact, the same metric and supports, the robot as modeled."""
         return ImpactOracle(self.robot, self.contact, self.metric, self.supports, self.compliance)
 
     def value(self, q: Vector) -> float:
@@ -216,35 +242,12 @@ class ImpactObjective:
         Raises:
             MetricError: ``sticking`` where S does not exist.
         """
-        if self.normal_cone_deg:
-            return worst_value(self, q)
-        found = self.oracle.quantities(q)
-        if self.kind == "impulse":
-            return self.scale * found.H
-        if self.kind == "speed":
-            return found.V
-        if self.kind == "energy":
-            return found.E
-        if found.S is None:
-            raise no_sticking()
-        return found.S
+        return self.inner.value(q)
 
     def gradient(self, q: Vector) -> Vector:
         """The tangent gradient at ``q`` from Pinocchio's numbers, shape (nv,); a subgradient where tied."""
-        if self.normal_cone_deg:
-            return worst_gradient(self, q)
-        oracle = self.oracle
-        if self.kind == "impulse":
-            return self.scale * oracle.gradient_H(q)
-        if self.kind == "sticking":
-            return oracle.gradient_S(q)
-        found = oracle.quantities(q)
-        if self.kind == "energy":
-            return -oracle.gradient_G(q) / (2 * found.G**2)
-        return oracle.gradient_H(q) / found.G**2 - 2 * found.H / found.G**3 * oracle.gradient_G(q)
+        return self.inner.gradient(q)
 
-    def subgradients(self, q: Vector) -> Subgradients:
-        """The gradient, or those at all tied worst normals of a cone."""
-        if self.normal_cone_deg:
-            return worst_subgradients(self, q)
-        return Subgradients(self.gradient(q)[None, :], np.zeros(1))
+    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+        """The gradient, or those of all that tie or lie at most ``within`` below."""
+        return self.inner.subgradients(q, within)

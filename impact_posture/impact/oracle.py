@@ -1,6 +1,8 @@
 """The impact quantities from Pinocchio's numbers, by dense linear algebra: an independent second opinion.
 
-Feet enter by the KKT system ``[M, −J_sᵀ; J_s, εI]`` and not by the heavy-foot shortcut of the symbolic kernel.
+Feet enter by the KKT system ``[M, −J_sᵀ; J_s, εI]`` and not by the heavy-foot shortcut of the symbolic kernel.  Their
+impulses ``f`` are its unknowns and stay so: ``−J_s a/ε`` is a small difference over a small number and loses as many
+digits as ε has zeros.
 """
 
 from __future__ import annotations
@@ -56,6 +58,25 @@ class ImpactQuantities:
     support_impulse: Vector
 
 
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What the robot does under a generalized impulse, or under several.
+
+    Attributes:
+        a: ``(M + J_sᵀJ_s/ε)⁻¹ τ``, shape (nv,) or (nv, k).
+        f: The supports' impulses ``−J_s a/ε``, shape (rows,) or (rows, k).
+    """
+
+    a: Vector
+    f: Vector
+
+    def __matmul__(self, combination: Vector) -> Answer:
+        return Answer(np.asarray(self.a @ combination), np.asarray(self.f @ combination))
+
+    def __add__(self, other: Answer) -> Answer:
+        return Answer(self.a + other.a, self.f + other.f)
+
+
 class ImpactOracle:
     """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one contact."""
 
@@ -91,10 +112,16 @@ class ImpactOracle:
         self._nv = nv
         return self
 
+    def answer(self, tau: Vector, slip: Vector | None = None) -> Answer:
+        """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for vectors or columns; no slip unless given."""
+        shape = (len(self.Js), *tau.shape[1:])
+        rhs = np.concatenate([tau, np.zeros(shape) if slip is None else slip])
+        found = np.asarray(scipy.linalg.lu_solve(self._lu, rhs))
+        return Answer(found[: self._nv], found[self._nv :])
+
     def solve(self, tau: Vector) -> Vector:
         """``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector or columns."""
-        rhs = np.vstack([tau.reshape(self._nv, -1), np.zeros((len(self.Js), tau.reshape(self._nv, -1).shape[1]))])
-        return np.asarray(scipy.linalg.lu_solve(self._lu, rhs)[: self._nv]).reshape(tau.shape)
+        return self.answer(tau).a
 
     def weigh(self, a: Vector) -> Vector:
         """``W a``."""
@@ -105,7 +132,8 @@ class ImpactOracle:
     def quantities(self, q: Vector) -> ImpactQuantities:
         """All quantities at ``q``."""
         self.at(q)
-        A = self.solve(self.J.T)
+        answers = self.answer(self.J.T)
+        A = answers.a
         mobility = self.J @ A
         mobility = (mobility + mobility.T) / 2
         ellipsoid = A.T @ self.weigh(A)
@@ -125,7 +153,7 @@ class ImpactOracle:
             ellipsoid=(ellipsoid + ellipsoid.T) / 2,
             mobility=mobility,
             normal=self.n.copy(),
-            support_impulse=-self.Js @ a / self.compliance,
+            support_impulse=np.asarray(answers.f @ self.n),
         )
 
     # ---- gradients --------------------------------------------------------------------------------------------
@@ -134,17 +162,17 @@ class ImpactOracle:
         """Tangent gradient of H, shape (nv,); along another ``normal`` than the contact's if given, in its axes."""
         self.at(q)
         own, n = self._normals(normal)
-        a = self.solve(self.J.T @ n)
-        b = self.solve(self.weigh(a))
-        gradient = 2 * (self._coupling(own, b, self._in_frame) - self._inertial(b, a))
-        return gradient + self._metric_gradient(a)
+        x = self.answer(self.J.T @ n)
+        y = self.answer(self.weigh(x.a))
+        gradient = 2 * (self.coupling(own, y.a, self._in_frame) - self.inertial(y, x))
+        return gradient + self.metric_gradient(x.a)
 
     def gradient_G(self, q: Vector, normal: Vector | None = None) -> Vector:
         """Tangent gradient of G, shape (nv,); ``normal`` as for H."""
         self.at(q)
         own, n = self._normals(normal)
-        a = self.solve(self.J.T @ n)
-        return 2 * self._coupling(own, a, self._in_frame) - self._inertial(a, a)
+        x = self.answer(self.J.T @ n)
+        return 2 * self.coupling(own, x.a, self._in_frame) - self.inertial(x, x)
 
     def gradient_S(self, q: Vector, normal: Vector | None = None) -> Vector:
         """Tangent gradient of S, shape (nv,); ``normal`` as for H.
@@ -157,19 +185,19 @@ class ImpactOracle:
         """
         self.at(q)
         _, n = self._normals(normal)
-        A = self.solve(self.J.T)
-        inverse = _Inverse.of(self.J @ A)
+        axes = self.answer(self.J.T)
+        inverse = _Inverse.of(self.J @ axes.a)
         s = inverse.solve(n)
         if s is None:
             raise no_sticking()
-        a = A @ s
-        free = self.solve(self.weigh(a))
-        r = -inverse.matrix @ (self.J @ free)
-        b = free + A @ r
-        gradient = 2 * (self._coupling(s, b, False) + self._coupling(r, a, False) - self._inertial(b, a))
+        x = axes @ s
+        free = self.answer(self.weigh(x.a))
+        r = np.asarray(-inverse.matrix @ (self.J @ free.a))
+        y = free + axes @ r
+        gradient = 2 * (self.coupling(s, y.a, False) + self.coupling(r, x.a, False) - self.inertial(y, x))
         if self._in_frame:
             gradient = gradient - 2 * self.numeric.turning_gradient(self.point, n, r)
-        return gradient + self._metric_gradient(a)
+        return gradient + self.metric_gradient(x.a)
 
     @property
     def _in_frame(self) -> bool:
@@ -181,47 +209,39 @@ class ImpactOracle:
         return own, self.numeric.placement(self.point).rotation @ own if self._in_frame else own
 
     def support_gradient(self, q: Vector) -> Vector:
-        """Tangent Jacobian of the supports' impulses ``f = −J_s a/ε``, shape (rows, nv)."""
-        self.at(q)
-        a = self.solve(self.J.T @ self.n)
-        responses = self.solve(self.Js.T)
-        in_frame = self.contact.normal_frame == "contact"
-        # ∂(J_s a) with a held fixed: by rows, once for all.
-        held = [
-            self.numeric.coupling_gradient(point, np.eye(6)[k], a) for point, count in self.feet for k in range(count)
-        ]
-        moved = np.array(held).reshape(len(self.Js), self._nv)
-        rows = []
-        for k, b in enumerate(responses.T):
-            feet = self.Js @ b / self.compliance
-            inertial = self.numeric.inertial_gradient(b, a) + feet @ moved
-            first = 0
-            for point, count in self.feet:
-                wrench = np.zeros(6)
-                wrench[:count] = self.Js[first : first + count] @ a / self.compliance
-                inertial = inertial + self.numeric.coupling_gradient(point, wrench, b)
-                first += count
-            rows.append(-(moved[k] + self._coupling(self.n, b, in_frame) - inertial) / self.compliance)
-        return np.array(rows).reshape(len(self.Js), self._nv)
+        """Tangent Jacobian of the supports' impulses ``f``, shape (rows, nv).
 
-    def _coupling(self, direction: Vector, v: Vector, in_frame: bool) -> Vector:
+        Row k by the adjoint ``M p − J_sᵀr = 0, J_s p + εr = −e_k``: ``∂f_k = pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)``.
+        """
+        self.at(q)
+        x = self.answer(self.J.T @ self.n)
+        rows = len(self.Js)
+        adjoints = self.answer(np.zeros((self._nv, rows)), -np.eye(rows))
+        found = [
+            self.coupling(np.array(self.contact.normal), p, self._in_frame) - self.inertial(Answer(p, r), x)
+            for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
+        ]
+        return np.array(found).reshape(rows, self._nv)
+
+    def coupling(self, direction: Vector, v: Vector, in_frame: bool) -> Vector:
+        """``∂_q directionᵀJ v``, the direction in world axes or turning with the frame, shape (nv,)."""
         wrench = np.concatenate([direction, np.zeros(3)])
         return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)
 
-    def _inertial(self, left: Vector, right: Vector) -> Vector:
-        """``∂_q leftᵀ(M + J_sᵀJ_s/ε) right``."""
-        gradient = self.numeric.inertial_gradient(left, right)
+    def inertial(self, left: Answer, right: Answer) -> Vector:
+        """``∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]``, all four letters held: ``∂_q lᵀ(M + J_sᵀJ_s/ε)r``."""
+        gradient = self.numeric.inertial_gradient(left.a, right.a)
         first = 0
         for point, rows in self.feet:
-            J = self.Js[first : first + rows]
             for one, other in ((left, right), (right, left)):
                 wrench = np.zeros(6)
-                wrench[:rows] = J @ one / self.compliance
-                gradient = gradient + self.numeric.coupling_gradient(point, wrench, other)
+                wrench[:rows] = one.f[first : first + rows]
+                gradient = gradient - self.numeric.coupling_gradient(point, wrench, other.a)
             first += rows
         return gradient
 
-    def _metric_gradient(self, a: Vector) -> Vector:
+    def metric_gradient(self, a: Vector) -> Vector:
+        """``∂_q aᵀWa`` with ``a`` held fixed: zero unless W = M, shape (nv,)."""
         return self.numeric.inertial_gradient(a, a) if self.metric.kind == "kinetic" else np.zeros(self._nv)
 
 

@@ -7,7 +7,6 @@ is no such form and has no such dual.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.cone import WorstNormal, tied_normals, worst_normal
 from impact_posture.impact.cone_symbolic import worst_normal_symbolic
+from impact_posture.impact.inner import Subgradients
 from impact_posture.impact.oracle import no_sticking
 
 if TYPE_CHECKING:
@@ -29,19 +29,6 @@ Vector = NDArray[np.float64]
 _ACTIVE = 1e-7
 # Below this share of the largest, an eigenvalue of JM⁻¹Jᵀ is zero.
 _SINGULAR = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Subgradients:
-    """Points whose convex hull is a subdifferential, up to their gaps.
-
-    Attributes:
-        gradients: Tangent gradients, shape (k, nv).
-        gaps: How far below the objective each one's own value is, shape (k,).
-    """
-
-    gradients: Vector
-    gaps: Vector
 
 
 def check_cone(objective: ImpactObjective) -> None:
@@ -93,11 +80,15 @@ def worst_gradient(objective: ImpactObjective, q: Vector) -> Vector:
     return slope * _form_gradient(objective, q, found.normal)
 
 
-def worst_subgradients(objective: ImpactObjective, q: Vector) -> Subgradients:
-    """Gradients at all worst normals, the named one first; of an arc or a circle of them a dense sample."""
+def worst_subgradients(objective: ImpactObjective, q: Vector, within: float = 0.0) -> Subgradients:
+    """Gradients at all worst normals, the named one first; of an arc or a circle of them a dense sample.
+
+    Those whose objective is at most ``within`` below count as well.
+    """
     form, axis = _form(objective, q), np.array(objective.contact.normal)
     found = worst_normal(form, axis, objective.normal_cone_deg)
-    normals = tied_normals(form, axis, objective.normal_cone_deg, found, _ACTIVE)
+    size = max(float(np.abs(form).max() * _slope(objective, np.array(found.value))), 1e-300)
+    normals = tied_normals(form, axis, objective.normal_cone_deg, found, max(_ACTIVE, within / size))
     values = np.einsum("ki,ij,kj->k", normals, form, normals)
     slopes = _slope(objective, values)
     gaps = np.maximum(_of_form(objective, np.array(found.value)) - _of_form(objective, values), 0.0)

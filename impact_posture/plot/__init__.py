@@ -17,7 +17,8 @@ from impact_posture.plot.jump import jump_figure
 from impact_posture.plot.path import path_figure
 from impact_posture.plot.robot import postures_figure
 from impact_posture.plot.style import FORMATS, check_formats, save
-from impact_posture.plot.view import PathData, ResultView, sample_path
+from impact_posture.plot.tradeoff import tradeoff_figure
+from impact_posture.plot.view import PathData, ResultView, TradeOffData, sample_path
 
 __all__ = [
     "FIGURES",
@@ -25,6 +26,7 @@ __all__ = [
     "FigureNotFound",
     "PathData",
     "ResultView",
+    "TradeOffData",
     "classical_figure",
     "draw_all",
     "ellipsoid_figure",
@@ -33,6 +35,7 @@ __all__ = [
     "postures_figure",
     "sample_path",
     "save",
+    "tradeoff_figure",
 ]
 
 FIGURES: dict[str, Callable[[ResultView], Figure]] = {
@@ -41,6 +44,7 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "jump": jump_figure,
     "nullspace": path_figure,
     "classical": classical_figure,
+    "tradeoff": tradeoff_figure,
 }
 
 
@@ -62,11 +66,12 @@ def draw_all(
         view: The result.
         out: Folder, made if missing; files of the same name are replaced.
         formats: Of ``png``, ``svg`` and ``pdf``.
-        only: Names of :data:`FIGURES` to draw; all if ``None`` (``nullspace`` only if the view has a path).
+        only: Names of :data:`FIGURES` to draw; all that the view has data for if ``None`` (``nullspace``: a path;
+            ``tradeoff``: a trade-off).
 
     Raises:
         FigureNotFound: An unknown name in ``only``.
-        InputError: An unknown format, or ``nullspace`` asked for without a path.
+        InputError: An unknown format, or a figure asked for that the view has no data for.
         OutputError: The folder or a file cannot be written.
     """
     wanted = check_formats(formats)
@@ -74,6 +79,7 @@ def draw_all(
     for name in names:
         if name not in FIGURES:
             raise FigureNotFound(name, FIGURES, where="plot")
-    if only is None and view.path is None:
-        names.remove("nullspace")
+    if only is None:
+        lacking = {"nullspace": view.path is None, "tradeoff": view.tradeoff is None}
+        names = [name for name in names if not lacking.get(name)]
     return [path for name in names for path in save(FIGURES[name](view), out, name, wanted)]

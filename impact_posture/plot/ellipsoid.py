@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,12 @@ from impact_posture.plot.shapes import (
     surface,
     upright_plane,
 )
-from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, framed, style
+from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, PLATE, framed, style
+from impact_posture.plot.uncertain import draw_uncertainty, draw_uncertainty_3d, has_cone, uncertainty_handles
 from impact_posture.plot.view import ResultView, jump_unit, number
 
+_FREE = "Free (thin): the same robot as if its feet were not held."
+_CONE = "The objective counts the worst normal of the cone; equally bad ones are all drawn."
 NOTES = (
     "The half-width of Λ$_c$ along any direction is the size ‖Δν‖ of the velocity jump that an impulse of 1 N·s "
     "along it causes. Planes show shadows (projections), not slices; √H is the distance of the tangent planes along "
@@ -30,27 +34,47 @@ NOTES = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class _State:
+    """One posture's curve: its name in the legend, quantities, line, and whether the feet stay."""
+
+    word: str
+    found: ImpactQuantities
+    line: dict[str, Any]
+    free: bool = False
+
+
 def ellipsoid_figure(view: ResultView) -> Figure:
     """Draw Λ_c before (dashed) and after (solid): shadows on the coordinate planes, and in 3-D with √H along n.
 
     A shadow on a plane that contains n has its tangent lines at ±√H drawn; where no coordinate plane contains n, the
-    upright plane through n is added.  Equal axes; all panels share one scale.
+    upright plane through n is added.  Equal axes; all panels share one scale.  Of a robot that stands, the ellipsoids
+    without its feet are drawn thin beside the contact-consistent ones; of an uncertain normal, its cone and the worst
+    normals in it.
     """
-    states = ((view.before, BEFORE), (view.after, AFTER))
+    states = [_State("before", view.before, BEFORE), _State("after", view.after, AFTER)]
+    for word, found, line in (("before", view.free_before, FREE_BEFORE), ("after", view.free_after, FREE_AFTER)):
+        if found is not None:
+            states.append(_State(f"{word}, free", found, line, free=True))
     unit = f"{jump_unit(view)}/(N·s)"
-    limit = common_limit([state.ellipsoid for state, _ in states])
+    limit = common_limit([state.found.ellipsoid for state in states])
     n = view.after.normal
+    notes = " ".join([*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if has_cone(view) else [])])
     with style():
-        figure, body = framed(view, 5.5, NOTES)
+        figure, body = framed(view, 5.5, [notes])
         grid = body.add_gridspec(2, 3, height_ratios=[1, 1.2])
-        for column, plane in enumerate(COORDINATE_PLANES):
-            _panel(body.add_subplot(grid[0, column]), plane, states, limit, unit)
         oblique = not any(plane.contains(n) for plane in COORDINATE_PLANES)
-        if oblique:
-            _panel(body.add_subplot(grid[1, 0]), upright_plane(n), states, limit, unit)
-        spot = grid[1, 1] if oblique else grid[1, :2]
-        _space(body.add_subplot(spot, projection="3d"), states, limit, unit)
-        _legend(body.add_subplot(grid[1, 2]), states, unit)
+        panels = [(grid[0, column], plane) for column, plane in enumerate(COORDINATE_PLANES)]
+        panels += [(grid[1, 0], upright_plane(n))] if oblique else []
+        for spot, plane in panels:
+            axes = body.add_subplot(spot)
+            _panel(axes, plane, states, limit, unit)
+            draw_uncertainty(axes, plane, view, limit)
+            draw_normals(axes, plane, normals(view.before, view.after), limit)
+        space = body.add_subplot(grid[1, 1] if oblique else grid[1, :2], projection="3d")
+        _space(space, states, limit, unit)
+        draw_uncertainty_3d(space, view, limit)
+        _legend(body.add_subplot(grid[1, 2]), states, unit, view)
     return figure
 
 
@@ -74,36 +98,42 @@ def square_panel(axes: Any, plane: Plane, limit: float, unit: str) -> None:
     axes.set_title(f"shadow on {plane.name}")
 
 
-def draw_normal(axes: Any, plane: Plane, n: Vector, limit: float, name: str = "n") -> None:
-    """Draw n's projection as an arrow, or a dot (towards the reader) or cross (away) where it has none."""
-    flat = plane.axes @ n
-    toward = float(np.cross(plane.axes[0], plane.axes[1]) @ n)
-    if np.linalg.norm(flat) < 0.05:
-        axes.plot(0, 0, "o", markersize=8, markerfacecolor="white", markeredgecolor=INK, markeredgewidth=1, zorder=5)
-        axes.plot(0, 0, "." if toward > 0 else "x", markersize=4, color=INK, zorder=6)
-        axes.annotate(name, (0, 0), (6, 5), textcoords="offset points", fontstyle="italic", zorder=6)
-        return
-    tip = flat * limit * 0.92
-    arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0}
-    axes.annotate("", tuple(tip), (0, 0), arrowprops=arrow, zorder=5)
-    # The name beside the shaft: above a lying one, right of a standing one (left where it leans to the right edge).
-    lying = abs(flat[0]) > abs(flat[1])
-    right = tip[0] < 0.5 * limit
-    shift = (0, 4) if lying else (5 if right else -5, 0)
-    look = {"ha": "center" if lying else ("left" if right else "right"), "va": "bottom" if lying else "center"}
-    # A long name needs more of the shaft.
-    at = tip * ((0.85 if len(name) == 1 else 0.6) if lying else 0.88)
-    axes.annotate(name, tuple(at), shift, textcoords="offset points", fontstyle="italic", zorder=6, **look)
+def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Vector]], limit: float) -> None:
+    """Draw each normal's projection as an arrow, or a dot (towards the reader) or cross (away) where it has none."""
+    for name, n in named:
+        flat = plane.axes @ n
+        toward = float(np.cross(plane.axes[0], plane.axes[1]) @ n)
+        look: dict[str, Any] = {"textcoords": "offset points", "fontstyle": "italic", "bbox": PLATE, "zorder": 6}
+        if np.linalg.norm(flat) < 0.05:
+            ring = {"markerfacecolor": "white", "markeredgecolor": INK, "markeredgewidth": 1}
+            axes.plot(0, 0, "o", markersize=8, zorder=5, **ring)
+            axes.plot(0, 0, "." if toward > 0 else "x", markersize=4, color=INK, zorder=6)
+            axes.annotate(name, (0, 0), (6, 5), **look)
+            continue
+        tip = flat * limit * 0.92
+        arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", tuple(tip), (0, 0), arrowprops=arrow, zorder=5)
+        if len(named) > 1:
+            # Beside the tip, on the side away from the other one.
+            left = np.array([-flat[1], flat[0]]) / np.linalg.norm(flat)
+            others = sum(float(left @ (plane.axes @ m)) for _, m in named if m is not n)
+            side = -1.0 if others > 0 or (others == 0 and name == named[0][0]) else 1.0
+            axes.annotate(name, tuple(0.92 * tip), tuple(8 * side * left), ha="center", va="center", **look)
+            continue
+        # The name beside the shaft: above a lying one, right of a standing one (left where that leans far right).
+        lying = abs(flat[0]) > abs(flat[1])
+        right = tip[0] < 0.5 * limit
+        shift = (0, 4) if lying else (5 if right else -5, 0)
+        look |= {"ha": "center" if lying else ("left" if right else "right"), "va": "bottom" if lying else "center"}
+        axes.annotate(name, tuple(tip * (0.85 if lying else 0.88)), shift, **look)
 
 
-def _panel(axes: Any, plane: Plane, states: Any, limit: float, unit: str) -> None:
+def _panel(axes: Any, plane: Plane, states: list[_State], limit: float, unit: str) -> None:
     square_panel(axes, plane, limit, unit)
-    for state, line in states:
-        axes.plot(*shadow(state.ellipsoid, plane.axes), solid_joinstyle="round", **line)
-        if plane.contains(state.normal):
-            _tangents(axes, plane, state, line, limit)
-    for name, n in normals(states[0][0], states[1][0]):
-        draw_normal(axes, plane, n, limit, name)
+    for state in states:
+        axes.plot(*shadow(state.found.ellipsoid, plane.axes), solid_joinstyle="round", **state.line)
+        if plane.contains(state.found.normal) and not state.free:
+            _tangents(axes, plane, state.found, state.line, limit)
 
 
 def _tangents(axes: Any, plane: Plane, state: ImpactQuantities, line: dict[str, Any], limit: float) -> None:
@@ -121,27 +151,33 @@ def normals(before: ImpactQuantities, after: ImpactQuantities) -> list[tuple[str
     """Name and direction of n: one, or two where it turned with the contact frame."""
     if np.linalg.norm(before.normal - after.normal) < 1e-3:
         return [("n", after.normal)]
-    return [("n before", before.normal), ("n after", after.normal)]
+    return [("n₀", before.normal), ("n₁", after.normal)]
 
 
-def _space(axes: Any, states: Any, limit: float, unit: str) -> None:
+def normal_label(named: list[tuple[str, Vector]]) -> str:
+    """What the legend says of :func:`normals`."""
+    return "n, out of the surface" if len(named) == 1 else "n₀ before, n₁ after"
+
+
+def _space(axes: Any, states: list[_State], limit: float, unit: str) -> None:
     set_cube(axes, limit)
-    for (state, line), fill in zip(states, (None, BLUE), strict=True):
-        if fill is not None:
-            axes.plot_surface(
-                *surface(state.ellipsoid), color=fill, alpha=0.12, shade=False, linewidth=0, antialiased=True
-            )
+    axes.plot_surface(
+        *surface(states[1].found.ellipsoid), color=BLUE, alpha=0.12, shade=False, linewidth=0, antialiased=True
+    )
+    for one in states:
+        state, line = one.found, one.line
         for section in principal_sections(state.ellipsoid):
-            axes.plot(*section, **(line | {"linewidth": 1.0}))
+            axes.plot(*section, **(line | {"linewidth": 0.7 if one.free else 1.0}))
+        if one.free:
+            continue
         width = half_width(state.ellipsoid, state.normal)
         for sign in (1, -1):
             corners = square(sign * width * state.normal, state.normal, 0.7 * limit)
             axes.plot(*corners, **(line | {"linewidth": 0.7}))
-    for name, n in normals(states[0][0], states[1][0]):
+    for name, n in normals(states[0].found, states[1].found):
         axes.plot(*np.outer(n, [-limit, limit]), color=GRAY, linewidth=0.6)
         axes.quiver(0, 0, 0, *(n * limit), color=INK, linewidth=1.1, arrow_length_ratio=0.12)
-        beyond = 1.12 if len(name) == 1 else 1.35
-        axes.text(*(n * limit * beyond), name, fontstyle="italic", ha="center", va="center")
+        axes.text(*(n * limit * 1.14), name, fontstyle="italic", ha="center", va="center", bbox=PLATE)
     axes.set_title(f"Λ$_c$ and its tangent planes along n\n[{unit}]")
 
 
@@ -152,22 +188,28 @@ def set_cube(axes: Any, limit: float) -> None:
         getattr(axes, f"set_{name}label")(name, labelpad=-6)
         axes.tick_params(axis=name, pad=0 if name == "z" else -2, labelsize=6.5)
         axes.locator_params(axis=name, nbins=4)
-    axes.set_box_aspect((1, 1, 1), zoom=1.1)
+    axes.set_box_aspect((1, 1, 1), zoom=1.03)
     axes.view_init(elev=22, azim=-55)
 
 
-def _legend(axes: Any, states: Any, unit: str) -> None:
+def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> None:
     axes.set_axis_off()
+    named = normals(view.before, view.after)
     handles = []
-    for word, (state, line) in zip(("before", "after"), states, strict=True):
-        width = half_width(state.ellipsoid, state.normal)
-        handles.append(Line2D([], [], label=f"{word}:  √H = {number(width)}", **line))
+    for state in states:
+        width = half_width(state.found.ellipsoid, state.found.normal)
+        handles.append(Line2D([], [], label=f"{state.word}:  √H = {number(width)}", **state.line))
     handles.append(Line2D([], [], color=GRAY, linewidth=0.7, label="tangents at ±√H along n"))
-    handles.append(Line2D([], [], color=INK, linewidth=1.1, label="n, out of the surface"))
-    axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.06, 0.95), borderpad=0, handlelength=2.6)
-    rows = ["semi-axes of Λ$_c$", f"[{unit}]"]
-    for word, (state, _) in zip(("before", "after  "), states, strict=True):
-        radii = np.sqrt(np.maximum(np.linalg.eigvalsh(state.ellipsoid)[::-1], 0.0))
+    handles.append(Line2D([], [], color=INK, linewidth=1.1, label=normal_label(named)))
+    handles += uncertainty_handles(view)
+    legend = axes.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=(0.0, 1.0), borderpad=0, handlelength=2.6, labelspacing=0.4
+    )
+    rows = [f"semi-axes of Λ$_c$  [{unit}]"]
+    for state in states:
+        radii = np.sqrt(np.maximum(np.linalg.eigvalsh(state.found.ellipsoid)[::-1], 0.0))
         largest = max(float(radii[0]), 1e-300)
-        rows.append(f"{word}  " + "   ".join(number(r if r > 1e-7 * largest else 0.0) for r in radii))
-    axes.text(0.08, 0.48, "\n".join(rows), transform=axes.transAxes, va="top", fontsize=7.5, linespacing=1.4)
+        rows.append(f"{state.word}  " + "  ".join(number(r if r > 1e-7 * largest else 0.0) for r in radii))
+    # Below the legend, however long that is.
+    look = {"xycoords": legend, "textcoords": "offset points", "va": "top", "fontsize": 7.0, "linespacing": 1.4}
+    axes.annotate("\n".join(rows), (0, 0), (0, -8), **look)

@@ -11,11 +11,11 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from impact_posture.errors import InputError
 from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import BLUE, GRAY, GREEN, INK, PURPLE, VERMILLION, framed, style
-from impact_posture.plot.view import PathData, ResultView, number
+from impact_posture.plot.view import PathData, ResultView, TradeOffData, number
 
 # A spread above this is drawn on a log axis.
 _SPREAD = 30.0
-_LINES: dict[str, dict[str, Any]] = {
+QUANTITIES: dict[str, dict[str, Any]] = {
     "H": {"color": BLUE, "linestyle": "-", "linewidth": 1.9, "marker": "o"},
     "G": {"color": GREEN, "linestyle": (0, (1, 1)), "linewidth": 1.5, "marker": "^"},
     "V": {"color": VERMILLION, "linestyle": (0, (5, 2)), "linewidth": 1.5, "marker": "s"},
@@ -30,37 +30,57 @@ def path_figure(view: ResultView) -> Figure:
         InputError: The view has no path, or its arrays do not fit together.
     """
     path = _checked(view.path)
-    curves = {name: normalized(path, name) for name in _LINES}
-    drawn = {name: curve for name, curve in curves.items() if curve is not None}
-    values = np.concatenate([curve[np.isfinite(curve)] for curve in drawn.values()]) if drawn else np.ones(1)
-    positive = values[values > 0]
-    log = bool(positive.size) and float(positive.max() / positive.min()) > _SPREAD
     with style():
-        figure, body = framed(view, 3.1, _notes(view, drawn))
+        figure, body = framed(view, 3.1, [share_notes("along the path", undrawn(path))])
         axes = body.subplots()
-        for name, look in _LINES.items():
-            if name in drawn:
-                curve = np.where(drawn[name] > 0, drawn[name], np.nan) if log else drawn[name]
-                every = max(len(path.s) // 10, 1)
-                at_start = number(float(getattr(path, name)[_first(path, name)]))
-                axes.plot(path.s, curve, label=f"{name} / {at_start}", markevery=every, markersize=3.5, **look)
-        axes.axhline(1.0, color=GRAY, linewidth=0.6, zorder=0)
+        drawn = draw_shares(axes, path.s, path)
         _mark(axes, path)
-        if log:
-            axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
-            axes.yaxis.set_minor_formatter(NullFormatter())
-        else:
-            axes.set_ylim(0.0, 1.12 * max(float(values.max()), 1.0))
-        axes.grid(True)
         axes.set_xlabel("path length in the null space, ∫‖dν‖  [rad, mixed with m]")
-        axes.set_ylabel("value / value at start" + ("  (log)" if log else ""))
         if drawn:
             body.legend(loc="outside right center", title="value / start", title_fontsize=7.5, handlelength=3.2)
     return figure
 
 
-def normalized(path: PathData, name: str) -> Vector | None:
+def draw_shares(axes: Any, x: Vector, data: PathData | TradeOffData) -> bool:
+    """Draw H, G, V and S over ``x``, each divided by its value at the start; whether there was any to draw."""
+    curves = {name: normalized(data, name) for name in QUANTITIES}
+    drawn = {name: curve for name, curve in curves.items() if curve is not None}
+    values = np.concatenate([curve[np.isfinite(curve)] for curve in drawn.values()]) if drawn else np.ones(1)
+    log = spreads(values)
+    for name, curve in drawn.items():
+        shown = np.where(curve > 0, curve, np.nan) if log else curve
+        at_start = number(float(getattr(data, name)[_first(data, name)]))
+        every = max(len(x) // 10, 1)
+        axes.plot(x, shown, label=f"{name} / {at_start}", markevery=every, markersize=3.5, **QUANTITIES[name])
+    axes.axhline(1.0, color=GRAY, linewidth=0.6, zorder=0)
+    if log:
+        log_axis(axes)
+    else:
+        axes.set_ylim(0.0, 1.12 * max(float(values.max()), 1.0))
+    axes.grid(True)
+    axes.set_ylabel("value / value at start" + ("  (log)" if log else ""))
+    return bool(drawn)
+
+
+def spreads(values: Vector) -> bool:
+    """Whether positive values lie so far apart that they want a log axis."""
+    positive = values[values > 0]
+    return bool(positive.size) and float(positive.max() / positive.min()) > _SPREAD
+
+
+def log_axis(axes: Any) -> None:
+    """Make the upright axis logarithmic, with plain numbers at few ticks."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def undrawn(data: PathData | TradeOffData) -> list[str]:
+    """Quantities that have no curve: undefined, or zero at the start."""
+    return [name for name in QUANTITIES if normalized(data, name) is None]
+
+
+def normalized(path: PathData | TradeOffData, name: str) -> Vector | None:
     """A quantity over its value at the start (its first value where it has none there); ``None`` where that is 0."""
     values = np.asarray(getattr(path, name), dtype=float)
     first = _first(path, name)
@@ -69,7 +89,7 @@ def normalized(path: PathData, name: str) -> Vector | None:
     return np.asarray(values / values[first])
 
 
-def _first(path: PathData, name: str) -> int | None:
+def _first(path: PathData | TradeOffData, name: str) -> int | None:
     values = np.asarray(getattr(path, name), dtype=float)
     start = range(len(values))[path.start]
     if np.isfinite(values[start]):
@@ -81,7 +101,7 @@ def _first(path: PathData, name: str) -> int | None:
 def _checked(path: PathData | None) -> PathData:
     if path is None:
         raise InputError("there is no path to draw", where="figure nullspace", mend="give ResultView.path")
-    sizes = {name: np.shape(getattr(path, name)) for name in ("s", *_LINES)}
+    sizes = {name: np.shape(getattr(path, name)) for name in ("s", *QUANTITIES)}
     count = len(path.s)
     if count < 2 or set(sizes.values()) != {(count,)}:
         raise InputError(
@@ -107,10 +127,10 @@ def _share(path: PathData, index: int) -> float:
     return float(path.s[index] - path.s[0]) / length if length > 0 else 0.0
 
 
-def _notes(view: ResultView, drawn: dict[str, Vector]) -> list[str]:
-    missing = [name for name in _LINES if name not in drawn]
+def share_notes(where: str, missing: list[str]) -> str:
+    """What to know of :func:`draw_shares`' curves."""
     notes = "Each curve is divided by its value at the start; for H, V and S less is better. G is 1/effective mass."
     if "S" in missing:
-        notes += " S is undefined along the path."
+        notes += f" S is undefined {where}."
     others = [name for name in missing if name != "S"]
-    return [notes + (f" {', '.join(others)} start at zero and cannot be divided by it." if others else "")]
+    return notes + (f" {', '.join(others)} start at zero and cannot be divided by it." if others else "")

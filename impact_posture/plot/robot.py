@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 
 from impact_posture.plot.shapes import COORDINATE_PLANES, XY, XZ, YZ, Plane, Vector, square, upright_plane
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
-from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, PALE, VERMILLION, framed, style
+from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, PALE, PLATE, VERMILLION, framed, style
 from impact_posture.plot.view import ResultView
 
 NOTES = (
@@ -20,7 +20,6 @@ NOTES = (
 )
 # The letter n, legible over sticks.
 _LETTER: dict[str, Any] = {"fontstyle": "italic", "ha": "center", "va": "center"}
-_PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.6}
 
 
 def postures_figure(view: ResultView) -> Figure:
@@ -171,7 +170,7 @@ def _plane_3d(axes: Any, state: Skeleton, patch: float, named: bool) -> None:
     if not named:
         return
     axes.quiver(*state.contact, *(0.8 * patch * state.normal), color=INK, linewidth=1.2, arrow_length_ratio=0.2)
-    axes.text(*(state.contact + 0.97 * patch * state.normal), "n", bbox=_PLATE, **_LETTER)
+    axes.text(*(state.contact + 0.97 * patch * state.normal), "n", bbox=PLATE, **_LETTER)
 
 
 def _plane_2d(axes: Any, state: Skeleton, plane: Plane, patch: float, named: bool) -> None:
@@ -184,7 +183,7 @@ def _plane_2d(axes: Any, state: Skeleton, plane: Plane, patch: float, named: boo
     tip = contact + 0.8 * patch * n
     arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.2, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", tuple(tip), tuple(contact), arrowprops=arrow, zorder=7)
-    axes.text(*(contact + 0.93 * patch * n), "n", bbox=_PLATE, zorder=7, **_LETTER)
+    axes.text(*(contact + 0.93 * patch * n), "n", bbox=PLATE, zorder=7, **_LETTER)
 
 
 def _handles(state: Skeleton) -> list[Any]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 Vector = NDArray[np.float64]
 
@@ -121,6 +122,21 @@ def polar(matrix: Vector, infinite: float) -> tuple[Vector, Vector]:
     bounded = values > 1e-10 * max(float(values[-1]), 1e-300)
     inverse = np.where(bounded, 1 / np.where(bounded, values, 1.0), infinite**2)
     return np.asarray((vectors * inverse) @ vectors.T), np.asarray(vectors[:, ~bounded])
+
+
+def cone_rim(axis: Vector, degrees: float, length: float, points: int = 73) -> Vector:
+    """Ends of the lines of ``length`` at ``degrees`` from a unit ``axis``, a closed circle, shape (3, points)."""
+    across = np.linalg.svd(axis[None])[2][1:]
+    angle, tilt = np.linspace(0.0, 2 * np.pi, points), np.radians(degrees)
+    around = across.T @ np.array([np.cos(angle), np.sin(angle)])
+    return np.asarray(length * (np.cos(tilt) * axis[:, None] + np.sin(tilt) * around))
+
+
+def cone_shadow(axis: Vector, degrees: float, length: float, axes: Vector) -> Vector:
+    """Outline of the projection of the cone from the origin to :func:`cone_rim`, closed, shape (2, k)."""
+    flat = np.column_stack([np.zeros(2), axes @ cone_rim(axis, degrees, length)[:, :-1]])
+    edge = ConvexHull(flat.T).vertices
+    return np.asarray(flat[:, [*edge, edge[0]]])
 
 
 def square(center: Vector, n: Vector, side: float) -> Vector:

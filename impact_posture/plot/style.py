@@ -24,6 +24,14 @@ INK, GRAY, PALE = "#000000", "#6b6b6b", "#d9d9d9"
 # The dashes lie on top: where both coincide, the solid line shows in their gaps.
 BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (4, 2)), "linewidth": 1.4, "zorder": 3.5}
 AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.6, "zorder": 3.0}
+# The same without supports: thinner, in other dashes.
+FREE_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (1, 1.6)), "linewidth": 1.0, "zorder": 2.8}
+FREE_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": (0, (6, 1.6, 1, 1.6)), "linewidth": 0.9, "zorder": 2.6}
+# Arrows of the worst normals of a cone.
+WORST_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (3, 1.5)), "linewidth": 1.1}
+WORST_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.1}
+# Behind a letter that stands on lines.
+PLATE: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.6}
 BEFORE_BAR: dict[str, Any] = {"facecolor": "#fbe3d3", "edgecolor": VERMILLION, "hatch": "//////", "linewidth": 0.6}
 AFTER_BAR: dict[str, Any] = {"facecolor": BLUE, "edgecolor": BLUE, "linewidth": 0.6}
 

@@ -12,9 +12,14 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.errors import MetricError
+from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.impact.one_blow import OneBlow
+from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
+from impact_posture.impact.scalars import objective_value
+from impact_posture.impact.uncertain import worst_in_world
 from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
@@ -47,6 +52,38 @@ class PathData:
 
 
 @dataclass(frozen=True, eq=False)
+class TradeOffData:
+    """The best posture within each distance from the initial one, one entry for each, the initial one first.
+
+    Attributes:
+        within: The bounds on the distance (rad mixed with m), increasing, shape (k,).
+        distance: How far each posture is, at most ``within``, shape (k,).
+        objective: Its objective, shape (k,).
+        H: ``nᵀΛ_c n``, shape (k,).
+        G: ``1/m_eff`` along the normal, 1/kg, shape (k,).
+        V: ``H/G²``, shape (k,).
+        S: The sticking counterpart of V, shape (k,); NaN where it does not exist.
+        certified: Whether its certificate holds, shape (k,).
+        knee: Index of the knee, if there is one.
+    """
+
+    within: Vector
+    distance: Vector
+    objective: Vector
+    H: Vector
+    G: Vector
+    V: Vector
+    S: Vector
+    certified: NDArray[np.bool_]
+    knee: int | None = None
+
+    @property
+    def start(self) -> int:
+        """Index of the posture that the others are compared with."""
+        return 0
+
+
+@dataclass(frozen=True, eq=False)
 class ResultView:
     """Everything that a picture needs to know of one result.
 
@@ -58,6 +95,7 @@ class ResultView:
         speed: Approach speed along the normal, m/s.
         restitution: Coefficient of restitution e, in [0, 1].
         path: Quantities along the null-space path between them, if known.
+        tradeoff: The trade-off of objective against distance, if it was computed.
         title: First line of every picture; robot and contact frame if empty.
     """
 
@@ -68,6 +106,7 @@ class ResultView:
     speed: float = 1.0
     restitution: float = 0.0
     path: PathData | None = None
+    tradeoff: TradeOffData | None = None
     title: str = ""
 
     @cached_property
@@ -79,6 +118,40 @@ class ResultView:
     def after(self) -> ImpactQuantities:
         """The quantities at ``q_optimal``."""
         return self.objective.oracle.quantities(self.q_optimal)
+
+    @cached_property
+    def free_before(self) -> ImpactQuantities | None:
+        """The quantities at ``q_initial`` without the supports; ``None`` where there are none."""
+        return self._free(self.q_initial)
+
+    @cached_property
+    def free_after(self) -> ImpactQuantities | None:
+        """The quantities at ``q_optimal`` without the supports; ``None`` where there are none."""
+        return self._free(self.q_optimal)
+
+    def _free(self, q: Vector) -> ImpactQuantities | None:
+        objective = self.objective
+        if not objective.supports:
+            return None
+        return ImpactOracle(objective.robot, objective.contact, objective.metric).quantities(q)
+
+    @cached_property
+    def worst_before(self) -> WorstNormal | None:
+        """The worst normal of the cone at ``q_initial``, world; ``None`` without a cone or where there is none."""
+        return self._worst(self.q_initial)
+
+    @cached_property
+    def worst_after(self) -> WorstNormal | None:
+        """The worst normal of the cone at ``q_optimal``, world; ``None`` without a cone or where there is none."""
+        return self._worst(self.q_optimal)
+
+    def _worst(self, q: Vector) -> WorstNormal | None:
+        if not self.objective.normal_cone_deg:
+            return None
+        try:
+            return worst_in_world(self.objective, q)
+        except MetricError:
+            return None
 
     @cached_property
     def contact_point(self) -> PointOnLink:
@@ -148,12 +221,20 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
     facts = [f"robot {robot.name}", f"contact {contact.frame}"] if view.title else []
     if any(contact.offset):
         facts.append(f"offset ({', '.join(number(v) for v in contact.offset)}) m")
+    cone = view.objective.normal_cone_deg
     facts += [
-        f"n = ({normal}) in {axes}",
-        f"objective {view.objective.name}",
+        f"n = ({normal}) in {axes}" + (f", worst within {cone:g}°" if cone else ""),
+        f"objective {view.objective.name}" + _worst_values(view),
         f"metric {view.objective.metric.kind}" + (f" ({_short(view.objective.metric.source)})" * _sourced(view)),
         f"armature {_armature(robot)}",
     ]
+    if view.objective.others:
+        others = ", ".join(other.frame for other in view.objective.others)
+        facts.insert(0, f"drawn and in numbers: this contact alone; objective also of {others}")
+    if view.objective.scenarios:
+        facts.insert(
+            0, f"drawn and in numbers: the model as it stands; objective the worst of {len(view.objective.scenarios)}"
+        )
     feet = [s.frame for s in view.objective.supports]
     facts.append(f"contact-consistent, on {', '.join(feet)}" if feet else "no supports")
     quantities: list[tuple[str, str, Callable[[ImpactQuantities], float | None]]] = [
@@ -169,6 +250,14 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
         for name, unit, get in quantities
     ]
     return title, [SEPARATOR.join(facts), SEPARATOR.join(numbers)]
+
+
+def _worst_values(view: ResultView) -> str:
+    """The objective before and after, where it is none of the five quantities but the worst of several blows."""
+    if isinstance(view.objective.inner, OneBlow):
+        return ""
+    found = [objective_value(view.objective, q) for q in (view.q_initial, view.q_optimal)]
+    return " " + " → ".join(number(value) for value in found)
 
 
 def number(value: float | None) -> str:

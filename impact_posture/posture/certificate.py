@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.posture.distance import distance_gradient
 from impact_posture.posture.equalities import RANK_TOLERANCE, equality_jacobian
 from impact_posture.posture.problem import PostureProblem
 
@@ -19,6 +20,9 @@ Vector = NDArray[np.float64]
 
 # An inequality closer than this (m, rad) may carry a multiplier; the product of the two is the complementarity.
 _ACTIVE = 1e-3
+# Of a maximum, members at most this share of f₀ below it take part: the solver's tolerance is a share of f₀ too, and
+# a large one of an objective that fell by orders of magnitude.  Half of what complementarity leaves to their gaps.
+_TIED = 5e-8
 # Multipliers below this are rounding.
 _MULTIPLIER = 1e-6
 
@@ -126,38 +130,12 @@ def objective_gradients(problem: PostureProblem, q: Vector, scale: float) -> tup
     Returns:
         Tangent gradients, shape (k, nv), one where it is smooth; how far each one's own value lies below, shape (k,).
     """
-    found = problem.objective.subgradients(q)
+    found = problem.objective.subgradients(q, _TIED * scale)
     gradients = found.gradients / scale
     weight = problem.requirements.regularization
     if weight:
-        gradients = gradients + weight * _distance_gradient(problem, q)
+        gradients = gradients + weight * distance_gradient(Chart(problem.robot.model), q, problem.given)
     return gradients, found.gaps / scale
-
-
-def _distance_gradient(problem: PostureProblem, q: Vector) -> Vector:
-    """Tangent gradient of ``nlp.distance_squared``."""
-    gradient = np.zeros(problem.robot.nv)
-    chart = Chart(problem.robot.model)
-    x, reference = chart.to_x(q), chart.to_x(problem.given)
-    for slot in chart.slots:
-        one, other = x[slot.x], reference[slot.x]
-        if slot.kind.family in ("free-flyer", "spherical"):
-            R = pin.Quaternion(one[-4:]).matrix()
-            relative = pin.Quaternion(other[-4:]).inverse() * pin.Quaternion(one[-4:])
-            vector, w = np.array(relative.coeffs()[:3]), float(relative.w)
-            # d(4 (1 − w²)) = −8 w dw with dw = −½ v·ω.
-            gradient[slot.v.stop - 3 : slot.v.stop] = 4 * w * vector
-            if slot.kind.family == "free-flyer":
-                gradient[slot.v.start : slot.v.start + 3] = 2 * R.T @ (one[:3] - other[:3])
-        elif slot.kind.family == "planar":
-            c, s = np.cos(one[2]), np.sin(one[2])
-            d = 2 * (one - other)
-            gradient[slot.v] = c * d[0] + s * d[1], -s * d[0] + c * d[1], 2 * np.sin(one[2] - other[2])
-        elif slot.kind.family == "continuous":
-            gradient[slot.v] = 2 * np.sin(one - other)
-        else:
-            gradient[slot.v] = 2 * (one - other)
-    return gradient
 
 
 @dataclass(frozen=True, eq=False)

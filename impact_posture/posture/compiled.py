@@ -19,7 +19,7 @@ import casadi as ca
 from impact_posture import __version__
 from impact_posture.errors import CompilerError
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.toolchain import find_compiler, run_compiler
+from impact_posture.toolchain import find_compiler, run_compiler, run_compilers
 
 CompileMode = Literal["auto", "always", "never"]
 
@@ -28,6 +28,9 @@ CompileMode = Literal["auto", "always", "never"]
 _COMPILE_S_PER_OPERATION = 1.2e-4
 _SAVED_S_PER_OPERATION = 6e-9
 _ITERATIONS = 35
+# Above so many operations a function is not optimized: a compiler takes three times as long for code three times as
+# fast, which then is no longer what a solve waits for.
+_OPTIMIZED = 100_000
 
 
 def cache_folder() -> Path:
@@ -65,7 +68,7 @@ def _pays(solver: ca.Function, starts: int) -> bool:
 
 
 def _key(problem: PostureProblem) -> str:
-    """Hash of everything that shapes the program's functions; targets, normals and limits are parameters."""
+    """Hash of what shapes the program's functions; targets, limits and the leading normal are parameters."""
     objective = problem.objective
     content = [
         __version__,
@@ -73,8 +76,11 @@ def _key(problem: PostureProblem) -> str:
         ca.CasadiMeta.version(),
         f"{platform.system()} {platform.machine()}",
         problem.robot.model_sha256,
+        # Where frames sit on their links is no part of the dynamics, but of every expression of a point.
+        *[f"{f.name} {f.parentJoint} {f.placement.homogeneous.tolist()}" for f in problem.robot.model.frames],
         repr((objective.kind, objective.metric, objective.supports, objective.compliance)),
-        repr(objective.normal_cone_deg),
+        repr((objective.normal_cone_deg, objective.others, objective.bilateral)),
+        repr([scenario.robot.model_sha256 for scenario in objective.scenarios]),
         repr((objective.contact.frame, objective.contact.offset, objective.contact.normal_frame)),
         repr(objective.scale),
         *[f"{c.structure}:{problem.carried(i)}" for i, c in enumerate(problem.constraints)],
@@ -93,13 +99,31 @@ def _own_source() -> str:
 
 
 def _compile(solver: ca.Function, compiler: list[str], library: Path) -> None:
+    """Each function in a file of its own, as many compilers at once as there are cores."""
     library.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-        source, built = Path(folder) / "program.c", Path(folder) / "program.so"
-        generator = ca.CodeGenerator(source.name)
-        generator.add(solver.oracle())
-        for name in solver.get_function():
-            generator.add(solver.get_function(name))
-        generator.generate(f"{folder}{os.sep}")
-        run_compiler([*compiler, "-O1", "-fPIC", "-shared", source.name, "-o", built.name, "-lm"], Path(folder))
-        os.replace(built, library)
+        functions = [solver.oracle(), *[_shared(solver.get_function(name)) for name in solver.get_function()]]
+        # The largest first: nothing waits for it in the end.
+        functions.sort(key=lambda function: -int(function.n_instructions()))
+        commands = [_command(function, compiler, folder) for function in functions]
+        run_compilers(commands, Path(folder))
+        objects = [f"{function.name()}.o" for function in functions]
+        run_compiler([*compiler, "-shared", *objects, "-o", "program.so", "-lm"], Path(folder))
+        os.replace(Path(folder) / "program.so", library)
+
+
+def _shared(function: ca.Function) -> ca.Function:
+    """The same function with equal subexpressions computed once, which differentiation leaves many of."""
+    inputs = function.sx_in()
+    names = (function.name_in(), function.name_out())
+    return ca.Function(function.name(), inputs, function.call(inputs), *names, {"cse": True})
+
+
+def _command(function: ca.Function, compiler: list[str], folder: str) -> list[str]:
+    """Write the function's C, and say how it is compiled."""
+    name = function.name()
+    generator = ca.CodeGenerator(f"{name}.c")
+    generator.add(function)
+    generator.generate(f"{folder}{os.sep}")
+    level = "-O1" if function.n_instructions() <= _OPTIMIZED else "-O0"
+    return [*compiler, level, "-fPIC", "-c", f"{name}.c", "-o", f"{name}.o"]

@@ -219,10 +219,15 @@ class CenterOfMassOverFeet(Constraint):
         normals: Outward unit normals of the support polygon's edges, shape (k, 2).
         offsets: ``b``, shape (k,).
         margin: Distance kept from the edges.
+        loaded: The model whose center of mass it is and what tells it from the problem's own; ``None``: that one.
     """
 
-    def __init__(self, normals: Vector, offsets: Vector, margin: float) -> None:
-        self.name = "center of mass over the feet"
+    def __init__(
+        self, normals: Vector, offsets: Vector, margin: float, loaded: tuple[pin.Model, str] | None = None
+    ) -> None:
+        self.name = "center of mass over the feet" + (f" with {loaded[1]}" if loaded else "")
+        self.normals, self.offsets, self.margin = normals, offsets, margin
+        self._model = loaded[0] if loaded else None
         self._k = len(offsets)
         self.parameters = np.concatenate([normals.T.reshape(-1), offsets])
         self.lower = np.full(self._k, -np.inf)
@@ -230,14 +235,16 @@ class CenterOfMassOverFeet(Constraint):
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
         """See :class:`Constraint`."""
-        k, center = self._k, tree.center_of_mass()
+        k, own = self._k, tree if self._model is None else Tree(self._model, tree.q)
+        center = own.center_of_mass()
         return parameters[:k] * center[0] + parameters[k : 2 * k] * center[1] - parameters[2 * k :]
 
     def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
         """See :class:`Constraint`."""
         k = self._k
         normals = self.parameters[: 2 * k].reshape(2, k).T
-        center, jacobian = numeric.center_of_mass()
+        own = numeric if self._model is None else Numeric(self._model).at(numeric.q)
+        center, jacobian = own.center_of_mass()
         return normals @ center[:2] - self.parameters[2 * k :], normals @ jacobian[:2]
 
     def row_name(self, row: int) -> str:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.posture.nlp import IPOPT_OPTIONS, distance_squared, run_solver
+from impact_posture.posture.distance import distance_squared
+from impact_posture.posture.nlp import IPOPT_OPTIONS, run_solver
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import random_posture
 
@@ -80,7 +81,7 @@ def _build(problem: PostureProblem, chart: Chart) -> tuple[ca.Function, int]:
     program = {
         "x": ca.vertcat(x, up, down),
         "p": ca.vertcat(reference, *targets),
-        "f": ca.sum1(up + down) + 1e-6 * distance_squared(chart, x, reference),
+        "f": ca.sum1(up + down) + 1e-6 * distance_squared(chart, tree.q, chart.configuration(reference)),
         "g": ca.vertcat(chart.norms(x), stacked + up - down),
     }
     return ca.nlpsol("elastic", "ipopt", program, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8}), k

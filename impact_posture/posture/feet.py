@@ -26,13 +26,15 @@ class KeptFeet(Constraint):
     about: sufficient for the feet to stay, and where the set has more than one member, more than necessary.
 
     Args:
-        objective: Whose blow, along the contact's normal, and whose feet.
+        objective: Whose blow, one along the contact's normal, and whose feet.
         numeric: At the given posture: soles keep their axes, for the feet are held.
         friction: Coefficient.
+        scenario: Name of the model that it is, where there are several.
     """
 
-    def __init__(self, objective: ImpactObjective, numeric: Numeric, friction: float) -> None:
-        self.name = "feet that stay"
+    def __init__(self, objective: ImpactObjective, numeric: Numeric, friction: float, scenario: str = "") -> None:
+        self._where = f" ({scenario})" if scenario else ""
+        self.name = f"feet that stay{self._where}"
         self._robot, self._supports = objective.robot, objective.supports
         self._objective = replace(objective, normal_cone_deg=0.0)
         self._feet = [(point_on(objective.robot, s.frame, s.offset), s.rows) for s in objective.supports]
@@ -69,4 +71,4 @@ class KeptFeet(Constraint):
 
     def row_name(self, row: int) -> str:
         """See :class:`Constraint`."""
-        return self._names[row]
+        return f"{self._names[row]}{self._where}"

@@ -33,7 +33,7 @@ def pin_undetermined(
     The objective depends on the base through ``R_bᵀn`` alone: moving the whole robot, or turning it about n, changes
     nothing (with a normal that turns along, neither does any other turn).  What of these motions the constraints
     allow is fixed at its initial value.  A contact pose that is free also gives up yaw: turning the whole robot to
-    the blow is no change of posture.
+    the blow is no change of posture.  Blows along several normals see every turn.
     """
     if not robot.floating:
         return [], []
@@ -43,6 +43,8 @@ def pin_undetermined(
     n = np.array(objective.contact.normal)
     world_normal = objective.contact.normal_frame == "world"
     turns = [n] if world_normal else list(np.eye(3))
+    if world_normal and any(np.linalg.norm(np.cross(n, other.normal)) > 1e-9 for other in objective.others):
+        turns = []
     if requirements.contact_pose == "free" and not objective.supports:
         turns.append(np.array([0.0, 0.0, 1.0]))
     blind = np.vstack([np.eye(6)[:3], *[np.concatenate([np.zeros(3), turn]) for turn in turns]]).T
@@ -60,7 +62,7 @@ def pin_undetermined(
 
     # Positions are the base's own: a turn about another point moves them too, so turns are fixed first.
     candidates = [("yaw", np.array([0.0, 0.0, 1.0]))]
-    candidates += [("turn about the normal", placement.rotation.T @ n)] if world_normal else []
+    candidates += [("turn about the normal", placement.rotation.T @ n)] if world_normal and turns else []
     candidates += [("roll", np.eye(3)[0]), ("pitch", np.eye(3)[1])]
     for name, axis in candidates:
         held = HeldTurn(base, placement.rotation, axis, f"base {name}")

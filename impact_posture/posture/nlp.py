@@ -7,7 +7,8 @@ Formulation (the "lifted" one): the impact's linear solve is left to IPOPT::
                           c(q) within bounds,  |quaternions| = 1,  limits,
 
 so that every function is linear or quadratic in the auxiliaries and the exact Hessian stays small
-(``tests/benchmarks/formulations.py`` measures both forms).  A cone of normals adds its dual (``impact/lifted.py``).
+(``tests/benchmarks/formulations.py`` measures both forms).  An inner maximum adds its own form
+(:mod:`impact_posture.impact.inner`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.compiled import CompileMode, compiled_solver
+from impact_posture.posture.distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
 
 Vector = NDArray[np.float64]
@@ -45,10 +47,13 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.max_iter": 300,
     "print_time": False,
     "calc_lam_p": False,
+    # Nobody asks for sensitivities.
+    "no_nlp_grad": True,
     "error_on_fail": False,
 }
-# The equations of a cone's dual are quadratic: steps that break them badly to gain in the objective never come back.
-_CONE_OPTIONS = {"ipopt.theta_max_fact": 1.0}
+# The equations of a cone's dual are quadratic, and a bound ``t`` falls as far as equations are broken for it: steps
+# that break them badly to gain in the objective never come back.
+_WORST_OPTIONS = {"ipopt.theta_max_fact": 1.0}
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -61,12 +66,14 @@ class SolveRecord:
         status: IPOPT's word.
         iterations: Its iterations.
         time_s: Wall time of the call.
+        cpu_s: Processor time of the call, all threads together.
     """
 
     q: Vector
     status: str
     iterations: int
     time_s: float
+    cpu_s: float
 
     @property
     def converged(self) -> bool:
@@ -83,6 +90,7 @@ class PostureNLP:
         chart: Coordinates.
         solver: CasADi's ``nlpsol``.
         size: Numbers of unknowns, of which the first ``chart.nx`` are ``x``.
+        bounded: How many of its rows, the last ones, are inequalities ``≤ 0`` of the objective.
         build_time_s: Time to build (and compile) it.
         compiled: Whether its functions run as machine code.
     """
@@ -91,6 +99,7 @@ class PostureNLP:
     chart: Chart
     solver: ca.Function
     size: int
+    bounded: int
     build_time_s: float
     compiled: bool
 
@@ -105,14 +114,14 @@ class PostureNLP:
         guess = problem.objective.guess(self.chart.to_q(x), scale, attempt)
         lower, upper = np.concatenate([problem.lower, guess.lower]), np.full(self.size, np.inf)
         upper[:nx] = problem.upper
-        began = time.perf_counter()
+        began, busy = time.perf_counter(), time.process_time()
         p = parameters(problem, self.chart, scale)
         x0 = np.concatenate([x, guess.values])
         answer = run_solver(self.solver, x0=x0, lbx=lower, ubx=upper, p=p, **_row_bounds(problem, self))
-        elapsed = time.perf_counter() - began
+        elapsed, busy = time.perf_counter() - began, time.process_time() - busy
         stats = self.solver.stats()
         q = self.chart.to_q(np.array(answer["x"]).reshape(-1)[:nx])
-        return SolveRecord(q, str(stats["return_status"]), int(stats["iter_count"]), elapsed)
+        return SolveRecord(q, str(stats["return_status"]), int(stats["iter_count"]), elapsed, busy)
 
 
 def run_solver(solver: ca.Function, **arguments: Vector) -> dict[str, ca.DM]:
@@ -151,14 +160,15 @@ def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts:
     """Build the program; ``starts`` tells how often it will be solved, so that compiling is worth it or not."""
     began = time.perf_counter()
     chart = Chart(problem.robot.model)
-    symbols = program(problem, chart)
-    options = IPOPT_OPTIONS | (_CONE_OPTIONS if problem.objective.normal_cone_deg else {})
+    symbols, bounded = program(problem, chart)
+    options = IPOPT_OPTIONS | (_WORST_OPTIONS if problem.objective.attempts > 1 else {})
     solver, compiled = compiled_solver(problem, symbols, options, compile, starts)
-    return PostureNLP(problem, chart, solver, int(symbols["x"].numel()), time.perf_counter() - began, compiled)
+    size = int(symbols["x"].numel())
+    return PostureNLP(problem, chart, solver, size, bounded, time.perf_counter() - began, compiled)
 
 
-def program(problem: PostureProblem, chart: Chart) -> dict[str, ca.SX]:
-    """The program's expressions: ``x`` (unknowns), ``p`` (parameters), ``f``, ``g``."""
+def program(problem: PostureProblem, chart: Chart) -> tuple[dict[str, ca.SX], int]:
+    """Its expressions ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``, and how many last rows are ``≤ 0``."""
     x = ca.SX.sym("x", chart.nx)
     n, scale, weight = ca.SX.sym("n", 3), ca.SX.sym("scale"), ca.SX.sym("weight")
     reference = ca.SX.sym("reference", chart.nx)
@@ -169,36 +179,15 @@ def program(problem: PostureProblem, chart: Chart) -> dict[str, ca.SX]:
         p = ca.SX.sym(f"p{index}", len(constraint.parameters))
         targets.append(p)
         rows.append(constraint.symbolic(tree, p)[problem.carried(index)])
-    rows.append(lifted.residual)
-    value = lifted.value / scale + weight * distance_squared(chart, x, reference)
-    return {
+    rows += [lifted.residual, lifted.inequalities]
+    value = lifted.value / scale + weight * distance_squared(chart, tree.q, chart.configuration(reference))
+    symbols = {
         "x": ca.vertcat(x, lifted.variables),
         "p": ca.vertcat(n, scale, weight, reference, *targets),
         "f": value,
         "g": ca.vertcat(*rows),
     }
-
-
-def distance_squared(chart: Chart, x: ca.SX, reference: ca.SX) -> ca.SX:
-    """Squared distance of two chart points; turns count ``4 (1 − (q·r)²)`` or ``2 (1 − cos Δ)``: about Δ²."""
-    total = ca.SX(0)
-    for slot in chart.slots:
-        one, other = x[slot.x], reference[slot.x]
-        width = one.numel()
-        if slot.kind.family in ("free-flyer", "spherical"):
-            total += 4 * (1 - ca.dot(one[width - 4 :], other[width - 4 :]) ** 2)
-            one, other = one[: width - 4], other[: width - 4]
-        elif slot.kind.family in ("continuous", "planar"):
-            total += 2 * (1 - ca.cos(one[width - 1] - other[width - 1]))
-            one, other = one[: width - 1], other[: width - 1]
-        total += ca.sumsqr(one - other)
-    return total
-
-
-def distance_squared_fun(chart: Chart) -> ca.Function:
-    """``(x, reference) → distance_squared``."""
-    x, reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
-    return ca.Function("distance", [x, reference], [distance_squared(chart, x, reference)])
+    return symbols, int(lifted.inequalities.numel())
 
 
 def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Vector:
@@ -218,6 +207,8 @@ def _row_bounds(problem: PostureProblem, nlp: PostureNLP) -> dict[str, Vector]:
     rows = list(enumerate(problem.constraints))
     lower = np.concatenate([norms, *[c.lower[problem.carried(i)] for i, c in rows]])
     upper = np.concatenate([norms, *[c.upper[problem.carried(i)] for i, c in rows]])
-    # The rest are the objective's equations: fewer than its auxiliaries where it has an inner dual.
+    # The rest are the objective's: equations, then what bounds it from below.
     lifted = np.zeros(nlp.solver.size1_in("lbg") - len(lower))
-    return {"lbg": np.concatenate([lower, lifted]), "ubg": np.concatenate([upper, lifted])}
+    below = lifted.copy()
+    below[lifted.size - nlp.bounded :] = -np.inf
+    return {"lbg": np.concatenate([lower, below]), "ubg": np.concatenate([upper, lifted])}

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import Support, point_on
+from impact_posture.impact.contact import Contact, Support, point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.constraint import (
     CenterOfMassOverFeet,
@@ -25,6 +25,7 @@ from impact_posture.posture.constraint import (
     PositionBox,
 )
 from impact_posture.posture.equalities import base_point
+from impact_posture.posture.every_scenario import in_every_scenario
 from impact_posture.posture.feet import KeptFeet
 from impact_posture.posture.gauge import pin_undetermined
 from impact_posture.posture.regular import regularize
@@ -40,7 +41,8 @@ class Requirements:
     """What the task asks of the posture.
 
     Attributes:
-        contact_pose: What is held of the contact frame.
+        contact_pose: What is held of the contact frame; of several, the leading one.
+        other_poses: What is held of each other contact frame.
         target_position: Contact frame's position, world, meters; ``None``: where it is.
         target_quaternion: Contact frame's orientation x y z w; ``None``: as it is.
         box: Half extents of the box of ``contact_pose = box``, meters.
@@ -49,6 +51,7 @@ class Requirements:
         keep: Frames whose pose is held.
         hold: Joints kept at their initial value.
         com_over_feet: Keep the center of mass above the support polygon.
+        com_asked: Whether that was asked for; else it is a habit of the robot, left where the feet span no area.
         com_margin: Distance from the polygon's edges, meters.
         keep_contacts: The blow must neither lift nor slide a foot.
         friction: Coefficient for that.
@@ -57,6 +60,7 @@ class Requirements:
     """
 
     contact_pose: ContactPose = "full"
+    other_poses: tuple[ContactPose, ...] = ()
     target_position: Vector3 | None = None
     target_quaternion: tuple[float, float, float, float] | None = None
     box: Vector3 = (0.05, 0.05, 0.05)
@@ -65,6 +69,7 @@ class Requirements:
     keep: tuple[str, ...] = ()
     hold: tuple[str, ...] = ()
     com_over_feet: bool = False
+    com_asked: bool = True
     com_margin: float = 0.0
     keep_contacts: bool = False
     friction: float = 0.7
@@ -125,21 +130,34 @@ def build_problem(
     constraints: list[Constraint] = []
     for support in objective.supports:
         constraints.append(_held_support(robot, numeric, support))
-    constraints += _contact_constraints(robot, objective, numeric, requirements)
     held = {s.frame for s in objective.supports}
+    poses = (requirements.contact_pose, *requirements.other_poses)
+    # Two blows at one frame, along two normals, hold it once.
+    struck: dict[str, tuple[Contact, ContactPose]] = {}
+    for contact, mode in zip(objective.contacts, poses, strict=True):
+        struck.setdefault(contact.frame, (contact, mode))
+    for contact, mode in struck.values():
+        constraints += _contact_constraints(robot, contact, numeric, requirements, mode)
     for frame in dict.fromkeys(requirements.keep):
         if frame not in held:
             point = point_on(robot, frame)
             constraints.append(HeldPose(f"pose of {frame}", point, numeric.placement(point)))
     constraints += _base_constraints(robot, numeric, requirements)
+    decided: list[str] = []
     if requirements.com_over_feet:
-        constraints.append(_com_constraint(robot, objective.supports, numeric, requirements.com_margin))
+        try:
+            constraints.append(_com_constraint(robot, objective.supports, numeric, requirements.com_margin))
+        except InputError:
+            if requirements.com_asked:
+                raise
+            decided.append("center of mass left free: the feet span no area to keep it above")
     if requirements.keep_contacts:
-        constraints.append(KeptFeet(objective, numeric, requirements.friction))
+        constraints += _kept_feet(objective, numeric, requirements.friction)
+    constraints += in_every_scenario(objective, numeric, requirements.friction, constraints)
     lower, upper = _bounds(robot, chart, given, requirements)
     more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
     problem = PostureProblem(
-        robot, objective, requirements, given, (*constraints, *more), lower, upper, notes=tuple(notes)
+        robot, objective, requirements, given, (*constraints, *more), lower, upper, notes=(*decided, *notes)
     )
     return regularize(problem)
 
@@ -164,6 +182,12 @@ def _check(robot: Robot, requirements: Requirements) -> None:
     if not (np.isfinite(requirements.friction) and requirements.friction > 0):
         raise InputError(f"is {requirements.friction:g}", where="friction", mend="give a coefficient above zero")
     quaternion = requirements.target_quaternion
+    if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):
+        raise InputError(
+            "is one target for several contacts",
+            where="--target-quaternion" if quaternion is not None else "--target-position",
+            mend="leave it out and start from a --posture that has the contacts in place",
+        )
     if quaternion is not None and not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
         raise InputError(
             f"has norm {np.linalg.norm(quaternion):.4g}", where="--target-quaternion", mend="give a unit x y z w"
@@ -182,9 +206,9 @@ def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constrain
     return HeldPose(f"foot {support.frame}", point, placement)
 
 
-def contact_target(robot: Robot, objective: ImpactObjective, numeric: Numeric, requirements: Requirements) -> pin.SE3:
-    """Where the contact frame is to be: the target given, else where it is at ``numeric.q``."""
-    placement = numeric.placement(point_on(robot, objective.contact.frame)).copy()
+def contact_target(robot: Robot, contact: Contact, numeric: Numeric, requirements: Requirements) -> pin.SE3:
+    """Where a contact frame is to be: the target given, else where it is at ``numeric.q``."""
+    placement = numeric.placement(point_on(robot, contact.frame)).copy()
     if requirements.target_position is not None:
         placement.translation = np.array(requirements.target_position)
     if requirements.target_quaternion is not None:
@@ -194,11 +218,10 @@ def contact_target(robot: Robot, objective: ImpactObjective, numeric: Numeric, r
 
 
 def _contact_constraints(
-    robot: Robot, objective: ImpactObjective, numeric: Numeric, requirements: Requirements
+    robot: Robot, contact: Contact, numeric: Numeric, requirements: Requirements, mode: ContactPose
 ) -> list[Constraint]:
-    contact, mode = objective.contact, requirements.contact_pose
     point = point_on(robot, contact.frame)
-    target = contact_target(robot, objective, numeric, requirements)
+    target = contact_target(robot, contact, numeric, requirements)
     name = f"pose of {contact.frame}"
     if mode == "free":
         if requirements.target_position is not None or requirements.target_quaternion is not None:
@@ -217,6 +240,17 @@ def _contact_constraints(
     if mode == "box":
         return [PositionBox(f"position of {contact.frame}", point, target.translation, requirements.box)]
     return [HeldPosition(f"position of {contact.frame}", point, target.translation)]
+
+
+def _kept_feet(objective: ImpactObjective, numeric: Numeric, friction: float) -> list[Constraint]:
+    """One constraint a contact: cones are convex, so what each blow leaves standing all pushes together do."""
+    if objective.bilateral:
+        raise InputError(
+            "contacts that pull as well as push would have to leave the feet without any impulse",
+            where="--keep-contacts",
+            mend="leave out --bilateral or --keep-contacts",
+        )
+    return [KeptFeet(single, numeric, friction) for single in objective.singles]
 
 
 def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements) -> list[Constraint]:

@@ -14,8 +14,10 @@ from impact_posture import __version__
 from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.posture.caveats import caveats
 from impact_posture.posture.path import NullSpacePath
+from impact_posture.posture.robustness import Robustness
 from impact_posture.posture.settings import Prepared
 from impact_posture.posture.solve import PostureSolution
+from impact_posture.posture.tradeoff import TradeOff
 
 SCHEMA = "impact-posture/result/1"
 
@@ -27,17 +29,20 @@ def evaluations(prepared: Prepared, solution: PostureSolution) -> tuple[Evaluati
     return initial, evaluate(impact.objective, solution.q, impact.speed, impact.restitution)
 
 
-def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, object]:
-    """The content of ``result.json``."""
+def result_document(
+    prepared: Prepared,
+    solution: PostureSolution,
+    robustness: Robustness | None = None,
+    tradeoff: TradeOff | None = None,
+) -> dict[str, object]:
+    """The content of ``result.json``; ``robustness`` and ``tradeoff`` are keys of it where there are such."""
     initial, optimal = evaluations(prepared, solution)
     impact = prepared.impact
-    asked = impact.to_dict()
-    contacts = [{**contact, "normal": [float(v) for v in initial.normal]} for contact in asked["contacts"]]  # type: ignore[attr-defined]
     warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *caveats(prepared, solution))
+    curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list()}
     return {
         "schema": SCHEMA,
-        **asked,
-        "contacts": contacts,
+        **impact.to_dict(solution.initial),
         "constraints": prepared.problem.describe(),
         "initial": {
             "given_q": [float(v) for v in prepared.problem.given],
@@ -46,6 +51,7 @@ def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, 
         },
         "optimal": optimal.to_dict(),
         "reduction": solution.reduction,
+        **({} if robustness is None else {"robustness": robustness.to_dict()}),
         "redundancy": solution.redundancy,
         "certificate": solution.certificate.to_dict(),
         "active": [
@@ -66,7 +72,8 @@ def result_document(prepared: Prepared, solution: PostureSolution) -> dict[str, 
                 {"q": [float(v) for v in o.q], "objective": o.objective, "hits": o.hits} for o in solution.optima
             ],
         },
-        "notes": list(solution.notes),
+        **curve,
+        "notes": [*solution.notes, *(tradeoff.notes if tradeoff else ())],
         "warnings": list(dict.fromkeys(warnings)),
         "versions": versions(),
     }
@@ -83,8 +90,10 @@ def versions() -> dict[str, str]:
     return found
 
 
-def result_arrays(solution: PostureSolution, path: NullSpacePath) -> dict[str, NDArray[np.float64]]:
-    """The content of ``result.npz``: postures, ellipsoids, jumps and the null-space path."""
+def result_arrays(
+    solution: PostureSolution, path: NullSpacePath, tradeoff: TradeOff | None = None
+) -> dict[str, NDArray[np.float64]]:
+    """The content of ``result.npz``: postures, ellipsoids, jumps, the null-space path, and the trade-off."""
     oracle = solution.problem.objective.oracle
     arrays: dict[str, NDArray[np.float64]] = {}
     for name, q in (("initial", solution.initial), ("optimal", solution.q)):
@@ -97,4 +106,4 @@ def result_arrays(solution: PostureSolution, path: NullSpacePath) -> dict[str, N
             f"{name}_gradient": oracle.gradient_H(q),
         }
     arrays |= {f"path_{key}": getattr(path, key) for key in ("q", "s", "H", "G", "V", "S", "objective")}
-    return arrays
+    return arrays if tradeoff is None else arrays | tradeoff.arrays()

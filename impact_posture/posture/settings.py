@@ -13,9 +13,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.metric import Metric, MetricKind, ObjectiveKind
 from impact_posture.impact.request import ImpactRequest, ResolvedImpact
+from impact_posture.posture.constraint import CenterOfMassOverFeet
 from impact_posture.posture.problem import BaseMode, PostureProblem, Requirements, build_problem
-from impact_posture.robot.loader import LoadOptions, names_a_path
-from impact_posture.robot.spec import ContactPose, Root, Vector3, read_toml, validate
+from impact_posture.robot.loader import LoadOptions, from_folder, names_a_path
+from impact_posture.robot.scenario import Payload
+from impact_posture.robot.spec import ContactPose, Root, Vector3, read_toml, validate, with_tuples
 
 SCHEMA = "impact-posture/problem/1"
 
@@ -41,6 +43,7 @@ class ProblemSettings(BaseModel):
     normal_frame: Literal["world", "contact"] = "world"
     offset: Vector3 | None = None
     contact: str | tuple[str, ...] | None = None
+    bilateral: bool = False
     impulse: float = 1.0
     speed: float = 1.0
     restitution: float = 0.0
@@ -66,6 +69,9 @@ class ProblemSettings(BaseModel):
     weights: str | tuple[float, ...] | None = None
     objective: ObjectiveKind = "impulse"
     normal_cone: float = 0.0
+    armature_range: tuple[float, float] | None = None
+    payload: tuple[tuple[str, float], ...] = ()
+    tradeoff: Annotated[int, Field(ge=0)] = 0
     starts: Annotated[int, Field(ge=1)] = 16
     seed: Annotated[int, Field(ge=0)] = 0
 
@@ -87,17 +93,7 @@ class Prepared:
 
 def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemSettings:
     """Read a ``problem.toml``; ``over`` (options of the command line) wins.  Paths in it start from its folder."""
-    data = read_toml(path)
-    folder = path.resolve().parent
-    for key in (*_FILES, "weights", "armature", "posture"):
-        value = data.get(key)
-        if isinstance(value, str) and (folder / value).is_file():
-            data[key] = str(folder / value)
-    robot = data.get("robot")
-    if isinstance(robot, str) and names_a_path(robot, folder):
-        data["robot"] = str(folder / Path(robot).expanduser())
-    if isinstance(data.get("package_dir"), list):
-        data["package_dir"] = [str(folder / str(p)) for p in data["package_dir"]]  # type: ignore[attr-defined]
+    data = from_folder(read_toml(path), path.resolve().parent, (*_FILES, "weights", "armature", "posture"))
     over = over or {}
     # What the command line says replaces what the file says of the same thing in other words.
     if over.get("metric", "weighted") != "weighted" and "weights" not in over:
@@ -109,11 +105,7 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
         data.pop("normal", None)
     if "posture" in over:
         data.pop("q", None)
-    return validate(ProblemSettings, {key: _tuples(value) for key, value in (data | over).items()}, str(path))
-
-
-def _tuples(value: object) -> object:
-    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
+    return validate(ProblemSettings, with_tuples(data | over), str(path))
 
 
 def make_settings(values: dict[str, object]) -> ProblemSettings:
@@ -128,12 +120,6 @@ def prepare(settings: ProblemSettings) -> Prepared:
         ImpactPostureError: The first thing that is wrong, in one line.
     """
     contacts = (settings.contact,) if isinstance(settings.contact, str) else settings.contact or ()
-    if len(contacts) > 1:
-        raise InputError(
-            f"{len(contacts)} contacts are given",
-            where="--contact",
-            mend="this version optimizes one contact at a time",
-        )
     if isinstance(settings.weights, tuple) and settings.metric != "weighted":
         raise InputError(
             f"weights are listed, but the metric is {settings.metric}",
@@ -155,7 +141,8 @@ def prepare(settings: ProblemSettings) -> Prepared:
         normal=settings.normal,
         offset=settings.offset,
         normal_frame=settings.normal_frame,
-        contact=contacts[0] if contacts else None,
+        contacts=contacts,
+        bilateral=settings.bilateral,
         impulse=settings.impulse,
         posture=settings.posture if settings.q is None else None,
         supports=settings.support,
@@ -166,6 +153,8 @@ def prepare(settings: ProblemSettings) -> Prepared:
         restitution=settings.restitution,
         compliance=settings.support_compliance,
         normal_cone=settings.normal_cone,
+        armature_range=settings.armature_range,
+        payloads=tuple(Payload(frame, mass) for frame, mass in settings.payload),
     )
     impact = request.resolve()
     if isinstance(settings.weights, tuple):
@@ -187,7 +176,6 @@ def _listed_metric(settings: ProblemSettings, impact: ResolvedImpact) -> Metric:
 
 def _requirements(settings: ProblemSettings, impact: ResolvedImpact) -> Requirements:
     robot, spec = impact.robot, impact.robot.spec.constraints
-    frame = impact.contact.frame
     free = tuple(j for j in spec.hold if j not in robot.locked)
     base: BaseMode = "level" if spec.level_base and robot.floating else "free"
     com = spec.com_over_feet and bool(impact.supports) if settings.com is None else settings.com
@@ -198,7 +186,8 @@ def _requirements(settings: ProblemSettings, impact: ResolvedImpact) -> Requirem
     if settings.keep_contacts and not impact.supports:
         raise InputError("there are no feet to keep", where="--keep-contacts", mend="add --support or leave it out")
     return Requirements(
-        contact_pose=settings.contact_pose or robot.contact_pose(frame),
+        contact_pose=settings.contact_pose or robot.contact_pose(impact.contact.frame),
+        other_poses=tuple(settings.contact_pose or robot.contact_pose(c.frame) for c in impact.objective.others),
         target_position=settings.target_position,
         target_quaternion=settings.target_quaternion,
         box=settings.box,
@@ -207,6 +196,7 @@ def _requirements(settings: ProblemSettings, impact: ResolvedImpact) -> Requirem
         keep=settings.keep,
         hold=free if settings.hold is None else settings.hold,
         com_over_feet=com,
+        com_asked=settings.com is not None,
         com_margin=spec.com_margin if settings.com_margin is None else settings.com_margin,
         keep_contacts=settings.keep_contacts,
         friction=settings.friction,
@@ -225,19 +215,16 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         "robot": robot,
         "root": impact.robot.root,
         "package_dir": tuple(str(Path(p).expanduser().resolve()) for p in settings.package_dir),
-        "frame": impact.contact.frame,
-        "normal": impact.contact.normal,
-        "offset": impact.contact.offset,
-        "contact": None,
-        "impulse": impact.contact.impulse,
+        **_resolved_contacts(impact),
         "posture": None,
         "q": tuple(float(v) for v in impact.q),
-        "contact_pose": wanted.contact_pose,
+        # One key for all contacts: where they differ it is left to robot.toml, as it was.
+        "contact_pose": settings.contact_pose if wanted.other_poses else wanted.contact_pose,
         "support": tuple(f"{s.frame}:{s.kind}" for s in impact.supports),
         "support_compliance": impact.objective.compliance if impact.supports else None,
         "hold": wanted.hold,
         "base": wanted.base,
-        "com": wanted.com_over_feet,
+        "com": any(isinstance(c, CenterOfMassOverFeet) for c in prepared.problem.constraints),
         "com_margin": wanted.com_margin,
         "limit_margin": wanted.limit_margin,
         "weights": impact.metric.weights,
@@ -248,6 +235,15 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
     if settings.armature is not None:
         changes["armature"] = _armature_by_joint(impact)
     return settings.model_copy(update=changes)
+
+
+def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
+    contact = impact.contact
+    if not impact.objective.others:
+        one = {"frame": contact.frame, "normal": contact.normal, "offset": contact.offset}
+        return one | {"contact": None, "impulse": contact.impulse}
+    texts = tuple(f"{c.frame}:{','.join(map(repr, c.normal))}:{c.impulse!r}" for c in impact.objective.contacts)
+    return {"frame": None, "normal": None, "offset": None, "contact": texts}
 
 
 def _armature_by_joint(impact: ResolvedImpact) -> str | dict[str, float]:

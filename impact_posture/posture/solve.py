@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing.pool import Pool
@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ContactError, Infeasible, MetricError, SolverFailed
+from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.posture.blas import one_blas_thread
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
+from impact_posture.posture.distance import distance
 from impact_posture.posture.elastic import elastic
 from impact_posture.posture.equalities import equality_jacobian, rank
-from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp, distance_squared_fun
+from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp
+from impact_posture.posture.notes import notes_on_blows
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import Projector, feasible_start
 
@@ -29,9 +33,9 @@ Vector = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 # Optima closer than this in posture (tangent norm) and in objective (relative) are one.
-_SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
-# The share of the initial 1/mass below which a contact counts as locked, and the starts from which one hit is few.
-_LOCKED, _MANY = 0.05, 8
+SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
+# The starts from which one hit is few.
+_MANY = 8
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,7 @@ class _Run:
     certificate: Certificate | None
 
 
+@one_blas_thread()
 def solve(
     problem: PostureProblem,
     *,
@@ -113,8 +118,9 @@ def solve(
     jobs: int = 2,
     compile: CompileMode = "auto",
     progress: Progress | None = None,
+    guesses: Sequence[Vector] = (),
 ) -> PostureSolution:
-    """Solve from the given posture and ``starts − 1`` random feasible ones.
+    """Solve from the given posture, from feasible ``guesses`` and from random feasible ones: ``starts`` in all.
 
     Raises:
         Infeasible: No posture satisfies the constraints; names those that conflict.
@@ -124,7 +130,8 @@ def solve(
     began = time.perf_counter()
     nlp = build_nlp(problem, compile=compile, starts=starts)
     scale = _initial_objective(problem, initial)
-    runs = _run_all(nlp, initial, scale, starts, seed, jobs, progress)
+    job = _Job(nlp, (initial, *guesses), scale, seed)
+    runs = _run_all(job, starts, jobs, progress)
     good = [r for r in runs if r.certificate is not None and r.certificate.holds()]
     if not good:
         raise _failure(runs)
@@ -141,7 +148,12 @@ def solve(
     elif best.objective > scale * (1 - 1e-6):
         notes.append("no better posture found: the initial one is already (locally) optimal for this blow")
     optima = distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None])
-    notes += _notes_on_answer(problem, initial, q, optima)
+    notes += notes_on_blows(problem, initial, q)
+    hits = sum(o.hits for o in optima)
+    if len(optima) > 1 and optima[0].hits == 1 and hits >= _MANY:
+        notes.append(
+            f"the best of {len(optima)} optima was found once in {hits} starts: more --starts may find a better one"
+        )
     return PostureSolution(
         problem=problem,
         initial=initial,
@@ -193,21 +205,25 @@ def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
     Raises:
         ContactError: The contact point cannot move along the normal there.
     """
-    if problem.objective.normal_cone_deg:
-        value = problem.objective.value(initial)
-        blocked = not (np.isfinite(value) and value > 0)
-    else:
-        found = problem.objective.oracle.quantities(initial)
-        blocked = not found.G > 1e-12 * float(np.linalg.eigvalsh(found.mobility)[-1])
-    if blocked:
+    objective = problem.objective
+    # A normal along which nothing can move leaves rounding; in a cone around it there are others.
+    quantities = [single.oracle.quantities(initial) for single in objective.singles]
+    moves = bool(objective.normal_cone_deg) or any(_moves(found) for found in quantities)
+    value = objective.value(initial) if moves else 0.0
+    if not (np.isfinite(value) and value > 0):
         raise ContactError(
-            f"the contact point at '{problem.objective.contact.frame}' cannot move along the normal",
+            f"the contact point at '{objective.contact.frame}' cannot move along the normal",
             where="--normal",
             mend="choose another frame, normal or posture: a blow along it moves nothing",
         )
-    return problem.objective.value(initial)
+    return value
 
 
+def _moves(found: ImpactQuantities) -> bool:
+    return bool(found.G > 1e-12 * float(np.linalg.eigvalsh(found.mobility)[-1]))
+
+
+@one_blas_thread()
 def run_start(nlp: PostureNLP, start: Vector, scale: float) -> tuple[SolveRecord, Certificate]:
     """Solve from one feasible start and certify what comes out; try the objective's other guesses if it does not."""
     record = nlp.solve(start, scale=scale)
@@ -217,12 +233,28 @@ def run_start(nlp: PostureNLP, start: Vector, scale: float) -> tuple[SolveRecord
             break
         again = nlp.solve(start, scale=scale, attempt=attempt)
         certificate = certify(nlp.problem, again.q, scale)
-        record = replace(again, iterations=record.iterations + again.iterations, time_s=record.time_s + again.time_s)
+        record = replace(
+            again,
+            iterations=record.iterations + again.iterations,
+            time_s=record.time_s + again.time_s,
+            cpu_s=record.cpu_s + again.cpu_s,
+        )
     return record, certificate
 
 
-def _run(nlp: PostureNLP, initial: Vector, scale: float, index: int, seed: int) -> _Run:
-    start = initial if index == 0 else feasible_start(nlp.problem, index, seed)
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """What every start shares: the program, the first starts, the scale, the seed of the others."""
+
+    nlp: PostureNLP
+    known: tuple[Vector, ...]
+    scale: float
+    seed: int
+
+
+def _run(job: _Job, index: int) -> _Run:
+    nlp, scale = job.nlp, job.scale
+    start = job.known[index] if index < len(job.known) else feasible_start(nlp.problem, index, job.seed)
     if start is None:
         return _Run(None, None, np.inf, np.inf, None)
     try:
@@ -231,28 +263,24 @@ def _run(nlp: PostureNLP, initial: Vector, scale: float, index: int, seed: int) 
     except MetricError:
         # This start led to a posture where the objective does not exist; the others go on.
         return _Run(start, None, np.inf, np.inf, None)
-    problem, chart = nlp.problem, nlp.chart
+    problem = nlp.problem
     minimized = objective / scale
     if problem.requirements.regularization:
-        distance = distance_squared_fun(chart)(chart.to_x(record.q), chart.to_x(problem.given))
-        minimized += problem.requirements.regularization * float(distance)
+        minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
     return _Run(start, record, objective, minimized, certificate)
 
 
 # Worker processes are forked and find the program here: a CasADi solver cannot be sent to them.
-_WORK: dict[str, tuple[PostureNLP, Vector, float, int]] = {}
+_WORK: dict[str, _Job] = {}
 
 
 def _worker(index: int) -> tuple[int, _Run]:
-    nlp, initial, scale, seed = _WORK["job"]
-    return index, _run(nlp, initial, scale, index, seed)
+    return index, _run(_WORK["job"], index)
 
 
-def _run_all(
-    nlp: PostureNLP, initial: Vector, scale: float, starts: int, seed: int, jobs: int, progress: Progress | None
-) -> list[_Run]:
+def _run_all(job: _Job, starts: int, jobs: int, progress: Progress | None) -> list[_Run]:
     runs: dict[int, _Run] = {}
-    with _results(nlp, initial, scale, starts, seed, jobs) as results:
+    with _results(job, starts, jobs) as results:
         for index, run in results:
             runs[index] = run
             if progress:
@@ -261,14 +289,12 @@ def _run_all(
 
 
 @contextmanager
-def _results(
-    nlp: PostureNLP, initial: Vector, scale: float, starts: int, seed: int, jobs: int
-) -> Iterator[Iterator[tuple[int, _Run]]]:
+def _results(job: _Job, starts: int, jobs: int) -> Iterator[Iterator[tuple[int, _Run]]]:
     """Runs as they finish, from forked processes where the system can fork and it pays."""
     if jobs < 2 or starts < 4 or "fork" not in multiprocessing.get_all_start_methods():
-        yield ((index, _run(nlp, initial, scale, index, seed)) for index in range(starts))
+        yield ((index, _run(job, index)) for index in range(starts))
         return
-    _WORK["job"] = (nlp, initial, scale, seed)
+    _WORK["job"] = job
     # Ctrl-C reaches every process of the terminal's group: workers must never see it, not even at birth.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -294,7 +320,7 @@ def distinct(problem: PostureProblem, ends: list[tuple[Vector, float]]) -> tuple
     for q, objective in sorted(ends, key=lambda end: end[1]):
         for k, known in enumerate(found):
             near = abs(objective - known.objective) <= _SAME_OBJECTIVE * max(abs(known.objective), 1e-300)
-            if near and np.linalg.norm(_wrapped_difference(problem, known.q, q)) < _SAME_POSTURE:
+            if near and np.linalg.norm(wrapped_difference(problem, known.q, q)) < SAME_POSTURE:
                 found[k] = Optimum(known.q, known.objective, known.hits + 1)
                 break
         else:
@@ -302,38 +328,13 @@ def distinct(problem: PostureProblem, ends: list[tuple[Vector, float]]) -> tuple
     return tuple(found)
 
 
-def _wrapped_difference(problem: PostureProblem, one: Vector, other: Vector) -> Vector:
+def wrapped_difference(problem: PostureProblem, one: Vector, other: Vector) -> Vector:
     """``other ⊖ one`` with full turns of revolute joints taken out."""
     step = np.array(pin.difference(problem.robot.model, one, other))
     for slot in Chart(problem.robot.model).slots:
         if slot.kind.family == "revolute":
             step[slot.v] = (step[slot.v] + np.pi) % (2 * np.pi) - np.pi
     return step
-
-
-def _notes_on_answer(problem: PostureProblem, initial: Vector, q: Vector, optima: tuple[Optimum, ...]) -> list[str]:
-    """What numbers alone would not tell a user."""
-    notes = []
-    found = problem.objective.oracle
-    start, end = found.quantities(initial), found.quantities(q)
-    before, after = start.G, end.G
-    if problem.objective.kind == "impulse" and end.V > start.V * (1 + 1e-3) and after >= _LOCKED * before:
-        notes.append(
-            f"at a given approach speed without friction the jump grows: V {start.V:.4g} to {end.V:.4g}; "
-            "--objective speed minimizes that"
-        )
-    if after < _LOCKED * before:
-        notes.append(
-            "the contact is nearly locked along the normal there: its effective mass is "
-            f"{before / max(after, 1e-300):.3g} times that of the start, and so is the impulse at a given approach "
-            "speed; compare V and S, or minimize them (--objective speed, sticking)"
-        )
-    if len(optima) > 1 and optima[0].hits == 1 and sum(o.hits for o in optima) >= _MANY:
-        notes.append(
-            f"the best of {len(optima)} optima was found once in {sum(o.hits for o in optima)} starts: "
-            "more --starts may find a better one"
-        )
-    return notes
 
 
 def _failure(runs: list[_Run]) -> SolverFailed:

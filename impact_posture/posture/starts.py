@@ -20,6 +20,8 @@ Vector = NDArray[np.float64]
 
 _ATTEMPTS = 20
 _STEPS = 80
+# Of a matrix's size: what makes a singular one regular.
+_ROUNDING = 1e-13
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,9 @@ class Projector:
             free = jacobian.copy()
             free[:, self._held | self._blocked(q, -jacobian.T @ value)] = 0.0
             gram = free @ free.T
-            step = -free.T @ np.linalg.solve(gram + damping * min(1.0, size) * np.eye(len(gram)), value)
+            # Rows may repeat others (two frames on one link): damping that goes to zero must not go below rounding.
+            damped = damping * min(1.0, size) + _ROUNDING * max(1.0, float(np.trace(gram)))
+            step = -free.T @ np.linalg.solve(gram + damped * np.eye(len(gram)), value)
             step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-12))
             candidate = self.clip(pin.integrate(self.problem.robot.model, q, step))
             new_value, new_jacobian = self.residual(candidate)

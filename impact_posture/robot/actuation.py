@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import linprog, lsq_linear
 
 from impact_posture.errors import FrameNotFound, PostureError, SpecError
 from impact_posture.robot.spec import PropulsionSpec
@@ -203,6 +202,9 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
     thrust limits and to ``|h_j + M_j e a| <= τ_max`` for the joints that hold the arm still; ``e`` moves the
     whole robot one way.  Give a level base for the force at zero tilt.
     """
+    # Here, not above: the online controllers want G alone, and SciPy's optimizers take long to load.
+    from scipy.optimize import linprog
+
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)
     q = _configuration(model, q)
@@ -239,6 +241,8 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
 
 def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
     """Thrusts with ``A f = w``, as far from their limits as can be; if there are none, the nearest within."""
+    from scipy.optimize import linprog, lsq_linear
+
     count = matrix.shape[1]
     if count == 6 and np.linalg.matrix_rank(matrix) == 6:
         return np.asarray(np.linalg.solve(matrix, wrench))

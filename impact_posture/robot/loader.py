@@ -111,6 +111,28 @@ def names_a_path(robot: str, folder: Path) -> bool:
     return robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or (folder / robot).is_file()
 
 
+def from_folder(data: dict[str, object], folder: Path, files: Sequence[str]) -> dict[str, object]:
+    """Let the paths in a file's content start from the file's folder.
+
+    Args:
+        data: Of a file that names a ``robot`` as the command line does; not changed.
+        folder: Where the file lies.
+        files: Keys that may name files.
+    """
+    data = dict(data)
+    for key in files:
+        value = data.get(key)
+        if isinstance(value, str) and (folder / value).is_file():
+            data[key] = str(folder / value)
+    robot = data.get("robot")
+    if isinstance(robot, str) and names_a_path(robot, folder):
+        data["robot"] = str(folder / Path(robot).expanduser())
+    folders = data.get("package_dir")
+    if isinstance(folders, list):
+        data["package_dir"] = [str(folder / str(name)) for name in folders]
+    return data
+
+
 def _locate(robot: str, options: LoadOptions) -> tuple[RobotSpec, Path, str, Path, str]:
     """Return spec, URDF file, its printable source, the folder that relative paths start from, and the name."""
     own = robots_data() / robot / "robot.toml"

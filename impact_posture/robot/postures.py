@@ -134,6 +134,23 @@ def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: st
         if len(pose) != 7:
             raise PostureError(f"'base' has {len(pose)} numbers", where=where, mend="give [x, y, z, qx, qy, qz, qw]")
         q[:7] = pose
+    return set_joints(robot, q, joints, where)
+
+
+def set_joints(robot: Robot, q: Vector, joints: Mapping[str, object], where: str) -> Vector:
+    """A configuration with some joints at other values; unchecked otherwise.
+
+    Args:
+        robot: The robot.
+        q: The configuration, shape (nq,); not changed.
+        joints: Values by name: one number for a joint of one degree of freedom, its entries of q for others.
+        where: What to name in errors.
+
+    Raises:
+        JointNotFound: With the nearest names.
+        PostureError: A value that is none.
+    """
+    q = q.copy()
     for name, value in joints.items():
         if name in robot.locked:
             continue  # a robot's own message names all its joints; a rigid one has no value to set

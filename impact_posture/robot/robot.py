@@ -150,8 +150,9 @@ class Robot:
         return int(self.model.getJointId(name))
 
     def contact_pose(self, frame: str) -> ContactPose:
-        """What is held of a contact frame unless the user says otherwise."""
-        return self.spec.contact.frames.get(frame, self.spec.contact.pose)
+        """What is held of a contact frame unless the user says otherwise; of a ball of a foot its position."""
+        balls = [foot.frame for foot in self.spec.supports if foot.kind == "point"]
+        return self.spec.contact.frames.get(frame, "position" if frame in balls else self.spec.contact.pose)
 
     def posture(self, name: str | None = None) -> Vector:
         """Return a copy of the named posture (the default one without a name), shape (nq,).
@@ -191,18 +192,13 @@ class Robot:
 
     def _check_norms(self, q: Vector, where: str) -> None:
         """Refuse quaternions, and cosines with sines of continuous joints, that are not of unit length."""
-        for i in range(1, self.model.njoints):
-            width, name = int(self.model.nqs[i]), str(self.model.names[i])
-            if width == int(self.model.nvs[i]):
-                continue
-            # Quaternions (and cosine with sine) come last in a joint's numbers.
-            count = 4 if int(self.model.nvs[i]) in (3, 6) and "Planar" not in self.model.joints[i].shortname() else 2
-            last = int(self.model.idx_qs[i]) + width
-            norm = float(np.linalg.norm(q[last - count : last]))
+        for i, part in unit_parts(self.model):
+            norm = float(np.linalg.norm(q[part]))
             if abs(norm - 1) > 1e-3:
-                what = "quaternion" if count == 4 else "pair of cosine and sine"
+                four, name = part.stop - part.start == 4, str(self.model.names[i])
+                what = "quaternion" if four else "pair of cosine and sine"
                 whose = f"the base {what}" if self.floating and i == 1 else f"the {what} of joint '{name}'"
-                order = " x y z w" if count == 4 else ""
+                order = " x y z w" if four else ""
                 raise PostureError(f"{whose} has norm {norm:.4g}", where=where, mend=f"give a unit {what}{order}")
 
     def _check_swapped(self, quaternion: Vector, where: str) -> None:
@@ -251,3 +247,14 @@ def _single(joint: pin.JointModel) -> pin.Model:
 def _rounded(values: object) -> list[str]:
     # 12 digits, and no dust of sines that should be zero: a model read twice, or on another machine, hashes the same.
     return [f"{v:.12g}" if abs(v) > _DUST else "0" for v in map(float, np.asarray(values).reshape(-1))]
+
+
+def unit_parts(model: pin.Model) -> list[tuple[int, slice]]:
+    """Joints whose ``q`` holds a quaternion or a cosine with its sine, and where: last among the joint's numbers."""
+    found = []
+    for joint in range(1, model.njoints):
+        width, freedom, start = int(model.nqs[joint]), int(model.nvs[joint]), int(model.idx_qs[joint])
+        if width != freedom:
+            count = 4 if freedom in (3, 6) and "Planar" not in model.joints[joint].shortname() else 2
+            found.append((joint, slice(start + width - count, start + width)))
+    return found

@@ -142,7 +142,9 @@ def validate(cls: type[_Model], data: object, where: str) -> _Model:
     try:
         return cls.model_validate(data)
     except ValidationError as error:
-        fault = error.errors()[0]
+        # A misspelt key that must be there is misspelt first, and missing second.
+        faults = error.errors()
+        fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
         path = ".".join(str(part) for part in fault["loc"])
         if fault["type"] == "extra_forbidden":
             known = _keys_at(cls, fault["loc"][:-1])
@@ -173,6 +175,13 @@ def read_toml(path: Path) -> dict[str, object]:
         raise SpecError(f"cannot be read ({error})", where=str(path), mend="check the file") from None
     except tomllib.TOMLDecodeError as error:
         raise SpecError(f"is not valid TOML ({error})", where=str(path), mend="correct the syntax") from None
+
+
+def with_tuples(value: object) -> object:
+    """The same data with every list a tuple, as strict models want it."""
+    if isinstance(value, dict):
+        return {key: with_tuples(inner) for key, inner in value.items()}
+    return tuple(with_tuples(inner) for inner in value) if isinstance(value, list) else value
 
 
 def read_spec(path: Path, over: Path | None = None) -> RobotSpec:

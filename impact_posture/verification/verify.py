@@ -45,7 +45,7 @@ class Tolerances:
 
     @staticmethod
     def of(objective: ImpactObjective) -> Tolerances:
-        """The tolerances in force: feet at compliance ε make a system of condition 1/ε, which costs digits."""
+        """The tolerances in force: heavy feet at compliance ε make a system of condition 1/ε, which costs digits."""
         return Tolerances(values=1e-7, differences=1e-6) if objective.supports else Tolerances()
 
 

@@ -15,7 +15,9 @@ from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.settings import make_settings, prepare
 
 
-def default_problem(name: str, frame: str, normal: tuple[float, float, float], **more: object) -> PostureProblem:
+def default_problem(
+    name: str, frame: str | None, normal: tuple[float, float, float] | None, **more: object
+) -> PostureProblem:
     """The problem that ``impact-posture optimize NAME --frame F --normal …`` solves."""
     return prepare(make_settings({"robot": name, "frame": frame, "normal": normal, **more})).problem
 

@@ -1,0 +1,209 @@
+"""Several contacts at once: the largest jump that impulses within a box can give.
+
+``‖Σ λ_i a_i‖²_W`` with ``a_i = M⁻¹J_iᵀn_i`` is a convex quadratic ``λᵀKλ`` of the impulses, ``K_ij = a_iᵀWa_j``, so
+its maximum over ``0 ≤ λ_i ≤ λ̄_i`` (``|λ_i| ≤ λ̄_i`` where contacts can pull) is at a corner of the box: one of
+``2^m − 1`` (``2^(m−1)``, up to sign).  In the program: ``min t`` with ``t ≥ λᵀKλ`` at every corner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.errors import ContactError, MetricError
+from impact_posture.impact.inner import Subgradients, finite_maximum, first_of_largest
+from impact_posture.impact.lifted import (
+    ABOVE,
+    Guess,
+    Lifted,
+    blow_at,
+    unknown_jump,
+    weighed,
+    worst_of,
+    worst_of_guesses,
+)
+
+if TYPE_CHECKING:
+    from impact_posture.impact.kernel import ImpactKernel
+    from impact_posture.impact.objective import ImpactObjective
+
+Vector = NDArray[np.float64]
+
+# 63 corners; each one more doubles the rows of the program.
+MOST_CONTACTS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class WorstImpulses:
+    """The corner of the box of impulses that jolts the robot most.
+
+    Attributes:
+        value: ``λᵀKλ`` there: the objective.
+        impulses: λ of each contact, N·s, shape (m,).
+        tied: All corners as bad as this one, it first, shape (k, m).
+        jump: ``Δν`` of it, shape (nv,).
+    """
+
+    value: float
+    impulses: Vector
+    tied: Vector
+    jump: Vector
+
+    def to_dict(self) -> dict[str, object]:
+        """The ``worst_impulses`` block of an evaluation."""
+        return {
+            "impulses": [float(v) for v in self.impulses],
+            "tied": len(self.tied) > 1,
+            "corners": [[float(v) for v in corner] for corner in self.tied],
+            "jump_norm": float(np.sqrt(max(self.value, 0.0))),
+        }
+
+
+def check_contacts(objective: ImpactObjective) -> None:
+    """Refuse what has no box of impulses to take the worst of.
+
+    Raises:
+        ContactError: Too many contacts, or one point along one normal twice.
+        MetricError: An objective per approach speed, or a cone of normals.
+    """
+    contacts = objective.contacts
+    if len(contacts) == 1:
+        if objective.bilateral:
+            raise ContactError(
+                "there is one contact: pulling is as bad as pushing", where="--bilateral", mend="leave it out"
+            )
+        return
+    if len(contacts) > MOST_CONTACTS:
+        raise ContactError(f"{len(contacts)} contacts", where="--contact", mend=f"give up to {MOST_CONTACTS}")
+    for i, one in enumerate(contacts):
+        for other in contacts[:i]:
+            if (one.frame, one.offset, one.normal) == (other.frame, other.offset, other.normal):
+                raise ContactError(f"'{one.frame}' is given twice", where="--contact", mend="remove one")
+    if objective.kind != "impulse":
+        raise MetricError(
+            f"{objective.kind} is per approach speed of one contact: of several at once the impulses are not known "
+            "from it",
+            where="--objective",
+            mend="choose impulse, whose bounds are given, or one --contact",
+        )
+    if objective.normal_cone_deg:
+        raise MetricError(
+            "the worst case over a cone of normals is exact for one contact only",
+            where="--normal-cone",
+            mend="give one --contact, or leave the cone out",
+        )
+
+
+def corners(count: int, bilateral: bool) -> Vector:
+    """Corners of the unit box as rows: of 0 and 1 without the origin, or of ±1 up to sign, shape (k, count)."""
+    if bilateral:
+        return np.array([[1.0, *rest] for rest in product((1.0, -1.0), repeat=count - 1)])
+    # From all contacts at once down: of equally bad ones the first is the one that a user expects.
+    found = sorted(product((1.0, 0.0), repeat=count), key=lambda corner: -sum(corner))
+    return np.array(found[:-1])
+
+
+@dataclass(frozen=True)
+class BoxOfImpulses:
+    """The worst corner of ``0 ≤ λ_i ≤ λ̄_i``, or of ``|λ_i| ≤ λ̄_i``."""
+
+    objective: ImpactObjective
+    attempts: int = len(ABOVE)
+
+    @cached_property
+    def corners(self) -> Vector:
+        """Impulses at the corners, N·s, shape (k, m)."""
+        bounds = np.array([contact.impulse for contact in self.objective.contacts])
+        return np.asarray(corners(len(bounds), self.objective.bilateral) * bounds)
+
+    def worst(self, q: Vector) -> WorstImpulses:
+        """The worst corner at ``q``, from Pinocchio's numbers."""
+        jumps, values = self._jumps_and_values(q)
+        leading, tied, _ = finite_maximum(values)
+        impulses = self.corners[leading]
+        return WorstImpulses(float(values[leading]), impulses, self.corners[tied], jumps @ impulses)
+
+    def value(self, q: Vector) -> float:
+        """See :class:`~impact_posture.impact.inner.InnerMaximum`."""
+        return float(self._jumps_and_values(q)[1].max())
+
+    def gradient(self, q: Vector) -> Vector:
+        """See :class:`~impact_posture.impact.inner.InnerMaximum`."""
+        return self._gradient(q, self.worst(q).impulses)
+
+    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+        """See :class:`~impact_posture.impact.inner.InnerMaximum`; of all corners that tie."""
+        _, tied, gaps = finite_maximum(self._jumps_and_values(q)[1], within)
+        return Subgradients(np.array([self._gradient(q, self.corners[k]) for k in tied]), gaps)
+
+    def _jumps_and_values(self, q: Vector) -> tuple[Vector, Vector]:
+        """``a_i`` as columns, shape (nv, m), and ``λᵀKλ`` at every corner, shape (k,)."""
+        singles = self.objective.singles
+        jumps = np.stack([single.oracle.quantities(q).jump for single in singles], axis=1)
+        K = jumps.T @ singles[0].oracle.at(q).weigh(jumps)
+        return jumps, np.asarray(np.einsum("ki,ij,kj->k", self.corners, K, self.corners))
+
+    def _gradient(self, q: Vector, impulses: Vector) -> Vector:
+        """``∂_q‖Σ λ_i a_i‖²_W = 2 ∂_q[Σ λ_i n_iᵀJ_i b − bᵀMa]``, shape (nv,)."""
+        oracles = [single.oracle.at(q) for single in self.objective.singles]
+        first = oracles[0]
+        blows = np.stack([oracle.J.T @ oracle.n for oracle in oracles], axis=1)
+        x = first.answer(blows @ impulses)
+        y = first.answer(first.weigh(x.a))
+        gradient = -first.inertial(y, x)
+        for weight, oracle in zip(impulses, oracles, strict=True):
+            own, in_frame = np.array(oracle.contact.normal), oracle.contact.normal_frame == "contact"
+            gradient = gradient + weight * oracle.coupling(own, y.a, in_frame)
+        return np.asarray(2 * gradient + first.metric_gradient(x.a))
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """See :class:`~impact_posture.impact.inner.InnerMaximum`: ``K``, its worst corner, one gradient there."""
+        blows = self._blows(k.n)
+        jumps = [k.answer([blow]) for blow in blows]
+        K = _gram(len(jumps), lambda i, j: k.product(jumps[i], jumps[j]))
+        rows = [ca.DM(corner) for corner in self.corners]
+        _, impulses = first_of_largest([_form(K, row) for row in rows], [ca.SX(row) for row in rows])
+        worst = k.answer([
+            Wrench(blow.point, blow.force * impulses[i], blow.moment, blow.in_frame) for i, blow in enumerate(blows)
+        ])  # fmt: skip
+        return k.product(worst, worst), k.size_gradient(worst)
+
+    def lift(self, tree: Tree, n: ca.SX, scale: ca.SX) -> Lifted:
+        """See :class:`~impact_posture.impact.inner.InnerMaximum`: a jump a contact, ``t`` above each corner."""
+        jumps = [unknown_jump(self.objective, tree, blow, f"{i}_") for i, blow in enumerate(self._blows(n))]
+        K = _gram(len(jumps), lambda i, j: weighed(self.objective, jumps[i], jumps[j]))
+        parts = [Lifted(jump.variables, jump.residual, ca.SX(0)) for jump in jumps]
+        return worst_of(parts, [_form(K, ca.DM(corner)) for corner in self.corners], scale)
+
+    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
+        """See :class:`~impact_posture.impact.inner.InnerMaximum`."""
+        found = [single.oracle.quantities(q) for single in self.objective.singles]
+        parts = [np.concatenate([one.jump, one.support_impulse]) for one in found]
+        guesses = [Guess(p, np.full(p.size, -np.inf)) for p in parts]
+        return worst_of_guesses(guesses, self.value(q) / scale, attempt)
+
+    def _blows(self, n: ca.SX) -> list[Wrench]:
+        """Unit blows of all contacts; the leading one's normal is an input, the others' are constants."""
+        leading = blow_at(self.objective, self.objective.contact, n)
+        others = self.objective.others
+        return [leading, *[blow_at(self.objective, other, ca.SX(np.array(other.normal))) for other in others]]
+
+
+def _gram(count: int, entry: Callable[[int, int], ca.SX]) -> ca.SX:
+    K = ca.SX.zeros(count, count)
+    for i in range(count):
+        for j in range(i, count):
+            K[i, j] = K[j, i] = entry(i, j)
+    return K
+
+
+def _form(K: ca.SX, row: ca.DM) -> ca.SX:
+    return ca.bilin(K, ca.SX(row), ca.SX(row))

@@ -1,0 +1,61 @@
+"""Which feet stay: from what a user named, and what no blow can be at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import get_args
+
+import numpy as np
+
+from impact_posture.errors import ContactError, FrameNotFound, InputError
+from impact_posture.impact.contact import Contact, Support, point_on
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.spec import SupportKind
+
+
+def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support, ...]:
+    """Turn ``FRAME[:point|surface]`` into supports; without texts those of ``robot.toml``.
+
+    A frame that ``robot.toml`` lists keeps its kind, offset and size from there.
+
+    Raises:
+        FrameNotFound: With the nearest names.
+        InputError: A frame given twice.
+    """
+    known = {spec.frame: Support.from_spec(spec) for spec in robot.spec.supports}
+    if texts is None:
+        found = list(known.values())
+    else:
+        found = [_support(robot, text, known) for text in texts]
+    for support in found:
+        if sum(s.frame == support.frame for s in found) > 1:
+            raise InputError(f"frame '{support.frame}' is given twice", where="--support", mend="remove one")
+        point_on(robot, support.frame, support.offset)
+    return tuple(found)
+
+
+def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
+    frame, kind = text, None
+    for candidate in get_args(SupportKind):
+        if text.endswith(f":{candidate}"):
+            frame, kind = text.removesuffix(f":{candidate}"), candidate
+    if frame not in robot.frame_names:
+        raise FrameNotFound(frame, robot.frame_names, where="--support", mend="(or FRAME:point, FRAME:surface)")
+    base = known.get(frame, Support(frame))
+    return Support(frame, kind or base.kind, base.offset, base.size)
+
+
+def refuse_held(robot: Robot, contact: Contact, supports: Sequence[Support]) -> None:
+    """Refuse a blow at a point that a support holds: nothing but the compliance would answer it."""
+    point = point_on(robot, contact.frame, contact.offset)
+    for support in supports:
+        foot = point_on(robot, support.frame, support.offset)
+        if foot.joint != point.joint:
+            continue
+        same_point = float(np.linalg.norm(foot.position - point.position)) < 1e-6
+        if support.kind == "surface" or support.frame == contact.frame or same_point:
+            raise ContactError(
+                f"the contact point is held by the support at '{support.frame}'",
+                where=f"--frame {contact.frame}",
+                mend="choose another frame, name the other --support frames, or --no-support",
+            )

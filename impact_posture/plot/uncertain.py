@@ -1,0 +1,80 @@
+"""The cone of an uncertain normal and the worst normals in it, as shadows and in space."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from impact_posture.impact.cone import WorstNormal
+from impact_posture.plot.shapes import Plane, Vector, cone_rim, cone_shadow, half_width
+from impact_posture.plot.style import GRAY, PALE, WORST_AFTER, WORST_BEFORE
+from impact_posture.plot.view import ResultView, number
+
+# How far arrows reach, as a part of the panel's limit; a worst normal on the cone's edge ends on the rim.
+REACH = 0.92
+
+
+def has_cone(view: ResultView) -> bool:
+    """Whether the view's normal is uncertain."""
+    return view.objective.normal_cone_deg > 0
+
+
+def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) -> None:
+    """Draw the shadow of the cone (of each of two, where n turned) and the worst normals before and after."""
+    if not has_cone(view):
+        return
+    for n in _axes_of_cones(view):
+        outline = cone_shadow(n, view.objective.normal_cone_deg, REACH * limit, plane.axes)
+        axes.fill(*outline, facecolor=PALE, edgecolor="none", alpha=0.55, zorder=0.5)
+        axes.plot(*outline, color=GRAY, linewidth=0.6, zorder=0.6)
+    for word, found, _, line in _worst(view):
+        for normal in found.normals:
+            tip = plane.axes @ normal * REACH * limit
+            arrow = {"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8, **line}
+            # The dashes on top, as with the ellipsoids.
+            axes.annotate("", tuple(tip), (0, 0), arrowprops=arrow, zorder=4.6 if word == "before" else 4.5)
+
+
+def draw_uncertainty_3d(axes: Any, view: ResultView, limit: float) -> None:
+    """Draw the cone's surface and rim, and the worst normals."""
+    if not has_cone(view):
+        return
+    for n in _axes_of_cones(view):
+        rim = cone_rim(n, view.objective.normal_cone_deg, limit, 49)
+        sheet = [row[None] * [[0.0], [1.0]] for row in rim]
+        axes.plot_surface(*sheet, color=GRAY, alpha=0.15, shade=False, linewidth=0)
+        axes.plot(*rim, color=GRAY, linewidth=0.6)
+    for _, found, _, line in _worst(view):
+        for normal in found.normals:
+            axes.quiver(0, 0, 0, *(normal * limit), arrow_length_ratio=0.12, **line)
+
+
+def uncertainty_handles(view: ResultView) -> list[Any]:
+    """Legend entries: the cone, and the worst normals with the half-width of Λ_c along them."""
+    if not has_cone(view):
+        return []
+    cone = f"cone of {view.objective.normal_cone_deg:g}° about n"
+    handles: list[Any] = [Patch(facecolor=PALE, edgecolor=GRAY, linewidth=0.6, label=cone)]
+    for word, found, ellipsoid, line in _worst(view):
+        width = number(half_width(ellipsoid, found.normal))
+        tied = f", {len(found.normals)} tied" if found.tied else ""
+        label = f"worst {word}: {number(found.angle_deg)}° off{tied},\njump {width} per N·s"
+        handles.append(Line2D([], [], label=label, **line))
+    return handles
+
+
+def _axes_of_cones(view: ResultView) -> list[Vector]:
+    """World axis of the cone, or both where it turned with the contact frame."""
+    before, after = view.before.normal, view.after.normal
+    return [after] if abs(before - after).max() < 1e-3 else [before, after]
+
+
+def _worst(view: ResultView) -> list[tuple[str, WorstNormal, Vector, dict[str, Any]]]:
+    """Name, worst normals, ellipsoid and line of each posture that has them."""
+    found = [
+        ("before", view.worst_before, view.before.ellipsoid, WORST_BEFORE),
+        ("after", view.worst_after, view.after.ellipsoid, WORST_AFTER),
+    ]
+    return [(word, worst, ellipsoid, line) for word, worst, ellipsoid, line in found if worst is not None]

@@ -1,0 +1,232 @@
+"""How far the optimum moves with the model: what robustness against a few scenarios costs and what it buys."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import Infeasible, SolverFailed
+from impact_posture.impact.scenarios import FewModels
+from impact_posture.posture.compiled import CompileMode
+from impact_posture.posture.problem import PostureProblem, build_problem
+from impact_posture.posture.solve import SAME_POSTURE, PostureSolution, Progress, solve, wrapped_difference
+from impact_posture.robot.scenario import between
+
+Vector = NDArray[np.float64]
+
+# Models drawn between the scenarios, to see whether something there is worse than all of them.
+_BETWEEN = 60
+# Shares below this are what the solver leaves, and constraints within this (m, rad) are kept.
+_NOISE = 1e-6
+_KEPT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioOptimum:
+    """One scenario, and the posture that would be best if it were known to hold.
+
+    Attributes:
+        name: The scenario's.
+        at_robust: Its objective at the robust optimum.
+        own: Its objective at its own optimum; ``None`` where no start certified.
+        q: That optimum, shape (nq,), or ``None``.
+        moved: Tangent distance of it from the robust optimum, or ``None``.
+    """
+
+    name: str
+    at_robust: float
+    own: float | None
+    q: Vector | None
+    moved: float | None
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON content."""
+        return {
+            "name": self.name,
+            "at_robust": self.at_robust,
+            "own_optimum": self.own,
+            "own_q": None if self.q is None else [float(v) for v in self.q],
+            "moved": self.moved,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Robustness:
+    """The robust optimum beside that of the model as it stands.
+
+    Attributes:
+        scenarios: The first is the model as it stands.
+        worst_robust: The worst over the scenarios at the robust optimum.
+        worst_nominal: The same at the optimum of the model as it stands; ``None`` where that has none, or where it
+            breaks a constraint in another scenario.
+        broken: The constraints that it breaks.
+        between: The largest objective at the robust optimum among models drawn between the scenarios.
+        drawn: How many were drawn.
+    """
+
+    scenarios: tuple[ScenarioOptimum, ...]
+    worst_robust: float
+    worst_nominal: float | None
+    broken: tuple[str, ...]
+    between: float
+    drawn: int
+
+    @property
+    def moved(self) -> float | None:
+        """How far the optimum moved from that of the model as it stands, tangent norm."""
+        return self.scenarios[0].moved
+
+    @property
+    def price(self) -> float | None:
+        """Share by which the objective of the model as it stands is above its own optimum."""
+        own = self.scenarios[0].own
+        return None if own is None else self.scenarios[0].at_robust / own - 1
+
+    @property
+    def gain(self) -> float | None:
+        """Share by which the worst case is below that at the optimum of the model as it stands."""
+        return None if self.worst_nominal is None else 1 - self.worst_robust / self.worst_nominal
+
+    @property
+    def line(self) -> str:
+        """The finding in words."""
+        if self.moved is None or self.price is None:
+            return "the model as it stands has no certified optimum of its own to compare with"
+        parts = [f"the optimum moves by {self.moved:.3g} rad (m)"]
+        here = "at the optimum of the model as it stands"
+        if self.gain is None:
+            parts.append(f"the optimum of the model as it stands breaks {', '.join(self.broken)}")
+        elif self.gain < -_NOISE:
+            parts.append(
+                f"the worst case is {-self.gain:.1%} higher than {here}: more --starts will find a better one"
+            )
+        else:
+            parts.append(f"the worst case is {max(self.gain, 0.0):.1%} lower than {here}")
+        lower = self.price < -_NOISE
+        parts.append(
+            f"the model as it stands is {abs(self.price):.1%} {'below' if lower else 'above'} its own optimum"
+        )
+        if self.between > self.worst_robust * (1 + _NOISE):
+            parts.append(f"between the scenarios it reaches {self.between:.4g}, above the worst of them")
+        return "; ".join(parts)
+
+    def to_dict(self) -> dict[str, object]:
+        """The ``robustness`` block of ``result.json``."""
+        return {
+            "moved": self.moved,
+            "price": self.price,
+            "gain": self.gain,
+            "worst_robust": self.worst_robust,
+            "worst_nominal": self.worst_nominal,
+            "broken": list(self.broken),
+            "between": {"drawn": self.drawn, "largest": self.between},
+            "scenarios": [scenario.to_dict() for scenario in self.scenarios],
+            "line": self.line,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class RobustSolution:
+    """A solution, and what robustness means for it; ``None`` where nothing is uncertain."""
+
+    solution: PostureSolution
+    robustness: Robustness | None
+
+
+def solve_robustly(
+    problem: PostureProblem,
+    *,
+    starts: int = 16,
+    seed: int = 0,
+    jobs: int = 2,
+    compile: CompileMode = "auto",
+    progress: Progress | None = None,
+) -> RobustSolution:
+    """Solve; with scenarios each alone first, then all from the optima of these besides ``starts`` others.
+
+    Raises:
+        Infeasible, SolverFailed: See :func:`~impact_posture.posture.solve.solve`.
+    """
+    objective, given, wanted = problem.objective, problem.given, problem.requirements
+    if not isinstance(objective.inner, FewModels):
+        return RobustSolution(
+            solve(problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress), None
+        )
+    # Each built anew: what the feet bear and where the center of mass is hangs on the model.
+    alone = [
+        build_problem(scenario.robot, member, given, wanted)
+        for scenario, member in zip(objective.scenarios, objective.inner.members, strict=True)
+    ]
+    total = starts * (len(alone) + 1)
+
+    def run(one: PostureProblem, guesses: Sequence[Vector], number: int) -> PostureSolution:
+        def advance(done: int, _: int) -> None:
+            if progress is not None:
+                progress(min(number * starts + done, total), total)
+
+        count = starts + len(guesses)
+        return solve(one, starts=count, seed=seed, jobs=jobs, compile=compile, progress=advance, guesses=guesses)
+
+    optima = [_optimum(partial(run, one, (), k)) for k, one in enumerate(alone)]
+    solution = run(
+        problem, _apart(problem, [q for q in optima if q is not None and not _broken(problem, q)]), len(alone)
+    )
+    for k, (one, q) in enumerate(zip(alone, optima, strict=True)):
+        # What is best for all is not better for one than its own optimum: that was not the best.
+        if q is None or one.objective.value(solution.q) < one.objective.value(q) * (1 - _NOISE):
+            optima[k] = _optimum(partial(run, one, (solution.q,), len(alone)))
+    return RobustSolution(solution, compare_scenarios(solution, optima, seed))
+
+
+def compare_scenarios(solution: PostureSolution, optima: Sequence[Vector | None], seed: int = 0) -> Robustness:
+    """The robust optimum beside the optimum of each scenario alone, and among models drawn between the scenarios."""
+    problem, objective = solution.problem, solution.problem.objective
+    found: list[ScenarioOptimum] = []
+    for scenario, q in zip(objective.scenarios, optima, strict=True):
+        member = replace(objective, robot=scenario.robot, scenarios=())
+        own = None if q is None else member.value(q)
+        step = None if q is None else float(np.linalg.norm(wrapped_difference(problem, solution.q, q)))
+        found.append(ScenarioOptimum(scenario.name, member.value(solution.q), own, q, step))
+    nominal = optima[0]
+    broken = () if nominal is None else tuple(_broken(problem, nominal))
+    drawn = between(objective.scenarios, _BETWEEN, seed)
+    values = [replace(objective, robot=robot, scenarios=()).value(solution.q) for robot in drawn]
+    return Robustness(
+        scenarios=tuple(found),
+        worst_robust=objective.value(solution.q),
+        worst_nominal=None if nominal is None or broken else objective.value(nominal),
+        broken=broken,
+        between=max(values),
+        drawn=len(values),
+    )
+
+
+def _apart(problem: PostureProblem, postures: Sequence[Vector]) -> list[Vector]:
+    """Those of some postures that are not nearly another one."""
+    found: list[Vector] = []
+    for q in postures:
+        if all(np.linalg.norm(wrapped_difference(problem, one, q)) > SAME_POSTURE for one in found):
+            found.append(q)
+    return found
+
+
+def _broken(problem: PostureProblem, q: Vector) -> list[str]:
+    """Names of the constraints that a posture does not satisfy."""
+    numeric, found = Numeric(problem.robot.model).at(q), []
+    for constraint in problem.constraints:
+        value, _ = constraint.numeric(numeric)
+        if np.abs(value - np.clip(value, constraint.lower, constraint.upper)).max(initial=0.0) > _KEPT:
+            found.append(constraint.name)
+    return found
+
+
+def _optimum(run: Callable[[], PostureSolution]) -> Vector | None:
+    try:
+        return run().q
+    except (Infeasible, SolverFailed):
+        return None

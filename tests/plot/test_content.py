@@ -1,0 +1,320 @@
+"""What the figures say against the numbers that they were drawn from."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from matplotlib.figure import Figure
+
+from impact_posture.errors import InputError
+from impact_posture.plot import (
+    FIGURES,
+    PathData,
+    ResultView,
+    classical_figure,
+    ellipsoid_figure,
+    jump_figure,
+    path_figure,
+    postures_figure,
+    tradeoff_figure,
+)
+from impact_posture.plot.classical import kinds_of
+from impact_posture.plot.jump import groups_of
+from impact_posture.plot.path import normalized
+from impact_posture.plot.robot import side_plane
+from impact_posture.plot.shapes import (
+    COORDINATE_PLANES,
+    half_width,
+)
+from impact_posture.plot.skeleton import build_skeleton
+from impact_posture.plot.style import WIDTH, lay_out, style, wrap
+from impact_posture.plot.view import SEPARATOR, header_lines, number, velocity_units
+from tests.plot.views import PENDULUM, make_view, text_of
+
+
+@pytest.mark.parametrize("figure", FIGURES.values(), ids=FIGURES)
+def test_no_figure_shows_H_alone(figure: object, tilthex: ResultView) -> None:
+    text = text_of(figure(tilthex))  # type: ignore[operator]
+    for name in ("H", "G", "V", "S", "E"):
+        before, after = (number(getattr(f, name)) for f in (tilthex.before, tilthex.after))
+        assert f"{name} {before} → {after}" in text
+    for fact in ("tilthex_arm", "impact at ee", "objective impulse", "metric euclidean", "0.01 kg·m² (robot.toml)"):
+        assert fact in text
+
+
+def test_header_states_feet_and_title(solo8: ResultView) -> None:
+    title, (facts, _) = header_lines(solo8)
+    assert title == "solo8, impact at base_link"
+    assert "contact-consistent, on FL_FOOT, FR_FOOT, HL_FOOT, HR_FOOT" in facts
+    named = ResultView(solo8.robot, solo8.objective, solo8.q_initial, solo8.q_optimal, title="A push of $5")
+    assert "robot solo8" in header_lines(named)[1][0]
+    assert "A push of $5" in text_of(jump_figure(named))
+
+
+def test_small_print_fits_the_page(solo8: ResultView) -> None:
+    line = SEPARATOR.join(header_lines(solo8)[1] * 2)
+    parts = wrap(line, SEPARATOR)
+    assert len(parts) > 1 and SEPARATOR.join(parts) == line
+    with style():
+        figure = Figure(figsize=(WIDTH, 1))
+        for part in parts:
+            drawn = figure.text(0.012, 0, part, fontsize=7.0)
+            assert drawn.get_window_extent().x1 < figure.bbox.x1
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "undefined"), (float("nan"), "undefined"), (-0.12345, "−0.123"), (2712.0, "2710"), (6.15e6, "6.15e6"),
+     (7.4e-5, "7.4e−5"), (0.0, "0"), (float("inf"), "∞")],
+)  # fmt: skip
+def test_number(value: float | None, text: str) -> None:
+    assert number(value) == text
+
+
+def test_ellipsoid_panels_are_equal_and_tangents_touch(tilthex: ResultView) -> None:
+    figure = ellipsoid_figure(tilthex)
+    figure.draw_without_rendering()
+    panels = [a for a in figure.axes if a.get_title().startswith("shadow")]
+    assert [a.get_title() for a in panels] == ["shadow on xy", "shadow on xz", "shadow on yz"]
+    for axes in panels:
+        box = axes.get_window_extent()
+        assert box.width == pytest.approx(box.height, rel=1e-6)
+        assert axes.get_xlim() == axes.get_ylim() == panels[0].get_xlim()
+        assert "(m/s, rad/s)/(N·s)" in axes.get_xlabel()
+    # n is z: the xz panel has horizontal tangents at ±√H of both postures, and the curves end there.
+    curves = [line.get_ydata() for line in panels[1].lines if len(line.get_ydata()) > 100]
+    tangents = [line.get_ydata() for line in panels[1].lines if line.get_linewidth() == 0.7]
+    heights = sorted(float(y[0]) for y in tangents)
+    roots = [np.sqrt(f.H) for f in (tilthex.before, tilthex.after)]
+    np.testing.assert_allclose(heights, sorted([*roots, *(-r for r in roots)]), rtol=1e-9)
+    np.testing.assert_allclose(sorted(c.max() for c in curves), sorted(roots), rtol=1e-3)
+
+
+def test_oblique_normal_gets_its_own_plane() -> None:
+    view = make_view("tilthex_arm", (-1, 0.6, 0.5), path=False)
+    figure = ellipsoid_figure(view)
+    (panel,) = (a for a in figure.axes if a.get_title() == "shadow on plane of n and z")
+    widths = []
+    for line in panel.lines:
+        if line.get_linewidth() == 0.7:
+            (x0, x1), (y0, y1) = line.get_xdata(), line.get_ydata()
+            widths.append(abs(x0 * y1 - x1 * y0) / np.hypot(x1 - x0, y1 - y0))
+    roots = [np.sqrt(f.H) for f in (view.before, view.after)]
+    np.testing.assert_allclose(sorted(widths), np.repeat(sorted(roots), 2), rtol=1e-9)
+
+
+def arrows(axes: object) -> list[np.ndarray]:
+    """Tips of a panel's arrows."""
+    return [np.array(t.xy) for t in axes.texts if t.arrow_patch is not None]  # type: ignore[attr-defined]
+
+
+def panels_of(figure: Figure) -> list[object]:
+    return [a for a in figure.axes if a.get_title().startswith("shadow")]
+
+
+def test_free_ellipsoid_stands_beside_the_consistent_one(solo8: ResultView, tilthex: ResultView) -> None:
+    assert tilthex.free_before is None and "free" not in text_of(ellipsoid_figure(tilthex))
+    assert solo8.free_before is not None and solo8.free_after is not None
+    # The oracle's numbers without feet: M alone.
+    J, M = solo8.jacobian(solo8.q_optimal), solo8.objective.oracle.at(solo8.q_optimal).M
+    expected = np.linalg.solve(M, J.T).T @ np.linalg.solve(M, J.T)
+    np.testing.assert_allclose(solo8.free_after.ellipsoid, expected, rtol=1e-9, atol=1e-12 * expected.max())
+    figure = ellipsoid_figure(solo8)
+    text = text_of(figure)
+    for word, found in (("before", solo8.free_before), ("after", solo8.free_after)):
+        assert f"{word}, free: √H = {number(np.sqrt(found.H))}" in text
+    matrices = [f.ellipsoid for f in (solo8.before, solo8.after, solo8.free_before, solo8.free_after)]
+    for axes, plane in zip(panels_of(figure), COORDINATE_PLANES, strict=True):
+        reach = [line.get_xdata().max() for line in axes.lines if len(line.get_xdata()) == 181]  # type: ignore[attr-defined]
+        widths = [half_width(matrix, plane.axes[0]) for matrix in matrices]
+        np.testing.assert_allclose(sorted(reach), sorted(widths), rtol=1e-3)
+
+
+def test_cone_and_all_tied_worst_normals_are_drawn(solo8_cone: ResultView, solo8: ResultView) -> None:
+    worst = solo8_cone.worst_after
+    assert worst is not None and len(worst.normals) == 2
+    figure = ellipsoid_figure(solo8_cone)
+    assert "cone of 20° about n" in text_of(figure) and "20° off, 2 tied" in text_of(figure)
+    assert "cone" not in text_of(ellipsoid_figure(solo8))
+    for axes, plane in zip(panels_of(figure), COORDINATE_PLANES, strict=True):
+        limit = axes.get_xlim()[1]  # type: ignore[attr-defined]
+        tips = arrows(axes)
+        # Two before and two after, the same posture; and n itself, where it is no dot.
+        assert len(tips) == 4 + plane.contains(solo8_cone.after.normal)
+        for normal in worst.normals:
+            assert sum(np.allclose(tip, 0.92 * limit * plane.axes @ normal, atol=1e-9) for tip in tips) >= 2
+        (patch,) = axes.patches  # type: ignore[attr-defined]
+        box = patch.get_xy()
+        # A worst normal on the cone's edge ends on the shadow's.
+        assert np.abs(box).max() <= 0.92 * limit * (1 + 1e-12)
+    value = number(solo8_cone.objective.value(solo8_cone.q_optimal))
+    assert f"objective impulse {value} → {value}" in text_of(figure)
+
+
+def test_cone_whose_worst_normal_does_not_exist_is_drawn_without() -> None:
+    view = make_view(PENDULUM, (0, 1, 0), q0=np.array([0.4, 0.9]), path=False)
+    objective = dataclasses.replace(view.objective, kind="sticking", normal_cone_deg=10.0)
+    view = dataclasses.replace(view, objective=objective)
+    assert view.worst_before is None
+    text = text_of(ellipsoid_figure(view))
+    assert "cone of 10° about n" in text and "worst before" not in text
+    assert "objective sticking undefined → undefined" in text
+
+
+def test_labels_of_two_normals_stand_apart(turned: ResultView) -> None:
+    figure = ellipsoid_figure(turned)
+    lay_out(figure)
+    for axes in panels_of(figure):
+        first, second = (t.get_window_extent() for t in axes.texts if t.get_text() in ("n₀", "n₁"))  # type: ignore[attr-defined]
+        assert not first.padded(-1).overlaps(second.padded(-1))
+
+
+def test_legend_and_semi_axes_do_not_overlap(solo8_cone: ResultView) -> None:
+    figure = ellipsoid_figure(solo8_cone)
+    lay_out(figure)
+    axes = figure.axes[-1]
+    (words,) = (t for t in axes.texts if t.get_text().startswith("semi-axes"))
+    assert not words.get_window_extent().overlaps(axes.get_legend().get_window_extent())
+    assert words.get_window_extent().y0 > figure.subfigs[1].bbox.y0
+
+
+def test_three_ellipsoids_share_panels_and_state_their_units(tilthex: ResultView) -> None:
+    figure = classical_figure(tilthex)
+    J = [tilthex.jacobian(q) for q in (tilthex.q_initial, tilthex.q_optimal)]
+    roots = {
+        "velocity": [np.linalg.svd(j, compute_uv=False) for j in J],
+        "force": [1 / np.linalg.svd(j, compute_uv=False) for j in J],
+        "impact": [np.sqrt(np.linalg.eigvalsh(f.ellipsoid)) for f in (tilthex.before, tilthex.after)],
+    }
+    units = {"velocity": "m/s", "force": "N", "impact": "(m/s, rad/s)/(N·s)"}
+    text = text_of(figure)
+    for kind in kinds_of(tilthex):
+        assert kind.scale == pytest.approx(roots[kind.name][0].max(), rel=1e-9)
+        assert f": 1 = {number(kind.scale)} {units[kind.name]}" in text
+        for matrix, found in zip(kind.matrices, roots[kind.name], strict=True):
+            sizes = np.sqrt(np.linalg.eigvalsh(matrix))
+            np.testing.assert_allclose(sizes, np.sort(found) / kind.scale, rtol=1e-9)
+    panels = np.array(figure.axes).reshape(2, 3)
+    limits = {axes.get_xlim() for axes in panels.flat} | {axes.get_ylim() for axes in panels.flat}
+    assert len(limits) == 1
+    assert all(len([c for c in axes.lines if len(c.get_xdata()) == 181]) == 3 for axes in panels.flat)
+
+
+def test_tradeoff_marks_knee_and_what_did_not_certify(tilthex: ResultView) -> None:
+    data = tilthex.tradeoff
+    assert data is not None
+    upper, lower = (a for a in tradeoff_figure(tilthex).axes if a.get_ylabel() != "reduction")
+    labels = upper.get_legend_handles_labels()[1]
+    assert labels == ["certified", "not certified"]
+    hollow = next(line for line in upper.lines if line.get_label() == "not certified")
+    np.testing.assert_array_equal(hollow.get_xdata(), data.within[~data.certified])
+    assert hollow.get_markerfacecolor() == "white"
+    np.testing.assert_allclose(upper.lines[0].get_ydata(), data.objective)
+    H = next(line for line in lower.lines if str(line.get_label()).startswith("H"))
+    np.testing.assert_allclose(H.get_ydata(), data.H / data.H[0])
+    kneed = dataclasses.replace(tilthex, tradeoff=dataclasses.replace(data, knee=4))
+    figure = tradeoff_figure(kneed)
+    ring = next(line for line in figure.axes[0].lines if line.get_label() == "knee")
+    assert ring.get_xdata() == data.within[4] and ring.get_ydata() == data.objective[4]
+    assert "marked only if that is by 1/3 or more" in text_of(figure)
+    assert "1/3" not in text_of(tradeoff_figure(tilthex))
+
+
+def test_tradeoff_axis_is_log_where_the_objective_spreads(tilthex: ResultView) -> None:
+    data = dataclasses.replace(tilthex.tradeoff, objective=np.geomspace(9e3, 2.0, len(tilthex.tradeoff.within)))  # type: ignore[union-attr, type-var]
+    figure = tradeoff_figure(dataclasses.replace(tilthex, tradeoff=data))
+    figure.draw_without_rendering()
+    assert figure.axes[0].get_yscale() == "log"
+
+
+def test_skeleton_meets_pinocchio(tilthex: ResultView, solo8: ResultView, pendulum: ResultView) -> None:
+    for view in (tilthex, solo8, pendulum):
+        model, data = view.robot.model, view.robot.model.createData()
+        pin.framesForwardKinematics(model, data, view.q_optimal)
+        seen = build_skeleton(view, view.q_optimal)
+        frame = view.robot.frame_id(view.objective.contact.frame)
+        np.testing.assert_allclose(seen.contact, data.oMf[frame].translation, atol=1e-12)
+        for support, foot in zip(view.objective.supports, seen.feet, strict=True):
+            place = data.oMf[view.robot.frame_id(support.frame)]
+            np.testing.assert_allclose(foot, place.act(np.array(support.offset)), atol=1e-12)
+    assert len(build_skeleton(solo8, solo8.q_initial).feet) == 4
+    rotors = build_skeleton(tilthex, tilthex.q_initial).rotors
+    centers = rotors.mean(axis=2) - tilthex.q_initial[:3]
+    expected = [r.position for r in tilthex.robot.spec.propulsion.rotors]  # type: ignore[union-attr]
+    np.testing.assert_allclose(centers, expected, atol=1e-9)
+    # Both links of the pendulum are there, the second one down to its center of mass.
+    assert len({tuple(p.round(9)) for bone in build_skeleton(pendulum, pendulum.q_optimal).bones for p in bone}) == 4
+
+
+def test_postures_are_drawn_to_scale(talos: ResultView, tilthex: ResultView) -> None:
+    for view in (talos, tilthex):
+        figure = postures_figure(view)
+        figure.draw_without_rendering()
+        space, flat = figure.axes
+        (x0, x1), (y0, y1) = flat.get_xlim(), flat.get_ylim()
+        box = flat.get_window_extent()
+        assert box.width / (x1 - x0) == pytest.approx(box.height / (y1 - y0), rel=1e-6)
+        spans = np.ptp([space.get_xlim(), space.get_ylim(), space.get_zlim()], axis=1)
+        np.testing.assert_allclose(space._box_aspect / space._box_aspect[0], spans / spans[0], rtol=1e-9)
+        first, second = (build_skeleton(view, q) for q in (view.q_initial, view.q_optimal))
+        plane = side_plane(first, second)
+        assert plane.contains(second.normal)
+        inside = plane.axes @ np.vstack([first.points, second.points]).T
+        assert (inside[0] > x0).all() and (inside[0] < x1).all() and (inside[1] > y0).all() and (inside[1] < y1).all()
+
+
+def test_jump_bars_carry_the_jump(tilthex: ResultView, panda: ResultView) -> None:
+    figure = jump_figure(tilthex)
+    panels = np.array(figure.axes).reshape(3, 2)
+    for column, factor in ((0, [1.0, 1.0]), (1, [0.6 / tilthex.before.G, 0.6 / tilthex.after.G])):
+        widths = [[bar.get_width() for bar in axes.patches] for axes in panels[:, column]]
+        # Each panel holds the bars before, then those after.
+        drawn = [[w for panel in widths for w in np.split(np.array(panel), 2)[k]] for k in (0, 1)]
+        for state, values, gain in zip((tilthex.before, tilthex.after), drawn, factor, strict=True):
+            np.testing.assert_allclose(values, gain * state.jump, rtol=1e-12)
+    assert [axes.get_xlabel() for axes in panels[:, 1]] == ["m/s", "rad/s", "rad/s"]
+    units = velocity_units(panda.robot)
+    assert [n for n, u in zip(panda.robot.tangent_names, units, strict=True) if u == "m/s"] == [
+        "panda_finger_joint1",
+        "panda_finger_joint2",
+    ]
+    assert [k for _, indices, _ in groups_of(panda) for k in indices] == list(range(9))
+
+
+def test_path_curves(tilthex: ResultView) -> None:
+    path = tilthex.path
+    assert path is not None
+    assert path.s[0] == 0 and (np.diff(path.s) > 0).all()
+    curve = normalized(path, "H")
+    assert curve is not None
+    np.testing.assert_allclose(curve, path.H / tilthex.before.H)
+    assert path.H[path.optimum] == pytest.approx(tilthex.after.H)
+
+
+def wide_path(factor: float) -> PathData:
+    s = np.linspace(0, 1, 9)
+    S = np.where(s < 0.3, np.nan, 2.0)
+    return PathData(s, H=np.geomspace(3, 3 * factor, 9), G=1 + s, V=2 - s, S=S, optimum=6)
+
+
+@pytest.mark.parametrize(("factor", "scale"), [(0.1, "linear"), (0.01, "log")])
+def test_path_axis_is_log_where_values_spread(factor: float, scale: str, panda: ResultView) -> None:
+    path = wide_path(factor)
+    view = ResultView(panda.robot, panda.objective, panda.q_initial, panda.q_optimal, path=path)
+    (axes,) = path_figure(view).axes
+    assert axes.get_yscale() == scale
+    assert {"start", "optimum"} <= {t.get_text() for t in axes.texts}
+    # S has no value at the start: it is divided by its first one, and starts where it exists.
+    (S,) = (line for line in axes.lines if str(line.get_label()).startswith("S"))
+    np.testing.assert_array_equal(np.isnan(S.get_ydata()), np.isnan(path.S))
+    assert np.nanmax(S.get_ydata()) == 1.0
+
+
+def test_path_of_wrong_shape(panda: ResultView) -> None:
+    path = PathData(np.arange(3.0), np.ones(3), np.ones(2), np.ones(3), np.ones(3))
+    view = ResultView(panda.robot, panda.objective, panda.q_initial, panda.q_optimal, path=path)
+    with pytest.raises(InputError, match="G \\(2,\\)"):
+        path_figure(view)

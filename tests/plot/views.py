@@ -1,0 +1,71 @@
+"""Views to draw, shared by the tests of the pictures."""
+
+from __future__ import annotations
+
+import matplotlib
+import matplotlib.image
+import numpy as np
+import pinocchio as pin
+from matplotlib.figure import Figure
+
+from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.metric import Metric
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.plot import (
+    ResultView,
+    TradeOffData,
+    sample_path,
+)
+from impact_posture.robot.loader import load_robot
+
+PENDULUM = "example-robot-data:double_pendulum_description/urdf/double_pendulum.urdf"
+
+
+def make_view(
+    name: str,
+    normal: tuple[float, float, float],
+    frame: str | None = None,
+    *,
+    q0: np.ndarray | None = None,
+    scale: float = 0.2,
+    path: bool = True,
+    **keys: object,
+) -> ResultView:
+    robot = load_robot(name)
+    supports = tuple(Support.from_spec(s) for s in robot.spec.supports)
+    frame = frame or robot.spec.contact.frame or robot.frame_names[-1]
+    normal_frame = keys.pop("normal_frame", "world")
+    contact = Contact.create(frame, normal, normal_frame=normal_frame)  # type: ignore[arg-type]
+    objective = ImpactObjective(robot, contact, keys.pop("metric", Metric()), supports=supports)  # type: ignore[arg-type]
+    q0 = robot.posture() if q0 is None else q0
+    v = scale * np.random.default_rng(3).normal(size=robot.nv)
+    if robot.floating:
+        v[:6] *= 0.2
+    way = [pin.integrate(robot.model, q0, v * t) for t in np.linspace(0, 1, 12)]
+    return ResultView(
+        robot,
+        objective,
+        q0,
+        way[-1],
+        path=sample_path(objective, way) if path else None,
+        tradeoff=trade_of(objective, way) if path else None,
+        **keys,  # type: ignore[arg-type]
+    )
+
+
+def trade_of(objective: ImpactObjective, way: list[np.ndarray], knee: int | None = None) -> TradeOffData:
+    """A curve to draw, better or worse as it may be; its last but one point is not certified."""
+    path = sample_path(objective, way)
+    certified = np.arange(len(way)) != len(way) - 2
+    values = np.array([objective.value(q) for q in way])
+    return TradeOffData(path.s, path.s, values, path.H, path.G, path.V, path.S, certified, knee)
+
+
+def spin(seed: int = 0) -> np.ndarray:
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return q
+
+
+def text_of(figure: Figure) -> str:
+    """All words of a figure; broken lines joined."""
+    return " | ".join(" ".join(t.get_text().split()) for t in figure.findobj(matplotlib.text.Text))

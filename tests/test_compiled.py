@@ -1,0 +1,96 @@
+"""The program as machine code: the same answers, kept in the cache, and one thread for its linear algebra."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+import threadpoolctl
+
+from impact_posture.errors import CompilerError
+from impact_posture.posture import compiled
+from impact_posture.posture.blas import one_blas_thread
+from impact_posture.posture.nlp import build_nlp
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.settings import make_settings, prepare
+from impact_posture.toolchain import run_compilers
+
+
+@pytest.fixture(scope="module")
+def problem() -> PostureProblem:
+    asked = {"robot": "tilthex_arm", "frame": "ee", "normal": (0.0, 0.0, 1.0)}
+    return prepare(make_settings(asked)).problem
+
+
+@pytest.mark.parametrize("optimized", [compiled._OPTIMIZED, 0])
+def test_the_same_answer_from_machine_code(
+    problem: PostureProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, optimized: int
+) -> None:
+    """Optimized or not: the iterations of the interpreter, and from the cache without a compiler."""
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
+    monkeypatch.setattr(compiled, "_OPTIMIZED", optimized)
+    interpreted = build_nlp(problem, compile="never").solve(problem.given)
+    built = build_nlp(problem, compile="always")
+    assert built.compiled
+    (library,) = tmp_path.iterdir()
+    assert library.suffix == ".so"
+    monkeypatch.setattr(compiled, "find_compiler", lambda: None)
+    cached = build_nlp(problem, compile="auto")
+    assert cached.compiled
+    for nlp in (built, cached):
+        record = nlp.solve(problem.given)
+        assert record.converged and record.iterations == interpreted.iterations
+        np.testing.assert_allclose(record.q, interpreted.q, atol=1e-9)
+
+
+def test_a_broken_library_is_not_used(
+    problem: PostureProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
+    broken = tmp_path / f"{compiled._key(problem)}.so"
+    broken.write_text("no library")
+    assert not build_nlp(problem, compile="auto").compiled
+    assert not broken.exists()
+
+
+def test_compiling_needs_a_compiler(problem: PostureProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
+    monkeypatch.setattr(compiled, "find_compiler", lambda: None)
+    with pytest.raises(CompilerError, match="no C compiler"):
+        build_nlp(problem, compile="always")
+
+
+def test_one_thread_within_and_as_before_after() -> None:
+    """All of them: NumPy's, SciPy's and the one that IPOPT works with."""
+    with one_blas_thread():
+        pass  # all are loaded now
+    libraries = threadpoolctl.ThreadpoolController().lib_controllers
+    assert libraries
+    if list(Path(ca.__file__).parent.glob("libcasadi-tp-openblas*")):
+        assert "casadi_openblas" in {library.internal_api for library in libraries}
+    for library in libraries:
+        library.set_num_threads(2)
+    with pytest.raises(KeyboardInterrupt), one_blas_thread():
+        assert [library.num_threads for library in libraries] == [1] * len(libraries)
+        raise KeyboardInterrupt
+    assert [library.num_threads for library in libraries] == [2] * len(libraries)
+
+
+def test_compilers_run_beside_each_other_and_none_stays(tmp_path: Path) -> None:
+    """The first failure is what is said; what still runs then is killed, its own children too."""
+    marks = [tmp_path / name for name in ("child", "never")]
+    slow = ["sh", "-c", f"(sleep 3; touch {marks[0]}) & sleep 3; touch {marks[1]}", "-o", "slow.o"]
+    began = time.perf_counter()
+    with pytest.raises(CompilerError, match="error: what is wrong"):
+        run_compilers([["sh", "-c", "echo 'error: what is wrong' >&2; exit 1", "-o", "first.o"], slow], tmp_path)
+    assert time.perf_counter() - began < 2
+    time.sleep(3.2)
+    assert not any(mark.exists() for mark in marks)
+
+
+def test_a_compiler_that_does_not_start_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CompilerError, match="no-such-compiler"):
+        run_compilers([["no-such-compiler", "-o", "x.o"]], tmp_path)
