@@ -1,0 +1,39 @@
+"""An aerial manipulator braces for a blow from below: nominal posture, impact-robust posture, and what changes.
+
+Run: python brace.py EXPORT
+EXPORT: what `impact-posture codegen tilthex_arm --frame ee --normal 0 0 1 --out EXPORT` wrote.
+"""
+
+import sys
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.robot.loader import load_robot
+from impact_posture.tsid.controller import Controller
+from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
+from impact_posture.tsid.program import aerial_program
+
+robot = load_robot("tilthex_arm")
+export = ImpactGradient.load(sys.argv[1], robot=robot)
+
+posture = ImpactRobustPosture(robot, gradient_of(export), K=20.0, kp=10.0, spring="release")
+controller = Controller(robot, aerial_program(robot, posture))
+
+q, v = robot.posture(), np.zeros(robot.nv)
+controller.reset(q, v)
+print(f"H before: {posture.value:.1f}")
+
+events = {500: posture.brace, 3500: posture.contact, 3800: posture.release}
+for k in range(4500):
+    if k in events:
+        events[k]()
+    command = controller.tick(k * 1e-3, q, v)
+    # On a robot: send command.rotor_speed and command.torque.  Here: what was planned happens.
+    v = v + 1e-3 * command.acceleration
+    q = pin.integrate(robot.model, q, 1e-3 * v)
+
+report = controller.report()
+print(f"H after: {export.objective(q)[0]:.1f}; {posture.activation.phase.value}, {command.status.value}")
+print(f"end effector: {1e3 * np.linalg.norm(report.residuals['ee pose']):.1e} mm/s² off what was asked for")

@@ -1,0 +1,206 @@
+"""The impact-robust term as a task of pink (https://github.com/stephane-caron/pink).
+
+    pip install pin-pink
+    python pink_impact.py
+
+``ImpactTask`` asks for the velocity ``v = −K ∇H(q)``.  It stands in the cost of pink's QP; what the robot must hold
+stands in pink's equality constraints, so that H falls in their null space alone.  The gradient comes from the
+compiled C export.  For each contact below, pink runs from the robot's posture until it rests; then the posture is put
+beside the optima that ``impact-posture optimize`` finds offline under the same constraints.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pink
+import pinocchio as pin
+from pink.tasks import FrameTask, Task
+
+from impact_posture.codegen.export import export
+from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.posture.settings import Prepared, make_settings, prepare
+from impact_posture.posture.solve import PostureSolution, solve
+
+DT, DURATION, AT_REST = 0.01, 60.0, 1e-6  # s, s, and a norm of v
+
+
+class ImpactTask(Task):
+    """``Δq = −K ∇H(q) Δt``: error ``K ∇H Δt`` and Jacobian 1, both on the tangent space.
+
+    H scales with the robot: K is given as the norm of v at the first tick.
+    """
+
+    def __init__(self, gradient: ImpactGradient, normal: tuple[float, ...], speed: float, q: np.ndarray) -> None:
+        super().__init__(cost=1.0)
+        self.gradient, self.normal = gradient, normal
+        self.K = speed / np.linalg.norm(gradient.value_and_gradient(q, normal)[1])
+
+    def compute_error(self, configuration: pink.Configuration) -> np.ndarray:
+        _, grad = self.gradient.value_and_gradient(configuration.q, self.normal)
+        return self.K * DT * grad
+
+    def compute_jacobian(self, configuration: pink.Configuration) -> np.ndarray:
+        return configuration.tangent.eye
+
+    def __repr__(self) -> str:
+        return f"ImpactTask(normal={self.normal}, K={self.K:.3g})"
+
+
+class PointTask(Task):
+    """A frame's origin stays where it is, its orientation is free; pink's FrameTask has all six rows."""
+
+    def __init__(self, frame: str, configuration: pink.Configuration) -> None:
+        super().__init__(cost=1.0)
+        self.frame, self.target = frame, configuration.get_transform_frame_to_world(frame).translation
+
+    def compute_error(self, configuration: pink.Configuration) -> np.ndarray:
+        return configuration.get_transform_frame_to_world(self.frame).translation - self.target
+
+    def compute_jacobian(self, configuration: pink.Configuration) -> np.ndarray:
+        rotation = configuration.get_transform_frame_to_world(self.frame).rotation
+        return rotation @ configuration.get_frame_jacobian(self.frame)[:3]
+
+    def __repr__(self) -> str:
+        return f"PointTask({self.frame})"
+
+
+class LevelTask(Task):
+    """The base keeps its z axis vertical, its yaw is free: ``e = (Rᵀ e_z)_xy``, with the rate ``−ω × Rᵀ e_z``."""
+
+    def __init__(self, frame: str) -> None:
+        super().__init__(cost=1.0)
+        self.frame = frame
+
+    def compute_error(self, configuration: pink.Configuration) -> np.ndarray:
+        return configuration.get_transform_frame_to_world(self.frame).rotation[2, :2]
+
+    def compute_jacobian(self, configuration: pink.Configuration) -> np.ndarray:
+        up = configuration.get_transform_frame_to_world(self.frame).rotation[2]
+        return (pin.skew(up) @ configuration.get_frame_jacobian(self.frame)[3:])[:2]
+
+    def __repr__(self) -> str:
+        return f"LevelTask({self.frame})"
+
+
+def pose_and_level(frame: str, configuration: pink.Configuration) -> list[Task]:
+    """What the aerial manipulator holds."""
+    pose = FrameTask(frame, position_cost=1.0, orientation_cost=1.0)
+    pose.set_target_from_configuration(configuration)
+    return [pose, LevelTask("base_link")]
+
+
+def point(frame: str, configuration: pink.Configuration) -> list[Task]:
+    """What an arm with a ball tip holds."""
+    return [PointTask(frame, configuration)]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """What is touched, in ``optimize``'s words, and what pink holds meanwhile."""
+
+    name: str
+    settings: dict[str, object]
+    held: Callable[[str, pink.Configuration], list[Task]]
+
+
+CONTACTS = (
+    Contact(
+        "tilthex_arm on a floor", {"robot": "tilthex_arm", "frame": "ee", "normal": (0, 0, 1)}, pose_and_level
+    ),
+    Contact(
+        "tilthex_arm against a wall",
+        {"robot": "tilthex_arm", "frame": "ee", "normal": (-1, 0, 0), "posture": "brace_forward"},
+        pose_and_level,
+    ),
+    Contact(
+        "ur5, ball tip on a table", {"robot": "ur5", "normal": (0, 0, 1), "contact_pose": "position"}, point
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where pink came to rest, and what the offline optimization says of the same problem."""
+
+    contact: Contact
+    prepared: Prepared
+    offline: PostureSolution  # its optima, best first
+    q: np.ndarray
+    H: np.ndarray  # at the start and after each tick
+    errors: np.ndarray  # norm of what is held, after each tick
+    speed: float  # norm of v at the last tick
+
+    def distances(self) -> list[float]:
+        """Tangent norm from the resting posture to each of ``optimize``'s optima."""
+        model = self.prepared.impact.robot.model
+        return [float(np.linalg.norm(pin.difference(model, self.q, o.q))) for o in self.offline.optima]
+
+
+def follow(contact: Contact, speed: float = 5.0) -> Outcome:
+    """Run pink from the start posture until it rests."""
+    prepared = prepare(make_settings(contact.settings))
+    impact, offline = prepared.impact, solve(prepared.problem)
+    frame, normal = impact.contact.frame, impact.contact.normal
+    with tempfile.TemporaryDirectory() as folder:
+        export(impact.objective, Path(folder), prefix="impact", check=False)
+        gradient = ImpactGradient.load(folder, robot=impact.robot)
+
+    model = limited(prepared)
+    configuration = pink.Configuration(model, model.createData(), offline.initial)
+    held = contact.held(frame, configuration)
+    task = ImpactTask(gradient, normal, speed, configuration.q)
+    H, errors = [gradient.value(configuration.q, normal)], []
+    for _ in range(round(DURATION / DT)):
+        v = pink.solve_ik(configuration, [task], DT, solver="daqp", constraints=held)
+        configuration.integrate_inplace(v, DT)
+        H.append(gradient.value(configuration.q, normal))
+        errors.append(np.linalg.norm(np.concatenate([t.compute_error(configuration) for t in held])))
+        if np.linalg.norm(v) < AT_REST:
+            break
+    return Outcome(contact, prepared, offline, configuration.q, np.array(H), np.array(errors), np.linalg.norm(v))
+
+
+def limited(prepared: Prepared) -> pin.Model:
+    """The robot with ``optimize``'s margin from the joint limits; pink reads limits from the model."""
+    model = prepared.impact.robot.model.copy()
+    joints = slice(7 if prepared.impact.robot.floating else 0, None)
+    lower, upper = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
+    lower[joints] += prepared.problem.requirements.limit_margin
+    upper[joints] -= prepared.problem.requirements.limit_margin
+    model.lowerPositionLimit, model.upperPositionLimit = lower, upper
+    return model
+
+
+def report(outcome: Outcome) -> None:
+    """Print what came of it."""
+    objective, H = outcome.prepared.impact.objective, outcome.H
+    print(outcome.contact.name)
+    print(f"  H {H[0]:.6g} → {H[-1]:.6g} ({100 * (H[-1] / H[0] - 1):+.1f} %) in {(len(H) - 1) * DT:.1f} s")
+    before, after = (objective.oracle.quantities(q) for q in (outcome.offline.initial, outcome.q))
+    print("  beside it", ", ".join(f"{k} {getattr(before, k):.4g} → {getattr(after, k):.4g}" for k in "GVS"))
+    print(f"  what is held was off by {outcome.errors.max():.1e} at most, {outcome.errors[-1]:.1e} at the end")
+    if outcome.speed >= AT_REST:
+        print(f"  still moving: |v| = {outcome.speed:.1e}")
+    distances, optima = outcome.distances(), outcome.offline.optima
+    nearest = int(np.argmin(distances))
+    print(f"  offline optima: {len(optima)}")
+    for k, words in {nearest: "nearest", 0: "best"}.items():
+        print(f"  the {words} of them: H {optima[k].objective:.6g}, posture {distances[k]:.1e} away")
+
+
+def main() -> list[Outcome]:
+    """All contacts."""
+    outcomes = []
+    for contact in CONTACTS:
+        outcomes.append(follow(contact))
+        report(outcomes[-1])
+    return outcomes
+
+
+if __name__ == "__main__":
+    main()

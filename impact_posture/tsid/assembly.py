@@ -1,0 +1,260 @@
+"""From a program and a state to the QP of one tick."""
+
+from __future__ import annotations
+
+from itertools import accumulate
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.robot.robot import Robot
+from impact_posture.tsid.actuators import Actuators
+from impact_posture.tsid.contacts import ContactStack
+from impact_posture.tsid.limits import AccelerationBounds
+from impact_posture.tsid.program import Program
+from impact_posture.tsid.qp import EQUALITY, QP
+from impact_posture.tsid.state import State
+from impact_posture.tsid.task import TaskStack
+
+Array = NDArray[np.float64]
+
+# Where no task has a say the cost still needs a minimum: weight of an acceleration that nothing weighs.
+_IDLE = 1e-8
+
+
+class Assembly:
+    """The buffers of a program's QP, and how a tick fills them.
+
+    Variables ``z = [ν̇; w; f]``: accelerations, what spare rotors leave to choose, contact forces in world axes.
+    Controls are no variables: ``u`` follows from ``p = Mν̇ + h − Jᵀf − J_eᵀF̂`` (:class:`Actuators`).  Rows, in order:
+
+    - ``blind``: ``blindᵀ p_base = 0``, the part of the dynamics that no rotor or motor acts on;
+    - ``contacts``: ``J ν̇ = a`` of the hard contacts;
+    - ``levels``: ``J ν̇ = a`` of each strict level;
+    - ``controls``: ``u_min ≤ u(z) ≤ u_max``;
+    - ``cones``: friction.
+
+    Bounds on the variables are the acceleration bounds of the joint limits.
+
+    Attributes:
+        program: What it is made from.
+        qp: The program of the last :meth:`build_qp`.
+        levels: Names and rows of the strict levels in the order in which they give way last to first; hard contacts
+            come first, as ``contacts``.
+        limits: The entries of ``[z; A z]`` that come from joint limits.
+        names: A name for each entry of ``[z; A z]``.
+    """
+
+    def __init__(self, robot: Robot, program: Program, actuators: Actuators) -> None:
+        self.program, self.actuators = program, actuators
+        nv = self._nv = robot.nv
+        self.contacts = ContactStack(robot, program.contacts)
+        strict = [task for level in program.levels for task in level]
+        widths = (actuators.blind.shape[1], int(self.contacts.hard.sum()), sum(task.size for task in strict))
+        ends = list(accumulate((*widths, actuators.controls, self.contacts.cone.shape[0])))
+        blind, hard, levels, controls, cones = (slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True))
+        spare, forces = actuators.spare.shape[1], self.contacts.size
+        self._w, self._f = slice(nv, nv + spare), slice(nv + spare, nv + spare + forces)
+        self.qp = qp = QP.empty(nv + spare + forces, ends[-1])
+        self.strict = TaskStack(strict, nv, qp.A[levels, :nv])
+        self.weighted = TaskStack(program.weighted, nv)
+        self.bounds = (
+            None if program.law is None else AccelerationBounds(robot, program.law, qp.lower[:nv], qp.upper[:nv])
+        )
+        self._place_rows(blind, hard, levels, controls, cones)
+        self._place_cost(robot)
+        self.levels = self._name_levels(hard, levels)
+        self.limits = np.arange(nv)
+        self.names = (
+            *robot.tangent_names,
+            *(f"spare {k}" for k in range(spare)),
+            *(f"force {k}" for k in range(forces)),
+            *(f"dynamics {k}" for k in range(blind.stop)),
+            *(f"contact motion {k}" for k in range(hard.stop - hard.start)),
+            *(f"{t.name}[{k}]" for t in strict for k in range(t.size)),
+            *actuators.names,
+            *(f"cone of {c.point.frame}[{k}]" for c in program.contacts for k in range(5 if c.size == 3 else 17)),
+        )
+        self._force = np.zeros(nv)
+        self._free = np.zeros(nv)
+
+    def reset(self, state: State) -> None:
+        """Take gains, weights and the places of the contacts anew."""
+        self.strict.refresh(state)
+        self.weighted.refresh(state)
+        self.contacts.reset(state)
+        self.qp.A[self._cones, self._f] = self.contacts.cone
+        self.qp.lower[self._at(self._cones)] = self.contacts.least
+        self._set_weights()
+
+    def build_qp(self, state: State) -> QP:
+        """Fill the buffers for the tasks, contacts and limits at ``state``; the same object every time."""
+        self.strict.update(state)
+        self.weighted.update(state)
+        self.contacts.update(state)
+        if self.bounds is not None:
+            self.bounds.update(state)
+        self._fill_dynamics(state)
+        self._fill_cost(state)
+        return self.qp
+
+    # ---- what a solution means ----------------------------------------------------------------------------------
+
+    def acceleration(self, z: Array) -> Array:
+        """``ν̇``, shape (nv,)."""
+        return z[: self._nv]
+
+    def forces(self, z: Array) -> Array:
+        """Contact forces in world axes, one contact after the other."""
+        return z[self._f]
+
+    def generalized_force(self, state: State, z: Array) -> Array:
+        """``p = Mν̇ + h − Jᵀf − J_eᵀF̂``, what the actuators are to make, shape (nv,)."""
+        force = state.M @ z[: self._nv]
+        force += self._free
+        if self.contacts.size:
+            force -= self.contacts.J.T @ z[self._f]
+        return np.asarray(force)
+
+    def controls(self, state: State, z: Array) -> Array:
+        """``u``: rotor thrusts (N), then joint torques (N·m); a fresh array.
+
+        It is ``actuators.solve(generalized_force(state, z), w)``; the rows that limit it hold it already.
+        """
+        u = self._A_controls @ z
+        u += self._known
+        return np.asarray(u)
+
+    def redundancy(self, state: State) -> Array:
+        """Orthonormal basis of the accelerations that no task but the posture determines, shape (nv, r).
+
+        Where tasks by weight determine all, those that only contacts and strict levels leave.
+        """
+        rows = [self.contacts.J, self.strict.J, self.weighted.J]
+        Z = _null_space(np.vstack(rows))
+        return Z if Z.shape[1] else _null_space(np.vstack(rows[:2]))
+
+    # ---- parts ----------------------------------------------------------------------------------------------------
+
+    def _at(self, rows: slice) -> slice:
+        """Where rows of A stand among the bounds."""
+        return slice(self.qp.n + rows.start, self.qp.n + rows.stop)
+
+    def _place_rows(self, blind: slice, hard: slice, levels: slice, controls: slice, cones: slice) -> None:
+        qp, nv, actuators = self.qp, self._nv, self.actuators
+        self._blind, self._hard, self._levels, self._cones = blind, hard, levels, cones
+        thrusts = slice(controls.start, controls.start + actuators.rotors)
+        torques = slice(thrusts.stop, controls.stop)
+        for rows in (blind, hard, levels):
+            qp.sense[self._at(rows)] = EQUALITY
+        qp.A[thrusts, self._w] = actuators.spare
+        self._controls, self._thrusts, self._torques = controls, thrusts, torques
+        self._A_blind, self._A_blind_f = qp.A[blind, :nv], qp.A[blind, self._f]
+        self._A_thrust, self._A_thrust_f = qp.A[thrusts, :nv], qp.A[thrusts, self._f]
+        self._A_torque, self._A_torque_f = qp.A[torques, :nv], qp.A[torques, self._f]
+        self._A_hard, self._A_controls = qp.A[hard, :nv], qp.A[controls]
+        self._blind_transposed = np.ascontiguousarray(actuators.blind.T)
+        self._known = np.zeros(actuators.controls)
+
+    def _place_cost(self, robot: Robot) -> None:
+        nv, contacts = self._nv, self.contacts
+        self._soft = np.flatnonzero(~contacts.hard)
+        self._hard_rows = np.flatnonzero(contacts.hard)
+        rows = self.weighted.size + self._soft.size
+        self._C, self._Cw = np.zeros((rows, nv)), np.zeros((rows, nv))
+        self._root, self._wanted = np.zeros((rows, 1)), np.zeros(rows)
+        diagonal = self.qp.H.reshape(-1)[:: self.qp.n + 1]
+        self._diagonal = diagonal[:nv]
+        diagonal[self._w] = self.program.spare_weight
+        moments = [6 * [1.0] if c.size == 6 else 3 * [1.0] for c in self.program.contacts]
+        for scale in moments:
+            scale[3:] = [100.0] * (len(scale) - 3)
+        diagonal[self._f] = self.program.force_weight * np.array([x for scale in moments for x in scale])
+        self._H = self.qp.H[:nv, :nv]
+        self._g = self.qp.g[:nv]
+        self._posture_weight = np.zeros(nv)
+
+    def _set_weights(self) -> None:
+        count = self.weighted.size
+        self._root[:count, 0] = np.sqrt(self.weighted.weight)
+        self._root[count:, 0] = np.sqrt(self.contacts.weight[self._soft])
+        posture = self.program.posture
+        self._posture_weight[:] = 0.0 if posture is None else posture.weight
+        self._added = np.maximum(self._posture_weight, _IDLE)
+        self._H[:] = 0.0
+        self._diagonal[:] = self._added
+
+    def _name_levels(self, hard: slice, levels: slice) -> tuple[tuple[str, slice], ...]:
+        found = [("contacts", hard)] if hard.stop > hard.start else []
+        start = levels.start
+        for tasks in self.program.levels:
+            stop = start + sum(task.size for task in tasks)
+            found.append((", ".join(task.name for task in tasks), slice(start, stop)))
+            start = stop
+        return tuple(found)
+
+    def _fill_dynamics(self, state: State) -> None:
+        qp, actuators, base, J = self.qp, self.actuators, self.actuators.base, self.contacts.J
+        M, free = state.M, self._free
+        free[:] = state.h
+        if self.program.force_point is not None and state.pushed:
+            free -= state.force @ state.at(self.program.force_point).jacobian
+        M_base = M[:base]
+        if self._A_blind.shape[0]:
+            plain = not actuators.rotors
+            self._A_blind[:] = M_base if plain else self._blind_transposed @ M_base
+            rhs = free[:base] if plain else self._blind_transposed @ free[:base]
+            np.negative(rhs, out=qp.lower[self._at(self._blind)])
+            np.negative(rhs, out=qp.upper[self._at(self._blind)])
+            if J.size:
+                turned = J[:, :base].T if plain else self._blind_transposed @ J[:, :base].T
+                np.negative(turned, out=self._A_blind_f)
+        self._A_torque[:] = M[base:]
+        known = self._known
+        known[actuators.rotors :] = free[base:]
+        if actuators.rotors:
+            np.matmul(actuators.inverse, M_base, out=self._A_thrust)
+            np.matmul(actuators.inverse, free[:base], out=known[: actuators.rotors])
+        if J.size:
+            np.negative(J[:, base:].T, out=self._A_torque_f)
+            if actuators.rotors:
+                self._A_thrust_f[:] = -actuators.inverse @ J[:, :base].T
+        at = self._at(self._controls)
+        np.subtract(actuators.lower, known, out=qp.lower[at])
+        np.subtract(actuators.upper, known, out=qp.upper[at])
+        if self._hard_rows.size:
+            whole = self._hard_rows.size == self.contacts.size
+            self._A_hard[:] = J if whole else J[self._hard_rows]
+            qp.lower[self._at(self._hard)] = self.contacts.a[self._hard_rows]
+            qp.upper[self._at(self._hard)] = self.contacts.a[self._hard_rows]
+        if self.strict.size:
+            qp.lower[self._at(self._levels)] = self.strict.a
+            qp.upper[self._at(self._levels)] = self.strict.a
+
+    def _fill_cost(self, state: State) -> None:
+        g, count, posture = self._g, self.weighted.size, self.program.posture
+        if self._C.shape[0]:
+            C, wanted = self._C, self._wanted
+            C[:count], wanted[:count] = self.weighted.J, self.weighted.a
+            if self._soft.size:
+                whole = self._soft.size == self.contacts.size
+                C[count:] = self.contacts.J if whole else self.contacts.J[self._soft]
+                wanted[count:] = self.contacts.a if whole else self.contacts.a[self._soft]
+            np.multiply(C, self._root, out=self._Cw)
+            wanted *= self._root[:, 0]
+            np.matmul(self._Cw.T, self._Cw, out=self._H)
+            self._diagonal += self._added
+            np.matmul(wanted, self._Cw, out=g)
+            np.negative(g, out=g)
+        else:
+            g[:] = 0.0
+        if posture is not None:
+            g -= self._posture_weight * posture.desired(state)
+
+
+def _null_space(J: Array) -> Array:
+    if not J.shape[0]:
+        return np.eye(J.shape[1])
+    _, values, right = np.linalg.svd(J)
+    rank = int(np.count_nonzero(values > 1e-6 * max(float(values[0]), 1e-12)))
+    return np.ascontiguousarray(right[rank:].T)

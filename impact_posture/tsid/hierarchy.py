@@ -1,0 +1,96 @@
+"""Rows in strict order of importance, each level as near to its bounds as those above it let it come."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.tsid.qp import EQUALITY, INEQUALITY
+
+Array = NDArray[np.float64]
+
+# Bounds are brought below this before they are handed over: DAQP's tolerances are absolute.
+_LARGEST = 1e4
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """``lower ≤ A z ≤ upper``; equal bounds make equations.
+
+    Attributes:
+        A: Shape (k, n).
+        lower: Shape (k,); may be minus infinity.
+        upper: Shape (k,); may be infinity.
+    """
+
+    A: Array
+    lower: Array
+    upper: Array
+
+
+def lexicographic(levels: Sequence[Level]) -> Array | None:
+    """A ``z`` that passes the bounds of the first level least, then of the second, and so on (least squares).
+
+    By DAQP's hierarchical programs, which have a solution whatever the bounds are.  It measures how far a row is off
+    in units of the row's length; equations are therefore turned among themselves (:func:`balanced`) until all rows
+    of a level are of one length, which changes nothing in the sum of squares.
+
+    Returns:
+        Shape (n,), to about six digits; ``None`` if the solver gave up.
+    """
+    given = [level for level in levels if level.lower.size]
+    A, lower, upper, sense = [], [], [], []
+    for level in given:
+        equal = level.lower == level.upper
+        rows, low, high = level.A, level.lower, level.upper
+        if equal.all():
+            rows, low = balanced(rows, low)
+            high = low
+        A.append(rows)
+        lower.append(low)
+        upper.append(high)
+        sense.append(np.where(equal, EQUALITY, INEQUALITY).astype(np.int32))
+    low, high = np.concatenate(lower), np.concatenate(upper)
+    bounds = np.abs(np.concatenate([low, high]))
+    scale = max(1.0, float(np.max(bounds, where=np.isfinite(bounds), initial=0.0)) / _LARGEST)
+    ends = np.cumsum([level.lower.size for level in given], dtype=np.int32)
+    z, _, flag, _ = daqp.solve(
+        None,
+        None,
+        np.ascontiguousarray(np.vstack(A)),
+        np.clip(high / scale, -1e30, 1e30),
+        np.clip(low / scale, -1e30, 1e30),
+        np.concatenate(sense),
+        ends,
+    )
+    z = scale * np.asarray(z)
+    return z if flag > 0 and np.isfinite(z).all() else None
+
+
+def balanced(A: Array, b: Array) -> tuple[Array, Array]:
+    """``QA`` and ``Qb`` with an orthogonal ``Q`` that makes all rows of ``QA`` equally long.
+
+    One rotation after the other, each of a row that is too short and one that is too long, in which the short one
+    gets the mean length (Bendel and Mickey 1978, "Population correlation matrices for sampling experiments").
+
+    Args:
+        A: Shape (k, n).
+        b: Shape (k,).
+    """
+    A, b = A.copy(), b.copy()
+    mean = float(np.sum(A * A)) / max(b.size, 1)
+    for _ in range(b.size - 1):
+        excess = np.sum(A * A, axis=1) - mean
+        i, j = int(excess.argmin()), int(excess.argmax())
+        if not (excess[i] < -1e-12 * mean and excess[j] > 1e-12 * mean):
+            break
+        along = A[i] @ A[j]
+        t = (-along + np.sqrt(along * along - excess[i] * excess[j])) / excess[j]
+        c, s = 1.0 / np.hypot(1.0, t), t / np.hypot(1.0, t)
+        turn = np.array([[c, s], [-s, c]])
+        A[[i, j]], b[[i, j]] = turn @ A[[i, j]], turn @ b[[i, j]]
+    return A, b

@@ -1,0 +1,291 @@
+"""The impact-robust posture task: the posture task with ``−K ∇H(q)`` in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.errors import InputError, MetricError
+from impact_posture.robot.robot import Robot
+from impact_posture.tsid.activation import Activation, Phase
+from impact_posture.tsid.posture_tasks import JointPosture, smooth
+from impact_posture.tsid.ranges import JointRanges
+from impact_posture.tsid.state import State
+
+Array = NDArray[np.float64]
+Gradient = Callable[[Array], tuple[float, Array]]
+Spring = Literal["keep", "release", "follow"]
+
+# Curvature is measured by central differences of the gradient (rad); less than this share of H per rad² is none.
+_STEP, _FLAT = 1e-5, 1e-3
+
+
+def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Gradient:
+    """The gradient that the term follows, out of a compiled export.
+
+    Args:
+        export: Of the robot in hand; load it with ``free=True`` for the robot without its supports.
+        normal: ``H`` at this normal (the export's ``_eval``); without one the exported problem's own objective at its
+            own normal (``_objective``): ``impulse``, ``speed``, ``sticking``, ``energy``, a cone, ….
+
+    Raises:
+        InputError: The normal is no unit vector.
+    """
+    if normal is None:
+        return export.objective
+    n = np.array(normal, dtype=float)
+    if n.shape != (3,) or not abs(float(np.linalg.norm(n)) - 1) < 1e-6:
+        raise InputError("is no unit vector of three", where="normal", mend="normalize it")
+    return lambda q: export.value_and_gradient(q, n)
+
+
+class ImpactRobustPosture(JointPosture):
+    """``ν̇* = K_p (q_des ⊖ q) − K_d ν − α K s(q) ∇H(q)/λ`` (Afifi et al. 2026, impact-robust posture).
+
+    - ``λ`` is ``H``'s largest curvature along the redundancy at ``reset`` (:meth:`normalize`), so that ``K`` is a
+      stiffness like ``K_p``, in 1/s², on every robot: near an optimum the term is a spring of at most ``K`` towards
+      it.  ``H`` itself scales like 1/armature².
+    - ``K_d = 2√(K_p + K)`` by default: critical for the stiffer of the two springs together.
+    - The term is at most ``K·reach`` long: as a spring ``K`` stretched by ``reach``.  A bound below
+      ``K_p|q_des ⊖ q|`` would stall the flow on its way.
+    - ``s(q)`` fades each joint's part out where it pushes into a position limit, from ``fade[1]`` rad before it to
+      ``fade[0]`` (at most a quarter and a sixteenth of the joint's range): else the robot braces on its stops.
+    - ``α`` is :class:`Activation`'s level.
+
+    ``spring``: what becomes of ``K_p`` while the term is on.  ``keep``: the flow rests where
+    ``K∇H/λ = K_p(q_des ⊖ q)``, short of the optimum.  ``release``: ``K_p`` is scaled by ``1 − α``; the flow goes all
+    the way.  ``follow``: ``q_des`` follows ``q`` with the time constant ``follow`` (s), so that the spring still
+    resists what is fast.
+
+    With :meth:`contact` (unless the activation is ``live``) and :meth:`release` the posture that was reached becomes
+    ``q_des``, faded in as the term fades out.
+
+    Attributes:
+        activation: The state machine.
+        value: ``H`` (or the objective) at the last evaluation.
+        term: ``−K s(q) ∇H/λ`` there, bounded, at full level, shape (nv,).
+        failed: Whether the last evaluation failed (it raised, or was not finite) and the term before it was kept.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        gradient: Gradient,
+        target: ArrayLike | None = None,
+        *,
+        K: float = 10.0,
+        name: str = "impact-robust posture",
+        kp: ArrayLike = 10.0,
+        kd: ArrayLike | None = None,
+        weight: ArrayLike = 1.0,
+        base_weight: float | None = None,
+        spring: Spring = "keep",
+        follow: float = 0.5,
+        reach: float = 2.0,
+        fade: tuple[float, float] = (0.05, 0.20),
+        every: int = 5,
+        scale: float | None = None,
+        activation: Activation | None = None,
+    ) -> None:
+        """Set gains; see the class.
+
+        Args:
+            robot: The robot.
+            gradient: ``q → (H, ∇H)``; see :func:`gradient_of`.
+            target: ``q_des``, shape (nq,); the posture at ``reset`` by default.
+            K: Gain, 1/s².
+            name: What it is called in reports.
+            kp: Stiffness, 1/s².
+            kd: Damping, 1/s.
+            weight: In the cost, one number or (nv,).
+            base_weight: Of the six base entries instead.
+            spring: What becomes of ``K_p`` while the term is on.
+            follow: Time constant of ``spring = "follow"``, s.
+            reach: Bound of the term over ``K``, rad.
+            fade: Distances from a position limit between which the term fades out, rad (m).
+            every: Ticks from one evaluation of the gradient to the next.
+            scale: ``λ``, instead of measuring it at ``reset``.
+            activation: The state machine; one of its own by default.
+
+        Raises:
+            InputError: A number out of its range.
+        """
+        super().__init__(robot, target, name=name, kp=kp, kd=kd, weight=weight, base_weight=base_weight)
+        if not (K >= 0 and reach > 0 and follow > 0 and 0 <= fade[0] < fade[1] and every >= 1 and (scale or 1) > 0):
+            raise InputError("a gain of the impact-robust term is out of range", where=name, mend="see its docstring")
+        self._K, self._scale, self._factor = float(K), 1.0 if scale is None else float(scale), np.zeros(())
+        self._set_factor()
+        self.activation = activation or Activation()
+        self.spring, self.reach, self.every = spring, float(reach), int(every)
+        if kd is None:
+            self.kd = 2.0 * np.sqrt(self.kp + self.K)
+        self._function, self._measure, self._follow = gradient, scale is None, float(follow)
+        ranges = JointRanges(robot)
+        width = ranges.upper - ranges.lower
+        near, self._farthest = np.minimum(fade[0], width / 16), fade[1]
+        # Plain numbers: few joints are near a limit at a time, and one number is cheaper than an array.
+        self._near, self._band = near.tolist(), (np.minimum(fade[1], width / 4) - near).tolist()
+        self._count, self._hold = 0, False
+        self.value, self.term, self.failed = 0.0, np.zeros(robot.nv), False
+        self._spare = np.zeros(robot.nv)
+
+    @property
+    def K(self) -> float:
+        """Gain, 1/s²."""
+        return self._K
+
+    @K.setter
+    def K(self, value: float) -> None:
+        self._K = float(value)
+        self._set_factor()
+
+    @property
+    def scale(self) -> float:
+        """``λ``, in the objective's unit per rad²."""
+        return self._scale
+
+    @scale.setter
+    def scale(self, value: float) -> None:
+        self._scale = float(value)
+        self._set_factor()
+
+    # ---- the course of an impact --------------------------------------------------------------------------------
+
+    def brace(self) -> None:
+        """An impact is coming: switch the term on."""
+        self.activation.enter(Phase.BRACE)
+
+    def contact(self) -> None:
+        """The impact is here: hold the reached posture (or, with a live activation, go on)."""
+        self.activation.enter(Phase.CONTACT)
+        self._hold = not self.activation.live
+
+    def release(self) -> None:
+        """It is over: switch the term off, hold the reached posture."""
+        was_on = self.activation.goal > 0
+        self.activation.enter(Phase.RELEASE)
+        self._hold = self._hold or was_on
+
+    # ---- the task -------------------------------------------------------------------------------------------------
+
+    def reset(self, state: State) -> None:
+        """Free, with the posture of the constructor; evaluate the gradient."""
+        super().reset(state)
+        self.activation.reset()
+        self._count, self._hold, self.failed = 0, False, False
+        self.value = self._function(state.q)[0]
+
+    def normalize(self, state: State, redundancy: Array) -> None:
+        """Measure ``λ`` at ``state``: the spectral norm of ``Zᵀ∇²H Z`` with ``Z`` = ``redundancy``, shape (nv, r).
+
+        Not below a thousandth of ``H`` per rad²: where ``H`` is flat there is nothing to gain.  Nothing happens where
+        ``scale`` was given.
+
+        Raises:
+            MetricError: The gradient does not exist there, or ``H`` and its curvature vanish.
+        """
+        if not self._measure:
+            return
+        Z = redundancy if redundancy.shape[1] else np.eye(state.nv)
+        columns = []
+        for z in Z.T:
+            ahead = np.array(self._function(pin.integrate(self._model, state.q, _STEP * z))[1])
+            behind = np.array(self._function(pin.integrate(self._model, state.q, -_STEP * z))[1])
+            columns.append(Z.T @ (ahead - behind) / (2 * _STEP))
+        curvature = float(np.linalg.norm(np.column_stack(columns), 2))
+        scale = max(curvature, _FLAT * abs(self._function(state.q)[0]))
+        if not (np.isfinite(scale) and scale > 0):
+            raise MetricError(
+                "the objective vanishes with its curvature", where=self.name, mend="start elsewhere, or give `scale`"
+            )
+        self.scale = scale
+
+    def advance(self, state: State, dt: float) -> None:
+        """Go on with ramps, fades and the following of ``q_des``; evaluate the gradient when it is due."""
+        if self._hold:
+            self._hold = False
+            # Where the spring was let go, it takes hold again at the very posture; where it pulled, it is let go as
+            # slowly as the term is.
+            self._fade_to(state.q, self.activation.ramp)
+        if self._blend < 1:
+            super().advance(state, dt)
+        level = self.activation.advance(dt)
+        if level <= 0:
+            return
+        if self.spring == "follow" and self._blend >= 1:
+            share = level * (1 - math.exp(-dt / self._follow))
+            way = pin.difference(self._model, self._target, state.q)
+            self._target[:] = pin.integrate(self._model, self._target, share * way)
+        self._count -= 1
+        if self._count <= 0:
+            self._count = self.every
+            self._evaluate(state)
+
+    def desired(self, state: State) -> Array:
+        """``ν̇*``, shape (nv,)."""
+        level = self.activation.level
+        wanted = self.kp * self.error(state)
+        if level > 0 and self.spring == "release":
+            wanted *= 1.0 - level
+        wanted += self._acceleration
+        wanted += self.kd * (self._velocity - state.v)
+        if level == 1:
+            wanted += self.term
+        elif level > 0:
+            wanted += level * self.term
+        return wanted
+
+    def feedforward(self, state: State) -> Array | None:
+        """Nothing: :meth:`desired` holds the term."""
+        return None
+
+    def step_bound(self, state: State, dt: float) -> float:
+        """How far ``ν̇*`` can move within ``dt`` because of ramps and fades alone (``q``, ν, ∇H held), largest entry.
+
+        ``1.5 dt/ramp·(K·reach + K_p|q_des ⊖ q|)`` for the level, plus the posture's own fade.
+        """
+        pull = float(np.max(np.abs(self.kp * self.error(state)))) if self.spring == "release" else 0.0
+        return self.activation.step_bound(dt) * (self.K * self.reach + pull) + super().step_bound(state, dt)
+
+    def _evaluate(self, state: State) -> None:
+        """The term at ``state``; the one before where the gradient does not exist."""
+        term, bound = self._spare, self._K * self.reach
+        try:
+            value, gradient = self._function(state.q)
+            np.multiply(gradient, self._factor, out=term)
+        except Exception:
+            # Whatever a user's function raises: a tick must go on, and `failed` tells.
+            self.failed = True
+            return
+        square = term.dot(term)
+        if not square <= bound * bound:
+            if not math.isfinite(square):
+                self.failed = True
+                return
+            term *= bound / math.sqrt(square)
+        if state.least_room < self._farthest:
+            self._fade(term, state.rooms)
+        self.value, self.failed = value, False
+        self.term, self._spare = term, self.term
+
+    def _fade(self, term: Array, rooms: Array) -> None:
+        """Take away, near a position limit, what pushes into it."""
+        size = term.size
+        for at in (rooms < self._farthest).nonzero()[0].tolist():
+            # First come the rooms up to the upper limits.
+            below, k = divmod(at, size)
+            push = term.item(k)
+            if (push < 0) if below else (push > 0):
+                distance, band = rooms.item(at) - self._near[k], self._band[k]
+                if distance < band:
+                    term[k] = push * smooth(distance / band) if distance > 0 else 0.0
+
+    def _set_factor(self) -> None:
+        # An array without dimensions: NumPy multiplies by it faster than by a number.
+        self._factor[...] = -self._K / self._scale

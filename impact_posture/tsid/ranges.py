@@ -1,0 +1,32 @@
+"""Joint limits along the entries of ν."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from impact_posture.robot.robot import Robot
+
+
+class JointRanges:
+    """Position and velocity limits along the entries of ν: infinite for the base and for continuous joints.
+
+    Attributes:
+        lower: Position, rad or m, shape (nv,).
+        upper: As ``lower``.
+        velocity: rad/s or m/s, shape (nv,); infinite where the model states none (or zero).
+        index: Which entry of ``q`` belongs to an entry of ν that has position limits (else any), shape (nv,).
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        model = robot.model
+        self.lower, self.upper = np.full(robot.nv, -np.inf), np.full(robot.nv, np.inf)
+        self.velocity, self.index = np.full(robot.nv, np.inf), np.zeros(robot.nv, dtype=np.intp)
+        for name in robot.joint_names:
+            joint = model.getJointId(name)
+            v = slice(model.idx_vs[joint], model.idx_vs[joint] + model.nvs[joint])
+            speed = np.asarray(model.velocityLimit)[v]
+            self.velocity[v] = np.where(speed > 0, speed, np.inf)
+            if model.nqs[joint] == model.nvs[joint]:
+                q = np.arange(model.idx_qs[joint], model.idx_qs[joint] + model.nqs[joint])
+                self.index[v] = q
+                self.lower[v], self.upper[v] = model.lowerPositionLimit[q], model.upperPositionLimit[q]
