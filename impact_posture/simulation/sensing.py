@@ -1,0 +1,69 @@
+"""From the truth to what a controller is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.robot.robot import Robot
+from impact_posture.simulation.scene import Sensors
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What the sensors say.
+
+    Attributes:
+        t: Time of reading, s; what is read may be older (``Sensors.delay``).
+        q: Configuration, shape (nq,).
+        v: ν, shape (nv,).
+        force: Force of the surfaces on the robot at the sensor's frame, world axes, N, shape (3,), low-passed;
+            ``None`` without a sensor.
+    """
+
+    t: float
+    q: Array
+    v: Array
+    force: Array | None
+
+
+class SensorNoise:
+    """White noise on the tangent space, and the encoders' steps.
+
+    Args:
+        robot: The robot.
+        sensors: How good its sensors are.
+    """
+
+    def __init__(self, robot: Robot, sensors: Sensors) -> None:
+        self._model, self._sensors = robot.model, sensors
+        base = 6 if robot.floating else 0
+        angles, rates = (np.full(robot.nv, value) for value in (sensors.joint_angle, sensors.joint_rate))
+        if base:
+            angles[:6] = [sensors.base_position] * 3 + [sensors.base_angle] * 3
+            rates[:6] = [sensors.base_velocity] * 3 + [sensors.base_rate] * 3
+        self._angles = angles if angles.any() else None
+        self._rates = rates if rates.any() else None
+        # Encoders count; joints of several numbers have none.
+        slots = Chart(robot.model).slots
+        self._counted = np.array([s.q.start for s in slots if s.kind.family in ("revolute", "prismatic")], dtype=int)
+
+    def read(self, t: float, q: Array, v: Array, force: Array | None, generator: np.random.Generator) -> Reading:
+        """Add noise to the truth; the arrays given are not changed."""
+        sensors = self._sensors
+        if self._angles is not None:
+            q = pin.integrate(self._model, q, self._angles * generator.standard_normal(self._angles.size))
+        if sensors.joint_resolution:
+            q = q.copy()
+            q[self._counted] = np.round(q[self._counted] / sensors.joint_resolution) * sensors.joint_resolution
+        if self._rates is not None:
+            v = v + self._rates * generator.standard_normal(self._rates.size)
+        if force is not None and sensors.force:
+            force = force + sensors.force * generator.standard_normal(3)
+        return Reading(t, q, v, force)

@@ -1,0 +1,293 @@
+"""The world: a robot in MuJoCo under rotor and motor commands, what its sensors read, and the truth beside it."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from impact_posture.dynamics.mjcf import import_mujoco
+from impact_posture.errors import InputError, PostureError, SimulationDiverged
+from impact_posture.impact.contact import point_on
+from impact_posture.robot.actuation import hover
+from impact_posture.robot.robot import Robot
+from impact_posture.simulation.build import BuiltScene, build_scene
+from impact_posture.simulation.exchange import Commands, Push, Truth
+from impact_posture.simulation.rotors import Rotors, Vibration
+from impact_posture.simulation.scene import Scene
+from impact_posture.simulation.sensing import Reading, SensorNoise
+from impact_posture.simulation.touching import ContactLog
+
+Array = NDArray[np.float64]
+
+_NOTHING = np.zeros(3)
+# No robot is as far or as fast, m, m/s, rad/s; nor are its torques, N·m.
+_RUNAWAY = 1e6
+
+
+def _silent(message: str) -> None:
+    """Take a warning of MuJoCo's: what it is about shows in the state."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """What the sensors saw at one step."""
+
+    qpos: Array
+    qvel: Array
+    speeds: Array
+    phases: Array
+    force: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _ActivePush:
+    """A push under way: on which body, where in it, until which step."""
+
+    body: int
+    point: Array
+    force: Array
+    end: int
+
+
+class World:
+    """A robot in its surroundings; made by :func:`build_world`.
+
+    Call :meth:`reset` first.  Coordinates are Pinocchio's throughout.
+
+    Attributes:
+        robot: The robot.
+        scene: Its surroundings.
+        built: The MuJoCo model and where the surfaces are.
+        timestep: Of the physics, s.
+    """
+
+    def __init__(self, robot: Robot, scene: Scene, built: BuiltScene) -> None:
+        """Compile the model.
+
+        Raises:
+            InputError: MuJoCo is not installed or refuses the model.
+        """
+        self._mujoco = import_mujoco()
+        self.robot, self.scene, self.built = robot, scene, built
+        self.timestep = scene.physics.timestep
+        self._layout = built.mjcf.layout
+        self._model = built.mjcf.compile()
+        self._data = self._mujoco.MjData(self._model)
+        self._log = ContactLog(self._model, built.shape_geoms, tuple(s.frame for s in scene.shapes))
+        self._noise = SensorNoise(robot, scene.sensors)
+        propulsion, unbalance = robot.spec.propulsion, scene.sensors.unbalance
+        self._rotors = None if propulsion is None else Rotors(propulsion, self.timestep)
+        self._vibration = None
+        if propulsion is not None and unbalance:
+            self._vibration = Vibration(robot.model, propulsion, unbalance)
+        self._count = 0 if propulsion is None else len(propulsion.rotors)
+        effort = np.asarray(robot.model.effortLimit, dtype=float)[6 if robot.floating else 0 :]
+        # No effort limit, or zero, is none stated.
+        self._effort = np.where(effort > 0, effort, np.inf)
+        self._torques: Array = np.zeros(self._effort.size)
+        frames = [s.frame for s in scene.shapes]
+        self._felt = None if scene.sensors.force_frame is None else frames.index(scene.sensors.force_frame)
+        self._smoothing = -np.expm1(-2 * np.pi * scene.sensors.force_cutoff * self.timestep)
+        self._force: Array = np.zeros(3)
+        self._past: deque[_Sample] = deque(maxlen=1 + round(scene.sensors.delay / self.timestep))
+        self._pushes: list[_ActivePush] = []
+        self._steps = 0
+        self._ready = False
+        limits = np.array(self._model.jnt_range)
+        limited = np.array(self._model.jnt_limited, dtype=bool)
+        self._limited = np.array(self._model.jnt_qposadr)[limited]
+        self._low, self._high = limits[limited].T
+        self._limited_names = [self._model.joint(int(k)).name for k in np.flatnonzero(limited)]
+
+    def reset(
+        self, q: ArrayLike, v: ArrayLike | None = None, seed: int = 0, *, rotor_speed: ArrayLike | None = None
+    ) -> None:
+        """Begin anew.
+
+        Args:
+            q: Configuration, shape (nq,).
+            v: ν, shape (nv,); at rest by default.
+            seed: Of all noise.
+            rotor_speed: Of the propellers, shape (rotors,); as for hovering at ``q`` by default.
+
+        Raises:
+            PostureError: No configuration of the robot, or a velocity that is none.
+            InputError: Rotor speeds that are none.
+        """
+        q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False, where="reset")
+        v = np.zeros(self.robot.nv) if v is None else np.asarray(v, dtype=float)
+        if v.shape != (self.robot.nv,) or not np.isfinite(v).all():
+            raise PostureError(
+                f"no velocity of {self.robot.name}", where="reset", mend=f"give {self.robot.nv} finite numbers"
+            )
+        self._mujoco.mj_resetData(self._model, self._data)
+        self._data.qpos[:] = self._layout.qpos(q)
+        self._data.qvel[:] = self._layout.qvel(q, v)
+        self._generator = np.random.default_rng(seed)
+        propulsion = self.robot.spec.propulsion
+        if self._rotors is not None and propulsion is not None:
+            self._rotors.reset(hover(self.robot.model, propulsion, q).speeds if rotor_speed is None else rotor_speed)
+        if self._vibration is not None:
+            self._vibration.reset(q, self._generator.uniform(0, 2 * np.pi, self._count))
+        self._log.reset()
+        self._force[:] = 0.0
+        self._torques = np.zeros(self._effort.size)
+        self._pushes.clear()
+        self._steps = 0
+        self._mujoco.mj_step1(self._model, self._data)
+        self._past.clear()
+        self._past.append(self._sample())
+        self._ready = True
+
+    @property
+    def time(self) -> float:
+        """Seconds since the reset."""
+        return self._steps * self.timestep
+
+    def push(self, push: Push) -> None:
+        """Begin to push now; pushes add up.
+
+        Raises:
+            FrameNotFound: No such frame.
+            InputError: A force or duration that is none.
+        """
+        point = point_on(self.robot, push.frame, push.offset)
+        steps = round(push.duration / self.timestep) if np.isfinite(push.duration) else 0
+        if steps < 1 or not np.isfinite(push.force).all():
+            raise InputError("has no force or no duration", where=f"push at '{push.frame}'",
+                             mend="give newtons, and seconds of at least a time step")  # fmt: skip
+        body = int(self._model.body(self.built.mjcf.bodies[point.joint]).id)
+        force = np.array(push.force, dtype=float)
+        self._pushes.append(_ActivePush(body, point.position, force, self._steps + steps))
+
+    def step(self, command: Commands, count: int = 1) -> None:
+        """Go on by physics steps under one command.
+
+        Args:
+            command: Rotor speeds and joint torques, cut to their limits.
+            count: How many steps.
+
+        Raises:
+            InputError: Before the first reset, or a command of other sizes or not finite.
+            SimulationDiverged: The state ran away.
+        """
+        self._check_ready()
+        speed, self._torques = self._checked(command)
+        self._data.ctrl[self._count :] = self._torques
+        # MuJoCo's own way with a warning is a log file in the working directory.
+        before = self._mujoco.get_mju_user_warning()
+        self._mujoco.set_mju_user_warning(_silent)
+        try:
+            for _ in range(count):
+                self._advance(speed)
+        finally:
+            self._mujoco.set_mju_user_warning(before)
+        if not (np.abs(self._data.qvel).max() < _RUNAWAY and np.abs(self._data.qpos).max() < _RUNAWAY):
+            raise SimulationDiverged(self.time, where=self.robot.name)
+        if self._past.maxlen == 1:
+            self._past.append(self._sample())
+
+    def _advance(self, speed: Array) -> None:
+        """One physics step."""
+        mujoco, model, data = self._mujoco, self._model, self._data
+        if self._rotors is not None:
+            data.ctrl[: self._count] = self._rotors.step(speed)
+            if self._vibration is not None:
+                self._vibration.step(self._rotors.speeds, self.timestep)
+        self._apply_pushes()
+        mujoco.mj_step2(model, data)
+        self._steps += 1
+        self._log.step(data)
+        if self._felt is not None:
+            self._force += self._smoothing * (self._log.forces[self._felt] - self._force)
+        # Positions, contacts and velocities of the new state; forces stay those of the step.
+        mujoco.mj_step1(model, data)
+        if self._past.maxlen != 1:
+            self._past.append(self._sample())
+
+    def read(self) -> Reading:
+        """What the sensors say now; every call draws its own noise."""
+        self._check_ready()
+        sample = self._past[0]
+        q, v = self._layout.state(sample.qpos, sample.qvel)
+        if self._vibration is not None:
+            v[:6] += self._vibration.twist(sample.speeds, sample.phases)
+        force = None if self._felt is None else sample.force
+        return self._noise.read(self.time, q, v, force, self._generator)
+
+    def truth(self) -> Truth:
+        """The state as it is; each shape's peak force and first touch start anew."""
+        self._check_ready()
+        data = self._data
+        q, v = self._layout.state(data.qpos, data.qvel)
+        values = data.qpos[self._limited]
+        stopped = np.flatnonzero((values <= self._low) | (values >= self._high))
+        rotors = self._rotors
+        return Truth(
+            t=self.time,
+            q=q,
+            v=v,
+            rotor_speeds=np.zeros(0) if rotors is None else rotors.speeds,
+            thrusts=np.zeros(0) if rotors is None else rotors.thrusts,
+            torques=self._torques,
+            shapes=self._log.look(data),
+            at_stops=tuple(self._limited_names[k] for k in stopped),
+        )
+
+    def _sample(self) -> _Sample:
+        nothing = np.zeros(0)
+        return _Sample(
+            self._data.qpos.copy(),
+            self._data.qvel.copy(),
+            nothing if self._rotors is None else self._rotors.speeds,
+            nothing if self._vibration is None else self._vibration.phases,
+            self._force.copy(),
+        )
+
+    def _apply_pushes(self) -> None:
+        if not self._pushes:
+            return
+        data = self._data
+        data.qfrc_applied[:] = 0.0
+        self._pushes = [push for push in self._pushes if push.end > self._steps]
+        for push in self._pushes:
+            place = data.xpos[push.body] + data.xmat[push.body].reshape(3, 3) @ push.point
+            self._mujoco.mj_applyFT(self._model, data, push.force, _NOTHING, place, push.body, data.qfrc_applied)
+
+    def _checked(self, command: Commands) -> tuple[Array, Array]:
+        speed, torque = np.asarray(command.rotor_speed, dtype=float), np.asarray(command.torque, dtype=float)
+        if speed.shape != (self._count,) or torque.shape != self._effort.shape:
+            raise InputError(
+                f"{speed.size} rotor speeds and {torque.size} torques",
+                where="command",
+                mend=f"give {self._count} and {self._effort.size}",
+            )
+        if not (np.isfinite(speed).all() and np.isfinite(torque).all()):
+            raise InputError("is not finite", where="command", mend="hold the last one instead")
+        torque = np.clip(torque, -self._effort, self._effort)
+        if not np.abs(torque).max(initial=0.0) < _RUNAWAY:
+            raise InputError("asks for endless torque", where="command", mend="give the joints effort limits")
+        return speed if self._rotors is None else self._rotors.within(speed), torque
+
+    def _check_ready(self) -> None:
+        if not self._ready:
+            raise InputError("has not been reset", where="world", mend="call reset(q) first")
+
+
+def build_world(robot: Robot, scene: Scene, q: ArrayLike | None = None) -> World:
+    """Build the simulation of a robot in its surroundings.
+
+    Args:
+        robot: The robot.
+        scene: Its surroundings.
+        q: Posture at which surfaces with a gap are placed, shape (nq,); the robot's default posture if not given.
+
+    Raises:
+        InputError: MuJoCo is not installed, or something of the scene does not fit the robot.
+    """
+    start = robot.posture() if q is None else robot.check_posture(np.asarray(q, dtype=float), where="start posture")
+    import_mujoco()
+    return World(robot, scene, build_scene(robot, scene, start))

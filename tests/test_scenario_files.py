@@ -1,0 +1,300 @@
+"""Experiments as files: the shipped ones, anybody's own, and what is refused."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impact_posture.errors import ImpactPostureError, InputError, ScenarioNotFound, SpecError
+from impact_posture.simulation import scenario_file
+from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.reference import Reference
+from impact_posture.simulation.scenario import (
+    Footing,
+    Gains,
+    ImpactScenario,
+    RepeatedContacts,
+    RobustTerm,
+    SinglePush,
+    set_up,
+)
+from impact_posture.simulation.scenario_file import known_scenarios, read_scenario
+from impact_posture.simulation.scene import ContactLaw, Physics, Sensors, Shape, Surface
+
+DOCS = Path(__file__).parents[1] / "docs"
+ARM = DOCS / "examples" / "rail_arm"
+SHIPPED = ("aerial-lateral", "aerial-vertical", "solo8-push", "talos-push")
+
+
+def needs_mujoco() -> None:
+    pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
+
+
+# ---- shipped ----------------------------------------------------------------------------------------------------
+
+
+def test_the_shipped_scenarios_are_known() -> None:
+    assert known_scenarios() == SHIPPED
+    for name in SHIPPED:
+        found = read_scenario(name)
+        assert found.name == name and found.description
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_scenario_can_be_set_up_and_run(name: str) -> None:
+    needs_mujoco()
+    setup = set_up(read_scenario(name))
+    world, robot = setup.world, setup.robot
+    world.reset(setup.q, seed=1)
+    before = world.truth()
+    assert not any(s.touching for s in before.shapes)
+    rotors = before.rotor_speeds
+    joints = robot.nv - 6
+    world.step(Drive(np.zeros(joints), rotors), 20)
+    reading, truth = world.read(), world.truth()
+    assert np.isfinite(truth.q).all() and np.isfinite(reading.v).all()
+    # A robot that flies is clear of the surface, one that stands is on it, with all its feet.
+    flies = isinstance(setup.scenario.task, RepeatedContacts)
+    assert (reading.force is not None) == flies
+    assert all(s.touching != flies for s in truth.shapes)
+
+
+def test_the_aerial_scenarios_are_as_designed() -> None:
+    vertical, lateral = read_scenario("aerial-vertical"), read_scenario("aerial-lateral")
+    for found, speed, normal in ((vertical, 0.5, (0, 0, 1)), (lateral, 0.4, (-1, 0, 0))):
+        task, control = found.task, found.control
+        assert isinstance(task, RepeatedContacts)
+        assert (task.count, task.speed, task.settle, task.dwell, task.beyond) == (5, speed, 4.0, 0.8, 0.03)
+        assert task.window == 0.3
+        assert control.period == 1e-3
+        assert (control.posture.kp, control.posture.kd) == (10.0, 6.0)
+        assert control.tilt is not None and control.end_effector is not None
+        np.testing.assert_array_equal(found.normal, normal)
+        assert found.surface.law.friction == 0.3
+        assert found.scene.sensors.force_frame == task.frame == found.shape.frame
+        assert found.scene.sensors.force_cutoff == 100.0
+        assert control.apparent_mass is not None
+
+
+def test_the_pushes_are_the_papers() -> None:
+    for name, frame, force in (("solo8-push", "base_link", 6.5), ("talos-push", "torso_2_link", 32.0)):
+        task = read_scenario(name).task
+        assert isinstance(task, SinglePush)
+        assert (task.frame, task.force, task.duration) == (frame, (force, 0, 0), 0.4)
+        assert set(task.signs) == {1, -1} and task.quiet == 0.005
+        assert task.push(-1).force == (-force, 0, 0)
+
+
+def test_the_robots_that_are_pushed_have_stated_armature_and_limits() -> None:
+    needs_mujoco()
+    solo = set_up(read_scenario("solo8-push")).robot
+    np.testing.assert_allclose(solo.armature[6:], 3.6e-4, rtol=0.02)
+    np.testing.assert_allclose(np.asarray(solo.model.effortLimit)[6:], 2.7)
+
+
+def test_the_lateral_arm_points_at_the_wall() -> None:
+    needs_mujoco()
+    setup = set_up(read_scenario("aerial-lateral"))
+    assert np.asarray(setup.robot.armature[6:]) == pytest.approx(0.03)
+    assert setup.gap == pytest.approx(0.2)
+    wall = setup.world.built.points["wall"]
+    assert wall[0] > 0.6, "beyond the propellers' discs"
+
+
+# ---- anybody's own ----------------------------------------------------------------------------------------------
+
+OWN = """
+name = "mine"
+robot = "rail_arm.urdf"
+joints = { elbow = 0.9 }
+
+[physics]
+timestep = 0.0005
+
+[[surfaces]]
+name = "table"
+normal = [0, 0, 2]
+gap = 0.05
+friction = 0.5
+
+[[shapes]]
+frame = "tool"
+size = [0.01]
+
+[contacts]
+frame = "tool"
+surface = "table"
+speed = 0.2
+
+[control.posture]
+kp = 10
+
+[control.robust]
+gain = 20
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "my_scenario.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    shutil.copytree(ARM, tmp_path / "own")
+    return tmp_path / "own"
+
+
+def test_anybodys_urdf_and_scenario_run_from_anywhere(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    needs_mujoco()
+    path = write(folder, OWN)
+    monkeypatch.chdir(folder.parent)
+    setup = set_up(read_scenario("own/my_scenario.toml"))
+    assert setup.scenario.source.endswith("my_scenario.toml")
+    assert setup.q[setup.robot.joint_names.index("elbow")] == 0.9
+    np.testing.assert_allclose(setup.scenario.normal, [0, 0, 1])
+    assert setup.gap == pytest.approx(0.05)
+    setup.world.reset(setup.q)
+    setup.world.step(Drive(np.zeros(setup.robot.nv), np.zeros(0)), 10)
+    assert read_scenario(path).control.posture == Gains(10)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("timestep =", "time_step =", r"unknown key 'physics.time_step'; did you mean timestep"),
+        ("friction =", "fricton =", r"unknown key 'surfaces.0.fricton'; did you mean friction"),
+        ("[control.robust]\ngain", "[control.robust]\nK", r"unknown key 'control.robust.K'"),
+        ('name = "mine"', 'nam = "mine"', r"unknown key 'nam'; did you mean name"),
+        ("speed = 0.2", 'speed = "0.2"', r"key 'contacts.speed'"),
+        ("speed = 0.2", "speed = -0.2", r"key 'contacts.speed'"),
+        ("normal = [0, 0, 2]", "normal = [0, 0]", r"key 'surfaces.0.normal"),
+        ("normal = [0, 0, 2]", "normal = [0, 0, 0]", r"surface 'table': the normal has no direction"),
+        ("timestep = 0.0005", "timestep = 0.005", r"table: solref|stops: solref"),
+        ("kp = 10", "kp = [10, 0]", r"key 'control.posture.kp"),
+        ('surface = "table"', 'surface = "tabel"', r"key 'contacts.surface': there is no 'tabel'; one of: table"),
+        ('frame = "tool"\nsurface', 'frame = "hand"\nsurface', r"key 'contacts.frame': there is no 'hand'"),
+        ("[contacts]", '[push]\nframe = "tool"\nforce = [1, 0, 0]\n\n[contacts]', r"has both"),
+        ('name = "mine"', 'schema = "impact-posture/problem/1"\nname = "mine"', r"schema 'impact-posture/problem/1'"),
+        ("[control.robust]\ngain = 20", "", r"key 'control.robust'"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_one_line(folder: Path, old: str, new: str, words: str) -> None:
+    assert old in OWN
+    with pytest.raises(SpecError, match=words) as caught:
+        read_scenario(write(folder, OWN.replace(old, new)))
+    assert "\n" not in caught.value.line and "my_scenario.toml" in caught.value.line
+
+
+def test_no_task_is_refused(folder: Path) -> None:
+    begin, end = OWN.index("[contacts]"), OWN.index("[control.posture]")
+    with pytest.raises(SpecError, match=r"neither \[contacts\] nor \[push\]"):
+        read_scenario(write(folder, OWN[:begin] + OWN[end:]))
+
+
+def test_a_misspelt_scenario_and_a_missing_file() -> None:
+    with pytest.raises(ScenarioNotFound, match="did you mean aerial-lateral"):
+        read_scenario("aerial-latral")
+    with pytest.raises(SpecError, match="no such file"):
+        read_scenario("nowhere/mine.toml")
+
+
+def test_a_frame_that_the_robot_lacks_is_refused(folder: Path) -> None:
+    needs_mujoco()
+    with pytest.raises(ImpactPostureError, match="no frame 'tool_tip'"):
+        set_up(read_scenario(write(folder, OWN.replace('frame = "', 'frame = "tool_tip" # '))))
+
+
+def test_surface_and_shape_of_a_push_are_refused() -> None:
+    found = read_scenario("solo8-push")
+    for ask in (lambda: found.surface, lambda: found.shape):
+        with pytest.raises(InputError, match="there is no"):
+            ask()
+
+
+@pytest.mark.parametrize(
+    ("file", "value"),
+    [
+        ("PhysicsFile", Physics), ("SurfaceFile", Surface), ("ShapeFile", Shape), ("SensorsFile", Sensors),
+        ("ContactsFile", RepeatedContacts), ("PushFile", SinglePush), ("GainsFile", Gains),
+        ("RobustFile", RobustTerm), ("FootingFile", Footing),
+    ],
+)  # fmt: skip
+def test_files_and_values_have_the_same_keys_and_defaults(file: str, value: Any) -> None:
+    model = getattr(scenario_file, file).model_fields
+    law = {f.name: f.default for f in fields(ContactLaw)} if value is Surface else {}
+    own = {f.name: f.default for f in fields(value) if f.name != "law"} | law
+    assert set(model) == set(own)
+    for key, field in model.items():
+        # A file must say how large a shape is.
+        if (value, key) != (Shape, "size"):
+            assert field.is_required() == (own[key] is MISSING), key
+            assert field.is_required() or field.default == own[key], key
+
+
+# ---- the reference ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("acceleration", [0.7, 5.0])
+@pytest.mark.parametrize("beyond", [0.0, 0.03])
+def test_the_reference_hits_the_surface_at_speed_and_comes_back(acceleration: float, beyond: float) -> None:
+    task = RepeatedContacts("ee", "wall", 0.5, acceleration=acceleration, count=2, settle=1.0, beyond=beyond)
+    reference = Reference(task, 0.2)
+    assert reference.total == pytest.approx(1.0 + 2 * reference.cycle)
+    times = np.arange(0, reference.total, 1e-4)
+    points = [reference.at(float(t)) for t in times]
+    distance, speed = np.array([p.distance for p in points]), np.array([p.speed for p in points])
+    acceleration_found = np.array([p.acceleration for p in points])
+    assert distance[0] == distance[-1] == 0 and distance.max() == pytest.approx(0.2 + beyond)
+    assert np.abs(speed).max() == pytest.approx(0.5, rel=1e-3)
+    # Distance, speed and acceleration belong together; without a way to brake in, the speed ends at once.
+    gone = np.sort(np.abs(np.diff(distance) - speed[:-1] * 1e-4))
+    assert gone[-3] < 1e-6 and gone[-1] < (1e-6 if beyond else 0.5e-4)
+    steps = np.diff(speed) - acceleration_found[:-1] * 1e-4
+    assert np.sort(np.abs(steps))[-3] < 0.01 and (beyond == 0 or np.abs(steps).max() < 0.01)
+    first = int(np.argmax(distance >= 0.2 - 1e-5))
+    assert speed[first - 1] == pytest.approx(0.5)
+    stay = np.flatnonzero((distance > 0.2 + beyond - 1e-9) & (speed == 0))
+    assert len(stay) * 1e-4 == pytest.approx(2 * task.dwell, abs=1e-3)
+    assert {p.contact for p in points} == {-1, 0, 1}
+    assert reference.at(reference.start(1)).distance == 0
+
+
+def test_a_gap_too_short_to_come_up_to_speed_in_is_refused() -> None:
+    with pytest.raises(InputError, match=r"takes 0\.125 m, the gap is 0\.1 m"):
+        Reference(RepeatedContacts("ee", "wall", 0.5), 0.1)
+
+
+def test_the_shipped_references_fit_their_gaps() -> None:
+    for name in ("aerial-vertical", "aerial-lateral"):
+        found: ImpactScenario = read_scenario(name)
+        assert isinstance(found.task, RepeatedContacts)
+        assert Reference(found.task, found.surface.gap).inward > 0.4
+
+
+# ---- the pages --------------------------------------------------------------------------------------------------
+
+
+def test_the_pages_program_runs() -> None:
+    needs_mujoco()
+    (program,) = re.findall(
+        r"^```python\n(.*?)^```", (DOCS / "simulation.md").read_text(encoding="utf-8"), re.M | re.S
+    )
+    names: dict[str, Any] = {}
+    exec(program, names)
+    assert names["truth"].t == pytest.approx(0.1)
+    assert names["reading"].force.shape == (3,)
+
+
+def test_the_pages_scenario_is_one(folder: Path) -> None:
+    page = (DOCS / "reference" / "scenario-toml.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"^```toml\n(.*?)^```", page, re.M | re.S)
+    found = read_scenario(write(folder, text))
+    assert isinstance(found.task, RepeatedContacts) and found.surface.gap == 0.1
