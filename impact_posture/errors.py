@@ -100,6 +100,12 @@ class ScenarioNotFound(NameNotFound):
     kind = "scenario"
 
 
+class ControllerNotFound(NameNotFound):
+    """No controller of that name is compared."""
+
+    kind = "controller"
+
+
 class PackageNotFound(NameNotFound):
     """A ``package://`` or ``example-robot-data:`` path leads nowhere."""
 

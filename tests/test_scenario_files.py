@@ -67,7 +67,7 @@ def test_every_shipped_scenario_can_be_set_up_and_run(name: str) -> None:
 
 def test_the_aerial_scenarios_are_as_designed() -> None:
     vertical, lateral = read_scenario("aerial-vertical"), read_scenario("aerial-lateral")
-    for found, speed, normal in ((vertical, 0.5, (0, 0, 1)), (lateral, 0.4, (-1, 0, 0))):
+    for found, speed, normal in ((vertical, 0.5, (0, 0, 1)), (lateral, 0.3, (-1, 0, 0))):
         task, control = found.task, found.control
         assert isinstance(task, RepeatedContacts)
         assert (task.count, task.speed, task.settle, task.dwell, task.beyond) == (5, speed, 4.0, 0.8, 0.03)

@@ -9,8 +9,8 @@ import os
 import platform
 import resource
 import shlex
-import signal
 import shutil
+import signal
 import subprocess
 import tempfile
 from collections.abc import Callable, Mapping, Sequence

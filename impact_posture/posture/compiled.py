@@ -72,7 +72,7 @@ def _key(problem: PostureProblem) -> str:
     objective = problem.objective
     content = [
         __version__,
-        _own_source(),
+        own_source("dynamics", "impact", "posture"),
         ca.CasadiMeta.version(),
         f"{platform.system()} {platform.machine()}",
         problem.robot.model_sha256,
@@ -88,11 +88,11 @@ def _key(problem: PostureProblem) -> str:
     return hashlib.sha256("\n".join(content).encode()).hexdigest()[:32]
 
 
-def _own_source() -> str:
+def own_source(*packages: str) -> str:
     """Hash of the code that writes the expressions: a changed formula never meets an old library."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
-    for folder in ("dynamics", "impact", "posture"):
+    for folder in packages:
         for path in sorted((root / folder).glob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from multiprocessing.pool import Pool
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -28,6 +25,7 @@ from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp
 from impact_posture.posture.notes import notes_on_blows
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import Projector, feasible_start
+from impact_posture.processes import shared_out
 
 Vector = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -270,48 +268,15 @@ def _run(job: _Job, index: int) -> _Run:
     return _Run(start, record, objective, minimized, certificate)
 
 
-# Worker processes are forked and find the program here: a CasADi solver cannot be sent to them.
-_WORK: dict[str, _Job] = {}
-
-
-def _worker(index: int) -> tuple[int, _Run]:
-    return index, _run(_WORK["job"], index)
-
-
 def _run_all(job: _Job, starts: int, jobs: int, progress: Progress | None) -> list[_Run]:
     runs: dict[int, _Run] = {}
-    with _results(job, starts, jobs) as results:
+    # Forking takes longer than three starts.
+    with shared_out(partial(_run, job), starts, jobs if starts > 3 else 1) as results:
         for index, run in results:
             runs[index] = run
             if progress:
                 progress(len(runs), starts)
     return [runs[index] for index in range(starts)]
-
-
-@contextmanager
-def _results(job: _Job, starts: int, jobs: int) -> Iterator[Iterator[tuple[int, _Run]]]:
-    """Runs as they finish, from forked processes where the system can fork and it pays."""
-    if jobs < 2 or starts < 4 or "fork" not in multiprocessing.get_all_start_methods():
-        yield ((index, _run(job, index)) for index in range(starts))
-        return
-    _WORK["job"] = job
-    # Ctrl-C reaches every process of the terminal's group: workers must never see it, not even at birth.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        pool: Pool = multiprocessing.get_context("fork").Pool(jobs, initializer=_ignore_interrupt)
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    try:
-        yield pool.imap_unordered(_worker, range(starts))
-    finally:
-        # On Ctrl-C as on success: nobody is left running.
-        pool.terminate()
-        pool.join()
-        _WORK.clear()
-
-
-def _ignore_interrupt() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def distinct(problem: PostureProblem, ends: list[tuple[Vector, float]]) -> tuple[Optimum, ...]:

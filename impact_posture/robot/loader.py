@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from impact_posture.errors import InputError, PackageNotFound, RobotNotFound, Sp
 from impact_posture.robot.armature import ArmatureOption, armature_warning, set_armature
 from impact_posture.robot.inertia import check_mass_matrix, check_moved_mass
 from impact_posture.robot.robot import Robot, Vector
-from impact_posture.robot.spec import RobotSpec, Root, read_spec
+from impact_posture.robot.spec import RobotSpec, Root, Vector3, read_spec
 from impact_posture.robot.urdf import (
     EXAMPLE_PREFIX,
     build_model,
@@ -36,6 +36,7 @@ class LoadOptions:
         armature: ``"none"``, a TOML file's path, or values by joint; ``None``: robot.toml's, else the rotor data of
             the SRDF, else zero.
         lock: Joints made rigid at the default posture.
+        mounting: How far joints sit from where the URDF has them, by joint: meters, in the parent joint's axes.
     """
 
     root: Root | None = None
@@ -44,6 +45,7 @@ class LoadOptions:
     config: str | None = None
     armature: ArmatureOption = None
     lock: tuple[str, ...] = field(default=())
+    mounting: Mapping[str, Vector3] = field(default_factory=dict)
 
 
 def known_robots() -> tuple[str, ...]:
@@ -65,6 +67,7 @@ def load_robot(robot: str, options: LoadOptions | None = None) -> Robot:
     _check_package_dirs(options.package_dirs, Path(), "--package-dir")
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
     model, warnings = build_model(urdf, free_flyer=root == "free-flyer", accept_inertias=spec.model.accept_inertias)
+    _remount(model, options.mounting, name)
     srdf = _srdf(spec, options, base)
     postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec, root, name)
     _override_limits(model, spec, name)
@@ -230,6 +233,17 @@ def _neutral(model: pin.Model) -> Vector:
         k = model.idx_qs[i]
         q[k] = np.clip(q[k], model.lowerPositionLimit[k], model.upperPositionLimit[k])
     return q
+
+
+def _remount(model: pin.Model, mounting: Mapping[str, Vector3], name: str) -> None:
+    """Move joints with all that hangs on them; the links before them keep their inertias."""
+    for joint, offset in mounting.items():
+        index = joint_index(model, joint, f"{name} mounting")
+        if not np.isfinite(offset).all():
+            raise InputError(f"the offset of '{joint}' is not finite", where=f"{name} mounting", mend="give meters")
+        placement = model.jointPlacements[index].copy()
+        placement.translation = placement.translation + np.array(offset, dtype=float)
+        model.jointPlacements[index] = placement
 
 
 def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:

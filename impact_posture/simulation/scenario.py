@@ -64,7 +64,7 @@ class SinglePush:
         settle: Least seconds before the push.
         quiet: ``‖ν‖`` below which the push may begin (mixes m/s and rad/s, as the paper's metric does).
         still: Seconds for which it must have been below.
-        patience: Seconds after which a robot that is not quiet counts as failed.
+        patience: Seconds beyond ``settle`` after which a robot that is not quiet is pushed all the same.
         after: Seconds that the run goes on after the push.
     """
 

@@ -167,6 +167,7 @@ class ScenarioFile(_Strict):
     config: str | None = None
     armature: str | dict[str, float] | None = None
     lock: tuple[str, ...] = ()
+    mounting: dict[str, Vector3] = {}
     posture: str | None = None
     joints: dict[str, float] = {}
     physics: PhysicsFile = PhysicsFile()
@@ -219,7 +220,9 @@ def _build(file: ScenarioFile, source: str) -> ImpactScenario:
         source=source,
         description=file.description,
         robot=file.robot,
-        load=LoadOptions(file.root, file.package_dir, file.srdf, file.config, file.armature, file.lock),
+        load=LoadOptions(
+            file.root, file.package_dir, file.srdf, file.config, file.armature, file.lock, file.mounting
+        ),
         posture=file.posture,
         joints=dict(file.joints),
         scene=_located(lambda: _scene(file), source),

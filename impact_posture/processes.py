@@ -1,0 +1,48 @@
+"""Work that is shared among forked processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.pool import Pool
+from typing import Any, TypeVar
+
+_Result = TypeVar("_Result")
+
+# Workers are forked and find the function here: what it holds (a CasADi solver) cannot be sent to them.
+_WORK: dict[str, Callable[[int], Any]] = {}
+
+
+def _worker(index: int) -> tuple[int, Any]:
+    return index, _WORK["function"](index)
+
+
+@contextmanager
+def shared_out(function: Callable[[int], _Result], count: int, jobs: int) -> Iterator[Iterator[tuple[int, _Result]]]:
+    """``(index, function(index))`` for each index below ``count``, as they finish.
+
+    In forked processes where ``jobs`` is more than one and the system can fork; else one after the other, here.  When
+    the block is left, in peace or by Ctrl-C, no process is left running.
+    """
+    if min(jobs, count) < 2 or "fork" not in multiprocessing.get_all_start_methods():
+        yield ((index, function(index)) for index in range(count))
+        return
+    _WORK["function"] = function
+    # Ctrl-C reaches every process of the terminal's group: workers must never see it, not even at birth.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        pool: Pool = multiprocessing.get_context("fork").Pool(min(jobs, count), initializer=_ignore_interrupt)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    try:
+        yield pool.imap_unordered(_worker, range(count))
+    finally:
+        pool.terminate()
+        pool.join()
+        _WORK.clear()
+
+
+def _ignore_interrupt() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

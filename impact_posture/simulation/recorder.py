@@ -1,0 +1,88 @@
+"""Takes down what happens in a run."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.errors import ImpactPostureError
+from impact_posture.simulation.blow import Gradient
+from impact_posture.simulation.exchange import Truth
+from impact_posture.simulation.scenario import RepeatedContacts, Setup
+from impact_posture.simulation.series import Series
+from impact_posture.tsid.controller import Command, Status
+
+Array = NDArray[np.float64]
+
+STATUSES: tuple[Status, ...] = tuple(Status)
+# The metric is drawn, not controlled with: ticks from one evaluation to the next.
+_EVERY = 10
+
+
+class Recorder:
+    """One row a tick.
+
+    Args:
+        setup: The experiment.
+        metric: ``q → (H, ∇H)``, for the course of H.
+    """
+
+    def __init__(self, setup: Setup, metric: Gradient) -> None:
+        self._setup, self._metric = setup, metric
+        robot, task = setup.robot, setup.scenario.task
+        shapes = [s.frame for s in setup.scenario.scene.shapes]
+        self._shape = shapes.index(task.frame) if isinstance(task, RepeatedContacts) else None
+        self._joints = {robot.tangent_names[k]: k for k in range(robot.nv)}
+        self._rows: list[tuple[object, ...]] = []
+        self._touches: list[float] = []
+        self._push = (np.zeros(3), np.inf, -np.inf)
+        propulsion = robot.spec.propulsion
+        self._rotors = (0.0, 0.0) if propulsion is None else (propulsion.speed_min, propulsion.speed_max)
+        self.speed = 0.0
+        """``‖ν‖`` at the last tick."""
+
+    def pushed(self, force: Array, begin: float, end: float) -> None:
+        """A push acts from ``begin`` to ``end``."""
+        self._push = (force, begin, end)
+
+    def take(self, truth: Truth, command: Command, level: float, distance: float) -> None:
+        """Take down a tick."""
+        self.speed = float(np.linalg.norm(truth.v))
+        hit = None if self._shape is None else truth.shapes[self._shape]
+        if hit is not None and hit.began is not None:
+            self._touches.append(hit.began)
+        force, begin, end = self._push
+        if hit is not None:
+            force, peak, slip = hit.force, hit.peak, hit.slip
+        else:
+            force = force if begin < truth.t <= end + 1e-9 else np.zeros(3)
+            peak = float(np.linalg.norm(force))
+            slip = max((s.slip for s in truth.shapes), default=0.0)
+        self._rows.append((
+            truth.t, truth.q, truth.v, truth.torques, np.clip(command.rotor_speed, *self._rotors), truth.rotor_speeds,
+            force, peak, slip, sum(s.touching for s in truth.shapes), self._value(truth.q), level,
+            STATUSES.index(command.status), self._stopped(truth), distance,
+        ))  # fmt: skip
+
+    def first_touch(self, begin: float, end: float) -> float | None:
+        """When the shape that hits was first pushed within ``[begin, end)``, s."""
+        return next((t for t in self._touches if begin <= t < end), None)
+
+    def series(self) -> Series:
+        """All of it."""
+        return Series(*(np.array(column) for column in zip(*self._rows, strict=True)))
+
+    def _value(self, q: Array) -> float:
+        if len(self._rows) % _EVERY:
+            return float("nan")
+        try:
+            return self._metric(q)[0]
+        except ImpactPostureError:
+            return float("nan")
+
+    def _stopped(self, truth: Truth) -> Array:
+        stopped = np.zeros(self._setup.robot.nv, dtype=bool)
+        for name in truth.at_stops:
+            if name in self._joints:
+                stopped[self._joints[name]] = True
+        return stopped

@@ -1,0 +1,166 @@
+"""One run: a controller in a scenario, from the start to the end, with a record of all that happened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.errors import InputError
+from impact_posture.simulation.blow import interpreted
+from impact_posture.simulation.controllers import Mode, Workshop
+from impact_posture.simulation.driver import Driver
+from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.recorder import Recorder
+from impact_posture.simulation.reference import Reference
+from impact_posture.simulation.scenario import RepeatedContacts, SinglePush
+from impact_posture.simulation.series import Series, Window
+from impact_posture.tsid.controller import Command
+
+Array = NDArray[np.float64]
+
+# When controllers begin to prepare, s: after the first reaction of sensors and motors.
+_BRACE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What came of a run.
+
+    Attributes:
+        series: Tick by tick.
+        windows: What counts as impact, one for each contact or push; then, for contacts, the dwell windows.
+        sign: Of the push; 1 for contacts.
+        waited: Seconds until the robot was pushed; NaN for contacts.
+        rested: Whether it had come to rest by then; one that does not within the scenario's patience is pushed all
+            the same, and what is measured holds its own motion.
+    """
+
+    series: Series
+    windows: tuple[Window, ...]
+    sign: int = 1
+    waited: float = float("nan")
+    rested: bool = True
+
+    @property
+    def impacts(self) -> tuple[Window, ...]:
+        """The windows that count as impact."""
+        return tuple(w for w in self.windows if w.kind == "impact")
+
+
+def run(workshop: Workshop, controller: str, *, seed: int = 0, mode: Mode = "live", gain: float | None = None,
+        only: int | None = None) -> tuple[Run, ...]:  # fmt: skip
+    """Let a controller live through a scenario: one run, or one for each sign of the push.
+
+    Args:
+        workshop: The scenario and its parts.
+        controller: Its name.
+        seed: Of the sensors' noise.
+        mode: ``live``: the term stays on; ``held``: the reached posture is held before the first blow.
+        gain: K instead of the scenario's, 1/s².
+        only: That sign of the push alone.
+
+    Raises:
+        SimulationDiverged: The robot ran away.
+        ControllerNotFound: No such controller.
+        InputError: Ticks that are no multiple of the physics' steps.
+    """
+    driver = workshop.driver(controller, mode, gain)
+    task = workshop.setup.scenario.task
+    if isinstance(task, RepeatedContacts):
+        return (_contacts(workshop, driver, task, seed, mode),)
+    signs = task.signs if only is None else (only,)
+    return tuple(_push(workshop, driver, task, sign, seed, mode) for sign in signs)
+
+
+class _Loop:
+    """Controller and world, tick by tick."""
+
+    def __init__(self, workshop: Workshop, driver: Driver, seed: int) -> None:
+        setup = workshop.setup
+        self.setup, self.driver, self.world = setup, driver, setup.world
+        self.period = setup.scenario.control.period
+        self.count = round(self.period / self.world.timestep)
+        if self.count < 1 or abs(self.count * self.world.timestep - self.period) > 1e-9:
+            raise InputError(
+                f"a tick of {self.period:g} s is no multiple of the physics' {self.world.timestep:g} s",
+                where=setup.scenario.source,
+                mend="change control.period or physics.timestep",
+            )
+        command = driver.reset(setup.q)
+        self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
+        self.recorder = Recorder(setup, interpreted(workshop.objective()))
+
+    @property
+    def t(self) -> float:
+        return self.world.time
+
+    def tick(self, reference: Reference | None = None) -> None:
+        point = None if reference is None else reference.at(self.t)
+        command: Command = self.driver.tick(self.world.read(), point)
+        self.world.step(Drive(command.torque, command.rotor_speed), self.count)
+        distance = 0.0 if point is None else point.distance
+        self.recorder.take(self.world.truth(), command, self.driver.level, distance)
+
+
+def _contacts(workshop: Workshop, driver: Driver, task: RepeatedContacts, seed: int, mode: Mode) -> Run:
+    loop = _Loop(workshop, driver, seed)
+    reference = Reference(task, workshop.setup.gap)
+    # Where the way in crosses the surface: what follows is braking behind it.
+    crossing = reference.inward - 2 * task.beyond / task.speed
+    blows = [reference.start(k) + crossing for k in range(task.count)]
+    ramp = workshop.setup.scenario.control.robust.ramp
+    events = [(_BRACE, driver.brace)]
+    if mode == "held":
+        events.append((max(_BRACE, reference.start(0) - 2 * ramp), driver.hold))
+    expected = list(blows)
+    for _ in range(round(reference.total / loop.period)):
+        while events and loop.t >= events[0][0] - 1e-9:
+            events.pop(0)[1]()
+        # The way in begins long before: from there on the next blow is the one that is expected.
+        if expected and loop.t >= expected[0] - crossing - 1e-9:
+            driver.expect(expected.pop(0))
+        loop.tick(reference)
+    series, first = loop.recorder.series(), []
+    for k, blow in enumerate(blows):
+        begin, end = reference.start(k), reference.start(k) + reference.cycle
+        touch = loop.recorder.first_touch(begin, end)
+        leaves = begin + reference.inward + task.dwell
+        at = blow if touch is None else touch
+        first.append(Window("impact", k, at, at + task.window, touch is not None))
+        first.append(Window("dwell", k, at, max(leaves, at), touch is not None))
+    return Run(series, tuple(sorted(first, key=lambda w: w.kind != "impact")))
+
+
+def _push(workshop: Workshop, driver: Driver, task: SinglePush, sign: int, seed: int, mode: Mode) -> Run:
+    loop = _Loop(workshop, driver, seed)
+    ramp, brace = workshop.setup.scenario.control.robust.ramp, [driver.brace]
+    rested = _settle(loop, task, task.settle, brace)
+    if mode == "held":
+        # What was reached is held, and comes to rest once more without the term.
+        driver.hold()
+        rested = _settle(loop, task, loop.t + 2 * ramp, []) and rested
+    begin = loop.t
+    loop.driver.expect(begin)
+    push = task.push(sign)
+    loop.world.push(push)
+    loop.recorder.pushed(np.array(push.force), begin, begin + task.duration)
+    for _ in range(round((task.duration + task.after) / loop.period)):
+        loop.tick()
+    window = Window("impact", 0, begin, begin + task.duration, True)
+    return Run(loop.recorder.series(), (window,), sign, begin, rested)
+
+
+def _settle(loop: _Loop, task: SinglePush, least: float, brace: list[Callable[[], None]]) -> bool:
+    """Go on until ``least`` and until the robot has been quiet for long enough; whether it has."""
+    still, end = 0.0, max(least, loop.t) + task.patience
+    while loop.t < least - 1e-9 or still < task.still - 1e-9:
+        if loop.t > end:
+            return False
+        if brace and loop.t >= _BRACE:
+            brace.pop()()
+        loop.tick()
+        still = still + loop.period if loop.recorder.speed < task.quiet else 0.0
+    return True
