@@ -173,9 +173,9 @@ def test_a_robot_that_stands_can_hit_something_too(folder: Path) -> None:
     begin, end = text.index("[push]"), text.index("[control.posture]")
     wall = (
         '[[surfaces]]\nname = "wall"\nnormal = [-1, 0, 0]\npoint = [0.27, 0, 0]\n\n'
-        '[[shapes]]\nframe = "base_link"\nsize = [0.02]\noffset = [0.24, 0, 0]\n\n'
+        '[[shapes]]\nframe = "base_link"\nsize = [0.02]\noffset = [0.24, 0, 0]\ncenter = [0.22, 0, 0]\n\n'
         '[contacts]\nframe = "base_link"\nsurface = "wall"\nspeed = 0.15\ncount = 1\nsettle = 0.2\ndwell = 0.2\n'
-        "pause = 0.05\nbeyond = 0.01\n\n[control.end_effector]\nkp = 65\nweight = 10\n\n"
+        "pause = 0.05\nbeyond = 0.01\n\n[control.end_effector]\nkp = 65\nweight = 1000\n\n"
     )
     path = folder / "bump.toml"
     path.write_text(text[:begin] + wall + text[end:], encoding="utf-8")
