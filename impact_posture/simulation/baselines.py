@@ -29,11 +29,12 @@ class StiffPosture(JointPosture):
 
     An impact-robust term that stays on pulls back like a spring ``K_r ∇²H/λ`` when the robot is pushed away from
     where it rests.  This nominal controller has that spring from the start, critically damped, and no better posture:
-    what the term gains over it, the posture gains.  ``K`` is symmetrized, its negative eigenvalues are cut off, and
-    the base of a floating robot, which other tasks lead, is left out.
+    what the term gains over it, the posture gains.  ``∇²H`` is symmetrized; the base of a floating robot, which other
+    tasks lead, is left out, and so is negative curvature: there the term is no spring, and ``K`` stays at ``K_p``.
 
     Attributes:
         stiffness: ``K``, 1/s², shape (nv, nv), once reset.
+        damping: ``D``, 1/s, likewise.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class StiffPosture(JointPosture):
         self._gradient, self._K = gradient, K
         # Only for its scale λ: normalized as the term would be.
         self._like = ImpactRobustPosture(robot, gradient, K=K, kp=kp)
-        self.stiffness, self._damping = np.diag(self.kp), np.diag(self.kd)
+        self.stiffness, self.damping = np.diag(self.kp), np.diag(self.kd)
 
     def stiffen(self, state: State, redundancy: Array) -> None:
         """Measure the curvature at ``state``, with ``redundancy`` as in :meth:`ImpactRobustPosture.normalize`."""
@@ -73,14 +74,15 @@ class StiffPosture(JointPosture):
         added = self._K / self._like.scale * (curvature + curvature.T) / 2
         if self._robot.floating:
             added[:6], added[:, :6] = 0.0, 0.0
-        values, vectors = np.linalg.eigh(np.diag(self.kp) + added)
-        values = np.maximum(values, 0.0)
-        self.stiffness = (vectors * values) @ vectors.T
-        self._damping = (vectors * (2 * np.sqrt(values))) @ vectors.T
+        values, vectors = np.linalg.eigh(added)
+        stiffness = np.diag(self.kp) + (vectors * np.maximum(values, 0.0)) @ vectors.T
+        self.stiffness = (stiffness + stiffness.T) / 2
+        values, vectors = np.linalg.eigh(self.stiffness)
+        self.damping = (vectors * (2 * np.sqrt(np.maximum(values, 0.0)))) @ vectors.T
 
     def desired(self, state: State) -> Array:
         """``ν̇*``, shape (nv,)."""
-        return np.asarray(self.stiffness @ self.error(state) - self._damping @ state.v)
+        return np.asarray(self.stiffness @ self.error(state) - self.damping @ state.v)
 
 
 class StiffDriver(Driver):
@@ -173,8 +175,11 @@ class WalkerDriver(Driver):
         self.posture.term.brace()
 
     def hold(self) -> None:
-        """Stop the flow where it is."""
+        """Stop the flow; hold the reached posture, center of mass and base orientation."""
         self.posture.term.contact()
+        # The reference has gone ahead wherever other tasks kept the robot back.
+        self.posture.move_to(self.controller.state.q, self.posture.term.activation.ramp)
+        self._freeze()
 
     @property
     def level(self) -> float:
@@ -187,9 +192,10 @@ class InvariantDriver(Driver):
 
     No impulse at the contact changes the component of ν in the null space of ``J M⁻¹``.  Around the blow the velocity
     that the feedback sees is ``ν̂ = ν + α M⁻¹Jᵀ λ*``, with ``λ*`` the impulse that brings the tasks' velocities
-    nearest to what they are asked for: what an impulse may have done is not fought.  ``M⁻¹`` is contact-consistent
-    for a robot that stands.  ``α`` is 1 from ``BEFORE`` before the blow, expected or felt, to ``AFTER`` after it,
-    with smooth flanks of ``FLANK`` (s).
+    nearest to what they are asked for: what an impulse may have done is not fought.  The posture task has no say in
+    ``λ*`` beside others: it asks for rest while they move.  ``M⁻¹`` is contact-consistent for a robot that stands.
+    ``α`` is 1 from ``BEFORE`` before the blow, expected or felt, to ``AFTER`` after it, with smooth flanks of
+    ``FLANK`` (s).
     """
 
     BEFORE, AFTER, FLANK = 0.02, 0.05, 0.03
@@ -202,7 +208,8 @@ class InvariantDriver(Driver):
         scenario = setup.scenario
         offset = scenario.shape.offset if isinstance(scenario.task, RepeatedContacts) else (0.0, 0.0, 0.0)
         self._point = Point(scenario.task.frame, offset)
-        self._aside = State(setup.robot, (self._point,))
+        points = (*self.controller.program.points, self._point)
+        self._aside = State(setup.robot, tuple(dict.fromkeys(points)))
         self._at, self._felt = -np.inf, False
 
     def reset(self, q: Array) -> Command:
@@ -216,6 +223,9 @@ class InvariantDriver(Driver):
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
         """The command for the velocity without what an impulse could have changed."""
+        if reference is not None:
+            # What is asked for now is what the error is measured from.
+            self._follow(reference)
         if reading.force is not None and not self._felt and reading.t > self._at - 0.2:
             if float(np.linalg.norm(reading.force)) > self.FELT:
                 self._at, self._felt = reading.t, True
@@ -232,20 +242,15 @@ class InvariantDriver(Driver):
         return smooth(1 - left / self.FLANK) if left < self.FLANK else 0.0
 
     def _correction(self, reading: Reading) -> Array:
-        state, assembly = self._aside.update(reading.q, reading.v), self.controller.assembly
+        state, program = self._aside.update(reading.q, reading.v), self.controller.program
         inverse = np.linalg.inv(state.M)
-        feet = assembly.contacts.J
-        if feet.shape[0]:
+        if program.contacts:
+            feet = np.vstack([state.at(c.point).jacobian[: c.size] for c in program.contacts])
             held = feet @ inverse
             inverse = inverse - held.T @ np.linalg.pinv(held @ feet.T, rcond=1e-6, hermitian=True) @ held
         change = inverse @ state.at(self._point).jacobian[:3].T
-        rows, wanted = [], []
-        for task in self.controller.program.tasks:
-            J = task.jacobian(self.controller.state)
-            weight = np.sqrt(task.weight)[:, None] if task is self.posture else 1.0
-            rows.append(weight * J)
-            wanted.append(np.asarray(weight * task.target_velocity[:, None])[:, 0])
-        J = np.vstack(rows)
-        error = np.concatenate(wanted) - J @ reading.v
+        leading = [task for task in program.tasks if task is not self.posture] or [self.posture]
+        J = np.vstack([task.jacobian(state) for task in leading])
+        error = np.concatenate([task.target_velocity for task in leading]) - J @ reading.v
         impulse = np.linalg.lstsq(J @ change, error, rcond=1e-9)[0]
         return np.asarray(change @ impulse)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from impact_posture import __version__
 from impact_posture.codegen.folder import write_export
 from impact_posture.codegen.loader import ImpactGradient
-from impact_posture.errors import CompilerError, MetricError
+from impact_posture.errors import CompilerError, MetricError, OutputError
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
@@ -113,7 +113,15 @@ def _key(objective: ImpactObjective) -> str:
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """One process at a time: the others find the work done."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w") as file:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("w")
+    except OSError as error:
+        raise OutputError(
+            f"cannot be written ({error.strerror})",
+            where=str(path.parent),
+            mend="set IMPACT_POSTURE_CACHE to a folder",
+        ) from None
+    with file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

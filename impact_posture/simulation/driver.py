@@ -41,9 +41,13 @@ class Driver:
         self._home: pin.SE3 | None = None
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest: what the tasks hold is what is there."""
+        """Begin at rest: what the tasks hold is what is there, whatever a run before has moved."""
         if self._hand is not None:
             self._hand.target = None
+            self._hand.target_velocity, self._hand.target_acceleration = np.zeros(6), np.zeros(6)
+        for task in self.controller.program.weighted:
+            if isinstance(task, CenterOfMass | BaseOrientation):
+                task.target = None
         command = self.controller.reset(q, np.zeros(self.setup.robot.nv))
         self._home = None if self._hand is None else self._hand.target
         return command
@@ -68,6 +72,15 @@ class Driver:
         """How much of the preparing term is on, 0 to 1."""
         return 0.0
 
+    def _freeze(self) -> None:
+        """Let center of mass and base orientation be wanted where they are now."""
+        state = self.controller.state
+        for task in self.controller.program.weighted:
+            if isinstance(task, CenterOfMass):
+                task.target = state.center_of_mass()[0].copy()
+            elif isinstance(task, BaseOrientation):
+                task.target = np.array(state.base_rotation)
+
     def _follow(self, reference: ReferencePoint) -> None:
         if self._hand is None or self._home is None:
             return
@@ -89,12 +102,7 @@ class RobustDriver(Driver):
     def hold(self) -> None:
         """Hold the reached posture, center of mass and base orientation; switch the term off."""
         self.posture.contact()
-        state = self.controller.state
-        for task in self.controller.program.weighted:
-            if isinstance(task, CenterOfMass):
-                task.target = state.center_of_mass()[0].copy()
-            elif isinstance(task, BaseOrientation):
-                task.target = np.array(state.base_rotation)
+        self._freeze()
 
     @property
     def level(self) -> float:
@@ -115,9 +123,6 @@ class PostureDriver(Driver):
 
     def reset(self, q: Array) -> Command:
         """Begin at rest."""
-        for task in self.controller.program.weighted:
-            if isinstance(task, CenterOfMass | BaseOrientation):
-                task.target = None
         self._since, self._from = None, {}
         return super().reset(q)
 

@@ -30,8 +30,8 @@ class Metrics:
         q_total_impact_base: The same of the floating base's six entries.
         q_total_impact_joints: The same of the joints'.
         q_total_dwell: The same as the first over the dwell windows; 0 for pushes.
-        peak_jump: Largest ``‖ν(t) − ν⁻‖`` within 15 ms of the first touch, mean over the contacts; for pushes the
-            largest ``‖ν‖`` within the window.
+        peak_jump: Largest ``‖ν(t) − ν⁻‖`` within 15 ms of the first touch, mean over the contacts that came about (0
+            without any); for pushes the largest ``‖ν‖`` within the window.
         peak_jump_max: The largest of them.
         peak_force: Largest normal force within the impact windows, N; for pushes the push.
         saturation_inside: Seconds within the impact windows with a rotor or a joint at a control limit.
@@ -83,7 +83,8 @@ def measure(setup: Setup, run: Run) -> Metrics:
     relaxed = series.status == STATUSES.index(Status.RELAXED)
     failed = ~relaxed & (series.status != STATUSES.index(Status.SOLVED))
     dwell = sum(float(speed[series.slice(w.begin, w.end)].sum()) * period for w in run.windows if w.kind == "dwell")
-    jumps = [jump(setup, series, w) for w in impacts]
+    # A blow that never came is no small one.
+    jumps = [jump(setup, series, w) for w in impacts if w.touched] or [0.0]
     stopped = (series.at_stop[inside] & ~series.at_stop[0]).any(axis=0) if inside.any() else np.zeros(0, bool)
     return Metrics(
         q_total_impact=float(speed[inside].sum() * period),

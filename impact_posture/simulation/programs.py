@@ -10,48 +10,58 @@ from impact_posture.tsid.frame_tasks import FramePose, Impedance
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.program import Program
+from impact_posture.tsid.task import Task
 
 
 def end_effector_task(setup: Setup) -> FramePose | None:
     """The end effector's task, where the scenario has gains for one.
 
     Raises:
-        SpecError: Gains for an end effector where nothing is touched.
+        SpecError: Gains for an end effector where nothing is touched, or none where something is.
     """
     control, task = setup.scenario.control, setup.scenario.task
-    if control.end_effector is None:
-        return None
-    if not isinstance(task, RepeatedContacts):
-        raise SpecError("has gains of an end effector, but a push", where=setup.scenario.source, mend="remove them")
     gains = control.end_effector
+    if not isinstance(task, RepeatedContacts):
+        if gains is not None:
+            raise SpecError(
+                "has gains of an end effector, but a push", where=setup.scenario.source, mend="remove them"
+            )
+        return None
+    if gains is None:
+        raise SpecError(
+            "has contacts, but nothing that leads the frame there",
+            where=setup.scenario.source,
+            mend="add [control.end_effector]",
+        )
     soften = None if control.apparent_mass is None else Impedance(control.apparent_mass)
     point = Point(task.frame, setup.scenario.shape.offset)
-    return FramePose(point, name="end effector", impedance=soften, kp=gains.kp, kd=gains.kd)
+    return FramePose(point, name="end effector", impedance=soften, kp=gains.kp, kd=gains.kd, weight=gains.weight)
 
 
 def build_program(setup: Setup, posture: JointPosture, end_effector: FramePose | None) -> Program:
     """The program of a scenario with a posture task of its own.
 
-    A robot with ``[control.footing]`` stands: contacts and friction constrain, center of mass, base orientation and
-    posture weigh.  Any other has strict levels: level base, end effector, posture in the cost.
+    A robot with ``[control.footing]`` stands: contacts and friction constrain, center of mass, base orientation, end
+    effector and posture weigh.  Any other has strict levels: level base, end effector, posture in the cost.
 
     Raises:
         SpecError: Gains for a task that the robot cannot have.
     """
     control, scenario = setup.scenario.control, setup.scenario
-    if scenario.control.footing is not None:
-        weighted = [
+    _check_gains(setup)
+    felt = None if end_effector is None or scenario.scene.sensors.force_frame is None else end_effector.point
+    if control.footing is not None:
+        weighted: list[Task] = [
             task(kp=gains.kp, kd=gains.kd, weight=gains.weight)
             for task, gains in ((CenterOfMass, control.center_of_mass), (BaseOrientation, control.base))
             if gains is not None
         ]
-        contacts = _contacts(setup, control)
-        return Program((), tuple(weighted), posture, contacts, force_weight=scenario.control.footing.force_weight)
-    if control.tilt is not None and not setup.robot.floating:
-        raise SpecError("has gains of a tilt, but a fixed base", where=scenario.source, mend="remove [control.tilt]")
+        if end_effector is not None:
+            weighted.append(end_effector)
+        contacts, cost = _contacts(setup, control), control.footing.force_weight
+        return Program((), tuple(weighted), posture, contacts, force_point=felt, force_weight=cost)
     tilt = () if control.tilt is None else ((Tilt(kp=control.tilt.kp, kd=control.tilt.kd),),)
     hand = () if end_effector is None else ((end_effector,),)
-    felt = None if end_effector is None or scenario.scene.sensors.force_frame is None else end_effector.point
     return Program((*tilt, *hand), (), posture, force_point=felt)
 
 
@@ -64,6 +74,20 @@ def nominal_posture(setup: Setup) -> JointPosture:
     """The posture task that holds the start posture."""
     gains = setup.scenario.control.posture
     return JointPosture(setup.robot, kp=gains.kp, kd=gains.kd, weight=gains.weight, base_weight=base_weight(setup))
+
+
+def _check_gains(setup: Setup) -> None:
+    """Refuse gains that no task would take."""
+    control, source = setup.scenario.control, setup.scenario.source
+    stands, flies = control.footing is not None, setup.robot.floating
+    for key, given, fits, why in (
+        ("footing", control.footing, flies, "a base that is fixed"),
+        ("tilt", control.tilt, flies and not stands, "feet" if stands else "a base that is fixed"),
+        ("center_of_mass", control.center_of_mass, stands, "no [control.footing]"),
+        ("base", control.base, stands, "no [control.footing]"),
+    ):
+        if given is not None and not fits:
+            raise SpecError(f"has [control.{key}], but {why}", where=source, mend=f"remove [control.{key}]")
 
 
 def _contacts(setup: Setup, control: Control) -> tuple[Contact, ...]:

@@ -35,6 +35,7 @@ class Recorder:
         self._joints = {robot.tangent_names[k]: k for k in range(robot.nv)}
         self._rows: list[tuple[object, ...]] = []
         self._touches: list[float] = []
+        self._touching = False
         self._push = (np.zeros(3), np.inf, -np.inf)
         propulsion = robot.spec.propulsion
         self._rotors = (0.0, 0.0) if propulsion is None else (propulsion.speed_min, propulsion.speed_max)
@@ -49,8 +50,11 @@ class Recorder:
         """Take down a tick."""
         self.speed = float(np.linalg.norm(truth.v))
         hit = None if self._shape is None else truth.shapes[self._shape]
-        if hit is not None and hit.began is not None:
-            self._touches.append(hit.began)
+        if hit is not None:
+            # One that lasts is told of anew at every look.
+            if hit.began is not None and not self._touching:
+                self._touches.append(hit.began)
+            self._touching = hit.touching
         force, begin, end = self._push
         if hit is not None:
             force, peak, slip = hit.force, hit.peak, hit.slip
@@ -65,7 +69,7 @@ class Recorder:
         ))  # fmt: skip
 
     def first_touch(self, begin: float, end: float) -> float | None:
-        """When the shape that hits was first pushed within ``[begin, end)``, s."""
+        """When a touch of the shape that hits first began within ``[begin, end)``, s."""
         return next((t for t in self._touches if begin <= t < end), None)
 
     def series(self) -> Series:

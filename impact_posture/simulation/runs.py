@@ -65,12 +65,14 @@ def run(workshop: Workshop, controller: str, *, seed: int = 0, mode: Mode = "liv
     Raises:
         SimulationDiverged: The robot ran away.
         ControllerNotFound: No such controller.
-        InputError: Ticks that are no multiple of the physics' steps.
+        InputError: Ticks that are no multiple of the physics' steps, or a sign that is none.
     """
     driver = workshop.driver(controller, mode, gain)
     task = workshop.setup.scenario.task
     if isinstance(task, RepeatedContacts):
         return (_contacts(workshop, driver, task, seed, mode),)
+    if only not in (None, 1, -1):
+        raise InputError(f"{only} is no sign of a push", where=workshop.setup.scenario.source, mend="give 1 or -1")
     signs = task.signs if only is None else (only,)
     return tuple(_push(workshop, driver, task, sign, seed, mode) for sign in signs)
 
@@ -137,7 +139,8 @@ def _contacts(workshop: Workshop, driver: Driver, task: RepeatedContacts, seed: 
 def _push(workshop: Workshop, driver: Driver, task: SinglePush, sign: int, seed: int, mode: Mode) -> Run:
     loop = _Loop(workshop, driver, seed)
     ramp, brace = workshop.setup.scenario.control.robust.ramp, [driver.brace]
-    rested = _settle(loop, task, task.settle, brace)
+    # Whatever the scenario's patience: all controllers begin to prepare before a push.
+    rested = _settle(loop, task, max(task.settle, _BRACE + loop.period), brace)
     if mode == "held":
         # What was reached is held, and comes to rest once more without the term.
         driver.hold()
@@ -159,7 +162,7 @@ def _settle(loop: _Loop, task: SinglePush, least: float, brace: list[Callable[[]
     while loop.t < least - 1e-9 or still < task.still - 1e-9:
         if loop.t > end:
             return False
-        if brace and loop.t >= _BRACE:
+        if brace and loop.t >= _BRACE - 1e-9:
             brace.pop()()
         loop.tick()
         still = still + loop.period if loop.recorder.speed < task.quiet else 0.0

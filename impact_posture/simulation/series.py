@@ -14,6 +14,9 @@ from impact_posture.errors import SpecError
 
 Array = NDArray[Any]
 
+# S within which two times are one: sums of time steps are not exact.
+_SAME = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class Window:
@@ -77,8 +80,8 @@ class Series:
     reference: Array
 
     def slice(self, begin: float, end: float) -> slice:
-        """The ticks that lie in ``(begin, end]``."""
-        first, last = np.searchsorted(self.t, [begin, end], side="right")
+        """The ticks that lie in ``(begin, end]``, rounding of the times aside."""
+        first, last = np.searchsorted(self.t, [begin + _SAME, end + _SAME], side="right")
         return slice(int(first), int(last))
 
     def save(self, path: Path, **more: Any) -> None:
@@ -96,5 +99,5 @@ class Series:
         try:
             with np.load(path, allow_pickle=False) as found:
                 return Series(**{f.name: found[f.name] for f in fields(Series)})
-        except (OSError, ValueError, KeyError, BadZipFile) as error:
+        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
             raise SpecError(f"is no time series ({error})", where=str(path), mend="run simulate again") from None

@@ -1,0 +1,1 @@
+"""Controllers, runs and metrics of the experiments."""
