@@ -51,7 +51,7 @@ def write_comparison(
     force: bool = False,
     formats: Sequence[str] = FORMATS,
 ) -> None:
-    """``comparison.json`` and figures of the first seed, controllers side by side.
+    """``comparison.json`` and figures of the first seed, controllers side by side; the store goes.
 
     Raises:
         OutputError: As :func:`write_simulation`.
@@ -59,6 +59,7 @@ def write_comparison(
     with whole_folder(out, force=force, marks=(COMPARISON,)) as folder:
         _write_json(folder / COMPARISON, document)
         draw_side_by_side([job for job in jobs if job.seed == 0], store, folder, formats)
+    shutil.rmtree(store.folder, ignore_errors=True)
 
 
 def write_reproduction(

@@ -85,7 +85,7 @@ def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
     """
     shop = workshop(job.scenario, job.free)
     scenario = shop.setup.scenario
-    if job.sign is not None and job.sign not in getattr(scenario.task, "signs", (job.sign,)):
+    if job.sign is not None and job.sign not in getattr(scenario.task, "signs", ()):
         raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, mend="leave --sign out")
     runs = run(shop, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
     found = [_of_run(shop, one) for one in runs]
