@@ -62,10 +62,10 @@ def draw_shares(axes: Any, x: Vector, data: PathData | TradeOffData) -> bool:
     return bool(drawn)
 
 
-def spreads(values: Vector) -> bool:
-    """Whether positive values lie so far apart that they want a log axis."""
+def spreads(values: Vector, ratio: float = _SPREAD) -> bool:
+    """Whether positive values lie so far apart, by more than ``ratio``, that they want a log axis."""
     positive = values[values > 0]
-    return bool(positive.size) and float(positive.max() / positive.min()) > _SPREAD
+    return bool(positive.size) and float(positive.max() / positive.min()) > ratio
 
 
 def log_axis(axes: Any) -> None:

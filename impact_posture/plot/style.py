@@ -17,7 +17,7 @@ from impact_posture.errors import InputError, OutputError
 from impact_posture.plot.view import SEPARATOR
 
 # Okabe and Ito's palette, "Color Universal Design", 2008.
-VERMILLION, BLUE, GREEN, SKY, PURPLE = "#D55E00", "#0072B2", "#009E73", "#56B4E9", "#CC79A7"
+VERMILLION, BLUE, GREEN, SKY, PURPLE, ORANGE = "#D55E00", "#0072B2", "#009E73", "#56B4E9", "#CC79A7", "#E69F00"
 INK, GRAY, PALE = "#000000", "#6b6b6b", "#d9d9d9"
 
 # Before and after differ by line and hatch as well, so that a gray print tells them apart.
