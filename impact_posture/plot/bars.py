@@ -28,10 +28,11 @@ from impact_posture.plot.style import (
 from impact_posture.plot.view import number
 
 NOTES = (
-    "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper states "
-    "neither gains nor masses enough to be run again as it was: its numbers are to be compared within a scenario, "
-    "controller against controller.",
+    "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper prints no "
+    "gains: its numbers are to be compared with each other.",
 )
+# The paper's number is on the axis if it is at most so many times our largest.
+_FAR = 2.0
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ def draw_bars(rows: Sequence[Bar], out_dir: Path, formats: Iterable[str] = FORMA
 
 
 def bars_figure(rows: Sequence[Bar]) -> Figure:
-    """Draw lying bars with intervals in the order given, two panels a line; diamonds mark the paper's numbers.
+    """Draw lying bars with intervals in the order given, two panels a line; marks show the paper's numbers.
 
     Raises:
         InputError: No rows.
@@ -75,7 +76,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
     groups = [[row for row in rows if row.scenario == name] for name in scenarios]
     columns = min(2, len(groups))
     lines = [groups[k : k + columns] for k in range(0, len(groups), columns)]
-    heights = [0.55 + 0.23 * max(len(group) for group in line) for line in lines]
+    heights = [0.55 + 0.3 * max(len(group) for group in line) for line in lines]
     lead = "Motion during impacts, ∫‖ν‖dt over the impact windows"
     facts = ["less is better", "the same windows for every controller", "bars: ours, mean and 95 % interval"]
     with style():
@@ -85,27 +86,27 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
             axes.set_visible(False)
         for axes, name, group in zip(panels.flat, scenarios, groups, strict=False):
             _panel(axes, name, group, max(len(other) for other in groups))
-        body.legend(handles=_handles(rows), loc="outside lower center", ncols=3)
+        body.legend(handles=_handles(rows), loc="outside lower center", ncols=4)
     return figure
 
 
 def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
-    ends = []
+    ours = max((row.mean + _wide(row) for row in group if np.isfinite(row.mean)), default=0.0)
+    papers = [row.paper for row in group if row.paper is not None]
+    # The paper's robot is another one: its numbers must not press ours together.
+    near = [paper for paper in papers if paper <= _FAR * ours or ours == 0]
+    end = 1.08 * (max([ours, *near]) or 1.0)
     for place, row in enumerate(group):
-        wide = row.half_width if np.isfinite(row.half_width) else 0.0
-        own = [value for value in (row.mean + wide, row.paper) if value is not None and np.isfinite(value)]
-        ends.append(max(own, default=0.0))
         if np.isfinite(row.mean):
             axes.barh(place, row.mean, height=0.6, **(BEFORE_BAR if row.controller == "nominal" else AFTER_BAR))
-        if np.isfinite(row.mean) and wide > 0:
-            axes.errorbar(row.mean, place, xerr=wide, color=INK, linewidth=1.0, capsize=2.5, zorder=4)
+            if _wide(row) > 0:
+                axes.errorbar(row.mean, place, xerr=_wide(row), color=INK, linewidth=1.0, capsize=2.5, zorder=4)
         if row.paper is not None:
-            axes.plot(row.paper, place, **_PAPER)
-    largest = max(ends) or 1.0
-    for place, (row, end) in enumerate(zip(group, ends, strict=True)):
-        axes.annotate(_words(row), (end, place), (6, 0), textcoords="offset points", va="center", fontsize=7)
-    # Room for the numbers on the right.
-    axes.set_xlim(0.0, 1.42 * largest)
+            axes.plot(min(row.paper, 0.975 * end), place, **(_PAPER if row.paper in near else _BEYOND))
+        # The numbers right of the panel, clear of the bars.
+        look = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "va": "center", "fontsize": 7}
+        axes.annotate(_words(row), (1.0, place), (5, 0), **look)
+    axes.set_xlim(0.0, end)
     axes.set_ylim(room - 0.4, -0.6)
     axes.set_yticks(range(len(group)), [row.controller for row in group])
     axes.tick_params(axis="y", length=0)
@@ -119,13 +120,23 @@ _PAPER: dict[str, Any] = {
     "linestyle": "", "marker": "D", "markersize": 4.5, "color": "white", "markeredgecolor": VERMILLION,
     "markeredgewidth": 1.2, "zorder": 5,
 }  # fmt: skip
+_BEYOND = _PAPER | {"marker": ">", "markersize": 6}
+
+
+def _wide(row: Bar) -> float:
+    """Half of the interval; 0 where there is none."""
+    return row.half_width if np.isfinite(row.half_width) else 0.0
 
 
 def _words(row: Bar) -> str:
+    """Mean and interval with the digits that the interval supports, and the paper's number."""
+    paper = f"\npaper {number(row.paper)}" if row.paper is not None else ""
     if not np.isfinite(row.mean):
-        return "no run ended" if row.paper is None else f"no run ended (paper {number(row.paper)})"
-    wide = f" ± {number(row.half_width)}" if np.isfinite(row.half_width) and row.half_width > 0 else ""
-    return number(row.mean) + wide + (f"  (paper {number(row.paper)})" if row.paper is not None else "")
+        return "no run ended" + paper
+    if not _wide(row) > 0:
+        return number(row.mean) + paper
+    digits = max(1 - int(np.floor(np.log10(_wide(row)))), 0)
+    return f"{row.mean:.{digits}f} ± {_wide(row):.{digits}f}{paper}"
 
 
 def _handles(rows: Sequence[Bar]) -> list[Any]:
@@ -136,4 +147,5 @@ def _handles(rows: Sequence[Bar]) -> list[Any]:
         handles.append(Patch(label="others", **AFTER_BAR))
     if any(row.paper is not None for row in rows):
         handles.append(Line2D([], [], label="paper", **_PAPER))
+        handles.append(Line2D([], [], label="paper, beyond the axis", **_BEYOND))
     return handles

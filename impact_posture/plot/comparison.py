@@ -25,7 +25,7 @@ from impact_posture.plot.run_axes import (
 )
 from impact_posture.plot.run_panels import RUNS, Clip, blows, control_panels, first_blow, joint_panels, whole
 from impact_posture.plot.run_view import RunView, check_same, run_header
-from impact_posture.plot.runs import METRIC, joints_figure
+from impact_posture.plot.runs import HINT, METRIC, joints_figure
 from impact_posture.plot.style import FORMATS, check_formats, framed, save, style
 from impact_posture.plot.view import mixed_unit
 
@@ -66,9 +66,9 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
     """
     views = check_same(views, "figure comparison-metric")
     hit = all(view.impacts for view in views)
-    notes = "Less H is better: it is the squared velocity jump of an impulse of 1 N·s along n. "
+    notes = HINT
     if hit and not views[0].pushed:
-        notes += f"Windows above: those of {views[0].name}. Below, time counts from each one's own touch."
+        notes += f" Windows above: those of {views[0].name}. Below, time counts from each one's own touch."
     spans = [_since_blow(view) for view in views]
     span = Clip(
         min(one.begin - one.origin for one in spans), max(one.end - one.origin for one in spans), label=spans[0].label
@@ -108,7 +108,7 @@ def _blow_panel(axes: Any, views: Sequence[RunView]) -> None:
     for view, clip, look in zip(views, clips, cycle(RUNS), strict=False):
         curve(axes, view, view.speed, clip, **look)
     axes.set_ylim(bottom=0.0)
-    axes.set_ylabel(f"‖ν‖  [{mixed_unit(views[0].robot)}]")
+    axes.set_ylabel(f"‖ν‖  [{mixed_unit(views[0].robot).strip('()')}]")
     axes.set_xlabel(longest.label)
 
 

@@ -22,6 +22,11 @@ SHADES: dict[str, dict[str, Any]] = {
 }
 LIMIT: dict[str, Any] = {"color": INK, "linestyle": (0, (6, 3)), "linewidth": 0.8, "zorder": 1.5}
 STOP: dict[str, Any] = {"color": INK, "linewidth": 3.6, "alpha": 0.35, "zorder": 2.0, "solid_capstyle": "butt"}
+AT_LIMIT: dict[str, Any] = {
+    "linestyle": "", "marker": "D", "markersize": 3.2, "color": INK, "markeredgecolor": "white",
+    "markeredgewidth": 0.4, "zorder": 5,
+}  # fmt: skip
+BAND: dict[str, Any] = {"facecolor": "#bdbdbd", "edgecolor": "none", "zorder": 1.2}
 # Points across a page's width; each shows the lowest and the highest value in it.
 _BINS = 1000
 
@@ -31,6 +36,9 @@ def draw_panel(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) -
     frame_time(axes, view, clip)
     for limit in panel.limits:
         axes.axhline(limit, **LIMIT)
+    _saturation(axes, panel, which, view, clip)
+    if panel.ranges is not None:
+        _band(axes, view, panel.ranges[which], clip)
     for k, name in enumerate(panel.names):
         look = LINES[k % len(LINES)]
         curve(axes, view, panel.values[which][:, k], clip, label=name, **look)
@@ -59,6 +67,25 @@ def curve(axes: Any, view: RunView, values: Vector, clip: Clip, **look: Any) -> 
     inside = (view.t >= clip.begin) & (view.t <= clip.end) & np.isfinite(values)
     t, y = thin(view.t[inside], values[inside])
     axes.plot(clip.x(t), y, **look)
+
+
+def _saturation(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) -> None:
+    """Mark on a limit when a command was at it: a tick of a controller is too short to be seen."""
+    for limit, flags in zip(panel.limits, panel.saturated(which), strict=True):
+        times = view.t[flags & (view.t >= clip.begin) & (view.t <= clip.end)]
+        # Not closer than can be seen.
+        places = np.floor(_BINS / 8 * (times - clip.begin) / (clip.end - clip.begin))
+        seen = times[np.unique(places, return_index=True)[1]]
+        axes.plot(clip.x(seen), np.full(len(seen), limit), **AT_LIMIT)
+
+
+def _band(axes: Any, view: RunView, bounds: Vector, clip: Clip) -> None:
+    """Fill between the lower and the upper bound; of each bin of ticks the lowest and the highest."""
+    inside = (view.t >= clip.begin) & (view.t <= clip.end)
+    t, bounds = view.t[inside], bounds[inside]
+    starts = np.arange(0, len(t), max(len(t) // _BINS, 1))
+    low, high = np.minimum.reduceat(bounds[:, 0], starts), np.maximum.reduceat(bounds[:, 1], starts)
+    axes.fill_between(clip.x(t[starts]), low, high, **BAND)
 
 
 def thin(t: Vector, values: Vector) -> tuple[Vector, Vector]:
@@ -99,6 +126,10 @@ def common_handles(views: Sequence[RunView], panels: Sequence[Panel] = ()) -> li
     handles: list[Any] = [Patch(label=words[kind], **SHADES[kind]) for kind in words if kind in kinds]
     if any(panel.limits for panel in panels):
         handles.append(Line2D([], [], label="limit", **LIMIT))
+    if any(flags.any() for panel in panels for k in range(len(views)) for flags in panel.saturated(k)):
+        handles.append(Line2D([], [], label="command at a limit", **AT_LIMIT))
+    if any(panel.ranges for panel in panels):
+        handles.append(Patch(label="range of commands", **BAND))
     stopped = [flags for panel in panels if panel.stopped is not None for flags in panel.stopped]
     if any(flags.any() for flags in stopped):
         handles.append(Line2D([], [], label="joint at its stop", **STOP))
@@ -135,4 +166,4 @@ def finish(body: Any, left: Sequence[Any], handles: Sequence[Any]) -> None:
     """Align the labels on the left, and put the legend of what all panels share below them."""
     body.align_ylabels(left)
     if handles:
-        body.legend(handles=list(handles), loc="outside lower center", ncols=4, handlelength=2.6)
+        body.legend(handles=list(handles), loc="outside lower center", ncols=5, handlelength=2.2, columnspacing=1.4)

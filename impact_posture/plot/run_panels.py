@@ -30,6 +30,8 @@ LINES: tuple[dict[str, Any], ...] = (
 RUNS: tuple[dict[str, Any], ...] = (LINES[1] | {"zorder": 3.5}, LINES[0] | {"linewidth": 1.6}, *LINES[2:])
 # A limit farther away than this many times the largest value is named, not drawn.
 _FAR = 4.0
+# A command counts as at its limit within this share of the range.
+_NEAR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,8 @@ class Panel:
         label: Of the upright axis.
         names: Of the curves.
         values: Curves of each run, shape (n, curves).
-        limits: Upright positions of dashed lines.
+        limits: Lower and upper limit of the commands: dashed lines; empty for none.
+        ranges: Of each run, a lower and an upper bound to shade between, shape (n, 2).
         stopped: When a curve's joint was at its stop, of each run, shape (n, curves).
         note: To be said below the picture.
     """
@@ -98,20 +101,35 @@ class Panel:
     label: str
     names: Sequence[str]
     values: Sequence[Vector]
-    limits: tuple[float, ...] = ()
+    limits: tuple[float, float] | tuple[()] = ()
+    ranges: Sequence[Vector] | None = None
     stopped: Sequence[Flags] | None = None
     note: str = ""
 
+    def saturated(self, which: int) -> list[Flags]:
+        """For each limit when a command of run ``which`` was at it, up to a thousandth of the range, shape (n,)."""
+        if not self.limits:
+            return []
+        commands = self.values[which] if self.ranges is None else self.ranges[which]
+        low, high = self.limits
+        near = _NEAR * (high - low)
+        return [(commands <= low + near).any(axis=1), (commands >= high - near).any(axis=1)]
+
 
 def rotor_panel(views: Sequence[RunView]) -> Panel | None:
-    """Commanded rotor speeds with their limits; ``None`` of a robot without rotors."""
+    """Rotor speeds, the range of their commands, and the limits; ``None`` of a robot without rotors.
+
+    Commands carry the sensors' noise: six of them over each other cannot be told apart.
+    """
     one = views[0]
     count = one.rotor_command.shape[1]
     if not count:
         return None
     label = f"rotor speed  [{one.rotor_unit or 'unit of robot.toml'}]"
     names = [f"rotor {k + 1}" for k in range(count)]
-    return Panel(label, names, [view.rotor_command for view in views], one.rotor_limits or ())
+    ranges = [np.stack([view.rotor_command.min(axis=1), view.rotor_command.max(axis=1)], axis=1) for view in views]
+    note = "Rotors: lines as they turn; the band holds all commands."
+    return Panel(label, names, [view.rotor_speed for view in views], one.rotor_limits or (), ranges, note=note)
 
 
 def control_panels(views: Sequence[RunView]) -> list[Panel]:

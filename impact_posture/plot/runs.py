@@ -28,6 +28,7 @@ from impact_posture.plot.style import FORMATS, check_formats, framed, save, styl
 from impact_posture.plot.view import mixed_unit
 
 METRIC = "H  [‖Δν‖²/(N·s)²]"
+HINT = "Less H is better: it is the squared velocity jump of an impulse of 1 N·s along n."
 LEFT = "Left: the whole run; right: the first blow."
 
 
@@ -60,18 +61,15 @@ def metric_figure(view: RunView) -> Figure:
         force.append((across, "friction", LINES[1]))
     rows: list[tuple[str, list[tuple[Any, str, dict[str, Any]]]]] = [
         (METRIC, [(view.objective, "", LINES[0])]),
-        (f"‖ν‖  [{unit}]", [(view.speed, "", LINES[0])]),
+        (f"‖ν‖  [{unit.strip('()')}]", [(view.speed, "", LINES[0])]),
         ("force  [N]", force),
     ]
     if np.ptp(view.level) > 1e-9:
         rows.append(("level of\nthe term", [(view.level, "", LINES[0])]))
-    notes = " ".join([
-        "Less H is better: it is the squared velocity jump of an impulse of 1 N·s along n.",
-        "Normal: the largest within each tick of the controller." * (not view.pushed),
-        LEFT * bool(view.impacts),
-    ])  # fmt: skip
+    notes = [HINT] if view.pushed else [HINT, "Normal: the largest within each tick of the controller."]
+    notes = [" ".join([*notes, *([LEFT] if view.impacts else [])])]
     with style():
-        figure, body = framed(*run_header([view]), 1.25 * len(rows) + 0.75, [notes])
+        figure, body = framed(*run_header([view]), 1.25 * len(rows) + 0.75, notes)
         panels, clips = grid(body, view, len(rows))
         for axes_row, (label, curves) in zip(panels, rows, strict=True):
             for axes, clip in zip(axes_row, clips, strict=True):
@@ -88,7 +86,7 @@ def metric_figure(view: RunView) -> Figure:
 
 
 def controls_figure(view: RunView) -> Figure:
-    """Draw the commanded rotor speeds and joint torques of a run, which has some, with their limits (dashed)."""
+    """Draw the rotor speeds and commanded joint torques of a run, which has some, with their limits (dashed)."""
     rows = control_panels([view])
     notes = [" ".join([*[panel.note for panel in rows if panel.note], LEFT * bool(view.impacts)])]
     with style():

@@ -18,10 +18,7 @@ from impact_posture.plot.shapes import Plane, Vector
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.style import BLUE, FORMATS, GRAY, INK, PALE, VERMILLION, check_formats, framed, save, style
 
-NOTES = (
-    "Sticks join joint origins; they are not the links' shapes. Gray: the posture at the start, where the robot was "
-    "when the run began.",
-)
+NOTES = ("Sticks join joint origins; they are not the links' shapes. Gray: where the robot was when the run began.",)
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
 _START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
 # Just before the blow: a tick that it has no part in, s.
@@ -70,7 +67,9 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
             tails = np.stack([plane.axes @ state.contact - arrow, plane.axes @ state.contact], axis=1)
             low, high = np.minimum(low, tails.min(axis=1)), np.maximum(high, tails.max(axis=1))
     low, high = _window(low, high, views[0], plane)
-    height = float(np.clip(2.1 * (high - low)[1] / (high - low)[0], 1.2, 3.0)) + 0.2
+    # As high as the robot needs, within a page's reason.
+    highest = float(np.clip(8.5 / len(views), 1.2, 3.0))
+    height = float(np.clip(2.1 * (high - low)[1] / (high - low)[0], 1.2, highest)) + 0.2
     with style():
         figure, body = framed(*run_header(views), height * len(views) + 0.85, NOTES)
         panels = subplots(body, len(views), 3, sharex=True, sharey=True)
