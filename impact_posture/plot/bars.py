@@ -28,8 +28,8 @@ from impact_posture.plot.style import (
 from impact_posture.plot.view import number
 
 NOTES = (
-    "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper prints no "
-    "gains: its numbers are to be compared with each other.",
+    "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper prints "
+    "no gains: its numbers are to be compared with each other.",
 )
 # The paper's number is on the axis if it is at most so many times our largest.
 _FAR = 2.0

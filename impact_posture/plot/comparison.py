@@ -85,7 +85,7 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
         scale_metric(panels[0], [view.objective for view in views])
         panels[0].set_ylabel(METRIC)
         panels[0].set_xlabel(span.label)
-        beside(panels[0], len(views))
+        beside(panels[0], panels[0])
         if hit:
             _blow_panel(panels[1], views)
         finish(body, list(panels), common_handles(views))
@@ -130,7 +130,8 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
         for row, column in np.ndindex(*panels.shape):
             axes, panel, which = panels[row, column], rows[row % len(rows)], row // len(rows) * columns + column
             if which >= len(views):
-                axes.set_visible(False)
+                # Stays as a place for the legend.
+                axes.set_axis_off()
                 continue
             draw_panel(axes, panel, which, views[which], blows(views[which]))
             if row % len(rows) == 0:
@@ -141,9 +142,9 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
                 axes.set_ylabel(panel.label)
             else:
                 axes.tick_params(labelleft=False)
-            if which == min((row // len(rows) + 1) * columns, len(views)) - 1:
-                beside(axes, len(panel.names))
         for k in range(len(rows)):
-            share_height([axes for axes in panels[k :: len(rows)].flat if axes.get_visible()])
+            share_height([axes for axes in panels[k :: len(rows)].flat if axes.axison])
+            for line in panels[k :: len(rows)]:
+                beside(line[-1], line[0])
         finish(body, list(panels[:, 0]), common_handles(views, rows))
     return figure

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator
 
 from impact_posture.plot.path import log_axis, spreads
 from impact_posture.plot.run_panels import LINES, Clip, Panel, first_blow, whole
@@ -107,16 +108,20 @@ def scale_metric(axes: Any, values: Sequence[Vector]) -> None:
     every = np.concatenate([value[np.isfinite(value)] for value in values])
     if every.size and (every > 0).all() and spreads(every, 10.0):
         log_axis(axes)
+        if not spreads(every, 100.0):
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     elif every.size:
         axes.set_ylim(min(0.0, 1.1 * float(every.min())), 1.1 * float(every.max()) or 1.0)
     else:
         axes.text(0.5, 0.5, "H was not evaluated", ha="center", va="center", transform=axes.transAxes, color=GRAY)
 
 
-def beside(axes: Any, count: int) -> None:
-    """Legend right of the panel; empty panels have none."""
-    if count:
-        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), handlelength=2.6, borderaxespad=0.2, fontsize=7)
+def beside(axes: Any, named: Any) -> None:
+    """Legend of the curves of panel ``named``, right of the last panel of its row; none where none has a name."""
+    handles, labels = named.get_legend_handles_labels()
+    if handles:
+        look = {"handlelength": 2.6, "borderaxespad": 0.2, "fontsize": 7}
+        axes.legend(handles, labels, loc="center left", bbox_to_anchor=(1.01, 0.5), **look)
 
 
 def common_handles(views: Sequence[RunView], panels: Sequence[Panel] = ()) -> list[Any]:

@@ -113,7 +113,7 @@ class Panel:
         commands = self.values[which] if self.ranges is None else self.ranges[which]
         low, high = self.limits
         near = _NEAR * (high - low)
-        return [(commands <= low + near).any(axis=1), (commands >= high - near).any(axis=1)]
+        return [np.any(commands <= low + near, axis=1), np.any(commands >= high - near, axis=1)]
 
 
 def rotor_panel(views: Sequence[RunView]) -> Panel | None:
@@ -125,10 +125,11 @@ def rotor_panel(views: Sequence[RunView]) -> Panel | None:
     count = one.rotor_command.shape[1]
     if not count:
         return None
-    label = f"rotor speed  [{one.rotor_unit or 'unit of robot.toml'}]"
+    label = f"rotor speed  [{one.rotor_unit}]" if one.rotor_unit else "rotor speed"
     names = [f"rotor {k + 1}" for k in range(count)]
     ranges = [np.stack([view.rotor_command.min(axis=1), view.rotor_command.max(axis=1)], axis=1) for view in views]
     note = "Rotors: lines as they turn; the band holds all commands."
+    note += "" if one.rotor_unit else " Their speeds are in the unit of the robot's speed_max."
     return Panel(label, names, [view.rotor_speed for view in views], one.rotor_limits or (), ranges, note=note)
 
 
@@ -143,57 +144,56 @@ def torque_panel(views: Sequence[RunView]) -> Panel | None:
     In N·m where all that are shown have the same limit or none, else as shares of each joint's own.
     ``None`` of a robot without joints.
     """
-    limits = views[0].torque_limits
+    one, limits = views[0], views[0].torque_limits
     if not limits.size:
         return None
     largest = np.max([np.abs(view.torque).max(axis=0) for view in views], axis=0)
-    bounded = bool(np.isfinite(limits).any())
-    # A joint without limit comes last: it comes close to none.
-    shown = _largest(largest / limits if bounded else largest)
-    note = f"Torques of the {SHOWN} of {limits.size} joints that come closest to their limits. " * bool(
-        len(shown) < limits.size
-    )
-    units = sorted({"N·m" if views[0].joint_units[k] == "rad" else "N" for k in shown}, reverse=True)
-    names = [views[0].joint_names[k] for k in shown]
-    own = limits[shown]
-    if not bounded or (len(set(own)) == 1 and len(units) == 1):
-        lines, values = (-own[0], own[0]) if bounded else (), [view.torque[:, shown] for view in views]
-        label = f"joint torque  [{', '.join(units)}]"
+    bounded = np.flatnonzero(np.isfinite(limits))
+    # Joints without a limit cannot come close to it: they are shown only where no joint has one.
+    eligible = bounded if bounded.size else np.arange(limits.size)
+    shown = eligible[_largest((largest / limits if bounded.size else largest)[eligible])]
+    notes = []
+    if len(shown) < len(eligible):
+        which = "come closest to their limits" if bounded.size else "exert most"
+        notes.append(f"Torques of the {SHOWN} of {len(eligible)} joints that {which}.")
+    if 0 < bounded.size < limits.size:
+        notes.append("Torques without a limit are left out.")
+    units = sorted({"N·m" if one.joint_units[k] == "rad" else "N" for k in shown}, reverse=True)
+    own, unit = limits[shown], ", ".join(units)
+    if bounded.size and (len(set(own)) > 1 or len(units) > 1):
+        notes.append("Each torque is divided by the joint's own limit.")
+        scale, label, unit, limit = own, "torque / limit", "", 1.0
     else:
-        shown = shown[np.isfinite(own)]
-        note += "Each torque is divided by the joint's own limit. "
-        note += "Joints without a limit are left out. " * bool(len(shown) < len(own))
-        names = [views[0].joint_names[k] for k in shown]
-        lines, values, label = (
-            (-1.0, 1.0),
-            [view.torque[:, shown] / limits[shown] for view in views],
-            "torque / limit",
-        )
+        scale, label, limit = np.ones(len(shown)), f"joint torque  [{unit}]", float(own[0])
+    values = [view.torque[:, shown] / scale for view in views]
+    lines: tuple[float, float] | tuple[()] = (-limit, limit) if bounded.size else ()
     peak = max(float(np.abs(value).max()) for value in values)
-    if lines and lines[1] > _FAR * peak:
-        unit = "of the limit" if label == "torque / limit" else units[0]
-        note += f"Torque limits (±{number(lines[1])} {unit}) lie outside of the panels. "
+    if lines and limit > _FAR * peak:
+        named = f"The torque limits (±{number(limit)} {unit}) lie outside of the panels."
+        notes.append(named if unit else f"All stay within {number(100 * peak)} % of it.")
         lines = ()
-    return Panel(label, names, values, tuple(float(line) for line in lines), note=note.strip())
+    return Panel(label, [one.joint_names[k] for k in shown], values, lines, note=" ".join(notes))
 
 
 def joint_panels(views: Sequence[RunView]) -> list[Panel]:
     """Positions of the joints that move most, those in rad and those in m apart."""
     one = views[0]
-    moved = (
-        np.max([np.ptp(view.positions, axis=0) for view in views], axis=0) if one.torque_limits.size else np.zeros(0)
-    )
+    moved = np.max([np.ptp(view.positions, axis=0) for view in views], axis=0)
     single = np.flatnonzero(np.isfinite(moved))
     shown = single[_largest(moved[single])]
-    note = f"Shown: the {SHOWN} of {single.size} joints that move most. " * bool(len(shown) < single.size)
-    note += "Joints of several degrees of freedom have no curve. " * bool(single.size < moved.size)
+    notes = []
+    if len(shown) < single.size:
+        notes.append(f"Shown: the {SHOWN} of {single.size} joints that move most.")
+    if single.size < moved.size:
+        notes.append("Joints of several degrees of freedom have no curve.")
     panels = []
     for unit, label in (("rad", "joint angle  [rad]"), ("m", "sliding joint  [m]")):
         own = [int(k) for k in shown if one.joint_units[k] == unit]
         if own:
             stopped = [view.at_stop[:, view.first_joint :][:, own] for view in views]
             values = [view.positions[:, own] for view in views]
-            panels.append(Panel(label, [one.joint_names[k] for k in own], values, stopped=stopped, note=note.strip()))
+            names = [one.joint_names[k] for k in own]
+            panels.append(Panel(label, names, values, stopped=stopped, note=" ".join(notes)))
     return panels
 
 

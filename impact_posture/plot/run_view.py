@@ -66,7 +66,7 @@ class RunView:
         label: What the run is called beside others; the controller's name if empty.
         title: First line of its pictures; scenario and controller if empty.
         facts: For the small print below the title: seed, sign of the push, metrics.
-        rotor_unit: Unit of the rotors' speeds, such as ``Hz``; a ``robot.toml`` does not name it.
+        rotor_unit: Unit of the rotors' speeds, such as ``Hz``, where it is known: a ``robot.toml`` does not name it.
     """
 
     scenario: str
@@ -185,7 +185,7 @@ class RunView:
 def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
     """Title and small print of a picture of runs of one scenario."""
     one = views[0]
-    names = ", ".join(view.name for view in views)
+    names = ", ".join(view.name for view in views) if len(views) < 5 else f"{len(views)} controllers"
     title = one.title if one.title and len(views) == 1 else f"{one.scenario}: {names}"
     n = ", ".join(number(value) for value in one.contact.normal)
     facts = [f"robot {one.robot.name}"]

@@ -56,13 +56,13 @@ def metric_figure(view: RunView) -> Figure:
     n = np.array(view.contact.normal)
     normal = view.force @ n
     across = np.linalg.norm(view.force - normal[:, None] * n, axis=1)
-    force = [(normal, "push", LINES[0])] if view.pushed else [(view.peak, "normal, peak", LINES[0])]
+    force = [(normal, "", LINES[0])] if view.pushed else [(view.peak, "normal, peak", LINES[0])]
     if not view.pushed:
         force.append((across, "friction", LINES[1]))
     rows: list[tuple[str, list[tuple[Any, str, dict[str, Any]]]]] = [
         (METRIC, [(view.objective, "", LINES[0])]),
         (f"‖ν‖  [{unit.strip('()')}]", [(view.speed, "", LINES[0])]),
-        ("force  [N]", force),
+        ("push  [N]" if view.pushed else "force  [N]", force),
     ]
     if np.ptp(view.level) > 1e-9:
         rows.append(("level of\nthe term", [(view.level, "", LINES[0])]))
@@ -77,7 +77,7 @@ def metric_figure(view: RunView) -> Figure:
                 for values, name, look in curves:
                     curve(axes, view, values, clip, label=name or None, **look)
             axes_row[0].set_ylabel(label)
-            beside(axes_row[-1], len([name for _, name, _ in curves if name]) if len(curves) > 1 else 0)
+            beside(axes_row[-1], axes_row[0])
         for axes in panels[0]:
             scale_metric(axes, [view.objective])
         name_time(panels, clips)
@@ -96,7 +96,7 @@ def controls_figure(view: RunView) -> Figure:
             for axes, clip in zip(axes_row, clips, strict=True):
                 draw_panel(axes, panel, 0, view, clip)
             axes_row[0].set_ylabel(panel.label)
-            beside(axes_row[-1], len(panel.names))
+            beside(axes_row[-1], axes_row[0])
         name_time(panels, clips)
         finish(body, list(panels[:, 0]), common_handles([view], rows))
     return figure
@@ -126,9 +126,9 @@ def joints_figure(views: Sequence[RunView]) -> Figure:
             axes_row[0].set_ylabel(panel.label)
             if len(views) > 1:
                 axes_row[0].set_title(views[which].name, loc="left", fontweight="bold")
-            beside(axes_row[-1], len(panel.names))
+            beside(axes_row[-1], axes_row[0])
         name_time(panels, clips[-1][:columns])
         finish(body, list(panels[:, 0]), common_handles(views, rows))
-        if len(rows) == 1:
-            share_height([axes for row in panels for axes in row])
+        for k in range(len(rows)):
+            share_height(list(panels[k :: len(rows)].flat))
     return figure
