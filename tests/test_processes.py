@@ -15,7 +15,6 @@ import pytest
 from impact_posture.errors import ControllerNotFound, ImpactPostureError, SimulationDiverged
 from impact_posture.processes import shared_out
 
-
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs /proc to look at processes")
 
 
