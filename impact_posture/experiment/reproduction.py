@@ -76,7 +76,7 @@ def controllers_of(scenario: str, everything: bool) -> tuple[str, ...]:
     pushed = scenario.endswith("-push")
     if everything:
         return (*CONTROLLERS, HELD, "robust:free") if pushed else (*CONTROLLERS, HELD)
-    return tuple(dict.fromkeys(("nominal", "robust", *((HELD,) if pushed else ()), RECOMMENDED[scenario])))
+    return tuple(dict.fromkeys(("nominal", "robust", RECOMMENDED[scenario])))
 
 
 def jobs_of(scenario: str, controllers: Sequence[str], seeds: int) -> list[Job]:
