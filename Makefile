@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test lint types docs bench study-impacts calibration regression pictures clean
+.PHONY: help demo test lint types docs bench study-impacts reproduction calibration regression pictures clean
 
 help:
 	@echo "make demo        install into .venv, optimize a real robot, leave pictures and C code in demo/"
@@ -13,6 +13,7 @@ help:
 	@echo "make docs        the documentation site in docs/_build/html"
 	@echo "make bench       solve times, and the exported kernel beside its peers, on this machine"
 	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
+	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make pictures    draw the pictures that the documentation shows"
@@ -65,6 +66,9 @@ bench: $(VENV)/.installed
 
 study-impacts: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks.impact_bench --write
+
+reproduction: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks.reproduction --write
 
 calibration: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks.restitution --write

@@ -10,11 +10,14 @@ from typing import Final
 
 from impact_posture_cli.commands.bench import bench
 from impact_posture_cli.commands.codegen import codegen
+from impact_posture_cli.commands.compare import compare
 from impact_posture_cli.commands.evaluate import evaluate
 from impact_posture_cli.commands.inspect import inspect
 from impact_posture_cli.commands.optimize import optimize
 from impact_posture_cli.commands.plot import plot
+from impact_posture_cli.commands.reproduce import reproduce
 from impact_posture_cli.commands.robots import robots
+from impact_posture_cli.commands.simulate import simulate
 from impact_posture_cli.commands.verify import verify
 
 COMMANDS: Final[dict[str, Callable[..., None]]] = {
@@ -25,6 +28,9 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "plot": plot,
     "codegen": codegen,
     "verify": verify,
+    "simulate": simulate,
+    "compare": compare,
+    "reproduce": reproduce,
     "bench": bench,
 }
 """Name to function, in the order of the help page."""

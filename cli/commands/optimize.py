@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -91,6 +89,7 @@ def optimize(
     from impact_posture.posture.robustness import solve_robustly
     from impact_posture.posture.settings import prepare
     from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.progress import progress_bar
 
     page = Page(quiet=quiet or json)
     prepared = prepare(settings)
@@ -98,7 +97,7 @@ def optimize(
     check_output(folder, force=force, marks=MARKS)
     if not json:
         _announce(page, prepared)
-    with _progress("starts", shown=not (quiet or json)) as progress:
+    with progress_bar("solving", "starts", shown=not (quiet or json)) as progress:
         # With each scenario alone beside it: how far the optimum moves with the model.
         found = solve_robustly(
             prepared.problem,
@@ -111,7 +110,7 @@ def optimize(
     solution, robustness = found.solution, found.robustness
     curve = None
     if settings.tradeoff:
-        with _progress("points", shown=not (quiet or json)) as progress:
+        with progress_bar("solving", "points", shown=not (quiet or json)) as progress:
             curve = trade_off(solution, settings.tradeoff, compile=compile, progress=progress)
     written = write_result(
         prepared,
@@ -212,30 +211,6 @@ def _announce(page: Page, prepared: Prepared) -> None:
         page.line(f"  ({note})", style="dim")
     page.warnings(impact.warnings)
     page.gap()
-
-
-@contextmanager
-def _progress(what: str, *, shown: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """A bar on standard error while starts, or points of a curve, are solved."""
-    if not shown:
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("solving"), BarColumn(), MofNCompleteColumn(), TextColumn(what), TimeElapsedColumn())
-    # The bar starts with the first result: worker processes are forked before its thread runs.
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = bar.add_task("solving", total=None)
-
-    def advance(done: int, total: int) -> None:
-        bar.start()
-        bar.update(task, completed=done, total=total)
-
-    try:
-        yield advance
-    finally:
-        bar.stop()
 
 
 def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, written: Written) -> None:

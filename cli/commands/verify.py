@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -68,9 +67,10 @@ def verify(
     )  # fmt: skip
     from impact_posture.verification.verify import verify as verify_objective
     from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.progress import progress_bar
 
     impact = request.resolve()
-    with _progress(shown=not (quiet or json)) as progress:
+    with progress_bar("comparing", shown=not (quiet or json)) as progress:
         report = verify_objective(impact.objective, samples, seed, progress)
     if json:
         asked = {key: value for key, value in impact.to_dict().items() if key != "metric"}
@@ -109,20 +109,3 @@ def _cells(row: Row) -> tuple[str, ...]:
     error = row.note if row.error is None else f"{row.error:.1e}"
     where = ", ".join(filter(None, (f"sample {row.sample}", row.entry)))
     return row.source, row.quantity, error, f"{row.tolerance:.0e}", row.verdict, where
-
-
-@contextmanager
-def _progress(*, shown: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """A bar on standard error."""
-    if not shown:
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    bar = Progress(
-        TextColumn("comparing"), BarColumn(), TimeElapsedColumn(), console=Console(stderr=True), transient=True
-    )
-    with bar:
-        task = bar.add_task("comparing", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -34,7 +34,7 @@ ControllerName = Literal[
 Mode = Literal["live", "held"]
 CONTROLLERS: tuple[ControllerName, ...] = get_args(ControllerName)
 # In words, for tables and help.
-MEANING: dict[ControllerName, str] = {
+MEANING: dict[str, str] = {
     "nominal": "TSID with the start posture",
     "robust": "its posture task with -K grad H, the paper's",
     "robust-speed": "the same with the gradient of V, the jump per approach speed",

@@ -191,7 +191,7 @@ def read_scenario(scenario: str | Path) -> ImpactScenario:
         ScenarioNotFound: With the nearest names.
         SpecError: The file cannot be read, an unknown key, or a value that is none.
     """
-    path = _path(scenario)
+    path = scenario_path(scenario)
     data = read_toml(path)
     # Before the keys: those of another schema are not misspelt.
     schema = data.get("schema", SCHEMA)
@@ -201,7 +201,12 @@ def read_scenario(scenario: str | Path) -> ImpactScenario:
     return _build(validate(ScenarioFile, with_tuples(data), str(path)), str(path))
 
 
-def _path(scenario: str | Path) -> Path:
+def scenario_path(scenario: str | Path) -> Path:
+    """Where a scenario's file is.
+
+    Raises:
+        ScenarioNotFound: With the nearest names.
+    """
     if isinstance(scenario, str):
         shipped = SHIPPED / f"{scenario}.toml"
         if scenario in known_scenarios():

@@ -95,6 +95,7 @@ class World:
         self._past: deque[_Sample] = deque(maxlen=1 + round(scene.sensors.delay / self.timestep))
         self._pushes: list[_ActivePush] = []
         self._steps = 0
+        self._converted: tuple[_Sample, Array, Array] | None = None
         self._ready = False
         limits = np.array(self._model.jnt_range)
         limited = np.array(self._model.jnt_limited, dtype=bool)
@@ -212,7 +213,7 @@ class World:
         """What the sensors say now; every call draws its own noise."""
         self._check_ready()
         sample = self._past[0]
-        q, v = self._layout.state(sample.qpos, sample.qvel)
+        q, v = self._state_of(sample)
         if self._vibration is not None:
             v[:6] += self._vibration.twist(sample.speeds, sample.phases)
         force = None if self._felt is None else sample.force
@@ -222,7 +223,8 @@ class World:
         """The state as it is; each shape's peak force and first touch start anew."""
         self._check_ready()
         data = self._data
-        q, v = self._layout.state(data.qpos, data.qvel)
+        # The newest sample is the present state: its conversion serves the sensors, too.
+        q, v = self._state_of(self._past[-1])
         values = data.qpos[self._limited]
         stopped = np.flatnonzero((values <= self._low) | (values >= self._high))
         rotors = self._rotors
@@ -236,6 +238,12 @@ class World:
             shapes=self._log.look(data),
             at_stops=tuple(self._limited_names[k] for k in stopped),
         )
+
+    def _state_of(self, sample: _Sample) -> tuple[Array, Array]:
+        """Pinocchio's ``(q, ν)`` of a sample, the caller's own arrays."""
+        if self._converted is None or self._converted[0] is not sample:
+            self._converted = (sample, *self._layout.state(sample.qpos, sample.qvel))
+        return self._converted[1].copy(), self._converted[2].copy()
 
     def _sample(self) -> _Sample:
         nothing = np.zeros(0)

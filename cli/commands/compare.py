@@ -1,0 +1,83 @@
+"""``impact-posture compare SCENARIO --controllers A,B``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from impact_posture_cli import options
+from impact_posture_cli.experiments import RUN, Processes, ScenarioName, Seeds, rows_table
+
+Controllers = Annotated[
+    str,
+    typer.Option(
+        "--controllers", metavar="A,B,…", rich_help_panel=RUN,
+        help="Names as in simulate; robust:held holds the reached posture, robust:free leaves the feet away.",
+    ),
+]  # fmt: skip
+Out = Annotated[
+    str | None,
+    typer.Option(
+        "--out", metavar="DIR", rich_help_panel=options.OUTPUT, show_default="none",
+        help="Folder for comparison.json and figures.",
+    ),
+]  # fmt: skip
+
+
+def compare(
+    scenario: ScenarioName,
+    controllers: Controllers = "nominal,robust,posture",
+    seeds: Seeds = 3,
+    jobs: Processes = 2,
+    out: Out = None,
+    force: options.Force = False,
+    format: options.Formats = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Run several controllers through an experiment, several seeds each: means with 95 % intervals."""
+    labels = [text.strip() for text in controllers.split(",") if text.strip()]
+    if not labels:
+        raise typer.BadParameter("name at least one controller", param_hint="--controllers")
+    from impact_posture.experiment.folders import COMPARISON, FORMATS, store_beside, write_comparison
+    from impact_posture.experiment.many import run_many
+    from impact_posture.experiment.reproduction import gather, jobs_of
+    from impact_posture.folder import check_output
+    from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.progress import progress_bar
+
+    labels = list(dict.fromkeys(labels))
+    folder = None if out is None else Path(out)
+    if folder is not None:
+        check_output(folder, force=force, marks=(COMPARISON,))
+    store = None if folder is None else store_beside(folder)
+    plan = jobs_of(scenario, labels, seeds)
+    with progress_bar("running", "runs", shown=not (quiet or json)) as progress:
+        documents = run_many(
+            plan,
+            processes=jobs,
+            store=store,
+            keep_series=lambda job: store is not None and job.seed == 0,
+            progress=progress,
+        )
+    rows = gather(scenario, labels, documents)
+    document: dict[str, Any] = {
+        "schema": "impact-posture/comparison/1",
+        "scenario": rows[0].scenario,
+        "seeds": list(range(seeds)),
+        "rows": [row.to_dict() for row in rows],
+    }
+    if folder is not None and store is not None:
+        formats = [f.value for f in format or ()] or FORMATS
+        write_comparison(folder, document, plan, store, force=force, formats=formats)
+    if json:
+        print_json(document)
+        return
+    page = Page(quiet=quiet)
+    page.title(rows[0].scenario, f"{seeds} seed{'s' if seeds > 1 else ''}, mean ± half of the 95 % interval")
+    rows_table(page, rows)
+    if folder is not None:
+        page.gap()
+        page.line(f"written: {folder}")

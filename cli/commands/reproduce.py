@@ -1,0 +1,75 @@
+"""``impact-posture reproduce``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impact_posture_cli import options
+from impact_posture_cli.experiments import RUN, Processes, Seeds, rows_table
+
+All = Annotated[
+    bool,
+    typer.Option(
+        "--all", rich_help_panel=RUN, help="Every controller, not only nominal, robust and the recommended."
+    ),
+]
+Scenarios = Annotated[
+    list[str] | None,
+    typer.Option("--scenario", rich_help_panel=RUN, show_default="all four", help="That one only; repeatable."),
+]
+Out = Annotated[
+    str,
+    typer.Option("--out", metavar="DIR", rich_help_panel=options.OUTPUT, help="Folder of the results."),
+]
+
+
+def reproduce(
+    seeds: Seeds = 10,
+    jobs: Processes = 2,
+    all_: All = False,
+    scenario: Scenarios = None,
+    out: Out = "reproduction",
+    force: options.Force = False,
+    format: options.Formats = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Run the paper's experiments: its table beside ours, figures, a summary. Goes on where it was interrupted."""
+    from impact_posture.errors import ScenarioNotFound
+    from impact_posture.experiment.folders import FORMATS, REPRODUCTION, store_beside, write_reproduction
+    from impact_posture.experiment.paper import PAPER
+    from impact_posture.experiment.reproduction import controllers_of, jobs_of
+    from impact_posture.experiment.reproduction import reproduce as reproduce_all
+    from impact_posture.experiment.summary import advice
+    from impact_posture.folder import check_output
+    from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.progress import progress_bar
+
+    scenarios = list(dict.fromkeys(scenario)) if scenario else list(PAPER)
+    for name in scenarios:
+        if name not in PAPER:
+            raise ScenarioNotFound(name, PAPER, mend="(others: simulate and compare)")
+    folder = Path(out)
+    check_output(folder, force=force, marks=(REPRODUCTION,))
+    store = store_beside(folder)
+    with progress_bar("running", "runs", shown=not (quiet or json)) as progress:
+        found = reproduce_all(scenarios, seeds=seeds, everything=all_, processes=jobs, store=store, progress=progress)
+    plan = [job for name in scenarios for job in jobs_of(name, controllers_of(name, all_), seeds)]
+    formats = [f.value for f in format or ()] or FORMATS
+    document = write_reproduction(folder, found, plan, store, force=force, formats=formats)
+    if json:
+        print_json(document)
+        return
+    page = Page(quiet=quiet)
+    for name in scenarios:
+        paper = PAPER[name]
+        page.title(name, f"the paper: {paper.nominal:g} to {paper.robust:g}, {100 * paper.reduction:.1f} % less")
+        rows_table(page, found.of(name))
+        page.gap()
+    for line in advice(found):
+        page.line(line.replace("**", "").replace("`", ""))
+    page.gap()
+    page.line(f"written: {folder}; read {folder / 'SUMMARY.md'}")

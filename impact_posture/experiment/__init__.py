@@ -1,0 +1,1 @@
+"""Runs of scenarios from end to end: one, several side by side, and the paper's table and figures."""

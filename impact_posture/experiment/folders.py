@@ -1,0 +1,100 @@
+"""What runs, comparisons and reproductions leave on disk; every folder whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from impact_posture.experiment.figures import draw_reproduction, draw_runs, draw_side_by_side
+from impact_posture.experiment.jobs import Job
+from impact_posture.experiment.many import Store
+from impact_posture.experiment.reproduction import Reproduction
+from impact_posture.experiment.summary import summary
+from impact_posture.folder import whole_folder
+from impact_posture.simulation.runs import Run
+
+# What makes a folder one that --force may replace.
+SIMULATION, COMPARISON, REPRODUCTION = "run.json", "comparison.json", "reproduction.json"
+FORMATS = ("png", "svg", "pdf")
+
+
+def write_simulation(
+    out: Path,
+    job: Job,
+    runs: Sequence[Run],
+    document: dict[str, Any],
+    *,
+    force: bool = False,
+    formats: Sequence[str] = FORMATS,
+) -> None:
+    """``run.json``, ``series.npz`` (``series-minus.npz`` for the push the other way), figures.
+
+    Raises:
+        OutputError: The folder exists without ``force``, is not ours, or cannot be written.
+    """
+    with whole_folder(out, force=force, marks=(SIMULATION,)) as folder:
+        _write_json(folder / SIMULATION, document)
+        for one in runs:
+            one.series.save(folder / f"series{'' if one.sign > 0 else '-minus'}.npz")
+        draw_runs(job, runs, folder, formats)
+
+
+def write_comparison(
+    out: Path,
+    document: dict[str, Any],
+    jobs: Sequence[Job],
+    store: Store,
+    *,
+    force: bool = False,
+    formats: Sequence[str] = FORMATS,
+) -> None:
+    """``comparison.json`` and figures of the first seed, controllers side by side; the store goes.
+
+    Raises:
+        OutputError: As :func:`write_simulation`.
+    """
+    with whole_folder(out, force=force, marks=(COMPARISON,)) as folder:
+        _write_json(folder / COMPARISON, document)
+        draw_side_by_side([job for job in jobs if job.seed == 0], store, folder, formats)
+    shutil.rmtree(store.folder, ignore_errors=True)
+
+
+def write_reproduction(
+    out: Path,
+    found: Reproduction,
+    jobs: Sequence[Job],
+    store: Store,
+    *,
+    force: bool = False,
+    formats: Sequence[str] = FORMATS,
+) -> dict[str, Any]:
+    """``reproduction.json``, ``SUMMARY.md``, ``runs/`` (every run's document) and figures; the store goes.
+
+    Returns:
+        The content of ``reproduction.json``.
+
+    Raises:
+        OutputError: As :func:`write_simulation`.
+    """
+    document = {**found.to_dict(), "summary": summary(found)}
+    with whole_folder(out, force=force, marks=(REPRODUCTION,)) as folder:
+        _write_json(folder / REPRODUCTION, document)
+        (folder / "SUMMARY.md").write_text(summary(found), encoding="utf-8")
+        (folder / "runs").mkdir()
+        for job in jobs:
+            _write_json(folder / "runs" / f"{job.name}.json", store.find(job))
+        draw_reproduction(found, [job for job in jobs if job.seed == 0], store, folder, formats)
+    shutil.rmtree(store.folder, ignore_errors=True)
+    return document
+
+
+def store_beside(out: Path) -> Store:
+    """Where the runs of an output folder are kept until it is written."""
+    return Store(out.absolute().parent / f".{out.name}.runs")
+
+
+def _write_json(path: Path, document: object) -> None:
+    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")

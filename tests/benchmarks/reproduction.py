@@ -1,0 +1,81 @@
+"""The paper's experiments for the documentation: its controllers over many seeds, every controller over a few.
+
+Run: make reproduction, or
+python -m tests.benchmarks.reproduction [--seeds 10] [--others 2] [--jobs 2] [--write]
+
+Runs that are done are kept in build/reproduction; run it again after an interruption.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from impact_posture.errors import ImpactPostureError
+from impact_posture.experiment.figures import draw_reproduction
+from impact_posture.experiment.many import Store
+from impact_posture.experiment.paper import PAPER
+from impact_posture.experiment.reproduction import Reproduction, controllers_of, jobs_of, reproduce
+from impact_posture.experiment.summary import advice, remarks, scenario_table, table_one
+
+ROOT = Path(__file__).parents[2]
+PAGE, IMAGES = ROOT / "docs" / "generated" / "reproduction.md", ROOT / "docs" / "images" / "reproduction"
+
+
+def main() -> int:
+    """Run, print, and with ``--write`` leave page and pictures for the documentation."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=10, help="of nominal, robust and the recommended controller")
+    parser.add_argument("--others", type=int, default=2, help="seeds of all controllers")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--write", action="store_true", help="write docs/generated and docs/images")
+    args = parser.parse_args()
+    store, scenarios = Store(ROOT / "build" / "reproduction"), tuple(PAPER)
+    began = time.perf_counter()
+    try:
+        main_rows = reproduce(scenarios, seeds=args.seeds, processes=args.jobs, store=store, progress=_say)
+        took = time.perf_counter() - began
+        every = reproduce(
+            scenarios, seeds=args.others, everything=True, processes=args.jobs, store=store, progress=_say
+        )
+    except ImpactPostureError as error:
+        print(error, file=sys.stderr)
+        return 1
+    page = "\n\n".join(_page(main_rows, every)) + "\n"
+    print(f"\n{page}\nthe first part took {took:.0f} s with {args.jobs} processes, less what was kept")
+    if args.write:
+        PAGE.write_text(f"<!-- Written by `make reproduction`; do not edit. -->\n\n{page}", encoding="utf-8")
+        first = [job for s in scenarios for job in jobs_of(s, controllers_of(s, False), 1)]
+        draw_reproduction(main_rows, first, store, IMAGES, ["png"])
+    return 0
+
+
+def _page(found: Reproduction, every: Reproduction) -> list[str]:
+    seeds = ", ".join(str(k) for k in range(found.seeds))
+    parts = [
+        "### What to choose",
+        "\n".join(f"- {line}" for line in advice(found)),
+        "### Table I of the paper, and ours",
+        f"`q_total_impact`, seeds {seeds}; mean ± half of the 95 % confidence interval.",
+        table_one(found),
+    ]
+    for scenario in found.scenarios:
+        few = f"seeds 0 to {every.seeds - 1}" if every.seeds > 1 else "seed 0"
+        parts += [
+            f"### {scenario}",
+            scenario_table(found.of(scenario)),
+            f"Every controller, {few}:",
+            scenario_table(every.of(scenario)),
+            " ".join(remarks(every, scenario)),
+        ]
+    return parts
+
+
+def _say(done: int, total: int) -> None:
+    print(f"\r{done} of {total} runs", end="", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,149 @@
+"""``simulate``, ``compare``, ``reproduce`` through the installed entry point."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impact_posture.simulation.series import Series
+
+COMMAND = Path(sys.executable).parent / "impact-posture"
+
+
+def start(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1"}
+    return subprocess.run(
+        [str(COMMAND), *arguments], capture_output=True, text=True, timeout=180, env=environment, cwd=cwd
+    )
+
+
+def document(*arguments: str, cwd: Path) -> dict[str, Any]:
+    done = start(*arguments, "--json", cwd=cwd)
+    assert (done.returncode, done.stderr) == (0, "")
+    found = json.loads(done.stdout)
+    assert isinstance(found, dict)
+    return found
+
+
+def test_simulate(aerial: Path, tmp_path: Path) -> None:
+    found = document(
+        "simulate",
+        str(aerial),
+        "--controller",
+        "robust",
+        "--seed",
+        "3",
+        "--out",
+        "run",
+        "--format",
+        "png",
+        cwd=tmp_path,
+    )
+    assert (found["scenario"], found["controller"], found["seed"]) == ("aerial-lateral", "robust", 3)
+    for key in ("q_total_impact", "q_total_dwell", "peak_jump", "peak_force", "relaxed_ticks"):
+        assert isinstance(found["metrics"][key], int | float)
+    assert json.loads((tmp_path / "run" / "run.json").read_text()) == found
+    series = Series.load(tmp_path / "run" / "series.npz")
+    window = found["windows"][0]
+    speed = np.linalg.norm(series.v[series.slice(window["begin"], window["end"])], axis=1)
+    assert speed.sum() * 1e-3 == pytest.approx(found["metrics"]["q_total_impact"])
+    assert list((tmp_path / "run").glob("*.png")) and not list((tmp_path / "run").glob("*.pdf"))
+    # Never over what is there; the same again is the same.
+    refused = start("simulate", str(aerial), "--controller", "robust", "--out", "run", cwd=tmp_path)
+    assert refused.returncode == 1 and "--force" in refused.stderr
+    again = document(
+        "simulate",
+        str(aerial),
+        "--controller",
+        "robust",
+        "--seed",
+        "3",
+        "--out",
+        "run",
+        "--force",
+        "--format",
+        "png",
+        cwd=tmp_path,
+    )
+    assert again == found
+
+
+def test_simulate_for_people(push: Path, tmp_path: Path) -> None:
+    done = start("simulate", str(push), "--controller", "robust", "--mode", "held", "--format", "png", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "solo8-push, robust:held" in done.stdout and "pushed after" in done.stdout
+    assert max(len(line) for line in done.stdout.splitlines()) <= 80
+    assert (tmp_path / "solo8-push-robust-held" / "series-minus.npz").is_file()
+
+
+def test_compare(aerial: Path, tmp_path: Path) -> None:
+    done = start("compare", str(aerial), "--controllers", "nominal,robust", "--seeds", "2", "--quiet", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert max(len(line) for line in done.stdout.splitlines()) <= 80
+    assert not list(tmp_path.iterdir())
+    found = document(
+        "compare",
+        str(aerial),
+        "--controllers",
+        "nominal,robust",
+        "--seeds",
+        "2",
+        "--out",
+        "both",
+        "--format",
+        "png",
+        cwd=tmp_path,
+    )
+    assert [row["controller"] for row in found["rows"]] == ["nominal", "robust"]
+    nominal, robust = (row["metrics"]["q_total_impact"] for row in found["rows"])
+    assert nominal["samples"] == 2 and nominal["half_width"] > 0
+    assert found["rows"][1]["reduction"]["mean"] == pytest.approx(1 - robust["mean"] / nominal["mean"], abs=0.05)
+    assert json.loads((tmp_path / "both" / "comparison.json").read_text()) == found
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["both"], "the runs' folder has gone"
+
+
+def test_reproduce(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
+    found = document(
+        "reproduce", "--scenario", "solo8-push", "--seeds", "1", "--out", "all", "--format", "png", cwd=tmp_path
+    )
+    rows = {row["controller"]: row for row in found["rows"]}
+    assert {"nominal", "robust"} < set(rows) and all(row["scenario"] == "solo8-push" for row in found["rows"])
+    assert rows["robust"]["paper"] == {"nominal": 0.411, "robust": 0.342, "reduction": 0.168}
+    assert rows["robust"]["reduction"]["mean"] > 0
+    assert sum(row["best"] for row in found["rows"]) == 1
+    text = (tmp_path / "all" / "SUMMARY.md").read_text()
+    assert text == found["summary"] and "## What to choose" in text
+    assert len(list((tmp_path / "all" / "runs").glob("*.json"))) == len(rows)
+    assert list((tmp_path / "all").rglob("*.png"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("simulate", "aerial-vertcal"), 1, "did you mean aerial-vertical"),
+        (("simulate", "solo8-push", "--controller", "robst"), 1, "did you mean robust"),
+        (("simulate", "solo8-push", "--controller", "nominal", "--mode", "held"), 1, "has no term to hold"),
+        (("simulate", "aerial-lateral", "--sign", "-1"), 1, "leave --sign out"),
+        (("simulate", "solo8-push", "--gain", "-1"), 2, "above zero"),
+        (("compare", "solo8-push", "--controllers", "nominal,robust:hold"), 1, "no variant 'hold'"),
+        (("compare", "solo8-push", "--controllers", " , "), 2, "at least one"),
+        (("reproduce", "--scenario", "mine.toml"), 1, "simulate and compare"),
+        (("simulate", "missing.toml"), 1, "missing.toml"),
+    ],
+)
+def test_one_line_says_what_is_wrong(arguments: tuple[str, ...], code: int, said: str, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
+    done = start(*arguments, cwd=tmp_path)
+    assert done.returncode == code
+    assert said in " ".join(done.stderr.replace("│", " ").split())
+    assert "Traceback" not in done.stderr and not list(tmp_path.iterdir())
+    if code == 1:
+        assert len(done.stderr.strip().splitlines()) == 1

@@ -1,0 +1,111 @@
+"""Jobs: what they answer, that they are kept, found again, and not found when anything has changed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from impact_posture.errors import ControllerNotFound, ScenarioNotFound, SimulationDiverged
+from impact_posture.experiment import many
+from impact_posture.experiment.jobs import SCHEMA, Job, execute, workshop
+from impact_posture.experiment.many import Store, key_of, run_many
+
+
+def test_a_run_answers_with_its_document(aerial: Path) -> None:
+    runs, found = execute(Job(str(aerial), "nominal"))
+    assert found["schema"] == SCHEMA and found["controller"] == "nominal" and found["seed"] == 0
+    assert found["metrics"]["contacts"] == 1 and found["metrics"]["q_total_impact"] > 0
+    assert {"inside", "outside"} <= set(found["metrics"]["saturation_s"])
+    assert [w["kind"] for w in found["windows"]] == ["impact", "dwell"]
+    assert found["windows"][0]["end"] - found["windows"][0]["begin"] == pytest.approx(0.3)
+    assert found["prediction"]["blows"] == 1 and found["prediction"]["ratio"] > 0
+    assert len(runs) == 1
+    json.dumps(found, allow_nan=False)
+
+
+def test_a_push_goes_both_ways(push: Path) -> None:
+    _, found = execute(Job(str(push), "nominal"))
+    assert [part["sign"] for part in found["runs"]] == [1, -1]
+    mean = sum(part["metrics"]["q_total_impact"] for part in found["runs"]) / 2
+    assert found["metrics"]["q_total_impact"] == pytest.approx(mean)
+    _, one = execute(Job(str(push), "nominal", sign=-1))
+    assert one["metrics"] == found["runs"][1]["metrics"]
+
+
+def test_processes_and_order_do_not_matter(aerial: Path, tmp_path: Path) -> None:
+    jobs = [Job(str(aerial), name, seed) for name, seed in (("nominal", 0), ("nominal", 1), ("robust", 0))]
+    seen: list[tuple[int, int]] = []
+    one = run_many(jobs, progress=lambda done, total: seen.append((done, total)))
+    two = run_many(jobs[::-1], processes=2, store=Store(tmp_path / "kept"))
+    assert one == two[::-1]
+    assert seen == [(k, 3) for k in range(4)]
+    assert one[0] != one[1]
+
+
+def test_what_was_interrupted_goes_on(aerial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    jobs = [Job(str(aerial), "nominal", seed) for seed in range(3)]
+    store = Store(tmp_path / "kept")
+    ran: list[int] = []
+    real = many.execute
+
+    def counted(job: Job) -> Any:
+        if len(ran) == 2:
+            raise KeyboardInterrupt
+        ran.append(job.seed)
+        return real(job)
+
+    monkeypatch.setattr(many, "execute", counted)
+    with pytest.raises(KeyboardInterrupt):
+        run_many(jobs, store=store)
+    assert ran == [0, 1]
+    monkeypatch.setattr(many, "execute", lambda job: (ran.append(job.seed), real(job))[1])
+    whole = run_many(jobs, store=store)
+    assert ran == [0, 1, 2]
+    assert whole == run_many(jobs)
+    assert ran == [0, 1, 2, 0, 1, 2]
+
+
+def test_series_are_kept_where_asked_for(push: Path, tmp_path: Path) -> None:
+    store, job = Store(tmp_path / "kept"), Job(str(push), "nominal")
+    run_many([job], store=store)
+    assert not list(store.folder.glob("*.npz"))
+    # The document alone is not enough now.
+    run_many([job], store=store, keep_series=lambda job: True)
+    assert sorted(path.name for path in store.folder.glob("*.npz")) == sorted(
+        [store.series(job, 1).name, store.series(job, -1).name]
+    )
+
+
+def test_a_changed_scenario_or_a_broken_file_is_run_anew(aerial: Path, tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(aerial.read_text(encoding="utf-8"), encoding="utf-8")
+    job, store = Job(str(path), "nominal"), Store(tmp_path / "kept")
+    before = key_of(job)
+    store.keep(job, {"metrics": {}})
+    assert store.find(job) == {"metrics": {}}
+    path.write_text(path.read_text(encoding="utf-8") + "\n# another one\n", encoding="utf-8")
+    many._scenario.cache_clear()
+    workshop.cache_clear()
+    assert key_of(job) != before and store.find(job) is None
+    assert key_of(Job(str(path), "nominal", gain=3.0)) != key_of(job)
+    next(store.folder.glob("*.json")).write_text("{", encoding="utf-8")
+    assert store.find(job) is None
+
+
+def test_a_robot_that_ran_away_is_a_result(aerial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def away(job: Job) -> Any:
+        raise SimulationDiverged(1.0, where="it")
+
+    monkeypatch.setattr(many, "execute", away)
+    (found,) = run_many([Job(str(aerial), "nominal")])
+    assert found["error"].startswith("SimulationDiverged") and found["seed"] == 0
+
+
+def test_what_is_misspelt_is_said_before_anything_runs(aerial: Path) -> None:
+    with pytest.raises(ControllerNotFound, match="did you mean robust"):
+        run_many([Job(str(aerial), "nominal"), Job(str(aerial), "robsut")])
+    with pytest.raises(ScenarioNotFound, match="aerial-vertical"):
+        run_many([Job("arial-vertical", "nominal")])

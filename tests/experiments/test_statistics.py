@@ -1,0 +1,181 @@
+"""Means, intervals, reductions, targets and what is said of them, from documents made by hand."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from impact_posture.errors import InputError
+from impact_posture.experiment.jobs import Job, finite, parse_controller, together
+from impact_posture.experiment.paper import PAPER, RECOMMENDED
+from impact_posture.experiment.reproduction import (
+    Reproduction,
+    best_of,
+    controllers_of,
+    gather,
+    jobs_of,
+    targets_of,
+)
+from impact_posture.experiment.statistics import QUANTITIES, Interval, row_of
+from impact_posture.experiment.summary import advice, remarks, scenario_table, summary, table_one
+from impact_posture.simulation.controllers import CONTROLLERS, MEANING
+from impact_posture.simulation.metrics import Metrics
+from impact_posture.simulation.scenario_file import known_scenarios
+
+METRICS = Metrics(1.0, 0.5, 0.8, 2.0, 3.0, 3.5, 100.0, 0.1, 0.2, 0.05, 7, 0, 0.01, (), 5)
+
+
+def document(controller: str, seed: int, q: float, **changed: Any) -> dict[str, Any]:
+    values = {**METRICS.__dict__, "q_total_impact": q, **changed}
+    prediction = {"H": 10.0 * q, "ratio": 1.2}
+    return {"scenario": "aerial-vertical", "controller": controller, "seed": seed,
+            "metrics": Metrics(**values).to_dict(), "prediction": prediction}  # fmt: skip
+
+
+NOMINAL = [document("nominal", k, 2.0 + 0.1 * k) for k in range(4)]
+
+
+def test_interval_is_students() -> None:
+    samples = [1.0, 2.0, 4.0, 4.5]
+    found = Interval.of(samples)
+    low, high = stats.t.interval(0.95, 3, loc=np.mean(samples), scale=stats.sem(samples))
+    assert found.mean - found.half_width == pytest.approx(low)
+    assert found.mean + found.half_width == pytest.approx(high)
+    assert Interval.of([3.0]) == Interval(3.0, None, 1)
+
+
+def test_reductions_are_paired_by_seed() -> None:
+    # Half of nominal, seed by seed; in another order, and one seed that nominal does not have.
+    own = [document("robust", k, (2.0 + 0.1 * k) / 2) for k in (3, 1, 0, 2)] + [document("robust", 9, 50.0)]
+    row = row_of("aerial-vertical", "robust", own, NOMINAL)
+    assert row.reduction is not None
+    assert row.reduction.mean == pytest.approx(0.5) and row.reduction.half_width == pytest.approx(0, abs=1e-12)
+    assert row.reduction.samples == 4
+    assert row.metrics["q_total_impact"].samples == 5
+    assert set(row.metrics) == set(QUANTITIES)
+
+
+def test_runs_that_failed_are_told_and_left_out() -> None:
+    own = [document("robust", 0, 1.0), {"seed": 1, "error": "SimulationDiverged: ran away"}]
+    row = row_of("aerial-vertical", "robust", own, NOMINAL)
+    assert row.failed == ("SimulationDiverged: ran away",) and row.metrics["peak_jump"].samples == 1
+    targets = targets_of(row)
+    assert targets is not None and targets.missed[-1] == "failed" and not targets.met
+    nothing = row_of("aerial-vertical", "robust", own[1:], NOMINAL)
+    assert nothing.reduction is None and targets_of(nothing) is None and not nothing.metrics
+    assert "failed: SimulationDiverged: ran away" in scenario_table([nothing])
+
+
+@pytest.mark.parametrize(
+    ("changed", "missed"),
+    [
+        ({}, ()),
+        ({"q_total_impact": 1.1}, ("reduction",)),
+        ({"peak_jump": 3.1}, ("peak_jump",)),
+        ({"saturation_inside": 0.11}, ("saturation",)),
+        ({"stops": ("elbow",)}, ("stops",)),
+        ({"rested": False}, ("rested",)),
+    ],
+)
+def test_targets(changed: dict[str, Any], missed: tuple[str, ...]) -> None:
+    own = [document("robust", k, **{"q": 0.9, **_without_q(changed)}) for k in range(4)]
+    if "q_total_impact" in changed:
+        own = [document("robust", k, 1.1) for k in range(4)]
+    targets = targets_of(row_of("aerial-vertical", "robust", own, NOMINAL))
+    assert targets is not None and targets.missed == missed and targets.met == (not missed)
+
+
+def _without_q(changed: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in changed.items() if key != "q_total_impact"}
+
+
+def rows() -> list[Any]:
+    good = [document("posture", k, 0.5) for k in range(4)]
+    less = [document("robust", k, 0.4, peak_jump=4.0) for k in range(4)]
+    restless = [document("walker", k, 0.1, rested=False) for k in range(4)]
+    return gather("aerial-vertical", ["nominal", "robust", "posture", "walker"], [*NOMINAL, *less, *good, *restless])
+
+
+def test_the_best_meets_the_targets_first_and_moves_least_second() -> None:
+    found = rows()
+    best = best_of(found)
+    assert best is not None and best.controller == "posture"
+    best = best_of([row for row in found if row.controller != "posture"])
+    # Nobody meets them all: the one that moves least, of those that were at rest.
+    assert best is not None and best.controller == "robust"
+    assert best_of(found[:1]) is None
+
+
+def test_the_summary_leads_with_a_choice_and_says_what_is_wrong() -> None:
+    found = Reproduction(4, tuple(rows()))
+    lines = advice(found)
+    assert len(lines) == 1 and "`posture`" in lines[0] and "every target met" in lines[0]
+    assert "a higher peak jump than nominal" in lines[0]
+    text = summary(found)
+    assert text.index("What to choose") < text.index("Table I")
+    assert "does not come to rest" in "\n".join(remarks(found, "aerial-vertical"))
+    cells = re.findall(r"^\| aerial-vertical \|.*$", table_one(found), re.MULTILINE)[0]
+    assert "10.4" in cells and "5.1" in cells and "51.0 %" in cells and "posture" in cells
+    rows_found = found.to_dict()["rows"]
+    assert [row["best"] for row in rows_found] == [False, False, True, False]
+    assert rows_found[0]["paper"] == {"nominal": 10.4, "robust": 5.1, "reduction": 0.51}
+
+
+def test_the_summary_of_one_seed_has_no_intervals() -> None:
+    found = Reproduction(
+        1, tuple(gather("aerial-vertical", ["nominal", "robust"], [NOMINAL[0], document("robust", 0, 1)]))
+    )
+    assert "±" not in summary(found) and "no intervals" in summary(found)
+
+
+def test_a_held_posture_tells_stiffness_from_posture() -> None:
+    for held, word in ((1.9, "stiffness"), (0.6, "most of it is posture")):
+        parts = [
+            *NOMINAL,
+            *[document("robust", k, 0.5) for k in range(4)],
+            *[document("robust", k, held) for k in range(4)],
+        ]
+        found = Reproduction(4, tuple(gather("aerial-vertical", ["nominal", "robust", "robust:held"], parts)))
+        assert word in "\n".join(remarks(found, "aerial-vertical"))
+
+
+def test_names_of_controllers() -> None:
+    assert parse_controller("robust") == ("robust", "live", False)
+    assert parse_controller(" robust:held:free ") == ("robust", "held", True)
+    with pytest.raises(InputError, match="no variant 'hold'"):
+        parse_controller("robust:hold")
+    assert [job.label for job in jobs_of("solo8-push", ["nominal", "robust:held"], 2)] == [
+        "nominal", "nominal", "robust:held", "robust:held"
+    ]  # fmt: skip
+    assert Job("a/b.toml", "robust", 3, "held").name == "a_b.toml-robust-held-3"
+
+
+def test_what_is_known_of_the_paper_fits_the_scenarios() -> None:
+    assert set(PAPER) == set(RECOMMENDED) == set(known_scenarios())
+    assert set(MEANING) == set(CONTROLLERS)
+    for name, row in PAPER.items():
+        # The text's percentages are those of its table's rounded numbers, within what rounding allows.
+        assert row.reduction == pytest.approx(1 - row.robust / row.nominal, abs=6e-3)
+        assert controllers_of(name, False)[:2] == ("nominal", "robust")
+        assert set(CONTROLLERS) < set(controllers_of(name, True))
+
+
+def test_metrics_of_both_signs() -> None:
+    other = Metrics(
+        **{**METRICS.__dict__, "q_total_impact": 3.0, "peak_jump_max": 9.0, "stops": ("knee",), "rested": False}
+    )
+    found = together([METRICS, other])
+    assert (found.q_total_impact, found.peak_jump_max, found.relaxed_ticks) == (2.0, 9.0, 14)
+    assert found.stops == ("knee",) and not found.rested
+    assert together([METRICS]) is METRICS
+
+
+def test_documents_have_no_infinities() -> None:
+    assert finite({"a": [1.0, float("inf")], "b": (float("nan"), "x", None, 3)}) == {
+        "a": [1.0, None],
+        "b": [None, "x", None, 3],
+    }
