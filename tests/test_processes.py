@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -115,9 +116,12 @@ def test_leaving_early_leaves_no_process(tmp_path: Path) -> None:
 
 
 PROGRAM = """
-import os, sys, time
+import os, signal, sys, time
 from pathlib import Path
 from impact_posture.processes import shared_out
+
+# A shell ignores Ctrl-C for what it runs in the background, and its children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def work(index):
     Path(sys.argv[1], str(os.getpid())).touch()
@@ -138,12 +142,17 @@ def test_ctrl_c_leaves_no_process_and_no_noise(tmp_path: Path, send: Callable[[i
         [sys.executable, "-c", PROGRAM, str(tmp_path)], start_new_session=True, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
-    end = time.monotonic() + 60
-    while len(list(tmp_path.iterdir())) < 2 and time.monotonic() < end:
-        time.sleep(0.02)
-    workers = [int(path.name) for path in tmp_path.iterdir()]
-    assert len(workers) == 2 and all(alive(pid) for pid in workers)
-    send(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=30)
-    assert (process.returncode, out, err) == (130, "stopped\n", "")
-    assert gone(workers)
+    try:
+        end = time.monotonic() + 60
+        while len(list(tmp_path.iterdir())) < 2 and time.monotonic() < end:
+            time.sleep(0.02)
+        workers = [int(path.name) for path in tmp_path.iterdir()]
+        assert len(workers) == 2 and all(alive(pid) for pid in workers)
+        send(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+        assert (process.returncode, out, err) == (130, "stopped\n", "")
+        assert gone(workers)
+    finally:
+        # Its own session: nothing else is in that group.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)

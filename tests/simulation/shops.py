@@ -57,6 +57,12 @@ def driven(made: Workshop, controller: str, *, mode: Mode = "live", seed: int = 
     return run(made, controller, mode=mode, seed=seed, only=1)[0]
 
 
+@functools.cache
+def lived(name: str, controller: str, mode: Mode = "live", settle: float | None = None) -> Run:
+    """A run of a shipped scenario, cut short; one of each in a process."""
+    return driven(shop(name, settle), controller, mode=mode)
+
+
 def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **columns: Any) -> Series:
     """A record of ``n`` ticks in which nothing happens but what ``columns`` say."""
     robot, propulsion = setup.robot, setup.robot.spec.propulsion
