@@ -16,6 +16,7 @@ from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.runs import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush, set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.world import build_world
 from tests.simulation.shops import (
     AERIAL,
     PUSHES,
@@ -141,9 +142,9 @@ def test_windows_begin_at_the_first_touch_and_are_as_long_for_every_controller(n
         assert (dwell.begin, dwell.end) == (impact.begin, pytest.approx(leaves))
         part = series.slice(impact.begin, impact.end)
         assert part.stop - part.start == 300
-        # Within a tenth of a second of when the reference crosses the surface.
+        # Not before the reference is there; a robot that still reconfigures may come late.
         crossing = task.settle + reference.inward - 2 * task.beyond / task.speed
-        assert abs(impact.begin - crossing) < 0.1
+        assert crossing - 0.03 < impact.begin < (crossing + 0.03 if controller == "nominal" else leaves)
 
 
 @pytest.mark.parametrize("name", PUSHES)
@@ -162,13 +163,11 @@ def test_pushes_have_windows_as_long_as_they_last_and_wait_for_rest(name: str) -
     assert measure(made.setup, found).rested == found.rested
 
 
-def test_a_contact_that_never_comes_has_a_window_where_it_was_expected() -> None:
+def test_a_contact_that_never_comes_has_a_window_where_it_was_expected(monkeypatch: pytest.MonkeyPatch) -> None:
     made = workshop(shortened("aerial-vertical", beyond=0.0, window=0.1))
-    # A reference that ends before the surface: what is asked for is not what the world has.
-    made = workshop(replace(made.setup, scenario=replace(made.setup.scenario)))
-    object.__setattr__(
-        made.setup.world.built, "gaps", {key: gap - 0.06 for key, gap in made.setup.world.built.gaps.items()}
-    )
+    # A reference that ends before the surface.
+    for key in made.setup.world.built.gaps:
+        monkeypatch.setitem(made.setup.world.built.gaps, key, 0.14)  # type: ignore[arg-type]
     found = driven(made, "nominal")
     impact, _ = found.windows
     assert not impact.touched and not found.series.touching.any()
@@ -188,20 +187,14 @@ def test_limits_that_the_tasks_break_relax_them(name: str, controller: str) -> N
     weak = setup.robot.model.effortLimit.copy()
     weak[6:] /= 3
     setup.robot.model.effortLimit = weak
-    made = workshop(set_up_with(setup))
+    # A world for the robot as it has become.
+    made = workshop(replace(setup, world=build_world(setup.robot, setup.scenario.scene, setup.q)))
     found = driven(made, controller)
     metrics = measure(made.setup, found)
     assert metrics.relaxed_ticks > 20 and metrics.failed_ticks == 0
     assert metrics.saturation_inside + metrics.saturation_outside > 0.01
     for name, column in fields_of(found.series).items():
         assert name == "objective" or np.isfinite(column).all(), name
-
-
-def set_up_with(setup: Any) -> Any:
-    """The same experiment with a world for the robot as it has become."""
-    from impact_posture.simulation.world import build_world
-
-    return replace(setup, world=build_world(setup.robot, setup.scenario.scene, setup.q))
 
 
 # ---- bad input ----------------------------------------------------------------------------------------------------
