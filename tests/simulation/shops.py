@@ -58,8 +58,8 @@ def driven(made: Workshop, controller: str, *, mode: Mode = "live", seed: int = 
 
 
 @functools.cache
-def lived(name: str, controller: str, mode: Mode = "live", settle: float | None = None) -> Run:
-    """A run of a shipped scenario, cut short; one of each in a process."""
+def lived(name: str, controller: str, mode: Mode, settle: float | None) -> Run:
+    """A run of a shipped scenario, cut short; one of each in a process.  No defaults: the cache tells them apart."""
     return driven(shop(name, settle), controller, mode=mode)
 
 

@@ -133,7 +133,7 @@ def test_windows_begin_at_the_first_touch_and_are_as_long_for_every_controller(n
     reference = Reference(task, made.setup.gap)
     leaves = task.settle + reference.inward + task.dwell
     for controller in ("nominal", "robust", "invariant", "walker"):
-        found = lived(name, controller)
+        found = lived(name, controller, "live", None)
         impact, dwell = found.windows
         series = found.series
         assert (impact.kind, dwell.kind, impact.touched) == ("impact", "dwell", True)
@@ -153,7 +153,7 @@ def test_pushes_have_windows_as_long_as_they_last_and_wait_for_rest(name: str) -
     made = shop(name)
     task = made.setup.scenario.task
     assert isinstance(task, SinglePush)
-    found = lived(name, "nominal")
+    found = lived(name, "nominal", "live", None)
     (window,) = found.windows
     assert window.end - window.begin == pytest.approx(task.duration) and window.begin == found.waited
     before = found.series.slice(window.begin - task.still, window.begin)
