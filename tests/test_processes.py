@@ -11,10 +11,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from impact_posture.errors import ControllerNotFound, ImpactPostureError, SimulationDiverged
-from impact_posture.processes import shared_out
+from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError, SimulationDiverged
+from impact_posture.processes import in_a_copy, shared_out
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs /proc to look at processes")
 
@@ -118,7 +119,7 @@ def test_leaving_early_leaves_no_process(tmp_path: Path) -> None:
 PROGRAM = """
 import os, signal, sys, time
 from pathlib import Path
-from impact_posture.processes import shared_out
+from impact_posture.processes import in_a_copy, shared_out
 
 # A shell ignores Ctrl-C for what it runs in the background, and its children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -156,3 +157,47 @@ def test_ctrl_c_leaves_no_process_and_no_noise(tmp_path: Path, send: Callable[[i
         # Its own session: nothing else is in that group.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
+
+
+# ---- a copy of this process ----------------------------------------------------------------------------------------
+
+
+def test_a_copy_goes_on_from_the_very_state() -> None:
+    numbers = np.random.default_rng(5)
+    numbers.random(3)
+
+    def draw() -> np.ndarray:
+        return numbers.random(100_000)
+
+    with in_a_copy(draw) as collect:
+        # More than a pipe holds: the copy waits, this process does not.
+        here = draw()
+        np.testing.assert_array_equal(collect(), here)
+
+
+def test_what_a_copy_raises_is_raised_here() -> None:
+    def fail() -> None:
+        raise InputError("is wrong", where="the copy", mend="mend it")
+
+    with in_a_copy(fail) as collect, pytest.raises(InputError, match="the copy: is wrong; mend it"):
+        collect()
+
+
+def test_a_copy_that_dies_is_an_error() -> None:
+    with in_a_copy(lambda: os.kill(os.getpid(), signal.SIGKILL)) as collect, pytest.raises(OSError, match="has died"):
+        collect()
+
+
+def test_no_copy_outlives_its_block(tmp_path: Path) -> None:
+    told = tmp_path / "pid"
+
+    def linger() -> None:
+        told.with_suffix(".part").write_text(str(os.getpid()))
+        told.with_suffix(".part").replace(told)
+        time.sleep(60)
+
+    with pytest.raises(KeyboardInterrupt), in_a_copy(linger):
+        while not told.exists():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+    assert gone([int(told.read_text())], within=1.0)
