@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.follow import trade_off
 from impact_posture.posture.problem import Requirements, build_problem
-from impact_posture.posture.solve import solve
+from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.programs import nominal_posture
 from impact_posture.simulation.scenario import Setup
@@ -25,8 +25,9 @@ _POINTS = 16
 _MARGIN = 0.1
 # Acceleration (rad/s², m/s²) that the least normal forces of the feet may cause in a robot that is held.
 _STILL = 0.5
-# M that the center of mass stays inside the feet's polygon.
-_COM_MARGIN = 0.02
+# M that the center of mass stays inside the feet's polygon, at least: a blow tips what stands on its heels, which the
+# motors alone would hold.
+_COM_MARGIN = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,25 +72,7 @@ def offline_posture(
     Raises:
         Infeasible, SolverFailed: As :func:`impact_posture.posture.solve.solve`.
     """
-    robot, control = setup.robot, setup.scenario.control
-    flies = control.footing is None
-    requirements = Requirements(
-        contact_pose="full" if control.end_effector is not None else "free",
-        base="level" if control.tilt is not None and robot.floating else "free",
-        hold=tuple(j for j in robot.spec.constraints.hold if j not in robot.locked),
-        com_over_feet=not flies,
-        com_margin=_COM_MARGIN if not flies else 0.0,
-        com_asked=False,
-        limit_margin=_MARGIN,
-    )
-    try:
-        problem = build_problem(robot, objective, setup.q, requirements)
-        solution = solve(problem, starts=starts, seed=seed, jobs=1)
-    except (Infeasible, SolverFailed):
-        # A start near its stops cannot keep so far from them.
-        requirements = Requirements(**{**requirements.__dict__, "limit_margin": 0.0})
-        problem = build_problem(robot, objective, setup.q, requirements)
-        solution = solve(problem, starts=starts, seed=seed, jobs=1)
+    solution = _solved(setup, objective, starts, seed)
     initial = objective.value(solution.initial)
     if holds(setup, solution.q, share):
         value = objective.value(solution.q)
@@ -105,6 +88,26 @@ def offline_posture(
             return OfflinePosture(point.q, point.objective, initial, optimum, point.distance, whole, note)
     note = f"no better posture can be held with {100 * share:.0f} % of the motors' torque: the start is kept"
     return OfflinePosture(solution.initial, initial, initial, optimum, 0.0, whole, note)
+
+
+def _solved(setup: Setup, objective: ImpactObjective, starts: int, seed: int) -> PostureSolution:
+    """The optimum as far from stops and from the feet's edges as the start allows."""
+    robot, control = setup.robot, setup.scenario.control
+    stands = control.footing is not None
+    asked = Requirements(
+        contact_pose="full" if control.end_effector is not None else "free",
+        base="level" if control.tilt is not None and robot.floating else "free",
+        hold=tuple(j for j in robot.spec.constraints.hold if j not in robot.locked),
+        com_over_feet=stands,
+        com_asked=False,
+    )
+    for stops, edges in ((_MARGIN, _COM_MARGIN), (0.0, _COM_MARGIN), (0.0, _COM_MARGIN / 2)):
+        try:
+            wanted = replace(asked, limit_margin=stops, com_margin=edges if stands else 0.0)
+            return solve(build_problem(robot, objective, setup.q, wanted), starts=starts, seed=seed, jobs=1)
+        except (Infeasible, SolverFailed):
+            continue
+    return solve(build_problem(robot, objective, setup.q, asked), starts=starts, seed=seed, jobs=1)
 
 
 def holds(setup: Setup, q: Array, share: float) -> bool:
