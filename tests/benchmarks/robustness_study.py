@@ -21,10 +21,12 @@ from impact_posture.processes import shared_out
 from tests.benchmarks.common import machine
 from tests.benchmarks.robustness.draws import RANGES
 from tests.benchmarks.robustness.outcomes import NotAdmissible, Record, Store, configuration
+from tests.benchmarks.robustness.tables import page
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "generated" / "robustness.md"
 WORK = ROOT / "build" / "robustness"
+HEAD = "<!-- Written by `make study-robustness`; do not edit. -->"
 
 
 def main() -> int:
@@ -38,6 +40,8 @@ def main() -> int:
     parser.add_argument("--work", type=Path, default=WORK, help="where finished configurations are kept")
     parser.add_argument("--write", action="store_true", help=f"also write {PAGE.name} of the documentation")
     args = parser.parse_args()
+    if args.configurations < 1:
+        parser.error("--configurations: at least one")
     if args.write and set(args.scenarios) != set(RANGES):
         parser.error("--write is for all scenarios together: leave --scenarios away")
     try:
@@ -52,7 +56,11 @@ def main() -> int:
     except (ImpactPostureError, NotAdmissible) as error:
         print(error, file=sys.stderr)
         return 1
-    print(f"{machine()}, MuJoCo {version}; {time.perf_counter() - began:.0f} s; {len(records)}")
+    text = page(records, args.seed)
+    print(text)
+    print(f"{machine()}, MuJoCo {version}; {time.perf_counter() - began:.0f} s")
+    if args.write:
+        PAGE.write_text(f"{HEAD}\n\n{text}", encoding="utf-8")
     return 0
 
 
