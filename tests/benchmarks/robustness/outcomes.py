@@ -27,7 +27,7 @@ from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, RAN
 SCHEMA = 1
 NOMINAL = "nominal"
 # The robust term that is off, with the posture that it reached, when the push comes.
-HELD = "robust, held"
+HELD = "robust:held"
 AERIAL = (NOMINAL, "robust", "robust-speed", "posture")
 PUSHED = (NOMINAL, "robust", HELD, "posture")
 # Share of the motors' limits with which the start must be held; share of a nominal run's ticks outside the windows
