@@ -24,6 +24,7 @@ from impact_posture.simulation.runs import Run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup, SinglePush, set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from tests.benchmarks.robustness import outcomes
+from tests.benchmarks.robustness.advice import percent
 from tests.benchmarks.robustness.draws import RANGES, Draw, draw, prepare
 from tests.benchmarks.robustness.outcomes import (
     ATTEMPTS,
@@ -37,8 +38,8 @@ from tests.benchmarks.robustness.outcomes import (
     controllers,
     play,
 )
-from tests.benchmarks.robustness.statistics import change, misled, quantile, rank, split, summarize, worst
-from tests.benchmarks.robustness.tables import MARK, page, percent, range_table
+from tests.benchmarks.robustness.statistics import agreement, change, misled, quantile, rank, split, summarize, worst
+from tests.benchmarks.robustness.tables import MARK, page, range_table
 from tests.benchmarks.robustness_study import HEAD, PAGE, study
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -68,10 +69,10 @@ def test_an_aerial_draw_looks_at_its_surface_from_where_it_is_mounted(scenario: 
     tool = -numeric.placement(point_on(setup.robot, "ee")).rotation[:, 2]
     off = math.degrees(math.acos(min(1.0, abs(float(tool @ setup.scenario.normal)))))
     assert off <= math.hypot(v["tilt"], v["roll"]) + 1e-6
-    shoulder = setup.robot.model
-    data = shoulder.createData()
-    pin.forwardKinematics(shoulder, data, setup.q)
-    place = data.oMi[shoulder.getJointId("shoulder_pitch")].translation - setup.q[:3]
+    model = setup.robot.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, setup.q)
+    place = data.oMi[model.getJointId("shoulder_pitch")].translation - setup.q[:3]
     np.testing.assert_allclose(place, [v["x"], 0.0, v["z"]], atol=1e-9)
     shipped = read_scenario(scenario)
     own = load_robot(shipped.robot, shipped.load).model.armature[6:]
@@ -206,6 +207,10 @@ def test_what_goes_with_success_by_hand() -> None:
     chosen, others = split(records, "robust", lambda r: r.draw.number < 2)
     assert (chosen.count, chosen.helps, chosen.median) == (2, 2, pytest.approx(-0.375))
     assert (others.count, others.helps, others.median) == (3, 0, pytest.approx(0.5))
+    # H fell in the first three and rose in the fourth: the motion went with it but in the third, the jump but in the
+    # first.
+    assert agreement(records, ["robust"], "H", "q_total_impact") == (3, 4)
+    assert agreement(records, ["robust"], "H", "peak_jump") == (3, 4)
     bad, wrong = worst(records, "robust"), misled(records, "robust")
     assert bad is records[3]
     # H fell in three; in the first of them the jump rose.

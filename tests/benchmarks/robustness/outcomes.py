@@ -109,9 +109,8 @@ class NotAdmissible(Exception):
 
 def play(workshop: Workshop, controller: str) -> tuple[Run, ...]:
     """One run, noise of seed 0."""
-    return run(
-        workshop, "robust" if controller == HELD else controller, mode="held" if controller == HELD else "live"
-    )
+    name, _, mode = controller.partition(":")
+    return run(workshop, name, mode="held" if mode else "live")
 
 
 def configuration(scenario: str, number: int, seed: int, runs: _RUNS = play) -> Record:

@@ -124,6 +124,17 @@ def fall(record: Record, controller: str, name: str) -> float | None:
     return float(before - after) if name == "offset" else math.log(before / after)
 
 
+def agreement(records: Sequence[Record], names: Sequence[str], of: str, metric: str) -> tuple[int, int]:
+    """In how many runs that did not fail a metric fell where H or V did, and rose where it rose; and of how many."""
+    same = [
+        (fallen > 0) == (change(r, c, metric) < 0)
+        for r in records
+        for c in names
+        if not r.outcomes[c].failure and (fallen := fall(r, c, of)) is not None
+    ]
+    return sum(same), len(same)
+
+
 def rank(records: Sequence[Record], controller: str, of: Callable[[Record], float | None]) -> float:
     """Spearman's correlation of a number with the *reduction* of the motion, among those that did not fail."""
     pairs = [(of(r), -change(r, controller)) for r in records if not r.outcomes[controller].failure]

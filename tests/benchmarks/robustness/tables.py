@@ -1,16 +1,16 @@
-"""The page's sentences and tables, all of them from the records."""
+"""The page's tables, all of them from the records."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
+from tests.benchmarks.robustness.advice import Records, choice_lines, percent
 from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, RANGES
-from tests.benchmarks.robustness.outcomes import HELD, NOMINAL, SATURATED, SHARE, Record, controllers
+from tests.benchmarks.robustness.outcomes import NOMINAL, SATURATED, SHARE, Record, controllers
 from tests.benchmarks.robustness.statistics import (
     Split,
-    Summary,
     change,
     fall,
     misled,
@@ -20,21 +20,12 @@ from tests.benchmarks.robustness.statistics import (
     worst,
 )
 
-Records = Mapping[str, Sequence[Record]]
 # The page of the documentation takes what is before and what is after.
 MARK = "<!-- tables -->"
-# A controller that helps less often than this, or at the median by less, is no advice.
-_OFTEN, _MUCH = 2 / 3, 0.05
 # M: a shoulder that is less than this ahead of or behind the base's center is under it.
 _UNDER = 0.04
 # Drawn values whose rank correlation is shown.
 _RANKED = ("x", "z", "speed", "force", "stiffness", "armature", "gain")
-WORDS = {
-    "aerial-vertical": "An arm that comes down on a floor",
-    "aerial-lateral": "An arm that runs against a wall",
-    "solo8-push": "A quadruped that is pushed",
-    "talos-push": "A humanoid that is pushed",
-}
 
 
 def page(records: Records, seed: int) -> str:
@@ -46,67 +37,9 @@ def page(records: Records, seed: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def percent(value: float) -> str:
-    """A relative change; what failed has none."""
-    return "fails" if value == math.inf else f"{100 * value:+.0f} %".replace("-", "−")
-
-
-def _change(summary: Summary) -> str:
-    low, middle, high = (percent(v) for v in summary.quartiles)
-    return f"median {middle}, quartiles {low} and {high}"
-
-
-def choice_lines(records: Records) -> list[str]:
-    """What to take, scenario by scenario, led by what helped most often."""
-    lines = []
-    for name, own in records.items():
-        found = [summarize(own, c) for c in controllers(name) if c != NOMINAL]
-        found.sort(key=lambda s: (-s.helps, s.quartiles[1]))
-        best = found[0]
-        good = best.helps >= _OFTEN * best.count and best.quartiles[1] <= -_MUCH
-        lead = f"take `{best.controller}`: it" if good else f"nothing helps reliably; at best `{best.controller}`"
-        others = "; ".join(f"`{s.controller}` in {s.helps} ({percent(s.quartiles[1])})" for s in found[1:])
-        fails = sum(best.failures.values())
-        lines.append(
-            f"- **{WORDS[name]}** (`{name}`): {lead} moved the robot less than the nominal controller in "
-            f"{best.helps} of {best.count} configurations ({_change(best)}), with a lower jump in {best.gentler}"
-            f"{f', and failed in {fails}' if fails else ''}. The others: {others}."
-        )
-    return [*lines, *_held_line(records), *_v_line(records)]
-
-
-def _held_line(records: Records) -> list[str]:
-    pushed = {name: own for name, own in records.items() if HELD in controllers(name)}
-    if not pushed:
-        return []
-    parts = [
-        f"`{name}` {percent(summarize(own, 'robust').quartiles[1])} live, "
-        f"{percent(summarize(own, HELD).quartiles[1])} held"
-        for name, own in pushed.items()
-    ]
-    return [
-        f"- **Posture or stiffness?** What is left when the term goes before the push is posture: {'; '.join(parts)}."
-    ]
-
-
 def _v_parts(own: Sequence[Record], controller: str) -> tuple[Split, Split]:
     known = [r for r in own if fall(r, controller, "V") is not None]
     return split(known, controller, lambda r: (fall(r, controller, "V") or 0.0) > 0)
-
-
-def _v_line(records: Records) -> list[str]:
-    aerial = [r for name, own in records.items() if NOMINAL in controllers(name) and HELD not in controllers(name)
-              for r in own]  # fmt: skip
-    if not aerial:
-        return []
-    lower, higher = _v_parts(aerial, "robust")
-    h_lower, _ = split(aerial, "robust", lambda r: (fall(r, "robust", "H") or 0.0) > 0)
-    return [
-        f"- **Before you trust a lower H, compare V.** `robust` lowered H in {h_lower.count} of {len(aerial)} aerial "
-        f"configurations and the motion in {h_lower.helps} of those. Where V was lower too it helped in "
-        f"{lower.helps} of {lower.count} (median {percent(lower.median)}), where V was higher in {higher.helps} of "
-        f"{higher.count}{f' (median {percent(higher.median)})' if higher.count else ''}."
-    ]
 
 
 def overview(records: Records) -> list[str]:
