@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from tests.benchmarks.robustness.advice import Records, choice_lines, percent
 from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, RANGES
-from tests.benchmarks.robustness.outcomes import NOMINAL, SATURATED, SHARE, Record, controllers
+from tests.benchmarks.robustness.outcomes import HELD, NOMINAL, SATURATED, SHARE, Record, controllers
 from tests.benchmarks.robustness.statistics import (
     Split,
     change,
@@ -96,7 +96,8 @@ def by_v(records: Records) -> list[str]:
     """Helped where V fell, and where it rose."""
     lines = ["| scenario | controller | V lower | V higher |", "|---|---|---|---|"]
     for name, own in records.items():
-        for controller in controllers(name)[1:]:
+        # A push gives its impulse, not its speed.
+        for controller in controllers(name)[1:] if HELD not in controllers(name) else ():
             lower, higher = _v_parts(own, controller)
             lines.append(f"| `{name}` | `{controller}` | {_part(lower)} | {_part(higher)} |")
     return ["Where a controller's V before the blow was lower than nominal's, and where it was not:", "", *lines]
