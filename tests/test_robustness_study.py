@@ -231,7 +231,7 @@ def test_the_advice_follows_the_numbers() -> None:
     assert "nothing helps reliably" in advice
     assert "take" not in advice
     live = [made(STANDING, k, {"robust": (0.7, 1.0), HELD: (0.99, 1.0)}) for k in range(4)]
-    assert f"`{STANDING}` −30 % live, −1 % held" in page({STANDING: live}, 0)
+    assert f"`{STANDING}` −30 % live, −1 % held: stiffness" in page({STANDING: live}, 0)
 
 
 def test_an_interrupted_study_goes_on_and_says_the_same(tmp_path: Path) -> None:

@@ -52,11 +52,16 @@ def _held_line(records: Records) -> list[str]:
     pushed = {name: own for name, own in records.items() if HELD in controllers(name)}
     if not pushed:
         return []
-    parts = [
-        f"`{name}` {percent(summarize(own, 'robust').quartiles[1])} live, "
-        f"{percent(summarize(own, HELD).quartiles[1])} held"
-        for name, own in pushed.items()
-    ]
+    parts = []
+    for name, own in pushed.items():
+        live, held = (summarize(own, c).quartiles[1] for c in ("robust", HELD))
+        if live > -_MUCH:
+            what = "neither"
+        elif held > -_MUCH:
+            what = "stiffness, which a higher gain of the nominal controller gives as well"
+        else:
+            what = "mostly posture" if held <= live / 2 else "both"
+        parts.append(f"`{name}` {percent(live)} live, {percent(held)} held: {what}")
     return [
         f"- **Posture or stiffness?** What is left when the term goes before the push is posture: {'; '.join(parts)}."
     ]
