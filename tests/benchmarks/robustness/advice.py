@@ -29,6 +29,11 @@ def _change(summary: Summary) -> str:
     return f"median {middle}, quartiles {low} and {high}"
 
 
+def _limits(summary: Summary) -> str:
+    inside, outside = summary.saturation
+    return f"{inside:.1f} s in the impact windows and {outside:.1f} s outside"
+
+
 def choice_lines(records: Records) -> list[str]:
     """What to take, scenario by scenario, led by what helped most often."""
     lines = []
@@ -43,7 +48,8 @@ def choice_lines(records: Records) -> list[str]:
         lines.append(
             f"- **{WORDS[name]}** (`{name}`): {lead} moved the robot less than the nominal controller in "
             f"{best.helps} of {best.count} configurations ({_change(best)}), with a lower jump in {best.gentler}"
-            f"{f', and failed in {fails}' if fails else ''}. The others: {others}."
+            f"{f', and failed in {fails}' if fails else ''}; at a control limit for {_limits(best)} of all runs, nominal "
+            f"for {_limits(summarize(own, NOMINAL))}. The others: {others}."
         )
     return [*lines, *_held_line(records), *_v_line(records)]
 
