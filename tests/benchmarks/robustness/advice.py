@@ -31,7 +31,7 @@ def _change(summary: Summary) -> str:
 
 def _limits(summary: Summary) -> str:
     inside, outside = summary.saturation
-    return f"{inside:.1f} s in the impact windows and {outside:.1f} s outside"
+    return f"{inside:.1f} + {outside:.1f}"
 
 
 def choice_lines(records: Records) -> list[str]:
@@ -48,8 +48,8 @@ def choice_lines(records: Records) -> list[str]:
         lines.append(
             f"- **{WORDS[name]}** (`{name}`): {lead} moved the robot less than the nominal controller in "
             f"{best.helps} of {best.count} configurations ({_change(best)}), with a lower jump in {best.gentler}"
-            f"{f', and failed in {fails}' if fails else ''}; at a control limit for {_limits(best)} of all runs, nominal "
-            f"for {_limits(summarize(own, NOMINAL))}. The others: {others}."
+            f"{f', and failed in {fails}' if fails else ''}. At a control limit in all, in the windows + "
+            f"outside: {_limits(best)} s, nominal {_limits(summarize(own, NOMINAL))} s. The others: {others}."
         )
     return [*lines, *_held_line(records), *_v_line(records)]
 
