@@ -1,13 +1,14 @@
-"""Work that is shared among forked processes."""
+"""Work that is shared among forked processes, and what a process does twice from one state."""
 
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.pool import Pool
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 _Result = TypeVar("_Result")
 
@@ -42,6 +43,53 @@ def shared_out(function: Callable[[int], _Result], count: int, jobs: int) -> Ite
         pool.terminate()
         pool.join()
         _WORK.clear()
+
+
+@contextmanager
+def in_a_copy(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
+    """Begin ``function()`` in a copy of this process, at the very state that it is in; yield what waits for its end.
+
+    For state that cannot be copied otherwise (physics, solvers).  The copy's exceptions are raised here.  When the
+    block is left, the copy is gone.
+
+    Raises:
+        OSError: The system cannot fork.
+    """
+    reader, writer = multiprocessing.Pipe(duplex=False)
+    child = os.fork()
+    if child == 0:
+        _answer(function, writer)
+    writer.close()
+
+    def collect() -> _Result:
+        try:
+            good, answer = reader.recv()
+        except EOFError:
+            raise OSError("a process that was forked has died") from None
+        if not good:
+            raise answer
+        result: _Result = answer
+        return result
+
+    try:
+        yield collect
+    finally:
+        reader.close()
+        with suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+
+
+def _answer(function: Callable[[], Any], writer: Any) -> NoReturn:
+    """Live as a copy: send what comes, and end without any of the original's clean-up."""
+    try:
+        try:
+            answer = (True, function())
+        except BaseException as error:
+            answer = (False, error)
+        writer.send(answer)
+    finally:
+        os._exit(0)
 
 
 def _ignore_interrupt() -> None:

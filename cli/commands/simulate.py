@@ -88,6 +88,14 @@ def simulate(
     _show(Page(quiet=quiet), document, job.label, folder)
 
 
+def _rigid(prediction: dict[str, Any]) -> str:
+    from impact_posture_cli.output import number
+
+    if prediction["sticking"] is None:
+        return f"{number(prediction['frictionless'], missing='–')} if nobody controlled"
+    return f"{number(prediction['frictionless'])} without friction, {number(prediction['sticking'])} sticking"
+
+
 def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> None:
     from impact_posture_cli.output import number
 
@@ -98,8 +106,7 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
     rows = [
         ("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints})"),
         ("peak jump", f"{number(metrics['peak_jump'])}, at most {number(metrics['peak_jump_max'])}"),
-        ("rigid model", f"{number(prediction['frictionless'], missing='–')}; measured over it "
-                        f"{number(prediction['ratio'], missing='–')}"),
+        ("rigid model", _rigid(prediction)),
         ("H before", number(prediction["H"], missing="–")),
         ("peak force", f"{number(metrics['peak_force'])} N"),
         ("saturated", f"{number(saturation['inside'])} s in the windows, {number(saturation['outside'])} s outside"),

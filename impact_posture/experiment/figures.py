@@ -5,21 +5,90 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from impact_posture.experiment.jobs import Job
-from impact_posture.experiment.many import Store
+import numpy as np
+
+from impact_posture.experiment.jobs import Job, workshop
+from impact_posture.experiment.many import Document, Store
+from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction
+from impact_posture.plot import Bar, RunView, Span, draw_bars, draw_comparison, draw_run, draw_snapshots
 from impact_posture.simulation.runs import Run
+from impact_posture.simulation.scenario import RepeatedContacts
+from impact_posture.simulation.series import Series, Window
 
 
 def draw_runs(job: Job, runs: Sequence[Run], folder: Path, formats: Sequence[str]) -> None:
-    """Figures of one job."""
+    """Figures of one job; those of a push the other way in ``minus/``."""
+    for one in runs:
+        into = folder if one is runs[0] else folder / "minus"
+        view = run_view(job, one.series, one.windows, one.sign)
+        draw_run(view, into, formats)
+        draw_snapshots([view], into, formats)
 
 
 def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]) -> None:
-    """Figures of several controllers in one scenario."""
+    """Figures of several controllers in one scenario; of pushes, those the first way."""
+    views = [view for job in jobs if (view := _kept(job, store)) is not None]
+    if views:
+        draw_comparison(views, folder, formats)
+        draw_snapshots(views, folder, formats)
 
 
 def draw_reproduction(
     found: Reproduction, jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]
 ) -> None:
-    """Figures of a reproduction."""
+    """``bars``, and a folder for each scenario: nominal, robust and the best controller side by side."""
+    bars = []
+    for row in found.rows:
+        paper, total = PAPER.get(row.scenario), row.metrics.get("q_total_impact")
+        printed = {} if paper is None else {"nominal": paper.nominal, "robust": paper.robust}
+        half = np.nan if total is None or total.half_width is None else total.half_width
+        mean = np.nan if total is None else total.mean
+        bars.append(Bar(row.scenario, row.controller, mean, half, printed.get(row.controller)))
+    draw_bars(bars, folder, formats)
+    for scenario in found.scenarios:
+        best = found.best(scenario)
+        shown = dict.fromkeys(("nominal", "robust", *(() if best is None else (best.controller,))))
+        labels = {job.label: job for job in jobs if job.scenario == scenario}
+        draw_side_by_side([labels[label] for label in shown if label in labels], store, folder / scenario, formats)
+
+
+def run_view(job: Job, series: Series, windows: Sequence[Window], sign: int) -> RunView:
+    """What is drawn of a run."""
+    shop = workshop(job.scenario, job.free)
+    setup, scenario = shop.setup, shop.setup.scenario
+    objective = shop.objective()
+    hits = isinstance(scenario.task, RepeatedContacts)
+    return RunView(
+        scenario=scenario.name,
+        controller=job.controller,
+        robot=setup.robot,
+        contact=objective.contact,
+        t=series.t,
+        q=series.q,
+        v=series.v,
+        torque=series.torque,
+        rotor_command=series.rotor_command,
+        rotor_speed=series.rotor_speed,
+        force=series.force,
+        peak=series.peak,
+        objective=series.objective,
+        level=series.level,
+        at_stop=series.at_stop,
+        windows=tuple(Span(w.kind, w.begin, w.end, w.contact, w.touched) for w in windows),
+        surface=np.array(setup.world.built.points[scenario.surface.name]) if hits else None,
+        supports=objective.supports,
+        label=job.label,
+        facts=(f"seed {job.seed}", *(() if hits else (f"push {sign:+d}",))),
+    )
+
+
+def _kept(job: Job, store: Store) -> RunView | None:
+    """The first run of a job whose series was kept; ``None`` where it came to no end."""
+    document: Document | None = store.find(job)
+    if document is None or "error" in document:
+        return None
+    part = document["runs"][0]
+    return run_view(
+        job, Series.load(store.series(job, part["sign"])), [Window(**w) for w in part["windows"]], part["sign"]
+    )

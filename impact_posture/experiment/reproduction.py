@@ -13,8 +13,8 @@ from impact_posture.experiment.statistics import Row, row_of
 from impact_posture.simulation.controllers import CONTROLLERS
 
 SCHEMA = "impact-posture/reproduction/1"
-# For robots that stand, the term's posture apart from its stiffness.
-HELD = "robust:held"
+# The posture that a term reaches apart from what it does while the blow lasts; and the metric without the feet.
+HELD, FREE = ("robust:held", "walker:held"), "robust:free"
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ def controllers_of(scenario: str, everything: bool) -> tuple[str, ...]:
     """Labels of the controllers of a reproduction: nominal first."""
     pushed = scenario.endswith("-push")
     if everything:
-        return (*CONTROLLERS, HELD, "robust:free") if pushed else (*CONTROLLERS, HELD)
-    return tuple(dict.fromkeys(("nominal", "robust", *((HELD,) if pushed else ()), RECOMMENDED[scenario])))
+        return (*CONTROLLERS, *HELD, FREE) if pushed else (*CONTROLLERS, *HELD)
+    return tuple(dict.fromkeys(("nominal", "robust", RECOMMENDED[scenario])))
 
 
 def jobs_of(scenario: str, controllers: Sequence[str], seeds: int) -> list[Job]:

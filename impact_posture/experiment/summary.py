@@ -113,12 +113,15 @@ def remarks(found: Reproduction, scenario: str) -> list[str]:
     """What a reader of a scenario's table must know."""
     rows = {row.controller: row for row in found.of(scenario)}
     lines = []
-    held, live, stiff = rows.get("robust:held"), rows.get("robust"), rows.get("stiff")
-    if held is not None and live is not None and held.reduction is not None and live.reduction is not None:
-        share = held.reduction.mean / live.reduction.mean if live.reduction.mean > 0 else float("nan")
+    live, stiff = rows.get("robust"), rows.get("stiff")
+    for name in ("robust", "walker"):
+        held, whole = rows.get(f"{name}:held"), rows.get(name)
+        if held is None or whole is None or held.reduction is None or whole.reduction is None:
+            continue
+        share = held.reduction.mean / whole.reduction.mean if whole.reduction.mean > 0 else float("nan")
         lines.append(
-            f"With the reached posture held, and the term off before the blow, {reduction_text(held)} remain of "
-            f"{reduction_text(live)}: "
+            f"`{name}`: with the reached posture held before the blow {reduction_text(held)} remain of "
+            f"{reduction_text(whole)}: "
             + ("most of it is posture." if share > 0.5 else "most of it is the term's stiffness, not the posture.")
         )
     if stiff is not None and live is not None and stiff.reduction is not None and live.reduction is not None:

@@ -1,5 +1,8 @@
 """Pictures of a result: :func:`draw_all` writes them, the ``*_figure`` functions return matplotlib figures.
 
+Of simulated runs: :func:`draw_run`, :func:`draw_comparison`, :func:`draw_snapshots` and :func:`draw_bars`, from a
+:class:`RunView` of each run.
+
 Nothing here touches pyplot's global state or shows a window.
 """
 
@@ -11,11 +14,16 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from impact_posture.errors import NameNotFound
+from impact_posture.plot.bars import Bar, bars_figure, draw_bars
 from impact_posture.plot.classical import classical_figure
+from impact_posture.plot.comparison import comparison_figure, controls_comparison_figure, draw_comparison
 from impact_posture.plot.ellipsoid import ellipsoid_figure
 from impact_posture.plot.jump import jump_figure
 from impact_posture.plot.path import path_figure
 from impact_posture.plot.robot import postures_figure
+from impact_posture.plot.run_view import RunView, Span
+from impact_posture.plot.runs import controls_figure, draw_run, joints_figure, metric_figure
+from impact_posture.plot.snapshots import draw_snapshots, snapshots_figure
 from impact_posture.plot.style import FORMATS, check_formats, save
 from impact_posture.plot.tradeoff import tradeoff_figure
 from impact_posture.plot.view import PathData, ResultView, TradeOffData, sample_path
@@ -23,18 +31,32 @@ from impact_posture.plot.view import PathData, ResultView, TradeOffData, sample_
 __all__ = [
     "FIGURES",
     "FORMATS",
+    "Bar",
     "FigureNotFound",
     "PathData",
     "ResultView",
+    "RunView",
+    "Span",
     "TradeOffData",
+    "bars_figure",
     "classical_figure",
+    "comparison_figure",
+    "controls_comparison_figure",
+    "controls_figure",
     "draw_all",
+    "draw_bars",
+    "draw_comparison",
+    "draw_run",
+    "draw_snapshots",
     "ellipsoid_figure",
+    "joints_figure",
     "jump_figure",
+    "metric_figure",
     "path_figure",
     "postures_figure",
     "sample_path",
     "save",
+    "snapshots_figure",
     "tradeoff_figure",
 ]
 

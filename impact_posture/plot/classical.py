@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from impact_posture.plot.ellipsoid import draw_normals, normal_label, normals, square_panel
 from impact_posture.plot.shapes import COORDINATE_PLANES, Plane, Vector, polar, shadow
 from impact_posture.plot.style import BLUE, GREEN, INK, VERMILLION, framed, style
-from impact_posture.plot.view import ResultView, jump_unit, number
+from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
 NOTES = (
     "Each kind is divided by its longest semi-axis before (of those that end), in both rows: the legend states it. "
@@ -91,7 +91,7 @@ def classical_figure(view: ResultView) -> Figure:
     limit = 1.18 * max(1.0, *(_longest(matrix) for kind in kinds for matrix in kind.finite))
     named = normals(view.before, view.after)
     with style():
-        figure, body = framed(view, 5.2, NOTES)
+        figure, body = framed(*header_lines(view), 5.2, NOTES)
         panels = body.subplots(2, 3)
         for row, word, which in ((panels[0], "before", 0), (panels[1], "after", 1)):
             own = named[min(which, len(named) - 1)]

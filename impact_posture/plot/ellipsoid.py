@@ -23,7 +23,7 @@ from impact_posture.plot.shapes import (
 )
 from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, PLATE, framed, style
 from impact_posture.plot.uncertain import draw_uncertainty, draw_uncertainty_3d, has_cone, uncertainty_handles
-from impact_posture.plot.view import ResultView, jump_unit, number
+from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
 _FREE = "Free (thin): the same robot as if its feet were not held."
 _CONE = "The objective counts the worst normal of the cone; equally bad ones are all drawn."
@@ -61,7 +61,7 @@ def ellipsoid_figure(view: ResultView) -> Figure:
     n = view.after.normal
     notes = " ".join([*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if has_cone(view) else [])])
     with style():
-        figure, body = framed(view, 5.5, [notes])
+        figure, body = framed(*header_lines(view), 5.5, [notes])
         grid = body.add_gridspec(2, 3, height_ratios=[1, 1.2])
         oblique = not any(plane.contains(n) for plane in COORDINATE_PLANES)
         panels = [(grid[0, column], plane) for column, plane in enumerate(COORDINATE_PLANES)]

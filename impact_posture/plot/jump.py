@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, BLUE, INK, VERMILLION, framed, style
-from impact_posture.plot.view import ResultView, jump_unit, number, velocity_units
+from impact_posture.plot.view import ResultView, header_lines, jump_unit, number, velocity_units
 
 _ROW = 0.17
 
@@ -39,7 +39,7 @@ def jump_figure(view: ResultView) -> Figure:
     ]
     heights = [0.42 + _ROW * len(indices) for _, indices, _ in groups]
     with style():
-        figure, body = framed(view, sum(heights) + 0.75, _notes(view, stuck))
+        figure, body = framed(*header_lines(view), sum(heights) + 0.75, _notes(view, stuck))
         panels: Any = body.subplots(len(groups), 2, squeeze=False, sharey="row", height_ratios=heights)
         for row, (name, indices, unit) in zip(panels, groups, strict=True):
             names = [view.robot.tangent_names[k].removeprefix("base ") for k in indices]

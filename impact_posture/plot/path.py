@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from impact_posture.errors import InputError
 from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import BLUE, GRAY, GREEN, INK, PURPLE, VERMILLION, framed, style
-from impact_posture.plot.view import PathData, ResultView, TradeOffData, number
+from impact_posture.plot.view import PathData, ResultView, TradeOffData, header_lines, number
 
 # A spread above this is drawn on a log axis.
 _SPREAD = 30.0
@@ -31,7 +31,7 @@ def path_figure(view: ResultView) -> Figure:
     """
     path = _checked(view.path)
     with style():
-        figure, body = framed(view, 3.1, [share_notes("along the path", undrawn(path))])
+        figure, body = framed(*header_lines(view), 3.1, [share_notes("along the path", undrawn(path))])
         axes = body.subplots()
         drawn = draw_shares(axes, path.s, path)
         _mark(axes, path)
@@ -62,10 +62,10 @@ def draw_shares(axes: Any, x: Vector, data: PathData | TradeOffData) -> bool:
     return bool(drawn)
 
 
-def spreads(values: Vector) -> bool:
-    """Whether positive values lie so far apart that they want a log axis."""
+def spreads(values: Vector, ratio: float = _SPREAD) -> bool:
+    """Whether positive values lie so far apart, by more than ``ratio``, that they want a log axis."""
     positive = values[values > 0]
-    return bool(positive.size) and float(positive.max() / positive.min()) > _SPREAD
+    return bool(positive.size) and float(positive.max() / positive.min()) > ratio
 
 
 def log_axis(axes: Any) -> None:

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from impact_posture.plot.shapes import COORDINATE_PLANES, XY, XZ, YZ, Plane, Vector, square, upright_plane
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, PALE, PLATE, VERMILLION, framed, style
-from impact_posture.plot.view import ResultView
+from impact_posture.plot.view import ResultView, header_lines
 
 NOTES = (
     "Sticks join joint origins and the last frame of each link (its center of mass where it has no other frame); "
@@ -28,7 +28,10 @@ def postures_figure(view: ResultView) -> Figure:
     Equal axes in meters; the contact plane as a square (from the side: an edge with hatched matter below it), feet
     and rotors where there are any.
     """
-    first, second = (build_skeleton(view, q) for q in (view.q_initial, view.q_optimal))
+    first, second = (
+        build_skeleton(view.robot, q, view.objective.contact, view.objective.supports)
+        for q in (view.q_initial, view.q_optimal)
+    )
     points = np.vstack([first.points, second.points])
     side = max(float(np.ptp(points, axis=0).max()), 1e-3)
     patch = 0.3 * side
@@ -39,7 +42,7 @@ def postures_figure(view: ResultView) -> Figure:
         low, high = _window([first, second], plane, surfaces, patch)
         # As high as the view from the side needs, within a page's reason.
         height = float(np.clip(3.1 * (high - low)[1] / (high - low)[0], 2.3, 3.6)) + 1.0
-        figure, body = framed(view, height, NOTES)
+        figure, body = framed(*header_lines(view), height, NOTES)
         # The empty column keeps the 3-D axes' labels, which the layout does not know of, off the others.
         grid = body.add_gridspec(1, 3, width_ratios=[1, 0.06, 1])
         space = body.add_subplot(grid[0, 0], projection="3d")
@@ -53,8 +56,8 @@ def postures_figure(view: ResultView) -> Figure:
             _plane_3d(space, state, patch, named)
             _plane_2d(flat, state, plane, patch, named)
         for state, line in states:
-            _sticks(space, state, line, None)
-            _sticks(flat, state, line, plane)
+            draw_sticks(space, state, line, None)
+            draw_sticks(flat, state, line, plane)
         _frame_2d(flat, plane, low, high)
         look = {"ncols": 7, "handlelength": 2.2, "columnspacing": 1.4}
         body.legend(handles=_handles(second), loc="outside lower center", **look)
@@ -127,10 +130,11 @@ def _frame_2d(axes: Any, plane: Plane, low: Vector, high: Vector) -> None:
     axes.locator_params(nbins=6)
     axes.set_xlabel(f"{plane.right} [m]")
     axes.set_ylabel(f"{plane.up} [m]")
-    axes.set_title("seen along " + _depth(plane))
+    axes.set_title("seen along " + depth_of(plane))
 
 
-def _depth(plane: Plane) -> str:
+def depth_of(plane: Plane) -> str:
+    """The direction that a reader of the plane looks in."""
     if plane in COORDINATE_PLANES:
         return {"xz": "+y", "yz": "−x", "xy": "−z"}[plane.name]
     return "the horizontal across n"
@@ -141,7 +145,8 @@ def _draw(axes: Any, points: Vector, plane: Plane | None, **look: Any) -> None:
     axes.plot(*(points if plane is None else plane.axes @ points), **look)
 
 
-def _sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane | None) -> None:
+def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane | None) -> None:
+    """Draw bones, rotors, joints, base, feet and the contact point; in 3-D, or projected where there is a plane."""
     for bone in state.bones:
         _draw(axes, bone.T, plane, solid_capstyle="round", **line)
     color = line["color"]

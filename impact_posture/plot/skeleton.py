@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.impact.contact import point_on
+from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.impact.contact import Contact, Support, point_on
 from impact_posture.plot.shapes import Vector
-from impact_posture.plot.view import ResultView
+from impact_posture.robot.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,22 +44,25 @@ class Skeleton:
         return np.vstack([self.bones.reshape(-1, 3), origin, self.contact[None], self.feet, circles])
 
 
-def build_skeleton(view: ResultView, q: Vector) -> Skeleton:
-    """Place the sticks at ``q``.
+def build_skeleton(robot: Robot, q: Vector, contact: Contact, supports: Sequence[Support] = ()) -> Skeleton:
+    """Place the sticks at ``q``, shape (nq,).
 
     A bone joins a joint's origin to its parent's.  The contact and the feet hang on their links; the last link of a
     chain without one goes on to its farthest frame, or to its center of mass where it has none.
     """
-    model, numeric = view.robot.model, view.objective.oracle.numeric.at(q)
-    places = numeric.data.oMi
-    first = 2 if view.robot.floating else 1
-    base = pin.SE3(places[1]) if view.robot.floating else pin.SE3.Identity()
+    model = robot.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    places = data.oMi
+    first = 2 if robot.floating else 1
+    base = pin.SE3(places[1]) if robot.floating else pin.SE3.Identity()
     origins = [np.zeros(3), *(np.array(places[i].translation) for i in range(1, model.njoints))]
     bones = [(origins[model.parents[i]], origins[i]) for i in range(first, model.njoints)]
-    held = [point_on(view.robot, s.frame, s.offset) for s in view.objective.supports]
-    hanging = [view.contact_point, *held]
-    ends = [np.array(numeric.placement(point).translation) for point in hanging]
-    contact, feet = ends[0], ends[1:]
+    held: list[Contact | Support] = [contact, *supports]
+    hanging = [point_on(robot, one.frame, one.offset) for one in held]
+    frames = [_placed(places, point) for point in hanging]
+    ends = [np.array(frame.translation) for frame in frames]
+    turned = np.asarray(frames[0].rotation) if contact.normal_frame == "contact" else np.eye(3)
     bones += [(origins[point.joint], end) for point, end in zip(hanging, ends, strict=True)]
     # A link that already goes on to its foot or contact needs no other tip.
     done = {int(model.parents[i]) for i in range(1, model.njoints)}
@@ -65,18 +70,23 @@ def build_skeleton(view: ResultView, q: Vector) -> Skeleton:
     for leaf in range(first, model.njoints):
         if leaf not in done:
             bones.append((origins[leaf], np.array(places[leaf].act(_tip(model, leaf)))))
-    rotors = _rotors(view, places)
+    rotors = _rotors(robot, places)
     for circle in rotors:
         bones.append((np.array(base.translation), circle.mean(axis=1)))
     return Skeleton(
         bones=np.array(bones),
         joints=np.array(origins[first:]).reshape(-1, 3),
         base=base,
-        contact=contact,
-        normal=np.array(view.objective.oracle.at(q).n),
-        feet=np.array(feet).reshape(-1, 3),
+        contact=ends[0],
+        normal=turned @ np.array(contact.normal),
+        feet=np.array(ends[1:]).reshape(-1, 3),
         rotors=rotors,
     )
+
+
+def _placed(places: Sequence[pin.SE3], point: PointOnLink) -> pin.SE3:
+    """World placement of a point's frame."""
+    return places[point.joint] * pin.SE3(point.rotation, point.position)
 
 
 def _tip(model: pin.Model, joint: int) -> Vector:
@@ -86,12 +96,12 @@ def _tip(model: pin.Model, joint: int) -> Vector:
     return tip if np.linalg.norm(tip) > 1e-3 else np.array(model.inertias[joint].lever)
 
 
-def _rotors(view: ResultView, places: list[pin.SE3]) -> Vector:
+def _rotors(robot: Robot, places: list[pin.SE3]) -> Vector:
     """Circles across the thrust directions, as large as the rotors' spacing allows."""
-    propulsion = view.robot.spec.propulsion
+    propulsion = robot.spec.propulsion
     if propulsion is None:
         return np.zeros((0, 3, 24))
-    frame = view.robot.model.frames[view.robot.frame_id(propulsion.frame)]
+    frame = robot.model.frames[robot.frame_id(propulsion.frame)]
     place = places[frame.parentJoint] * frame.placement
     centers = [np.array(rotor.position) for rotor in propulsion.rotors]
     gaps = [float(np.linalg.norm(a - b)) for k, a in enumerate(centers) for b in centers[:k]]

@@ -14,10 +14,10 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
 from impact_posture.errors import InputError, OutputError
-from impact_posture.plot.view import SEPARATOR, ResultView, header_lines
+from impact_posture.plot.view import SEPARATOR
 
 # Okabe and Ito's palette, "Color Universal Design", 2008.
-VERMILLION, BLUE, GREEN, SKY, PURPLE = "#D55E00", "#0072B2", "#009E73", "#56B4E9", "#CC79A7"
+VERMILLION, BLUE, GREEN, SKY, PURPLE, ORANGE = "#D55E00", "#0072B2", "#009E73", "#56B4E9", "#CC79A7", "#E69F00"
 INK, GRAY, PALE = "#000000", "#6b6b6b", "#d9d9d9"
 
 # Before and after differ by line and hatch as well, so that a gray print tells them apart.
@@ -71,15 +71,15 @@ def style() -> Iterator[None]:
         yield
 
 
-def framed(view: ResultView, height: float, notes: Sequence[str] = ()) -> tuple[Figure, Any]:
+def framed(title: str, lines: Sequence[str], height: float, notes: Sequence[str] = ()) -> tuple[Figure, Any]:
     """Make a figure with the header above and ``notes`` below; return it and the part to draw in.
 
     Args:
-        view: What is drawn.
+        title: First line.
+        lines: Small print below it, broken between its facts where it is too long.
         height: Height of the part to draw in, inches.
         notes: Sentences below the picture.
     """
-    title, lines = header_lines(view)
     small = [part for line in lines for part in wrap(line, SEPARATOR)]
     below = [part for line in notes for part in wrap(line, " ")]
     head, foot = 0.26 + _LINE * len(small), 0.06 + _LINE * len(below)

@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter
 from impact_posture.errors import InputError
 from impact_posture.plot.path import draw_shares, log_axis, share_notes, spreads, undrawn
 from impact_posture.plot.style import BLUE, GRAY, INK, VERMILLION, framed, style
-from impact_posture.plot.view import ResultView, TradeOffData
+from impact_posture.plot.view import ResultView, TradeOffData, header_lines
 
 NOTES = (
     "Each point is the best posture found that moves at most so far from the initial one (joint angles, sliding "
@@ -40,7 +40,7 @@ def tradeoff_figure(view: ResultView) -> Figure:
     knee = [_KNEE] if data.knee is not None else []
     with style():
         notes = [*NOTES, *knee, share_notes("at these postures", undrawn(data))]
-        figure, body = framed(view, 5.6, [" ".join(notes)])
+        figure, body = framed(*header_lines(view), 5.6, [" ".join(notes)])
         upper, lower = body.subplots(2, 1, sharex=True, height_ratios=[1.25, 1])
         _objective(upper, data, view)
         drawn = draw_shares(lower, data.within, data)

@@ -205,7 +205,12 @@ def jump_unit(view: ResultView) -> str:
         return "√J"
     if metric.kind == "weighted":
         return "weighted"
-    kinds = [u for u in ("m/s", "rad/s") if u in velocity_units(view.robot)]
+    return mixed_unit(view.robot)
+
+
+def mixed_unit(robot: Robot) -> str:
+    """Unit of the Euclidean ``‖ν‖``: both units where it mixes them."""
+    kinds = [u for u in ("m/s", "rad/s") if u in velocity_units(robot)]
     return kinds[0] if len(kinds) == 1 else f"({', '.join(kinds)})"
 
 

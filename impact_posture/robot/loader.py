@@ -239,10 +239,14 @@ def _remount(model: pin.Model, mounting: Mapping[str, Vector3], name: str) -> No
     """Move joints with all that hangs on them; the links before them keep their inertias."""
     for joint, offset in mounting.items():
         index = joint_index(model, joint, f"{name} mounting")
-        if not np.isfinite(offset).all():
-            raise InputError(f"the offset of '{joint}' is not finite", where=f"{name} mounting", mend="give meters")
+        moved = np.array(offset, dtype=float)
+        if moved.shape != (3,) or not np.isfinite(moved).all():
+            what = "is not finite" if moved.shape == (3,) else "has not three numbers"
+            raise InputError(
+                f"the offset of '{joint}' {what}", where=f"{name} mounting", mend="give three, in meters"
+            )
         placement = model.jointPlacements[index].copy()
-        placement.translation = placement.translation + np.array(offset, dtype=float)
+        placement.translation = placement.translation + moved
         model.jointPlacements[index] = placement
 
 

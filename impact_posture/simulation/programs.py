@@ -23,8 +23,9 @@ def end_effector_task(setup: Setup) -> FramePose | None:
     gains = control.end_effector
     if not isinstance(task, RepeatedContacts):
         if gains is not None:
+            where = setup.scenario.source
             raise SpecError(
-                "has gains of an end effector, but a push", where=setup.scenario.source, mend="remove them"
+                "has [control.end_effector], but a push", where=where, mend="remove [control.end_effector]"
             )
         return None
     if gains is None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import InputError
+from impact_posture.processes import in_a_copy
 from impact_posture.simulation.blow import interpreted
 from impact_posture.simulation.controllers import Mode, Workshop
 from impact_posture.simulation.driver import Driver
@@ -73,8 +76,7 @@ def run(workshop: Workshop, controller: str, *, seed: int = 0, mode: Mode = "liv
         return (_contacts(workshop, driver, task, seed, mode),)
     if only not in (None, 1, -1):
         raise InputError(f"{only} is no sign of a push", where=workshop.setup.scenario.source, mend="give 1 or -1")
-    signs = task.signs if only is None else (only,)
-    return tuple(_push(workshop, driver, task, sign, seed, mode) for sign in signs)
+    return _pushes(workshop, driver, task, task.signs if only is None else (only,), seed, mode)
 
 
 class _Loop:
@@ -136,7 +138,10 @@ def _contacts(workshop: Workshop, driver: Driver, task: RepeatedContacts, seed: 
     return Run(series, tuple(sorted(first, key=lambda w: w.kind != "impact")))
 
 
-def _push(workshop: Workshop, driver: Driver, task: SinglePush, sign: int, seed: int, mode: Mode) -> Run:
+def _pushes(
+    workshop: Workshop, driver: Driver, task: SinglePush, signs: Sequence[int], seed: int, mode: Mode
+) -> tuple[Run, ...]:
+    """Settle once, and push each way from there: the other ways in copies of this process."""
     loop = _Loop(workshop, driver, seed)
     ramp, brace = workshop.setup.scenario.control.robust.ramp, [driver.brace]
     # Whatever the scenario's patience: all controllers begin to prepare before a push.
@@ -145,6 +150,13 @@ def _push(workshop: Workshop, driver: Driver, task: SinglePush, sign: int, seed:
         # What was reached is held, and comes to rest once more without the term.
         driver.hold()
         rested = _settle(loop, task, loop.t + 2 * ramp, []) and rested
+    first, *others = (partial(_push, loop, task, sign, rested) for sign in signs)
+    with ExitStack() as copies:
+        waiting = [copies.enter_context(in_a_copy(other)) for other in others]
+        return (first(), *(collect() for collect in waiting))
+
+
+def _push(loop: _Loop, task: SinglePush, sign: int, rested: bool) -> Run:
     begin = loop.t
     loop.driver.expect(begin)
     push = task.push(sign)

@@ -9,7 +9,10 @@ Runs that are done are kept in build/reproduction; run it again after an interru
 from __future__ import annotations
 
 import argparse
+import re
+import shutil
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -48,8 +51,19 @@ def main() -> int:
     if args.write:
         PAGE.write_text(f"<!-- Written by `make reproduction`; do not edit. -->\n\n{page}", encoding="utf-8")
         first = [job for s in scenarios for job in jobs_of(s, controllers_of(s, False), 1)]
-        draw_reproduction(main_rows, first, store, IMAGES, ["png"])
+        with tempfile.TemporaryDirectory() as folder:
+            draw_reproduction(main_rows, first, store, Path(folder), ["png"])
+            _take_shown(Path(folder))
     return 0
+
+
+def _take_shown(folder: Path) -> None:
+    """The pictures that the documentation shows; the others stay away from the repository."""
+    text = (ROOT / "docs" / "reproduction.md").read_text(encoding="utf-8")
+    shutil.rmtree(IMAGES, ignore_errors=True)
+    for name in re.findall(r"images/reproduction/(\S+\.png)", text):
+        (IMAGES / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(folder / name, IMAGES / name)
 
 
 def _page(found: Reproduction, every: Reproduction) -> list[str]:

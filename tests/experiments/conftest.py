@@ -24,9 +24,8 @@ def aerial(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One contact with the wall, soon."""
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
     path = tmp_path_factory.mktemp("scenarios") / "aerial.toml"
-    path.write_text(
-        shortened("aerial-lateral", count=1, settle=0.1, dwell=0.2, pause=0.05, gap=0.06), encoding="utf-8"
-    )
+    text = shortened("aerial-lateral", count=1, settle=0.1, dwell=0.2, pause=0.05, gap=0.06)
+    path.write_text(text, encoding="utf-8")
     return path
 
 

@@ -29,7 +29,7 @@ from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
     half_width,
 )
-from impact_posture.plot.skeleton import build_skeleton
+from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.style import WIDTH, lay_out, style, wrap
 from impact_posture.plot.view import SEPARATOR, header_lines, number, velocity_units
 from tests.plot.views import PENDULUM, make_view, text_of
@@ -230,23 +230,30 @@ def test_tradeoff_axis_is_log_where_the_objective_spreads(tilthex: ResultView) -
     assert figure.axes[0].get_yscale() == "log"
 
 
-def test_skeleton_meets_pinocchio(tilthex: ResultView, solo8: ResultView, pendulum: ResultView) -> None:
-    for view in (tilthex, solo8, pendulum):
+def skeleton(view: ResultView, q: np.ndarray) -> Skeleton:
+    return build_skeleton(view.robot, q, view.objective.contact, view.objective.supports)
+
+
+def test_skeleton_meets_pinocchio(
+    tilthex: ResultView, solo8: ResultView, pendulum: ResultView, turned: ResultView
+) -> None:
+    for view in (tilthex, solo8, pendulum, turned):
         model, data = view.robot.model, view.robot.model.createData()
         pin.framesForwardKinematics(model, data, view.q_optimal)
-        seen = build_skeleton(view, view.q_optimal)
+        seen = skeleton(view, view.q_optimal)
         frame = view.robot.frame_id(view.objective.contact.frame)
         np.testing.assert_allclose(seen.contact, data.oMf[frame].translation, atol=1e-12)
+        np.testing.assert_allclose(seen.normal, view.after.normal, atol=1e-12)
         for support, foot in zip(view.objective.supports, seen.feet, strict=True):
             place = data.oMf[view.robot.frame_id(support.frame)]
             np.testing.assert_allclose(foot, place.act(np.array(support.offset)), atol=1e-12)
-    assert len(build_skeleton(solo8, solo8.q_initial).feet) == 4
-    rotors = build_skeleton(tilthex, tilthex.q_initial).rotors
+    assert len(skeleton(solo8, solo8.q_initial).feet) == 4
+    rotors = skeleton(tilthex, tilthex.q_initial).rotors
     centers = rotors.mean(axis=2) - tilthex.q_initial[:3]
     expected = [r.position for r in tilthex.robot.spec.propulsion.rotors]  # type: ignore[union-attr]
     np.testing.assert_allclose(centers, expected, atol=1e-9)
     # Both links of the pendulum are there, the second one down to its center of mass.
-    assert len({tuple(p.round(9)) for bone in build_skeleton(pendulum, pendulum.q_optimal).bones for p in bone}) == 4
+    assert len({tuple(p.round(9)) for bone in skeleton(pendulum, pendulum.q_optimal).bones for p in bone}) == 4
 
 
 def test_postures_are_drawn_to_scale(talos: ResultView, tilthex: ResultView) -> None:
@@ -259,7 +266,7 @@ def test_postures_are_drawn_to_scale(talos: ResultView, tilthex: ResultView) -> 
         assert box.width / (x1 - x0) == pytest.approx(box.height / (y1 - y0), rel=1e-6)
         spans = np.ptp([space.get_xlim(), space.get_ylim(), space.get_zlim()], axis=1)
         np.testing.assert_allclose(space._box_aspect / space._box_aspect[0], spans / spans[0], rtol=1e-9)
-        first, second = (build_skeleton(view, q) for q in (view.q_initial, view.q_optimal))
+        first, second = (skeleton(view, q) for q in (view.q_initial, view.q_optimal))
         plane = side_plane(first, second)
         assert plane.contains(second.normal)
         inside = plane.axes @ np.vstack([first.points, second.points]).T

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from impact_posture.simulation.blow import interpreted
-from impact_posture.simulation.controllers import CONTROLLERS, Mode, Workshop
+from impact_posture.simulation.controllers import Mode, Workshop
 from impact_posture.simulation.offline import offline_posture
 from impact_posture.simulation.runs import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup, set_up
@@ -21,7 +21,6 @@ from impact_posture.simulation.series import Series
 AERIAL = ("aerial-vertical", "aerial-lateral")
 PUSHES = ("solo8-push", "talos-push")
 SHIPPED = (*AERIAL, *PUSHES)
-HELD = tuple(name for name in CONTROLLERS if name.startswith("robust") or name == "walker")
 
 
 def needs_mujoco() -> None:
@@ -32,23 +31,22 @@ def shortened(source: str | Path, **changes: Any) -> Setup:
     """A scenario with one contact or a short wait, and whatever else is to change in its task."""
     scenario = read_scenario(source)
     if isinstance(scenario.task, RepeatedContacts):
-        short: dict[str, Any] = {"count": 1, "settle": 0.3, "dwell": 0.2, "pause": 0.1}
+        short: dict[str, Any] = {"count": 1, "settle": 0.3, "dwell": 0.2, "pause": 0.05}
     else:
-        short = {"settle": 0.1, "patience": 0.5, "after": 0.1}
+        short = {"settle": 0.1, "patience": 0.3, "duration": 0.2, "after": 0.05}
     task: Any = replace(scenario.task, **{**short, **changes})
     return set_up(replace(scenario, task=task))
 
 
 def workshop(setup: Setup, free: bool = False) -> Workshop:
     """Gradients at once, and an offline optimum from few starts."""
-    made = Workshop(setup, free=free, gradient_of=interpreted)
-    return made
+    return Workshop(setup, free=free, gradient_of=interpreted)
 
 
 @functools.cache
-def shop(name: str) -> Workshop:
+def shop(name: str, settle: float | None = None) -> Workshop:
     """A shipped scenario cut short; one of each in a process."""
-    return workshop(shortened(name))
+    return workshop(shortened(name) if settle is None else shortened(name, settle=settle))
 
 
 def driven(made: Workshop, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
@@ -57,6 +55,12 @@ def driven(made: Workshop, controller: str, *, mode: Mode = "live", seed: int = 
         # Few starts: what is tested is the driver.
         made._offline = offline_posture(made.setup, made.objective(), starts=1)
     return run(made, controller, mode=mode, seed=seed, only=1)[0]
+
+
+@functools.cache
+def lived(name: str, controller: str, mode: Mode, settle: float | None) -> Run:
+    """A run of a shipped scenario, cut short; one of each in a process.  No defaults: the cache tells them apart."""
+    return driven(shop(name, settle), controller, mode=mode)
 
 
 def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **columns: Any) -> Series:

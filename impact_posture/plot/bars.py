@@ -1,0 +1,151 @@
+"""Figure ``bars``: motion during impacts of every controller, a panel a scenario, beside the paper's numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from impact_posture.errors import InputError
+from impact_posture.plot.run_axes import subplots
+from impact_posture.plot.style import (
+    AFTER_BAR,
+    BEFORE_BAR,
+    FORMATS,
+    INK,
+    VERMILLION,
+    check_formats,
+    framed,
+    save,
+    style,
+)
+from impact_posture.plot.view import number
+
+NOTES = (
+    "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper prints "
+    "no gains: its numbers are to be compared with each other.",
+)
+# The paper's number is on the axis if it is at most so many times our largest.
+_FAR = 2.0
+
+
+@dataclass(frozen=True)
+class Bar:
+    """``q_total_impact`` of a controller in a scenario.
+
+    Attributes:
+        scenario: Name of the scenario: rows of one scenario share a panel.
+        controller: Name of the controller.
+        mean: ``∫‖ν‖dt`` over the impact windows, mean over the runs; NaN where no run came to its end.
+        half_width: Of the 95 % interval; NaN or 0 where there is none (one run).
+        paper: The paper's number for the same controller, if it has one.
+    """
+
+    scenario: str
+    controller: str
+    mean: float
+    half_width: float = float("nan")
+    paper: float | None = None
+
+
+def draw_bars(rows: Sequence[Bar], out_dir: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+    """Write ``bars`` into ``out_dir``; return the paths.
+
+    Raises:
+        InputError: No rows, or an unknown format.
+        OutputError: The folder or a file cannot be written.
+    """
+    return save(bars_figure(rows), out_dir, "bars", check_formats(formats))
+
+
+def bars_figure(rows: Sequence[Bar]) -> Figure:
+    """Draw lying bars with intervals in the order given, two panels a line; marks show the paper's numbers.
+
+    Raises:
+        InputError: No rows.
+    """
+    if not rows:
+        raise InputError("there is nothing to draw", where="figure bars", mend="give at least one row")
+    scenarios = list(dict.fromkeys(row.scenario for row in rows))
+    groups = [[row for row in rows if row.scenario == name] for name in scenarios]
+    columns = min(2, len(groups))
+    lines = [groups[k : k + columns] for k in range(0, len(groups), columns)]
+    heights = [0.55 + 0.3 * max(len(group) for group in line) for line in lines]
+    lead = "Motion during impacts, ∫‖ν‖dt over the impact windows"
+    facts = ["less is better", "the same windows for every controller", "bars: ours, mean and 95 % interval"]
+    with style():
+        figure, body = framed(lead, ["  ·  ".join(facts)], sum(heights) + 0.4, NOTES)
+        panels = subplots(body, len(lines), columns, height_ratios=heights)
+        for axes in panels.flat[len(groups) :]:
+            axes.set_visible(False)
+        for axes, name, group in zip(panels.flat, scenarios, groups, strict=False):
+            _panel(axes, name, group, max(len(other) for other in groups))
+        body.legend(handles=_handles(rows), loc="outside lower center", ncols=4)
+    return figure
+
+
+def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
+    ours = max((row.mean + _wide(row) for row in group if np.isfinite(row.mean)), default=0.0)
+    papers = [row.paper for row in group if row.paper is not None]
+    # The paper's robot is another one: its numbers must not press ours together.
+    near = [paper for paper in papers if paper <= _FAR * ours or ours == 0]
+    end = 1.08 * (max([ours, *near]) or 1.0)
+    for place, row in enumerate(group):
+        if np.isfinite(row.mean):
+            axes.barh(place, row.mean, height=0.6, **(BEFORE_BAR if row.controller == "nominal" else AFTER_BAR))
+            if _wide(row) > 0:
+                axes.errorbar(row.mean, place, xerr=_wide(row), color=INK, linewidth=1.0, capsize=2.5, zorder=4)
+        if row.paper is not None:
+            axes.plot(min(row.paper, 0.975 * end), place, **(_PAPER if row.paper in near else _BEYOND))
+        # The numbers right of the panel, clear of the bars.
+        look = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "va": "center", "fontsize": 7}
+        axes.annotate(_words(row), (1.0, place), (5, 0), **look)
+    axes.set_xlim(0.0, end)
+    axes.set_ylim(room - 0.4, -0.6)
+    axes.set_yticks(range(len(group)), [row.controller for row in group])
+    axes.tick_params(axis="y", length=0)
+    axes.locator_params(axis="x", nbins=5)
+    axes.grid(True, axis="x")
+    axes.set_title(name)
+    axes.set_xlabel("∫‖ν‖dt  [m, rad]")
+
+
+_PAPER: dict[str, Any] = {
+    "linestyle": "", "marker": "D", "markersize": 4.5, "color": "white", "markeredgecolor": VERMILLION,
+    "markeredgewidth": 1.2, "zorder": 5,
+}  # fmt: skip
+_BEYOND = _PAPER | {"marker": ">", "markersize": 6}
+
+
+def _wide(row: Bar) -> float:
+    """Half of the interval; 0 where there is none."""
+    return row.half_width if np.isfinite(row.half_width) else 0.0
+
+
+def _words(row: Bar) -> str:
+    """Mean and interval with the digits that the interval supports, and the paper's number."""
+    paper = f"\npaper {number(row.paper)}" if row.paper is not None else ""
+    if not np.isfinite(row.mean):
+        return "no run ended" + paper
+    if not _wide(row) > 0:
+        return number(row.mean) + paper
+    digits = max(1 - int(np.floor(np.log10(_wide(row)))), 0)
+    return f"{row.mean:.{digits}f} ± {_wide(row):.{digits}f}{paper}"
+
+
+def _handles(rows: Sequence[Bar]) -> list[Any]:
+    handles: list[Any] = []
+    if any(row.controller == "nominal" for row in rows):
+        handles.append(Patch(label="nominal", **BEFORE_BAR))
+    if any(row.controller != "nominal" for row in rows):
+        handles.append(Patch(label="others", **AFTER_BAR))
+    if any(row.paper is not None for row in rows):
+        handles.append(Line2D([], [], label="paper", **_PAPER))
+        handles.append(Line2D([], [], label="paper, beyond the axis", **_BEYOND))
+    return handles

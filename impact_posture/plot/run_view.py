@@ -1,0 +1,226 @@
+"""What the pictures of a simulated run are drawn from: the robot, the blow, and plain arrays, one row a tick."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.errors import InputError
+from impact_posture.impact.contact import Contact, Support
+from impact_posture.plot.shapes import Vector
+from impact_posture.plot.view import number, velocity_units
+from impact_posture.robot.robot import Robot
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Span:
+    """A time that is shaded.
+
+    Attributes:
+        kind: ``impact``: what counts as the impact; ``dwell``: while a contact is asked for (drawn lighter).
+        begin: s.
+        end: s.
+        contact: Which contact, or push, it belongs to, from 0.
+        touched: Whether the blow came; else the span begins where it was expected.
+    """
+
+    kind: str
+    begin: float
+    end: float
+    contact: int = 0
+    touched: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class RunView:
+    """One run: a controller that lives through a scenario.  n ticks; states are those at a tick's end.
+
+    What limits a command has is the robot's to say: ``model.effortLimit`` and its propulsion's speeds.
+
+    Attributes:
+        scenario: Name of the scenario.
+        controller: Name of the controller.
+        robot: The robot.
+        contact: Where the blow comes: frame, offset, and the world normal out of the surface (or along the push).
+        t: s, increasing, shape (n,).
+        q: Configuration, shape (n, nq).
+        v: ν, shape (n, nv).
+        torque: Joint torques as commanded, N·m (N for sliding joints), shape (n, joints).
+        rotor_command: Rotor speeds as commanded, shape (n, rotors).
+        rotor_speed: As they turn, shape (n, rotors).
+        force: Of the surface on the robot, or of the push, world, N, shape (n, 3).
+        peak: Largest normal force within each tick, N, shape (n,).
+        objective: H of the blow, shape (n,); NaN where it was not evaluated.
+        level: Of the term that prepares for the blow, 0 to 1, shape (n,).
+        at_stop: Whether a joint is at a position limit, shape (n, nv).
+        windows: What to shade; the first of kind ``impact`` is the first blow.
+        surface: A point on the surface that is hit, world, m, shape (3,); ``None`` for a push.
+        supports: Feet that stay.
+        label: What the run is called beside others; the controller's name if empty.
+        title: First line of its pictures; scenario and controller if empty.
+        facts: For the small print below the title: seed, sign of the push, metrics.
+        rotor_unit: Unit of the rotors' speeds, such as ``Hz``, where it is known: a ``robot.toml`` does not name it.
+    """
+
+    scenario: str
+    controller: str
+    robot: Robot
+    contact: Contact
+    t: Vector
+    q: Vector
+    v: Vector
+    torque: Vector
+    rotor_command: Vector
+    rotor_speed: Vector
+    force: Vector
+    peak: Vector
+    objective: Vector
+    level: Vector
+    at_stop: Flags
+    windows: tuple[Span, ...] = ()
+    surface: Vector | None = None
+    supports: tuple[Support, ...] = ()
+    label: str = ""
+    title: str = ""
+    facts: tuple[str, ...] = ()
+    rotor_unit: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together.
+
+        Raises:
+            InputError: A wrong shape, fewer than two ticks, or times that do not increase.
+        """
+        n, nv = len(self.t), self.robot.nv
+        rotors = np.shape(self.rotor_command)[1:]
+        wanted: dict[str, tuple[int, ...]] = {
+            "t": (n,), "q": (n, self.robot.nq), "v": (n, nv), "torque": (n, nv - self.first_joint),
+            "rotor_command": (n, *rotors), "rotor_speed": (n, *rotors), "force": (n, 3), "peak": (n,),
+            "objective": (n,), "level": (n,), "at_stop": (n, nv),
+        }  # fmt: skip
+        for name, shape in wanted.items():
+            if np.shape(getattr(self, name)) != shape:
+                raise self._wrong(f"{name} has the shape {np.shape(getattr(self, name))}", f"give {shape}")
+        if len(rotors) != 1 or n < 2 or not (np.diff(self.t) > 0).all():
+            raise self._wrong("there is no course of time", "give at least two ticks, later ones later")
+
+    def _wrong(self, what: str, mend: str) -> InputError:
+        return InputError(what, where=f"run view {self.scenario}, {self.controller}", mend=mend)
+
+    @property
+    def name(self) -> str:
+        """What the run is called beside others."""
+        return self.label or self.controller
+
+    @property
+    def first_joint(self) -> int:
+        """Index of the first joint's entry in ν."""
+        return 6 if self.robot.floating else 0
+
+    @property
+    def impacts(self) -> tuple[Span, ...]:
+        """The spans that count as impact, the first blow first."""
+        return tuple(sorted((w for w in self.windows if w.kind == "impact"), key=lambda w: w.begin))
+
+    @property
+    def pushed(self) -> bool:
+        """Whether the blow is a push: there is no surface."""
+        return self.surface is None
+
+    @cached_property
+    def speed(self) -> Vector:
+        """``‖ν‖``, shape (n,)."""
+        return np.asarray(np.linalg.norm(self.v, axis=1))
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the entries of ν that are joints'."""
+        return self.robot.tangent_names[self.first_joint :]
+
+    @cached_property
+    def joint_units(self) -> tuple[str, ...]:
+        """``rad`` or ``m`` of each."""
+        return tuple(unit.removesuffix("/s") for unit in velocity_units(self.robot)[self.first_joint :])
+
+    @cached_property
+    def positions(self) -> Vector:
+        """Position of each joint, shape (n, joints): rad (of endless joints unwrapped) or m.
+
+        NaN for the entries of joints of several degrees of freedom, which have no angle of their own.
+        """
+        model, q = self.robot.model, np.asarray(self.q)
+        found = np.full((len(self.t), self.robot.nv), np.nan)
+        for joint in range(1, model.njoints):
+            at, size, entry = int(model.idx_qs[joint]), int(model.nqs[joint]), int(model.idx_vs[joint])
+            if int(model.nvs[joint]) != 1:
+                continue
+            # Pinocchio's endless joints: cosine and sine.
+            found[:, entry] = q[:, at] if size == 1 else np.unwrap(np.arctan2(q[:, at + 1], q[:, at]))
+        return found[:, self.first_joint :]
+
+    @property
+    def torque_limits(self) -> Vector:
+        """Of each joint, N·m (N), shape (joints,); infinite where there is none."""
+        effort = np.array(self.robot.model.effortLimit, dtype=float)[self.first_joint :]
+        return np.where(effort > 0, effort, np.inf)
+
+    @property
+    def rotor_limits(self) -> tuple[float, float] | None:
+        """Lowest and highest rotor speed; ``None`` without rotors."""
+        propulsion = self.robot.spec.propulsion
+        return None if propulsion is None else (propulsion.speed_min, propulsion.speed_max)
+
+    def index(self, time: float) -> int:
+        """The last tick that has ended by ``time`` (s); the first tick before that."""
+        return max(int(np.searchsorted(self.t, time, side="right")) - 1, 0)
+
+
+def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
+    """Title and small print of a picture of runs of one scenario."""
+    one = views[0]
+    names = ", ".join(view.name for view in views) if len(views) < 5 else f"{len(views)} controllers"
+    title = one.title if one.title and len(views) == 1 else f"{one.scenario}: {names}"
+    n = ", ".join(number(value) for value in one.contact.normal)
+    facts = [f"robot {one.robot.name}"]
+    if one.pushed:
+        facts += [f"pushed at {one.contact.frame}", f"H along ({n})"]
+    else:
+        touched = [sum(w.touched for w in view.impacts) for view in views]
+        counts = ", ".join(str(count) for count in (touched if len(set(touched)) > 1 else touched[:1]))
+        facts += [f"contact {one.contact.frame}", f"n = ({n})", f"contacts {counts}"]
+    facts.append(f"on {', '.join(s.frame for s in one.supports)}" if one.supports else "no supports")
+    shared = [fact for fact in one.facts if all(fact in view.facts for view in views)]
+    return title, ["  ·  ".join([*facts, *shared])]
+
+
+def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
+    """Return the views of one scenario and robot, the nominal one first.
+
+    Raises:
+        InputError: No view, or views that have nothing to do with each other.
+    """
+    if not views:
+        raise InputError("there is no run to draw", where=where, mend="give at least one view")
+    first = views[0]
+    for view in views:
+        other: dict[str, Any] = {
+            "scenario": (view.scenario, first.scenario),
+            "robot": (view.robot.name, first.robot.name),
+            "number of joint speeds": (view.robot.nv, first.robot.nv),
+            "number of rotors": (view.rotor_command.shape[1], first.rotor_command.shape[1]),
+        }
+        for what, (own, theirs) in other.items():
+            if own != theirs:
+                raise InputError(
+                    f"the {what} of {view.name} is {own}, of {first.name} {theirs}",
+                    where=where,
+                    mend="compare runs of one scenario",
+                )
+    return tuple(sorted(views, key=lambda view: view.controller != "nominal"))

@@ -1,0 +1,168 @@
+"""Figure ``snapshots``: the robot as sticks at three instants of a run, a row for each controller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from impact_posture.plot.robot import depth_of, draw_sticks, side_plane
+from impact_posture.plot.run_axes import subplots
+from impact_posture.plot.run_view import RunView, check_same, run_header
+from impact_posture.plot.shapes import Plane, Vector
+from impact_posture.plot.skeleton import Skeleton, build_skeleton
+from impact_posture.plot.style import BLUE, FORMATS, GRAY, INK, PALE, VERMILLION, check_formats, framed, save, style
+
+NOTES = ("Sticks join joint origins; they are not the links' shapes. Gray: where the robot was when the run began.",)
+_NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
+_START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
+# Just before the blow: a tick that it has no part in, s.
+_BEFORE = 0.005
+
+
+def draw_snapshots(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+    """Write ``snapshots`` of one run of each controller (nominal first) into ``out_dir``; return the paths.
+
+    Raises:
+        InputError: No view, views of different scenarios or robots, an unknown format.
+        OutputError: The folder or a file cannot be written.
+    """
+    return save(snapshots_figure(views), out_dir, "snapshots", check_formats(formats))
+
+
+def instants(view: RunView) -> list[tuple[str, float]]:
+    """Start, just before the first blow, end of its window: what and when (s); without a blow the start and end."""
+    start = ("start", float(view.t[0]))
+    if not view.impacts:
+        return [start, ("half of the run", float(view.t[len(view.t) // 2])), ("end", float(view.t[-1]))]
+    first = view.impacts[0]
+    word = "push" if view.pushed else "impact window"
+    return [start, ("just before the first blow", first.begin - _BEFORE), (f"end of the {word}", first.end)]
+
+
+def snapshots_figure(views: Sequence[RunView]) -> Figure:
+    """Draw the robot from the side that shows n and most of the motion; all panels to one scale, in meters.
+
+    With the surface that is hit, or the push as an arrow, the contact point, feet and rotors.
+
+    Raises:
+        InputError: No view, or views of different scenarios or robots.
+    """
+    views = check_same(views, "figure snapshots")
+    rows = [[_skeleton(view, view.index(time)) for _, time in instants(view)] for view in views]
+    plane = side_plane(rows[-1][0], rows[-1][1])
+    every = np.hstack([plane.axes @ state.points.T for row in rows for state in row])
+    low, high = every.min(axis=1), every.max(axis=1)
+    reach = 0.22 * float((high - low).max())
+    arrows = [_arrow(view, row[0], plane, reach) for view, row in zip(views, rows, strict=True)]
+    for arrow, row in zip(arrows, rows, strict=True):
+        if arrow is None:
+            continue
+        for state in row[1:]:
+            tails = np.stack([plane.axes @ state.contact - arrow, plane.axes @ state.contact], axis=1)
+            low, high = np.minimum(low, tails.min(axis=1)), np.maximum(high, tails.max(axis=1))
+    low, high = _window(low, high, views[0], plane)
+    # As high as the robot needs, within a page's reason.
+    highest = float(np.clip(8.5 / len(views), 1.2, 3.0))
+    height = float(np.clip(2.1 * (high - low)[1] / (high - low)[0], 1.2, highest)) + 0.2
+    with style():
+        figure, body = framed(*run_header(views), height * len(views) + 0.85, NOTES)
+        panels = subplots(body, len(views), 3, sharex=True, sharey=True)
+        for axes_row, row, view, arrow in zip(panels, rows, views, arrows, strict=True):
+            for column, (axes, state, (word, time)) in enumerate(zip(axes_row, row, instants(view), strict=True)):
+                _surface(axes, view, plane, low, high)
+                if column:
+                    draw_sticks(axes, row[0], _START, plane)
+                draw_sticks(axes, state, _NOW, plane)
+                if arrow is not None and column:
+                    _push(axes, plane.axes @ state.contact, arrow, acting=column == 2)
+                axes.set_xlim(low[0], high[0])
+                axes.set_ylim(low[1], high[1])
+                axes.set_aspect("equal", adjustable="box")
+                axes.locator_params(nbins=5)
+                first = f"{word}\n" * (view is views[0])
+                axes.set_title(f"{first}t = {max(time, 0.0):.2f} s", fontsize=8)
+            axes_row[0].set_ylabel(f"{view.name}\n{plane.up} [m]")
+        for axes in panels[-1]:
+            axes.set_xlabel(f"{plane.right} [m]")
+        # The lowest panels say what the eye looks along.
+        panels[-1][1].set_xlabel(f"{plane.right} [m]\nseen along {depth_of(plane)}")
+        look = {"ncols": 7, "handlelength": 2.0, "columnspacing": 1.2}
+        body.legend(handles=_handles(rows[0][0], views[0]), loc="outside lower center", **look)
+    return figure
+
+
+def _skeleton(view: RunView, tick: int) -> Skeleton:
+    return build_skeleton(view.robot, view.q[tick], view.contact, view.supports)
+
+
+def _window(low: Vector, high: Vector, view: RunView, plane: Plane) -> tuple[Vector, Vector]:
+    """Corners of what is shown: all sticks, and the surface where it is seen from its edge."""
+    if view.surface is not None:
+        touched = plane.axes @ view.surface
+        n = plane.axes @ np.array(view.contact.normal)
+        # The surface's own place along its normal only: it has no end across.
+        edge = touched - 0.05 * float((high - low).max()) * n
+        for axis in range(2):
+            if abs(n[axis]) > 0.5:
+                low[axis], high[axis] = min(low[axis], edge[axis]), max(high[axis], edge[axis])
+    longest = float((high - low).max()) or 1.0
+    middle, half = (low + high) / 2, np.maximum(high - low, 0.5 * longest) / 2 + 0.06 * longest
+    return middle - half, middle + half
+
+
+def _surface(axes: Any, view: RunView, plane: Plane, low: Vector, high: Vector) -> None:
+    """The surface from its edge, hatched behind it."""
+    if view.surface is None:
+        return
+    n = plane.axes @ np.array(view.contact.normal)
+    if np.linalg.norm(n) < 1e-6:
+        return
+    n = n / np.linalg.norm(n)
+    size = 2 * float((high - low).max())
+    point, along = plane.axes @ view.surface, size * np.array([-n[1], n[0]])
+    # From where the panel's middle is nearest.
+    point = point + along * float(along @ ((low + high) / 2 - point)) / size**2
+    corners = np.array([point + along, point - along, point - along - size * n, point + along - size * n])
+    axes.fill(*corners.T, facecolor="white", edgecolor=GRAY, hatch="/////", linewidth=0, zorder=0.5)
+    axes.plot(*corners[:2].T, color=INK, linewidth=1.0, zorder=1)
+
+
+def _arrow(view: RunView, state: Skeleton, plane: Plane, reach: float) -> Vector | None:
+    """The push from tail to tip in the picture; ``None`` where there is none."""
+    largest = view.force[int(np.argmax(np.linalg.norm(view.force, axis=1)))]
+    size = float(np.linalg.norm(largest))
+    if not view.pushed or size == 0:
+        return None
+    return np.asarray(plane.axes @ largest / size * reach)
+
+
+def _push(axes: Any, contact: Vector, arrow: Vector, *, acting: bool) -> None:
+    look = {"arrowstyle": "-|>", "color": VERMILLION, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 3}
+    look |= {} if acting else {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}
+    axes.annotate("", tuple(contact), tuple(contact - arrow), arrowprops=look, zorder=7)
+
+
+def _handles(state: Skeleton, view: RunView) -> list[Any]:
+    def mark(label: str, marker: str, **look: Any) -> Line2D:
+        return Line2D([], [], linestyle="", marker=marker, color=BLUE, label=label, **look)
+
+    handles: list[Any] = [
+        Line2D([], [], label="now", **_NOW),
+        Line2D([], [], label="start", **_START),
+        mark("base", "P", markersize=7),
+        mark("contact point", "o", markersize=5.5),
+    ]
+    if len(state.feet):
+        handles.append(mark("foot that stays", "^", markersize=6, markerfacecolor="white"))
+    if view.surface is not None:
+        handles.append(Patch(facecolor=PALE, edgecolor=GRAY, hatch="/////", linewidth=0, label="surface"))
+    else:
+        handles.append(mark("push (dashed: to come)", r"$\rightarrow$", markersize=11))
+        handles[-1].set_color(VERMILLION)
+    return handles

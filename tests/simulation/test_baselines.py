@@ -1,0 +1,277 @@
+"""The controllers that the impact-robust term is held against do what their papers say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.simulation.baselines import InvariantDriver, StiffDriver, WalkerDriver
+from impact_posture.simulation.controllers import Workshop
+from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.reference import Reference
+from impact_posture.simulation.scenario import RepeatedContacts
+from impact_posture.simulation.sensing import Reading
+from impact_posture.tsid.task import Task
+from tests.helpers import Vector, central_gradient, frame_jacobian, mass_matrix, rng
+from tests.simulation.shops import SHIPPED, needs_mujoco, shop
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _mujoco() -> None:
+    needs_mujoco()
+
+
+def moving(made: Workshop, *key: object) -> Reading:
+    """A state near the start, in motion."""
+    generator, robot = rng(*key), made.setup.robot
+    q = np.array(pin.integrate(robot.model, made.setup.q, 0.02 * generator.normal(size=robot.nv)))
+    return Reading(0.5, q, 0.3 * generator.normal(size=robot.nv), None)
+
+
+# ---- stiff --------------------------------------------------------------------------------------------------------
+
+
+def stiff(name: str) -> StiffDriver:
+    driver = shop(name).driver("stiff")
+    assert isinstance(driver, StiffDriver)
+    driver.reset(shop(name).setup.q)
+    return driver
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_stiffness_is_the_terms_by_another_route(name: str) -> None:
+    made, driver = shop(name), stiff(name)
+    robot, control, q = made.setup.robot, made.setup.scenario.control, made.setup.q
+    objective = made.objective()
+    # The oracle's gradients, differentiated with a larger step and to fourth order.
+    hessian = central_gradient(objective.gradient, robot.model, q, 1e-3)
+    Z = driver.controller.assembly.redundancy(driver.controller.state)
+    scale = np.linalg.norm(Z.T @ hessian @ Z, 2)
+    joints = (hessian + hessian.T)[6:, 6:] / 2 * control.robust.gain / scale
+    values, vectors = np.linalg.eigh(joints)
+    expected = np.diag(np.full(robot.nv, control.posture.kp))
+    expected[6:, 6:] += (vectors * np.maximum(values, 0)) @ vectors.T
+    found = driver.posture.stiffness
+    np.testing.assert_allclose(found, expected, atol=1e-3 * control.robust.gain)
+    # It is stiffer than the nominal somewhere, and softer nowhere.
+    assert np.linalg.eigvalsh(found)[-1] > 1.02 * np.max(control.posture.kp)
+    assert np.linalg.eigvalsh(found)[0] >= np.min(control.posture.kp) * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_stiffness_is_symmetric_and_critically_damped(name: str) -> None:
+    posture = stiff(name).posture
+    K, D = posture.stiffness, posture.damping
+    np.testing.assert_array_equal(K, K.T)
+    # Critical in every direction at once: (s + K^½)² = s² + D s + K.
+    np.testing.assert_allclose(D @ D / 4, K, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(D, D.T, atol=1e-9)
+    assert np.linalg.eigvalsh(D)[0] > 0
+
+
+@pytest.mark.parametrize("name", ["aerial-lateral", "solo8-push"])
+def test_the_stiff_law_is_a_spring_and_a_damper(name: str) -> None:
+    made, driver = shop(name), stiff(name)
+    reading, state = moving(made, name, "spring"), driver.controller.state
+    state.update(reading.q, reading.v)
+    away = pin.difference(made.setup.robot.model, reading.q, made.setup.q)
+    wanted = driver.posture.stiffness @ away - driver.posture.damping @ reading.v
+    np.testing.assert_allclose(driver.posture.desired(state), wanted, atol=1e-9)
+
+
+# ---- walker -------------------------------------------------------------------------------------------------------
+
+
+def walk(name: str, seconds: float) -> tuple[WalkerDriver, Any, list[Any], list[Vector]]:
+    """Let it flow; the driver, the world, states and steps of the reference at every tick."""
+    made = shop(name)
+    driver, world = made.driver("walker"), made.setup.world
+    assert isinstance(driver, WalkerDriver)
+    command = driver.reset(made.setup.q)
+    world.reset(made.setup.q, rotor_speed=command.rotor_speed)
+    count, period = round(1e-3 / world.timestep), made.setup.scenario.control.period
+    readings, flows = [], []
+    driver.brace()
+    for _ in range(round(seconds / period)):
+        before = driver.posture.target.copy()
+        reading = world.read()
+        command = driver.tick(reading)
+        flows.append(pin.difference(made.setup.robot.model, before, driver.posture.target) / period)
+        readings.append(reading)
+        world.step(Drive(command.torque, command.rotor_speed), count)
+    return driver, world, readings, flows
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_flow_lies_in_what_the_other_tasks_leave_and_lowers_the_metric(name: str) -> None:
+    driver, world, _, flows = walk(name, 0.5)
+    made, assembly, state = shop(name), driver.controller.assembly, driver.controller.state
+    flow = flows[-1]
+    assert np.linalg.norm(flow) > 1e-3
+    rows = np.vstack([assembly.contacts.J, assembly.strict.J, assembly.weighted.J])
+    rank = np.linalg.matrix_rank(rows, tol=1e-6 * np.linalg.norm(rows, 2))
+    if rank == state.nv:
+        # Tasks by weight leave nothing: then it is what contacts and strict levels leave.
+        rows = np.vstack([assembly.contacts.J, assembly.strict.J])
+    # The projector is renewed every fifth tick, within which the robot goes on.
+    assert np.linalg.norm(rows @ flow) < 0.02 * np.linalg.norm(rows, 2) * np.linalg.norm(flow)
+    objective = made.objective()
+    assert objective.gradient(state.q) @ flow < 0
+    assert objective.value(world.truth().q) < objective.value(made.setup.q) * (1 - 2e-3)
+
+
+def test_the_flow_is_the_projected_gradient() -> None:
+    made = shop("aerial-vertical")
+    driver = made.driver("walker")
+    assert isinstance(driver, WalkerDriver)
+    driver.reset(made.setup.q)
+    driver.brace()
+    control = made.setup.scenario.control
+    q, v = made.setup.q, np.zeros(9)
+    for k in range(400):
+        # The robot is held where it is: only the reference flows.
+        last = driver.posture.target.copy()
+        driver.tick(Reading(1e-3 * k, q, v, None))
+    assert driver.level == 1
+    J = np.vstack([np.eye(2, 9, 3), frame_jacobian(made.setup.robot.model, q, made.setup.robot.frame_id("ee"))])
+    Z = np.linalg.svd(J)[2][8:].T
+    assert Z.shape == (9, 1)
+    term = -control.robust.gain / driver.posture.term.scale * made.objective().gradient(q)
+    # Not further than K times its reach.
+    bound = control.robust.gain * driver.posture.term.reach
+    term *= min(1.0, bound / np.linalg.norm(term))
+    expected = Z @ (Z.T @ term) / control.posture.kd
+    found = pin.difference(made.setup.robot.model, last, driver.posture.target) / 1e-3
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_without_being_asked_nothing_flows() -> None:
+    made = shop("aerial-vertical")
+    driver = made.driver("walker")
+    driver.reset(made.setup.q)
+    for k in range(50):
+        driver.tick(Reading(1e-3 * k, made.setup.q, np.zeros(9), None))
+    np.testing.assert_array_equal(driver.posture.target, made.setup.q)
+
+
+# ---- invariant ----------------------------------------------------------------------------------------------------
+
+
+def invariant(name: str) -> InvariantDriver:
+    driver = shop(name).driver("invariant")
+    assert isinstance(driver, InvariantDriver)
+    driver.reset(shop(name).setup.q)
+    return driver
+
+
+def impulses(name: str, q: Vector) -> Vector:
+    """``M⁻¹Jᵀ`` of the blow, feet holding exactly, shape (nv, 3); from raw Pinocchio."""
+    setup = shop(name).setup
+    model, frame = setup.robot.model, setup.scenario.task.frame
+    M = mass_matrix(model, q)
+    J = frame_jacobian(model, q, setup.robot.frame_id(frame))[:3]
+    free = np.linalg.solve(M, J.T)
+    if setup.scenario.control.footing is None:
+        return free
+    feet = np.vstack([
+        frame_jacobian(model, q, setup.robot.frame_id(s.frame), s.offset)[: 3 if s.kind == "point" else 6]
+        for s in setup.robot.spec.supports
+    ])  # fmt: skip
+    back = np.linalg.solve(M, feet.T)
+    return np.asarray(free - back @ np.linalg.pinv(feet @ back, rcond=1e-6) @ (feet @ free))
+
+
+def leading(driver: InvariantDriver) -> list[Task]:
+    return [task for task in driver.controller.program.tasks if task is not driver.posture]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_what_an_impulse_does_is_invisible_and_nothing_else(name: str) -> None:
+    made, driver = shop(name), invariant(name)
+    generator = rng(name, "impulse")
+    quiet = moving(made, name, "invariant")
+    quiet = Reading(quiet.t, quiet.q, np.zeros_like(quiet.v), None)
+    change = impulses(name, quiet.q)
+    for _ in range(5):
+        blow = change @ generator.normal(size=3)
+        correction = driver._correction(Reading(quiet.t, quiet.q, blow, None))
+        # What the feedback sees is rest.
+        np.testing.assert_allclose(blow + correction, 0, atol=1e-6 * np.abs(blow).max())
+    # A motion that no impulse makes better: the tasks' errors stand square on what an impulse can do to them.
+    state = driver._aside.update(quiet.q, quiet.v)
+    J = np.vstack([task.jacobian(state) for task in leading(driver)])
+    v = generator.normal(size=quiet.v.size)
+    error = J @ v
+    possible = J @ change
+    within = possible @ np.linalg.lstsq(possible, error, rcond=1e-9)[0]
+    v = v - np.linalg.pinv(J) @ within
+    correction = driver._correction(Reading(quiet.t, quiet.q, v, None))
+    assert np.linalg.norm(correction) < 1e-6 * np.linalg.norm(v)
+
+
+@pytest.mark.parametrize("name", ["aerial-vertical", "talos-push"])
+def test_the_invariant_part_of_a_velocity_is_kept(name: str) -> None:
+    made, driver = shop(name), invariant(name)
+    reading = moving(made, name, "kept")
+    # The null space of J M⁻¹: what no impulse changes.
+    kept = np.linalg.svd(impulses(name, reading.q).T)[2][3:]
+    correction = driver._correction(reading)
+    np.testing.assert_allclose(kept @ (reading.v + correction), kept @ reading.v, atol=1e-9)
+    assert np.linalg.norm(correction) > 1e-3
+
+
+def test_the_approach_is_no_velocity_error() -> None:
+    # On its way in the end effector moves as it is asked to: nothing may be taken for the work of an impulse.
+    made = shop("aerial-vertical")
+    task = made.setup.scenario.task
+    assert isinstance(task, RepeatedContacts)
+    reference, driver = Reference(task, made.setup.gap), invariant("aerial-vertical")
+    point = reference.at(task.settle + 0.5)
+    assert point.speed == pytest.approx(0.5)
+    v = np.zeros(9)
+    v[2] = -point.speed
+    driver._follow(point)
+    assert np.abs(driver._correction(Reading(0.5, made.setup.q, v, None))).max() < 1e-9
+
+
+def test_when_it_is_on() -> None:
+    driver = invariant("aerial-vertical")
+    assert driver.share(1.0) == 0
+    driver.expect(1.0)
+    for t, level in ((0.949, 0), (0.98, 1), (1.0, 1), (1.05, 1), (1.065, 0.5), (0.965, 0.5), (1.081, 0)):
+        assert driver.share(t) == pytest.approx(level, abs=1e-9), t
+    assert np.abs(np.diff([driver.share(t) for t in np.arange(0.9, 1.15, 1e-3)])).max() < 1.51e-3 / driver.FLANK
+    driver.reset(shop("aerial-vertical").setup.q)
+    assert driver.share(1.0) == 0
+
+
+def test_a_blow_that_is_felt_sets_the_time_once() -> None:
+    made, driver = shop("aerial-vertical"), invariant("aerial-vertical")
+    q, v = made.setup.q, np.zeros(9)
+    driver.expect(1.0)
+    for t, force, expected in ((0.5, 50, 1.0), (0.9, 2, 1.0), (0.95, 50, 0.95), (0.97, 50, 0.95)):
+        driver.tick(Reading(t, q, v, np.array([0.0, 0.0, force])))
+        assert driver._at == expected
+    driver.expect(4.0)
+    driver.tick(Reading(3.9, q, v, np.array([0.0, 0.0, 50.0])))
+    assert driver._at == 3.9
+
+
+@pytest.mark.parametrize("name", ["aerial-vertical", "solo8-push"])
+def test_outside_its_time_the_command_is_nominals_bit_for_bit(name: str) -> None:
+    made, driver, nominal = shop(name), invariant(name), shop(name).driver("nominal")
+    nominal.reset(made.setup.q)
+    driver.expect(0.3)
+    other = 0
+    for k in range(500):
+        t, still = 1e-3 * k, moving(made, name, "bits", k)
+        reading = Reading(t, still.q, 0.1 * still.v, None)
+        a, b = driver.tick(reading).u, nominal.tick(reading).u
+        if abs(t - 0.315) < 0.06:
+            other += not np.array_equal(a, b)
+        elif t < 0.25:
+            np.testing.assert_array_equal(a, b)
+    assert other > 60

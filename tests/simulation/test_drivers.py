@@ -1,0 +1,256 @@
+"""Drivers: what each does before the blow, what it holds, and what it leaves behind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.errors import SpecError
+from impact_posture.simulation.controllers import CONTROLLERS, Mode, Workshop
+from impact_posture.simulation.driver import MOVE, Driver, PostureDriver
+from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.offline import OfflinePosture
+from impact_posture.simulation.programs import nominal_posture
+from impact_posture.simulation.reference import ReferencePoint
+from impact_posture.simulation.scenario import Gains
+from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
+from impact_posture.tsid.frame_tasks import FramePose
+from tests.simulation.shops import AERIAL, PUSHES, SHIPPED, needs_mujoco, shop
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _mujoco() -> None:
+    needs_mujoco()
+
+
+class Stage:
+    """A driver in its world, without reference and recorder."""
+
+    def __init__(self, made: Workshop, driver: Driver, seed: int = 0) -> None:
+        setup = made.setup
+        self.made, self.driver, self.world = made, driver, setup.world
+        command = driver.reset(setup.q)
+        self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
+        self.count = round(setup.scenario.control.period / self.world.timestep)
+
+    def go(self, seconds: float) -> Any:
+        for _ in range(round(seconds / (self.count * self.world.timestep))):
+            command = self.driver.tick(self.world.read())
+            self.world.step(Drive(command.torque, command.rotor_speed), self.count)
+        return self.world.truth()
+
+    def moved(self, q: Any) -> float:
+        """Largest way of a joint from the start."""
+        return float(np.abs(pin.difference(self.made.setup.robot.model, self.made.setup.q, q)[6:]).max())
+
+    def H(self) -> float:
+        return self.made.objective().value(self.world.truth().q)
+
+
+def stage(name: str, controller: str, mode: Mode = "live") -> Stage:
+    made = shop(name)
+    return Stage(made, made.driver(controller, mode))
+
+
+# ---- before the blow ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_nominal_holds_its_posture_whatever_it_is_told(name: str) -> None:
+    play = stage(name, "nominal")
+    play.go(0.1)
+    play.driver.brace()
+    truth = play.go(0.4)
+    assert play.moved(truth.q) < 0.02 and play.driver.level == 0
+    assert np.linalg.norm(truth.v) < 0.2
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_term_lowers_the_metric_once_it_is_on_and_never_before(name: str) -> None:
+    off, on = stage(name, "robust"), None
+    still = off.go(0.5).q
+    assert off.driver.level == 0 and off.moved(still) < 0.02
+    idle = off.H()
+    on = stage(name, "robust")
+    on.go(0.05)
+    on.driver.brace()
+    on.go(0.45)
+    assert on.driver.level == 1
+    # The first half second of the way: how far it gets differs by robot.
+    assert on.H() < idle * (1 - 2e-3)
+
+
+def test_before_the_term_is_on_robust_is_nominal_bit_for_bit() -> None:
+    for name in ("aerial-vertical", "solo8-push"):
+        a, b = stage(name, "nominal").go(0.1), stage(name, "robust").go(0.1)
+        np.testing.assert_array_equal(a.q, b.q)
+        np.testing.assert_array_equal(a.torques, b.torques)
+
+
+@pytest.mark.parametrize("controller", ["robust-speed", "robust-sticking"])
+def test_the_other_gradients_lower_their_own_metric(controller: str) -> None:
+    kind: Any = controller.removeprefix("robust-")
+    play = stage("aerial-vertical", controller)
+    objective = play.made.objective(kind)
+    before = objective.value(play.made.setup.q)
+    play.go(0.1)
+    play.driver.brace()
+    assert objective.value(play.go(1.0).q) < 0.9 * before
+
+
+def test_all_controllers_share_gains_tasks_and_weights() -> None:
+    for name in ("aerial-lateral", "talos-push"):
+        made = shop(name)
+        made._offline = made._offline or OfflinePosture(made.setup.q, 1.0, 1.0, 1.0, 0.0, 0.0)
+        nominal = made.driver("nominal").controller.program
+        for controller in CONTROLLERS:
+            program = made.driver(controller).controller.program
+            assert [t.name for t in program.tasks[:-1]] == [t.name for t in nominal.tasks[:-1]]
+            for task, other in zip(program.tasks, nominal.tasks, strict=True):
+                np.testing.assert_array_equal(task.kp, other.kp)
+                np.testing.assert_array_equal(task.weight, other.weight)
+                # The stiff one is critically damped for a stiffness of its own.
+                if controller != "stiff" or task is not program.posture:
+                    np.testing.assert_array_equal(task.kd, other.kd)
+            assert [c.friction for c in program.contacts] == [c.friction for c in nominal.contacts]
+
+
+# ---- held ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("controller", ["robust", "walker"])
+@pytest.mark.parametrize("name", ["aerial-vertical", *PUSHES])
+def test_held_freezes_posture_center_of_mass_and_base_where_they_are(name: str, controller: str) -> None:
+    play = stage(name, controller, "held")
+    play.go(0.1)
+    play.driver.brace()
+    play.go(0.4)
+    driver = play.driver
+    driver.hold()
+    reached = play.world.truth().q
+    state = driver.controller.state
+    for task in driver.controller.program.weighted:
+        if isinstance(task, CenterOfMass):
+            np.testing.assert_array_equal(task.target, state.center_of_mass()[0])
+        if isinstance(task, BaseOrientation):
+            np.testing.assert_array_equal(task.target, state.base_rotation)
+    play.go(0.4)
+    assert driver.level == 0
+    target = driver.posture.target
+    way = pin.difference(play.made.setup.robot.model, reached, target)[6:]
+    # What is held is what was measured in the last tick before.
+    assert np.abs(way).max() < 0.01
+    wanted = [np.array(t.target) for t in driver.controller.program.weighted]  # type: ignore[attr-defined]
+    last = play.go(2.5 if name in AERIAL else 0.8).q
+    np.testing.assert_array_equal(driver.posture.target, target)
+    for task, kept in zip(driver.controller.program.weighted, wanted, strict=True):
+        np.testing.assert_array_equal(task.target, kept)  # type: ignore[attr-defined]
+    assert np.abs(pin.difference(play.made.setup.robot.model, last, target)[6:]).max() < 0.04
+
+
+@pytest.mark.parametrize("controller", ["robust", "walker", "posture"])
+def test_nothing_of_a_run_survives_a_reset(controller: str) -> None:
+    made = shop("solo8-push")
+    goal = np.array(pin.integrate(made.setup.robot.model, made.setup.q, 0.05 * np.ones(14)))
+    driver: Driver
+    if controller == "posture":
+        driver = PostureDriver(made.setup, nominal_posture(made.setup), goal)
+    else:
+        driver = made.driver(controller, "held")
+    first = Stage(made, driver).go(0.05)
+    used = Stage(made, driver)
+    used.go(0.05)
+    driver.brace()
+    used.go(0.3)
+    driver.hold()
+    used.go(0.05)
+    again = Stage(made, driver).go(0.05)
+    np.testing.assert_array_equal(first.q, again.q)
+    np.testing.assert_array_equal(first.torques, again.torques)
+    assert driver.level == 0
+
+
+def test_a_reference_of_the_hand_does_not_survive_a_reset() -> None:
+    made = shop("aerial-vertical")
+    driver = made.driver("nominal")
+    fresh = driver.reset(made.setup.q)
+    made.setup.world.reset(made.setup.q)
+    driver.tick(made.setup.world.read(), ReferencePoint(0.05, 0.5, 1.0, 0))
+    again = driver.reset(made.setup.q)
+    np.testing.assert_array_equal(fresh.u, again.u)
+
+
+def test_the_hand_follows_its_reference_into_the_surface() -> None:
+    made = shop("aerial-lateral")
+    driver = made.driver("nominal")
+    driver.reset(made.setup.q)
+    made.setup.world.reset(made.setup.q)
+    (hand,) = [t for t in driver.controller.program.tasks if isinstance(t, FramePose)]
+    assert hand.target is not None
+    home = hand.target.translation.copy()
+    driver.tick(made.setup.world.read(), ReferencePoint(0.1, 0.3, 0.8, 0))
+    # Against the wall's normal, which is −x.
+    np.testing.assert_allclose(hand.target.translation - home, [0.1, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(hand.target_velocity, [0.3, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(hand.target_acceleration, [0.8, 0, 0, 0, 0, 0])
+
+
+# ---- the offline posture ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["aerial-lateral", "solo8-push"])
+def test_the_posture_driver_reaches_its_goal(name: str) -> None:
+    made = shop(name)
+    robot = made.setup.robot
+    goal = made.setup.q.copy()
+    if name in AERIAL:
+        goal[-1] += 0.1
+    else:
+        # All legs a tenth further bent: the base comes down, feet stay.
+        goal[7:] *= 1.1
+        data = robot.model.createData()
+        pin.framesForwardKinematics(robot.model, data, made.setup.q)
+        foot = robot.frame_id("FL_FOOT")
+        before = data.oMf[foot].translation.copy()
+        pin.framesForwardKinematics(robot.model, data, goal)
+        goal[:3] += before - data.oMf[foot].translation
+    play = Stage(made, PostureDriver(made.setup, nominal_posture(made.setup), goal))
+    play.go(0.1)
+    assert play.driver.level == 0
+    play.driver.brace()
+    play.go(MOVE / 2)
+    assert 0.4 < play.driver.level < 0.6
+    reached = play.go(MOVE / 2 + 1.5).q
+    assert play.driver.level == 1
+    np.testing.assert_array_equal(play.driver.posture.target, goal)
+    if name in PUSHES:
+        assert np.abs(pin.difference(robot.model, reached, goal)[6:]).max() < 0.02
+        (center,) = [t for t in play.driver.controller.program.weighted if isinstance(t, CenterOfMass)]
+        data = robot.model.createData()
+        np.testing.assert_allclose(center.target, pin.centerOfMass(robot.model, data, goal), atol=1e-12)
+
+
+# ---- bad input ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("aerial-vertical", {"end_effector": None}, r"nothing that leads the frame there.*\[control.end_effector\]"),
+        ("aerial-vertical", {"center_of_mass": Gains(10)}, r"has \[control.center_of_mass\], but no"),
+        ("aerial-vertical", {"base": Gains(10)}, r"has \[control.base\], but no \[control.footing\]"),
+        ("solo8-push", {"tilt": Gains(10)}, r"has \[control.tilt\], but feet"),
+        ("solo8-push", {"end_effector": Gains(10)}, r"has \[control.end_effector\], but a push"),
+        ("solo8-push", {"footing": None}, r"but no \[control.footing\]"),
+    ],
+)
+def test_gains_that_no_task_takes_are_refused(name: str, change: dict[str, Any], words: str) -> None:
+    setup = shop(name).setup
+    control = replace(setup.scenario.control, **change)
+    with pytest.raises(SpecError, match=words) as caught:
+        Workshop(replace(setup, scenario=replace(setup.scenario, control=control))).driver("nominal")
+    assert "\n" not in caught.value.line and name in caught.value.line

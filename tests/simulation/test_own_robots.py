@@ -1,0 +1,226 @@
+"""Anybody's own scenario: arms on a fixed base with and without robot.toml, and other robots that stand."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from impact_posture.errors import ImpactPostureError
+from impact_posture.simulation.controllers import CONTROLLERS, Workshop
+from impact_posture.simulation.metrics import measure
+from impact_posture.simulation.prediction import predict
+from impact_posture.simulation.runs import run
+from impact_posture.simulation.scenario import set_up
+from impact_posture.simulation.scenario_file import read_scenario
+from tests.helpers import robot
+from tests.simulation.shops import driven, fields_of, needs_mujoco, workshop
+
+RAIL = Path(__file__).parents[2] / "docs" / "examples" / "rail_arm"
+
+HIT = """
+name = "mine"
+robot = "{robot}"
+{more}
+
+[physics]
+timestep = 0.0005
+
+[[surfaces]]
+name = "table"
+normal = [0, 0, 1]
+gap = 0.04
+
+[[shapes]]
+frame = "{frame}"
+size = [0.01]
+
+[contacts]
+frame = "{frame}"
+surface = "table"
+speed = 0.2
+count = 1
+settle = 0.2
+dwell = 0.1
+pause = 0.05
+
+[control.end_effector]
+kp = 100
+
+[control.posture]
+kp = 10
+
+[control.robust]
+gain = 20
+"""
+
+PUSH = """
+name = "mine"
+robot = "{robot}"
+
+[physics]
+timestep = 0.0005
+
+[[surfaces]]
+name = "ground"
+normal = [0, 0, 1]
+
+{shapes}
+
+[push]
+frame = "{frame}"
+force = [{force}, 0, 0]
+duration = 0.2
+settle = 0.1
+patience = 0.3
+after = 0.05
+
+[control.center_of_mass]
+kp = 65
+weight = 10
+
+[control.base]
+kp = 65
+
+[control.posture]
+kp = 65
+weight = 0.1
+
+[control.footing]
+least = 0.1
+
+[control.robust]
+gain = 130
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _mujoco() -> None:
+    needs_mujoco()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("own")
+
+
+@functools.cache
+def arm(folder: Path, which: str) -> Workshop:
+    """A fixed-base arm above a table."""
+    path, more = folder / f"{which}.toml", ""
+    name, frame = which, robot(which).spec.contact.frame if which in ("panda", "ur5") else "tool"
+    if which == "rail_arm":
+        shutil.copytree(RAIL, folder / "rail")
+        name = "rail/rail_arm.urdf"
+    elif which == "stranger":
+        # The URDF alone: no robot.toml beside it.
+        shutil.copy(RAIL / "rail_arm.urdf", folder / "stranger.urdf")
+        name = "stranger.urdf"
+        more = "armature = { rail = 6.0 }\njoints = { shoulder_pitch = 0.6, elbow = 1.2, wrist_pitch = 0.9 }"
+    path.write_text(HIT.format(robot=name, frame=frame, more=more), encoding="utf-8")
+    return workshop(set_up(read_scenario(path)))
+
+
+def standing(folder: Path, name: str, force: float) -> Workshop:
+    """A robot of the catalogue on its own supports."""
+    found = robot(name)
+    shapes = "\n".join(f'[[shapes]]\nframe = "{s.frame}"\nsize = [0.016]' for s in found.spec.supports)
+    path = folder / f"{name}.toml"
+    text = PUSH.format(robot=name, frame=found.spec.contact.frame, shapes=shapes, force=force)
+    path.write_text(text, encoding="utf-8")
+    return workshop(set_up(read_scenario(path)))
+
+
+@pytest.mark.parametrize(
+    ("which", "controller"),
+    [("stranger", c) for c in CONTROLLERS]
+    + [(w, c) for w in ("panda", "rail_arm") for c in ("nominal", "robust", "walker")],
+)
+def test_an_arm_on_a_fixed_base_meets_a_table(folder: Path, which: str, controller: str) -> None:
+    made = arm(folder, which)
+    found = driven(made, controller)
+    for name, column in fields_of(found.series).items():
+        assert name == "objective" or np.isfinite(column).all(), name
+    metrics = measure(made.setup, found)
+    assert metrics.contacts == 1 and metrics.failed_ticks == 0 and metrics.relaxed_ticks < 30
+    assert 0 < metrics.q_total_impact < 1
+    # There is no base to move.
+    assert metrics.q_total_impact_base == 0 and metrics.q_total_impact_joints == metrics.q_total_impact
+    (blow,) = predict(made.setup, made.objective(), found)
+    # It arrives as fast as the reference does, whatever prepares it.
+    assert blow.approach == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.parametrize(("name", "force"), [("solo12", 6.5), ("go2", 30.0)])
+def test_another_robot_stands_and_is_pushed(folder: Path, name: str, force: float) -> None:
+    made = standing(folder, name, force)
+    for controller in ("nominal", "robust", "walker"):
+        found = driven(made, controller)
+        metrics = measure(made.setup, found)
+        assert np.isfinite(found.series.v).all() and metrics.failed_ticks == 0
+        assert np.abs(found.series.q[:, :3] - made.setup.q[:3]).max() < 0.1, controller
+        assert (found.series.touching[found.series.t > 0.05] == 4).mean() > 0.9, controller
+        assert 0 < metrics.q_total_impact < 1
+
+
+def test_a_robot_that_stands_can_hit_something_too(folder: Path) -> None:
+    standing(folder, "solo12", 1.0)
+    text = (folder / "solo12.toml").read_text(encoding="utf-8")
+    # The base itself is led into the wall: nothing else may hold it.
+    begin, end = text.index("[push]"), text.index("[control.posture]")
+    wall = (
+        '[[surfaces]]\nname = "wall"\nnormal = [-1, 0, 0]\npoint = [0.27, 0, 0]\n\n'
+        '[[shapes]]\nframe = "base_link"\nsize = [0.02]\noffset = [0.24, 0, 0]\ncenter = [0.22, 0, 0]\n\n'
+        '[contacts]\nframe = "base_link"\nsurface = "wall"\nspeed = 0.15\ncount = 1\nsettle = 0.2\ndwell = 0.2\n'
+        "pause = 0.05\nbeyond = 0.01\n\n[control.end_effector]\nkp = 65\nweight = 1000\n\n"
+    )
+    path = folder / "bump.toml"
+    path.write_text(text[:begin] + wall + text[end:], encoding="utf-8")
+    made = workshop(set_up(read_scenario(path)))
+    for controller in ("nominal", "robust"):
+        (bump,) = run(made, controller)
+        metrics = measure(made.setup, bump)
+        assert metrics.failed_ticks == 0 and np.isfinite(bump.series.v).all()
+        assert metrics.contacts == 1, controller
+        assert np.abs(bump.series.q[:, 2] - made.setup.q[2]).max() < 0.08
+
+
+def test_a_pushed_arm_without_a_hand_task_still_runs(folder: Path) -> None:
+    text = HIT.format(robot="ur5", frame="tool0", more="")
+    begin, end = text.index("[[surfaces]]"), text.index("[control.posture]")
+    push = (
+        '[push]\nframe = "tool0"\nforce = [20, 0, 0]\nduration = 0.1\nsettle = 0.1\npatience = 0.1\nafter = 0.05\n\n'
+    )
+    path = folder / "pushed.toml"
+    path.write_text(text[:begin] + push + text[end:], encoding="utf-8")
+    made = workshop(set_up(read_scenario(path)))
+    for controller in ("nominal", "robust", "posture", "invariant"):
+        found = driven(made, controller)
+        assert np.isfinite(found.series.v).all() and measure(made.setup, found).q_total_impact > 0, controller
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[control.end_effector]\nkp = 100\n", "", r"nothing that leads the frame there"),
+        (
+            "[control.posture]",
+            "[control.tilt]\nkp = 10\n\n[control.posture]",
+            r"\[control.tilt\], but a base that is",
+        ),
+        ("[control.posture]", "[control.footing]\n\n[control.posture]", r"\[control.footing\], but a base that is"),
+        ("speed = 0.2", "speed = 0.9", r"the gap is 0.04 m"),
+        ("[control.posture]\nkp = 10", "[control.posture]\nkp = [1, 2]", r"kp: has shape"),
+    ],
+)
+def test_what_does_not_fit_the_arm_is_one_line(folder: Path, old: str, new: str, words: str) -> None:
+    text = HIT.format(robot="ur5", frame="tool0", more="")
+    assert old in text
+    path = folder / "wrong.toml"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(ImpactPostureError, match=words) as caught:
+        run(workshop(set_up(read_scenario(path))), "nominal")
+    assert "\n" not in caught.value.line

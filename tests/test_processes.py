@@ -1,0 +1,203 @@
+"""Work shared out among processes: the same results in whatever order, faults come home, nobody is left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError, SimulationDiverged
+from impact_posture.processes import in_a_copy, shared_out
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs /proc to look at processes")
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended and that nobody asked about yet does not."""
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+    except OSError:
+        return False
+
+
+def gone(pids: list[int], within: float = 10.0) -> bool:
+    end = time.monotonic() + within
+    while any(alive(pid) for pid in pids):
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 5])
+def test_every_index_comes_once_with_its_result_in_whatever_order(jobs: int) -> None:
+    def work(index: int) -> tuple[int, int]:
+        # The first are the slowest: they come last where others work beside them.
+        time.sleep(0.02 * (3 - index) if index < 3 else 0)
+        return index**2, os.getpid()
+
+    with shared_out(work, 7, jobs) as results:
+        found = dict(results)
+    assert {index: square for index, (square, _) in found.items()} == {k: k**2 for k in range(7)}
+    pids = {pid for _, pid in found.values()}
+    assert (os.getpid() in pids) == (jobs == 1) and len(pids) <= jobs
+    assert jobs == 1 or gone(list(pids))
+
+
+def test_what_cannot_be_sent_to_a_process_is_found_there() -> None:
+    held = open(__file__, encoding="utf-8")
+    with held, shared_out(lambda index: (index, held.name), 3, 2) as results:
+        assert sorted(results) == [(k, (k, __file__)) for k in range(3)]
+
+
+def test_nothing_to_do() -> None:
+    with shared_out(lambda index: index, 0, 4) as results:
+        assert list(results) == []
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+@pytest.mark.parametrize(
+    "error",
+    [
+        SimulationDiverged(1.25, where="solo8"),
+        ControllerNotFound("robsut", ("robust", "nominal"), mend="look"),
+        ZeroDivisionError("by zero"),
+    ],
+    ids=lambda e: type(e).__name__,
+)
+def test_a_workers_fault_reaches_the_caller_whole(error: Exception, jobs: int) -> None:
+    def work(index: int) -> int:
+        if index == 2:
+            raise error
+        return index
+
+    with pytest.raises(type(error)) as caught, shared_out(work, 6, jobs) as results:
+        for _ in results:
+            pass
+    assert str(caught.value) == str(error)
+    if isinstance(error, ImpactPostureError):
+        assert vars(caught.value) == vars(error)
+
+
+def test_after_a_fault_no_process_is_left_and_the_next_sharing_works(tmp_path: Path) -> None:
+    def work(index: int) -> int:
+        (tmp_path / str(os.getpid())).touch()
+        if index == 0:
+            raise ValueError("stop")
+        time.sleep(30)
+        return index
+
+    begin = time.monotonic()
+    with pytest.raises(ValueError, match="stop"), shared_out(work, 4, 2) as results:
+        list(results)
+    assert time.monotonic() - begin < 15
+    assert gone([int(path.name) for path in tmp_path.iterdir()])
+    with shared_out(lambda index: -index, 4, 2) as results:
+        assert dict(results) == {k: -k for k in range(4)}
+
+
+def test_leaving_early_leaves_no_process(tmp_path: Path) -> None:
+    def work(index: int) -> int:
+        (tmp_path / str(os.getpid())).touch()
+        time.sleep(0 if index == 0 else 30)
+        return index
+
+    with shared_out(work, 4, 2) as results:
+        assert next(results) == (0, 0)
+    pids = [int(path.name) for path in tmp_path.iterdir()]
+    assert pids and gone(pids)
+
+
+PROGRAM = """
+import os, signal, sys, time
+from pathlib import Path
+from impact_posture.processes import in_a_copy, shared_out
+
+# A shell ignores Ctrl-C for what it runs in the background, and its children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+def work(index):
+    Path(sys.argv[1], str(os.getpid())).touch()
+    time.sleep(60)
+
+try:
+    with shared_out(work, 4, 2) as results:
+        list(results)
+except KeyboardInterrupt:
+    print("stopped")
+    sys.exit(130)
+"""
+
+
+@pytest.mark.parametrize("send", [os.kill, os.killpg], ids=["to the parent", "to the group, as a terminal does"])
+def test_ctrl_c_leaves_no_process_and_no_noise(tmp_path: Path, send: Callable[[int, int], None]) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, str(tmp_path)], start_new_session=True, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        end = time.monotonic() + 60
+        while len(list(tmp_path.iterdir())) < 2 and time.monotonic() < end:
+            time.sleep(0.02)
+        workers = [int(path.name) for path in tmp_path.iterdir()]
+        assert len(workers) == 2 and all(alive(pid) for pid in workers)
+        send(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+        assert (process.returncode, out, err) == (130, "stopped\n", "")
+        assert gone(workers)
+    finally:
+        # Its own session: nothing else is in that group.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+# ---- a copy of this process ----------------------------------------------------------------------------------------
+
+
+def test_a_copy_goes_on_from_the_very_state() -> None:
+    numbers = np.random.default_rng(5)
+    numbers.random(3)
+
+    def draw() -> np.ndarray:
+        return numbers.random(100_000)
+
+    with in_a_copy(draw) as collect:
+        # More than a pipe holds: the copy waits, this process does not.
+        here = draw()
+        np.testing.assert_array_equal(collect(), here)
+
+
+def test_what_a_copy_raises_is_raised_here() -> None:
+    def fail() -> None:
+        raise InputError("is wrong", where="the copy", mend="mend it")
+
+    with in_a_copy(fail) as collect, pytest.raises(InputError, match="the copy: is wrong; mend it"):
+        collect()
+
+
+def test_a_copy_that_dies_is_an_error() -> None:
+    with in_a_copy(lambda: os.kill(os.getpid(), signal.SIGKILL)) as collect, pytest.raises(OSError, match="has died"):
+        collect()
+
+
+def test_no_copy_outlives_its_block(tmp_path: Path) -> None:
+    told = tmp_path / "pid"
+
+    def linger() -> None:
+        told.with_suffix(".part").write_text(str(os.getpid()))
+        told.with_suffix(".part").replace(told)
+        time.sleep(60)
+
+    with pytest.raises(KeyboardInterrupt), in_a_copy(linger):
+        while not told.exists():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+    assert gone([int(told.read_text())], within=1.0)
