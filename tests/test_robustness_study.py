@@ -230,6 +230,7 @@ def test_the_advice_follows_the_numbers() -> None:
     advice = page({AERIAL: poor}, 0).partition(MARK)[0]
     assert "nothing helps reliably" in advice
     assert "take" not in advice
+    assert f"**What failed:** `posture` in `{AERIAL}` (fell in 4 of 4)." in advice
     live = [made(STANDING, k, {"robust": (0.7, 1.0), HELD: (0.99, 1.0)}) for k in range(4)]
     assert f"`{STANDING}` −30 % live, −1 % held: stiffness" in page({STANDING: live}, 0)
 

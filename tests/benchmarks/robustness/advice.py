@@ -51,7 +51,7 @@ def choice_lines(records: Records) -> list[str]:
             f"{f', and failed in {fails}' if fails else ''}. At a control limit in all, in the windows + "
             f"outside: {_limits(best)} s, nominal {_limits(summarize(own, NOMINAL))} s. The others: {others}."
         )
-    return [*lines, *_held_line(records), *_v_line(records)]
+    return [*lines, *_held_line(records), *_failed_line(records), *_v_line(records)]
 
 
 def _held_line(records: Records) -> list[str]:
@@ -71,6 +71,17 @@ def _held_line(records: Records) -> list[str]:
     return [
         f"- **Posture or stiffness?** What is left when the term goes before the push is posture: {'; '.join(parts)}."
     ]
+
+
+def _failed_line(records: Records) -> list[str]:
+    found = []
+    for name, own in records.items():
+        for controller in controllers(name):
+            failures = summarize(own, controller).failures
+            if failures:
+                words = ", ".join(f"{kind} in {n}" for kind, n in sorted(failures.items()))
+                found.append(f"`{controller}` in `{name}` ({words} of {len(own)})")
+    return [f"- **What failed:** {'; '.join(found)}."] if found else ["- **What failed:** nothing."]
 
 
 def _v_line(records: Records) -> list[str]:
