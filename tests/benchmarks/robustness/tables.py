@@ -159,8 +159,8 @@ def counterexamples(records: Records) -> list[str]:
 
 
 def _where(record: Record) -> str:
-    values = ", ".join(f"{key} {value:.4g}" for key, value in record.draw.values.items())
-    return f"`{record.draw.scenario}` number {record.draw.number} ({values})".replace("-0.", "−0.")
+    values = ", ".join(f"{key} {value:.4g}" for key, value in record.draw.values.items()).replace("-", "−")
+    return f"`{record.draw.scenario}` number {record.draw.number} ({values})"
 
 
 def _case(record: Record) -> str:
