@@ -4,7 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test lint types docs bench study-impacts reproduction calibration regression pictures clean
+.PHONY: help demo test lint types docs bench study-impacts study-robustness reproduction calibration regression
+.PHONY: pictures clean
 
 help:
 	@echo "make demo        install into .venv, optimize a real robot, leave pictures and C code in demo/"
@@ -14,6 +15,7 @@ help:
 	@echo "make bench       solve times, and the exported kernel beside its peers, on this machine"
 	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
+	@echo "make study-robustness  where each controller helps: 40 random variations of each experiment (an hour or two)"
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make pictures    draw the pictures that the documentation shows"
@@ -69,6 +71,9 @@ study-impacts: $(VENV)/.installed-test
 
 reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks.reproduction --write
+
+study-robustness: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks.robustness_study --jobs $(JOBS) --write
 
 calibration: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks.restitution --write

@@ -1,0 +1,1 @@
+"""Random variations of the shipped experiments: where does each controller help?"""

@@ -1,0 +1,222 @@
+"""What becomes of one configuration: every controller runs through it, and what goes wrong is an outcome too."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import ImpactPostureError, SimulationDiverged
+from impact_posture.impact.contact import point_on
+from impact_posture.simulation.blow import interpreted
+from impact_posture.simulation.controllers import Workshop
+from impact_posture.simulation.metrics import Metrics, before, measure
+from impact_posture.simulation.offline import holds
+from impact_posture.simulation.prediction import predict
+from impact_posture.simulation.runs import Run, run
+from impact_posture.simulation.scenario import RepeatedContacts, Setup
+from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, RANGES, Draw, draw, prepare
+
+SCHEMA = 1
+NOMINAL = "nominal"
+# The robust term that is off, with the posture that it reached, when the push comes.
+HELD = "robust:held"
+AERIAL = (NOMINAL, "robust", "robust-speed", "posture")
+PUSHED = (NOMINAL, "robust", HELD, "posture")
+# Share of the motors' limits with which the start must be held; share of a nominal run's ticks outside the windows
+# that may be at a limit.
+SHARE, SATURATED = 0.8, 0.05
+# Draws of a configuration before it is given up.
+ATTEMPTS = 40
+# Tilt (rad) from which on a robot that flies has lost itself; share of its height below which one that stands has
+# fallen: only its feet meet the ground, the rest falls through.
+_TILT, _HEIGHT = math.pi / 4, 0.3
+_RUNS = Callable[[Workshop, str], tuple[Run, ...]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one controller in one configuration.
+
+    Attributes:
+        failure: What went wrong; empty: nothing.
+        metrics: As :class:`~impact_posture.simulation.metrics.Metrics`; empty where there are none.
+        H: Before the blows, mean.
+        V: The same.
+        offset: Of the center of mass from the line of the first blow, m.
+    """
+
+    failure: str = ""
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    stops: tuple[str, ...] = ()
+    H: float | None = None
+    V: float | None = None
+    offset: float | None = None
+
+
+@dataclass(frozen=True)
+class Record:
+    """Of one configuration.
+
+    Attributes:
+        draw: What was drawn.
+        rejected: Why each draw before it was not admissible.
+        q: Start posture.
+        outcomes: By controller.
+    """
+
+    draw: Draw
+    rejected: tuple[str, ...]
+    q: tuple[float, ...]
+    outcomes: Mapping[str, Outcome]
+
+    def to_json(self) -> str:
+        """The record as text."""
+        return json.dumps({"key": key(self.draw.scenario), **asdict(self)}, indent=1)
+
+    @classmethod
+    def from_json(cls, text: str) -> Record | None:
+        """Back again; ``None`` where the study has changed since."""
+        found = json.loads(text)
+        chosen = Draw(**found["draw"])
+        if chosen.scenario not in RANGES or found["key"] != key(chosen.scenario):
+            return None
+        outcomes = {name: Outcome(**{**o, "stops": tuple(o["stops"])}) for name, o in found["outcomes"].items()}
+        return cls(chosen, tuple(found["rejected"]), tuple(found["q"]), outcomes)
+
+
+def controllers(scenario: str) -> tuple[str, ...]:
+    """Those that run in a scenario."""
+    return AERIAL if scenario.startswith("aerial") else PUSHED
+
+
+def key(scenario: str) -> str:
+    """What a kept record must have in common with this code."""
+    ranges = tuple((r.name, r.low, r.high, r.scale) for r in RANGES[scenario])
+    return repr((SCHEMA, controllers(scenario), SHARE, SATURATED, ranges, COUNT, DWELL, PATIENCE, PAUSE))
+
+
+class NotAdmissible(Exception):
+    """A draw that makes no experiment: the nominal controller itself does not get through it."""
+
+
+def play(workshop: Workshop, controller: str) -> tuple[Run, ...]:
+    """One run, noise of seed 0."""
+    name, _, mode = controller.partition(":")
+    return run(workshop, name, mode="held" if mode else "live")
+
+
+def configuration(scenario: str, number: int, seed: int, runs: _RUNS = play) -> Record:
+    """Draw until the nominal controller gets through, then let all controllers.
+
+    Raises:
+        NotAdmissible: No draw was.
+    """
+    rejected: list[str] = []
+    for attempt in range(ATTEMPTS):
+        chosen = draw(scenario, number, attempt, seed)
+        try:
+            workshop, nominal = _admit(chosen, runs)
+        except NotAdmissible as error:
+            rejected.append(str(error))
+            continue
+        outcomes = {NOMINAL: nominal}
+        for name in controllers(scenario)[1:]:
+            outcomes[name] = outcome(workshop, name, runs)
+        return Record(chosen, tuple(rejected), tuple(float(x) for x in workshop.setup.q), outcomes)
+    raise NotAdmissible(f"{scenario} {number}: none of {ATTEMPTS} draws is admissible: {sorted(set(rejected))}")
+
+
+def _admit(chosen: Draw, runs: _RUNS) -> tuple[Workshop, Outcome]:
+    try:
+        setup = prepare(chosen)
+    except ImpactPostureError as error:
+        raise NotAdmissible(f"no start ({type(error).__name__})") from None
+    if not holds(setup, setup.q, SHARE):
+        raise NotAdmissible(f"the motors do not hold the start with {100 * SHARE:.0f} % of their limits")
+    workshop = Workshop(setup, gradient_of=interpreted)
+    nominal = outcome(workshop, NOMINAL, runs)
+    if nominal.failure:
+        raise NotAdmissible(f"nominal {nominal.failure}")
+    if nominal.metrics["saturation_outside"] > SATURATED * nominal.metrics["duration"]:
+        raise NotAdmissible(f"nominal is at a limit for over {100 * SATURATED:.0f} % of the time between the blows")
+    return workshop, nominal
+
+
+def outcome(workshop: Workshop, controller: str, runs: _RUNS = play) -> Outcome:
+    """Let a controller run; what it raises is what becomes of it."""
+    try:
+        [found] = runs(workshop, controller)
+    except SimulationDiverged:
+        return Outcome("diverged")
+    except (ImpactPostureError, np.linalg.LinAlgError) as error:
+        return Outcome(f"raised {type(error).__name__}")
+    setup, metrics = workshop.setup, measure(workshop.setup, found)
+    blows = predict(setup, workshop.objective(), found)
+    numbers = {name: float(value) for name, value in asdict(metrics).items() if isinstance(value, int | float)}
+    return Outcome(
+        _failure(setup, found, metrics),
+        {**numbers, "duration": float(found.series.t[-1])},
+        metrics.stops,
+        float(np.mean([b.H for b in blows])) if blows else None,
+        float(np.mean([b.V for b in blows])) if blows else None,
+        _offset(workshop, found),
+    )
+
+
+def _failure(setup: Setup, found: Run, metrics: Metrics) -> str:
+    task, series = setup.scenario.task, found.series
+    if isinstance(task, RepeatedContacts):
+        upright = np.array([pin.Quaternion(q[3:7]).matrix()[2, 2] for q in series.q[::10]])
+        if (upright < math.cos(_TILT)).any():
+            return "tipped over"
+        return "missed a contact" if metrics.contacts < task.count else ""
+    # The ground is at height zero.
+    if (series.q[:, 2] < _HEIGHT * series.q[0, 2]).any():
+        return "fell"
+    return "" if metrics.rested else "did not come to rest"
+
+
+def _offset(workshop: Workshop, found: Run) -> float | None:
+    """Distance of the center of mass from the line along which the first blow acts."""
+    robot, contact = workshop.setup.robot, workshop.objective().contact
+    q = found.series.q[before(found.series, found.impacts[0])]
+    place = Numeric(robot.model).at(q).placement(point_on(robot, contact.frame, contact.offset)).translation
+    arm = np.array(pin.centerOfMass(robot.model, robot.model.createData(), q)) - place
+    n = workshop.setup.scenario.normal
+    return float(np.linalg.norm(arm - n * (n @ arm)))
+
+
+class Store:
+    """Finished configurations, a file each: an interrupted study goes on where it was.
+
+    Args:
+        folder: Where they lie; made when the first is kept.
+        seed: Of the study.
+    """
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self._folder, self._seed = folder, seed
+
+    def _file(self, scenario: str, number: int) -> Path:
+        return self._folder / f"seed-{self._seed}" / scenario / f"{number:03d}.json"
+
+    def get(self, scenario: str, number: int) -> Record | None:
+        """What was kept of a configuration, if it still holds."""
+        file = self._file(scenario, number)
+        return Record.from_json(file.read_text(encoding="utf-8")) if file.is_file() else None
+
+    def keep(self, record: Record) -> None:
+        """Write it down, whole or not at all."""
+        file = self._file(record.draw.scenario, record.draw.number)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        beside = file.with_suffix(f".{os.getpid()}")
+        beside.write_text(record.to_json() + "\n", encoding="utf-8")
+        beside.replace(file)
