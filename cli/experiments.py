@@ -39,7 +39,7 @@ def rows_table(page: Page, rows: tuple[Row, ...] | list[Row]) -> None:
             (
                 row.controller + ("" if row.rested else " *"),
                 interval_text(row.metrics["q_total_impact"]),
-                "" if row.controller == "nominal" else reduction_text(row),
+                reduction_text(row),
                 interval_text(row.metrics["peak_jump"]),
                 interval_text(row.metrics["saturation_inside"], 2),
                 "" if row.H is None else f"{row.H:.3g}",

@@ -76,7 +76,8 @@ def compare(
         print_json(document)
         return
     page = Page(quiet=quiet)
-    page.title(rows[0].scenario, f"{seeds} seed{'s' if seeds > 1 else ''}, mean ± half of the 95 % interval")
+    shown = "mean ± half of the 95 % interval" if seeds > 2 else "means (intervals from 3 seeds on)"
+    page.title(rows[0].scenario, f"{seeds} seeds, {shown}" if seeds > 1 else "1 seed")
     rows_table(page, rows)
     if folder is not None:
         page.gap()

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction, targets_of
 from impact_posture.experiment.statistics import Interval, Row
 from impact_posture.simulation.controllers import MEANING
 
+# Of numbers that are nearly zero.
+_DECIMALS = 4
 _MISSED = {
     "reduction": "less than the paper's reduction",
     "peak_jump": "a higher peak jump than nominal",
@@ -69,10 +73,11 @@ def scenario_table(rows: Sequence[Row]) -> str:
 
 def summary(found: Reproduction) -> str:
     """The whole document."""
-    many = f"{found.seeds} seeds" if found.seeds > 1 else "one seed: no intervals"
+    many = f"{found.seeds} seeds" if found.seeds > 1 else "one seed"
+    shown = ", with 95 % confidence intervals." if found.seeds > 2 else ": no intervals."
     parts = [
         "# The paper's experiments, simulated anew",
-        f"Means over {many}" + (", with 95 % confidence intervals." if found.seeds > 1 else "."),
+        f"Means over {many}{shown}",
         "## What to choose",
         "\n".join(f"- {line}" for line in advice(found)),
         "## Table I of Afifi et al. 2026, and ours",
@@ -140,17 +145,21 @@ def remarks(found: Reproduction, scenario: str) -> list[str]:
 
 
 def interval_text(value: Interval, digits: int = 3) -> str:
-    """``mean ± half width``."""
-    if value.half_width is None:
-        return f"{value.mean:.{digits}g}"
-    return f"{value.mean:.{digits}g} ± {value.half_width:.1g}"
+    """``mean ± half width``, the mean with so many digits and the half width with its decimals.
+
+    From fewer than three samples no half width is shown: it would say more of Student's t than of them.
+    """
+    decimals = max(0, digits - 1 - int(np.floor(np.log10(abs(value.mean))))) if value.mean else 0
+    decimals = min(decimals, _DECIMALS)
+    text = f"{value.mean:.{decimals}f}"
+    return text if value.half_width is None or value.samples < 3 else f"{text} ± {value.half_width:.{decimals}f}"
 
 
 def reduction_text(row: Row | None) -> str:
     """A reduction in percent."""
-    if row is None or row.reduction is None:
+    if row is None or row.reduction is None or row.controller == "nominal":
         return "–"
-    half = row.reduction.half_width
+    half = row.reduction.half_width if row.reduction.samples > 2 else None
     return f"{100 * row.reduction.mean:.1f}" + ("" if half is None else f" ± {100 * half:.1f}") + " %"
 
 

@@ -76,7 +76,7 @@ def _page(found: Reproduction, every: Reproduction) -> list[str]:
         table_one(found),
     ]
     for scenario in found.scenarios:
-        few = f"seeds 0 to {every.seeds - 1}" if every.seeds > 1 else "seed 0"
+        few = f"means over seeds 0 to {every.seeds - 1}" if every.seeds > 1 else "seed 0"
         parts += [
             f"### {scenario}",
             scenario_table(found.of(scenario)),
