@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -42,8 +42,8 @@ def compare(
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
     from impact_posture.experiment.folders import COMPARISON, FORMATS, store_beside, write_comparison
-    from impact_posture.experiment.many import run_many
-    from impact_posture.experiment.reproduction import gather, jobs_of
+    from impact_posture.experiment.reproduction import compare as run_all
+    from impact_posture.experiment.reproduction import comparison_document, jobs_of
     from impact_posture.folder import check_output
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.progress import progress_bar
@@ -53,25 +53,12 @@ def compare(
     if folder is not None:
         check_output(folder, force=force, marks=(COMPARISON,))
     store = None if folder is None else store_beside(folder)
-    plan = jobs_of(scenario, labels, seeds)
     with progress_bar("running", "runs", shown=not (quiet or json)) as progress:
-        documents = run_many(
-            plan,
-            processes=jobs,
-            store=store,
-            keep_series=lambda job: store is not None and job.seed == 0,
-            progress=progress,
-        )
-    rows = gather(scenario, labels, documents)
-    document: dict[str, Any] = {
-        "schema": "impact-posture/comparison/1",
-        "scenario": rows[0].scenario,
-        "seeds": list(range(seeds)),
-        "rows": [row.to_dict() for row in rows],
-    }
+        rows = run_all(scenario, labels, seeds=seeds, processes=jobs, store=store, progress=progress)
+    document = comparison_document(rows, seeds)
     if folder is not None and store is not None:
         formats = [f.value for f in format or ()] or FORMATS
-        write_comparison(folder, document, plan, store, force=force, formats=formats)
+        write_comparison(folder, document, jobs_of(scenario, labels, seeds), store, force=force, formats=formats)
     if json:
         print_json(document)
         return

@@ -12,7 +12,7 @@ from impact_posture.experiment.paper import PAPER, RECOMMENDED
 from impact_posture.experiment.statistics import Row, row_of
 from impact_posture.simulation.controllers import CONTROLLERS
 
-SCHEMA = "impact-posture/reproduction/1"
+SCHEMA, COMPARISON_SCHEMA = "impact-posture/reproduction/1", "impact-posture/comparison/1"
 # The posture that a term reaches apart from what it does while the blow lasts; and the metric without the feet.
 HELD, FREE = ("robust:held", "walker:held"), "robust:free"
 
@@ -94,6 +94,49 @@ def gather(scenario: str, controllers: Sequence[str], documents: Sequence[Docume
     parts = {c: documents[k * count : (k + 1) * count] for k, c in enumerate(controllers)}
     name = next((d["scenario"] for d in documents if "error" not in d), scenario)
     return [row_of(name, c, own, parts.get("nominal", [])) for c, own in parts.items()]
+
+
+def compare(
+    scenario: str,
+    controllers: Sequence[str],
+    *,
+    seeds: int = 3,
+    processes: int = 1,
+    store: Store | None = None,
+    progress: Progress | None = None,
+) -> list[Row]:
+    """Run controllers through a scenario, each with every seed; time series of the first seed are kept in the store.
+
+    Args:
+        scenario: Name or file.
+        controllers: Labels (:func:`~impact_posture.experiment.jobs.parse_controller`).
+        seeds: How many, from 0.
+        processes: How many runs at once.
+        store: Where finished runs are kept.
+        progress: Told of (done, all).
+
+    Raises:
+        ImpactPostureError: A scenario that cannot be set up, no such controller.
+    """
+    jobs = jobs_of(scenario, controllers, seeds)
+    documents = run_many(
+        jobs,
+        processes=processes,
+        store=store,
+        keep_series=lambda job: store is not None and job.seed == 0,
+        progress=progress,
+    )
+    return gather(scenario, controllers, documents)
+
+
+def comparison_document(rows: Sequence[Row], seeds: int) -> dict[str, Any]:
+    """Content of ``comparison.json``."""
+    return {
+        "schema": COMPARISON_SCHEMA,
+        "scenario": rows[0].scenario,
+        "seeds": list(range(seeds)),
+        "rows": [row.to_dict() for row in rows],
+    }
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,8 +91,13 @@ def summary(found: Reproduction) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def advice(found: Reproduction) -> list[str]:
-    """One line a scenario: which controller, what it gives, what it costs."""
+def advice(found: Reproduction, beside: Reproduction | None = None) -> list[str]:
+    """One line a scenario: which controller, what it gives, what it costs.
+
+    Args:
+        found: The rows that count.
+        beside: Rows of more controllers, where the held variant of the best one is looked for.
+    """
     lines = []
     for scenario in found.scenarios:
         best, robust = found.best(scenario), next((r for r in found.of(scenario) if r.controller == "robust"), None)
@@ -106,12 +111,35 @@ def advice(found: Reproduction) -> list[str]:
             f"{reduction_text(best)} less than nominal"
         )
         line += ", every target met." if met or targets is None else f", but with {_misses(targets.missed)}."
+        line += _force(best, found.of(scenario)) + _held((beside or found).of(scenario), best)
         if robust is not None and robust is not best and robust.reduction is not None:
             line += f" The paper's term: {reduction_text(robust)}"
             missed = targets_of(robust)
             line += "." if missed is None or missed.met else f", with {_misses(missed.missed)}."
         lines.append(line)
     return lines
+
+
+def _force(best: Row, rows: Sequence[Row]) -> str:
+    """What the contact has to bear for it."""
+    nominal = next((row for row in rows if row.controller == "nominal"), None)
+    if nominal is None:
+        return ""
+    before, after = (row.metrics["peak_force"].mean for row in (nominal, best))
+    return f" The contact bears up to {after:.0f} N instead of {before:.0f} N." if after > 1.1 * before else ""
+
+
+def _held(rows: Sequence[Row], best: Row) -> str:
+    """Whether a live term's gain is its posture."""
+    held = next((row for row in rows if row.controller == f"{best.controller}:held"), None)
+    if held is None or held.reduction is None or best.reduction is None:
+        return ""
+    if held.reduction.mean > best.reduction.mean / 2:
+        return ""
+    return (
+        f" Not its posture does it: held before the blow, that gives {reduction_text(held)}; a stiffer nominal "
+        "controller is the simpler way."
+    )
 
 
 def remarks(found: Reproduction, scenario: str) -> list[str]:

@@ -70,7 +70,7 @@ def _page(found: Reproduction, every: Reproduction) -> list[str]:
     seeds = ", ".join(str(k) for k in range(found.seeds))
     parts = [
         "### What to choose",
-        "\n".join(f"- {line}" for line in advice(found)),
+        "\n".join(f"- {line}" for line in advice(found, every)),
         "### Table I of the paper, and ours",
         f"`q_total_impact`, seeds {seeds}; mean ± half of the 95 % confidence interval.",
         table_one(found),
