@@ -69,16 +69,16 @@ def _take_shown(folder: Path) -> None:
 def _page(found: Reproduction, every: Reproduction) -> list[str]:
     seeds = ", ".join(str(k) for k in range(found.seeds))
     parts = [
-        "### What to choose",
+        "## What to choose",
         "\n".join(f"- {line}" for line in advice(found, every)),
-        "### Table I of the paper, and ours",
+        "## Table I of the paper, and ours",
         f"`q_total_impact`, seeds {seeds}; mean ± half of the 95 % confidence interval.",
         table_one(found),
     ]
     for scenario in found.scenarios:
         few = f"means over seeds 0 to {every.seeds - 1}" if every.seeds > 1 else "seed 0"
         parts += [
-            f"### {scenario}",
+            f"## {scenario}",
             scenario_table(found.of(scenario)),
             f"Every controller, {few}:",
             scenario_table(every.of(scenario)),
