@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.distance import distance
 from impact_posture.posture.follow import trade_off
 from impact_posture.posture.problem import Requirements, build_problem
 from impact_posture.posture.solve import PostureSolution, solve
@@ -75,8 +77,8 @@ def offline_posture(
     solution = _solved(setup, objective, starts, seed)
     initial = objective.value(solution.initial)
     if holds(setup, solution.q, share):
-        value = objective.value(solution.q)
-        return OfflinePosture(solution.q, value, initial, value, *(2 * (_far(setup, solution.q, solution.initial),)))
+        value, far = objective.value(solution.q), _far(setup, solution.q, solution.initial)
+        return OfflinePosture(solution.q, value, initial, value, far, far)
     curve = trade_off(solution, _POINTS)
     whole, optimum = curve.points[-1].distance, curve.points[-1].objective
     for point in reversed(curve.points):
@@ -124,7 +126,4 @@ def holds(setup: Setup, q: Array, share: float) -> bool:
 
 
 def _far(setup: Setup, q: Array, start: Array) -> float:
-    from impact_posture.dynamics.chart import Chart
-    from impact_posture.posture.distance import distance
-
     return distance(Chart(setup.robot.model), q, start)

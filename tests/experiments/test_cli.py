@@ -33,19 +33,8 @@ def document(*arguments: str, cwd: Path) -> dict[str, Any]:
 
 
 def test_simulate(aerial: Path, tmp_path: Path) -> None:
-    found = document(
-        "simulate",
-        str(aerial),
-        "--controller",
-        "robust",
-        "--seed",
-        "3",
-        "--out",
-        "run",
-        "--format",
-        "png",
-        cwd=tmp_path,
-    )
+    asked = ("simulate", str(aerial), *"--controller robust --seed 3 --out run --format png".split())
+    found = document(*asked, cwd=tmp_path)
     assert (found["scenario"], found["controller"], found["seed"]) == ("aerial-lateral", "robust", 3)
     for key in ("q_total_impact", "q_total_dwell", "peak_jump", "peak_force", "relaxed_ticks"):
         assert isinstance(found["metrics"][key], int | float)
@@ -58,20 +47,7 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
     # Never over what is there; the same again is the same.
     refused = start("simulate", str(aerial), "--controller", "robust", "--out", "run", cwd=tmp_path)
     assert refused.returncode == 1 and "--force" in refused.stderr
-    again = document(
-        "simulate",
-        str(aerial),
-        "--controller",
-        "robust",
-        "--seed",
-        "3",
-        "--out",
-        "run",
-        "--force",
-        "--format",
-        "png",
-        cwd=tmp_path,
-    )
+    again = document(*asked, "--force", cwd=tmp_path)
     assert again == found
 
 
