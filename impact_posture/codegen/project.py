@@ -180,13 +180,14 @@ $prefix.o: $prefix.c $prefix.h
 shared: lib$prefix.so
 
 lib$prefix.so: $prefix.o
+	rm -f $$@.sha256
 	$$(CC) -shared $prefix.o -o $$@ -lm
 
 check: example
 	./example
 
 clean:
-	rm -f example example_cpp $prefix.o lib$prefix.so
+	rm -f example example_cpp $prefix.o lib$prefix.so lib$prefix.so.sha256
 
 .PHONY: all shared check clean
 """)

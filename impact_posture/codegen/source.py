@@ -11,6 +11,7 @@ from impact_posture.codegen.code import Code
 from impact_posture.codegen.compiler import self_test_tolerance
 from impact_posture.codegen.emitter import SHORT_NAMES, Real, c_double, c_vector
 from impact_posture.codegen.manifest import unit_slices
+from impact_posture.codegen.reader import identity
 from impact_posture.codegen.variants import Variant
 from impact_posture.escape import c_comment, markdown
 from impact_posture.impact.objective import ImpactObjective
@@ -82,6 +83,7 @@ def build_texts(
                 "unit_checks": _unit_checks(objectives[0], real),
                 "vectors": code.vectors,
                 "functions": code.functions,
+                "identity": identity(manifest),
                 "undefined": "\n".join(f"#undef {name}" for name in SHORT_NAMES),
             }
         ),
