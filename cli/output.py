@@ -46,7 +46,7 @@ class Page:
         """A paragraph, wrapped at words."""
         from rich.text import Text
 
-        self.console.print(Text(printable(text, keep="\n"), style=style))
+        self.console.print(Text(printable(text), style=style))
 
     def gap(self) -> None:
         """An empty line."""
@@ -90,7 +90,7 @@ class Page:
                 overflow="fold",
             )
         for row in rows:
-            table.add_row(*[Text(printable(cell, keep="\n")) for cell in row])
+            table.add_row(*[Text(printable(cell)) for cell in row])
         self.console.print(table)
 
     def warnings(self, lines: Iterable[str]) -> None:

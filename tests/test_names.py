@@ -11,6 +11,7 @@ import unicodedata
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
@@ -30,11 +31,13 @@ from impact_posture.codegen.variants import variants
 from impact_posture.dynamics.mjcf import write_mjcf
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.plot import ResultView, jump_figure, save
+from impact_posture.plot import ResultView, draw_all, jump_figure, save
 from impact_posture.posture.settings import ProblemSettings, dump_settings, read_settings
 from impact_posture.robot.loader import load_robot
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RobotSpec
+from impact_posture.simulation.build import build_scene
+from impact_posture.simulation.scene import Scene, Shape, Surface
 from impact_posture_cli.boundary import run
 from impact_posture_cli.main import app
 from impact_posture_cli.words import put_right
@@ -228,6 +231,16 @@ def test_mujoco_loads_every_name(arm: Robot, many: Robot) -> None:
         assert len(set(written.sites.values())) == len(written.sites)
 
 
+def test_mujoco_loads_a_scene_with_such_surfaces_and_shapes(arm: Robot) -> None:
+    pytest.importorskip("mujoco")
+    for name in NASTY:
+        robot = renamed(arm, name)
+        surface = Surface(name, (0.0, 0.0, 1.0), gap=0.1)
+        built = build_scene(robot, Scene((surface,), (Shape(name),)), robot.posture())
+        model = built.mjcf.compile()
+        assert (model.npair, model.ngeom) == (1, 2) and model.geom(built.shape_geoms[0]).id >= 0, ascii(name)[:60]
+
+
 # ---- pictures -----------------------------------------------------------------------------------------------------
 
 
@@ -325,11 +338,12 @@ def test_every_error_is_one_safe_line() -> None:
 def test_optimize_and_codegen_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiler = need_compiler()
     monkeypatch.setenv("CFLAGS", "-O0")
+    monkeypatch.setattr("impact_posture.job.draw_all", partial(draw_all, only=["jump"]))
     names = ["base", '*/ #error "out"\n#include <x>', "$\\frac{$", "[red]|`<script>", "??/\\"]
     folder = tmp_path / "\x1b]0;x\x07 *\n"
     folder.mkdir()
     robot = folder / 'a"b*\n[red].urdf'
-    robot.write_text(urdf(names, moving=2), encoding="utf-8")
+    robot.write_text(urdf(names, moving=1), encoding="utf-8")
     problem = [str(robot), "--frame", names[1], "--offset", "0.3", "0", "0", "--normal", "0", "1", "0"]
     out = folder / "out\x1b[31m"
     pose = ["--contact-pose", "free", "--starts", "1", "--jobs", "1", "--format", "svg"]

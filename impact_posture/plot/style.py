@@ -41,7 +41,7 @@ FORMATS = ("png", "svg", "pdf")
 # Width of a two-column page, inches.
 WIDTH = 7.2
 _SMALL = 7.0
-_LONGEST_TITLE = 110
+_LONGEST_TITLE = 85
 _LINE = 0.15
 _RC: dict[str, Any] = {
     "font.family": "DejaVu Sans",

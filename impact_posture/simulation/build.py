@@ -15,6 +15,7 @@ from impact_posture.dynamics.mjcf_additions import Additions
 from impact_posture.dynamics.mjcf_text import numbers
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, UnsupportedJoint
+from impact_posture.escape import xml_name
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import actuation_matrix
 from impact_posture.robot.robot import Robot
@@ -76,7 +77,7 @@ def build_scene(robot: Robot, scene: Scene, q: Array) -> BuiltScene:
     for shape in scene.shapes:
         place = _placement(robot, numeric, shape, first)
         joint = point_on(robot, shape.frame).joint
-        geoms.append(f"shape {shape.frame}")
+        geoms.append(xml_name(f"shape {shape.frame}"))
         added.shape(joint, geoms[-1], shape.kind, shape.size, place)
         placed.append((shape, numeric.data.oMi[joint] * place))
     points = {s.name: _point(s, normals[s.name], placed) for s in scene.surfaces}
@@ -86,7 +87,7 @@ def build_scene(robot: Robot, scene: Scene, q: Array) -> BuiltScene:
         for shape, place in placed
     }
     for surface in scene.surfaces:
-        name, law = f"surface {surface.name}", surface.law
+        name, law = xml_name(f"surface {surface.name}"), surface.law
         added.plane(name, points[surface.name], normals[surface.name])
         for geom in geoms:
             added.pair(
@@ -147,7 +148,7 @@ def _add_rotors(added: Additions, robot: Robot) -> None:
     wrenches = actuation_matrix(robot.model, propulsion)[:6, : len(propulsion.rotors)]
     added.site(1, "base of the rotors", pin.SE3.Identity())
     for rotor, wrench in zip(propulsion.rotors, wrenches.T, strict=True):
-        added.motor(f"rotor {rotor.name}", wrench, site="base of the rotors")
+        added.motor(xml_name(f"rotor {rotor.name}"), wrench, site="base of the rotors")
 
 
 def _add_motors(added: Additions, robot: Robot, joints: Mapping[int, tuple[str, ...]]) -> None:
@@ -161,7 +162,7 @@ def _add_motors(added: Additions, robot: Robot, joints: Mapping[int, tuple[str, 
             )
         if slot.kind.family == "spherical":
             for k, axis in enumerate(np.eye(3)):
-                added.motor(f"motor {slot.name}[{k}]", axis, joint=joints[slot.index][0])
+                added.motor(xml_name(f"motor {slot.name}[{k}]"), axis, joint=joints[slot.index][0])
             continue
         for name in joints[slot.index]:
             added.motor(f"motor {name}", (1.0,), joint=name)
