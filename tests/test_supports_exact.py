@@ -224,7 +224,8 @@ def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
     base = replace(objective(name, 1e-4), supports=supports)
     (q,) = random_configurations(found.model, 1, name, count, "full rank", spread=0.5)
     rigid = Rigid(base, q)
-    oracles = [ImpactOracle(found, base.contact, base.metric, supports, base.compliance / k) for k in (1, 2, 4)]
+    case = replace(base.case, robot=found, supports=supports)
+    oracles = [ImpactOracle(replace(case, compliance=base.compliance / k)) for k in (1, 2, 4)]
     M, n = oracles[0].at(q).M, oracles[0].n
     held = np.linalg.svd(np.linalg.solve(np.linalg.cholesky(M), rigid.Js.T), compute_uv=False)[-1] ** 2
     all_of_them = [oracle.quantities(q) for oracle in oracles]

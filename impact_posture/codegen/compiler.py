@@ -217,7 +217,7 @@ def oracle_difference(library: CompiledExport, objective: ImpactObjective, sampl
     contact, worst = objective.contact, 0.0
     for q, n in _samples(objective, samples, library.real):
         turned = replace(contact, normal=(float(n[0]), float(n[1]), float(n[2])))
-        oracle = ImpactOracle(objective.robot, turned, objective.metric, objective.supports, objective.compliance)
+        oracle = ImpactOracle(replace(objective.case, contact=turned))
         found, gradient = oracle.quantities(q), oracle.gradient_H(q)
         worst = _worst(worst, library.eval(q, n), found.H, gradient)
         worst = _worst(worst, library.objective(q), objective.value(q), objective.gradient(q))

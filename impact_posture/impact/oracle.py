@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import MetricError
-from impact_posture.impact.contact import Contact, Support, point_on
-from impact_posture.impact.metric import Metric
-from impact_posture.robot.robot import Robot
+from impact_posture.impact.contact import point_on
+from impact_posture.impact.impact_case import ImpactCase
 
 Vector = NDArray[np.float64]
 
@@ -78,21 +77,14 @@ class Answer:
 
 
 class ImpactOracle:
-    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one contact."""
+    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        contact: Contact,
-        metric: Metric,
-        supports: tuple[Support, ...] = (),
-        compliance: float = 1.0,
-    ) -> None:
-        self.robot, self.contact, self.metric = robot, contact, metric
-        self.numeric = Numeric(robot.model)
-        self.point = point_on(robot, contact.frame, contact.offset)
-        self.feet = [(point_on(robot, s.frame, s.offset), s.rows) for s in supports]
-        self.compliance = compliance
+    def __init__(self, case: ImpactCase) -> None:
+        self.case, self.robot, self.contact, self.metric = case, case.robot, case.contact, case.metric
+        self.numeric = Numeric(case.robot.model)
+        self.point = case.point
+        self.feet = [(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
+        self.compliance = case.compliance
         self._q: Vector | None = None
 
     def at(self, q: Vector) -> ImpactOracle:
@@ -156,6 +148,10 @@ class ImpactOracle:
             support_impulse=np.asarray(answers.f @ self.n),
         )
 
+    def with_support_impulses(self, a: Vector) -> Vector:
+        """``a`` and the impulses ``−J_s a/ε`` that it means at the supports, at the last posture, one vector."""
+        return np.concatenate([a, -self.Js @ a / self.compliance])
+
     # ---- gradients --------------------------------------------------------------------------------------------
 
     def gradient_H(self, q: Vector, normal: Vector | None = None) -> Vector:
@@ -164,7 +160,7 @@ class ImpactOracle:
         own, n = self._normals(normal)
         x = self.answer(self.J.T @ n)
         y = self.answer(self.weigh(x.a))
-        gradient = 2 * (self.coupling(own, y.a, self._in_frame) - self.inertial(y, x))
+        gradient = 2 * (self.coupling(own, y.a, self.case.in_contact_frame) - self.inertial(y, x))
         return gradient + self.metric_gradient(x.a)
 
     def gradient_G(self, q: Vector, normal: Vector | None = None) -> Vector:
@@ -172,7 +168,7 @@ class ImpactOracle:
         self.at(q)
         own, n = self._normals(normal)
         x = self.answer(self.J.T @ n)
-        return 2 * self.coupling(own, x.a, self._in_frame) - self.inertial(x, x)
+        return 2 * self.coupling(own, x.a, self.case.in_contact_frame) - self.inertial(x, x)
 
     def gradient_S(self, q: Vector, normal: Vector | None = None) -> Vector:
         """Tangent gradient of S, shape (nv,); ``normal`` as for H.
@@ -195,18 +191,14 @@ class ImpactOracle:
         r = np.asarray(-inverse.matrix @ (self.J @ free.a))
         y = free + axes @ r
         gradient = 2 * (self.coupling(s, y.a, False) + self.coupling(r, x.a, False) - self.inertial(y, x))
-        if self._in_frame:
+        if self.case.in_contact_frame:
             gradient = gradient - 2 * self.numeric.turning_gradient(self.point, n, r)
         return gradient + self.metric_gradient(x.a)
-
-    @property
-    def _in_frame(self) -> bool:
-        return self.contact.normal_frame == "contact"
 
     def _normals(self, given: Vector | None) -> tuple[Vector, Vector]:
         """A normal (the contact's own if none is given) in the axes that it is given in, and in world axes."""
         own = np.array(self.contact.normal) if given is None else given
-        return own, self.numeric.placement(self.point).rotation @ own if self._in_frame else own
+        return own, self.numeric.placement(self.point).rotation @ own if self.case.in_contact_frame else own
 
     def support_gradient(self, q: Vector) -> Vector:
         """Tangent Jacobian of the supports' impulses ``f``, shape (rows, nv).
@@ -218,7 +210,8 @@ class ImpactOracle:
         rows = len(self.Js)
         adjoints = self.answer(np.zeros((self._nv, rows)), -np.eye(rows))
         found = [
-            self.coupling(np.array(self.contact.normal), p, self._in_frame) - self.inertial(Answer(p, r), x)
+            self.coupling(np.array(self.contact.normal), p, self.case.in_contact_frame)
+            - self.inertial(Answer(p, r), x)
             for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
         ]
         return np.array(found).reshape(rows, self._nv)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -16,10 +16,9 @@ from impact_posture.errors import MetricError
 from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.one_blow import OneBlow
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
 from impact_posture.impact.scalars import objective_value
-from impact_posture.impact.uncertain import worst_in_world
+from impact_posture.impact.single_impact import SingleImpact
 from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
@@ -133,7 +132,7 @@ class ResultView:
         objective = self.objective
         if not objective.supports:
             return None
-        return ImpactOracle(objective.robot, objective.contact, objective.metric).quantities(q)
+        return ImpactOracle(replace(objective.case, supports=())).quantities(q)
 
     @cached_property
     def worst_before(self) -> WorstNormal | None:
@@ -146,10 +145,11 @@ class ResultView:
         return self._worst(self.q_optimal)
 
     def _worst(self, q: Vector) -> WorstNormal | None:
-        if not self.objective.normal_cone_deg:
+        cone = self.objective.normal_cone
+        if cone is None:
             return None
         try:
-            return worst_in_world(self.objective, q)
+            return cone.worst_in_world(q)
         except MetricError:
             return None
 
@@ -259,7 +259,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
 
 def _worst_values(view: ResultView) -> str:
     """The objective before and after, where it is none of the five quantities but the worst of several blows."""
-    if isinstance(view.objective.inner, OneBlow):
+    if isinstance(view.objective.worst_case, SingleImpact):
         return ""
     found = [objective_value(view.objective, q) for q in (view.q_initial, view.q_optimal)]
     return " " + " → ".join(number(value) for value in found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.posture.problem import PostureProblem
+from impact_posture.impact.objective import ImpactObjective, Objective
 
 Vector = NDArray[np.float64]
 
@@ -13,9 +13,11 @@ Vector = NDArray[np.float64]
 _LOCKED = 0.05
 
 
-def notes_on_blows(problem: PostureProblem, initial: Vector, q: Vector) -> list[str]:
+def notes_on_impacts(objective: Objective, initial: Vector, q: Vector) -> list[str]:
     """Where a smaller jump per impulse is no smaller jump per speed, and contacts that lock; one line each."""
-    objective, notes = problem.objective, []
+    notes: list[str] = []
+    if not isinstance(objective, ImpactObjective):
+        return notes
     for single in objective.singles:
         start, end = single.oracle.quantities(initial), single.oracle.quantities(q)
         before, after = start.G, end.G

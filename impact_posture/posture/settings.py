@@ -13,8 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.metric import Metric, MetricKind, ObjectiveKind
 from impact_posture.impact.request import ImpactRequest, ResolvedImpact
+from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.constraint import CenterOfMassOverFeet
-from impact_posture.posture.problem import BaseMode, PostureProblem, Requirements, build_problem
+from impact_posture.posture.problem import BaseMode, PostureProblem, Requirements
 from impact_posture.robot.loader import LoadOptions, from_folder, names_a_path
 from impact_posture.robot.scenario import Payload
 from impact_posture.robot.spec import ContactPose, Root, Vector3, read_toml, validate, with_tuples

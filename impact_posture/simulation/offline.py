@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.distance import distance
 from impact_posture.posture.follow import trade_off
-from impact_posture.posture.problem import Requirements, build_problem
+from impact_posture.posture.problem import Requirements
 from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.programs import nominal_posture

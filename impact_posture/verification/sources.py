@@ -74,7 +74,7 @@ def pinocchio_differences(objective: ImpactObjective, sample: Sample) -> Numbers
 def _oracle(objective: ImpactObjective, sample: Sample) -> ImpactOracle:
     x, y, z = (float(v) for v in sample.normal)
     contact = replace(objective.contact, normal=(x, y, z))
-    return ImpactOracle(objective.robot, contact, objective.metric, objective.supports, objective.compliance)
+    return ImpactOracle(replace(objective.case, contact=contact))
 
 
 def casadi_source(objective: ImpactObjective) -> Source:
