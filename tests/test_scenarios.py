@@ -260,7 +260,7 @@ def problem_of(task: dict[str, object], **more: object) -> PostureProblem:
 @pytest.mark.parametrize("name", TASKS)
 def test_optima_certify(name: str) -> None:
     problem = problem_of(TASKS[name])
-    nominal = solve(replace(problem, objective=few(problem.objective).members[0]), starts=2, jobs=1, compile="never")
+    nominal = solve(replace(problem, objective=problem.impact.by_scenario[0]), starts=2, jobs=1, compile="never")
     solution = solve(problem, starts=2, jobs=1, compile="never", guesses=(nominal.q,))
     assert solution.certificate.holds() and solution.certified_starts == solution.feasible_starts
     assert problem.objective.value(solution.q) <= problem.objective.value(nominal.q) * (1 + 1e-9)
@@ -273,7 +273,7 @@ def test_how_far_the_optimum_moves() -> None:
     both = solve_robustly(problem, starts=3, seed=4, jobs=1, compile="never")
     found, q = both.robustness, both.solution.q
     assert found is not None and both.solution.certificate.holds()
-    members = few(problem.objective).members
+    members = problem.impact.by_scenario
     at_robust = [member.value(q) for member in members]
     assert [s.name for s in found.scenarios] == [s.name for s in problem.impact.scenarios]
     assert [s.at_robust for s in found.scenarios] == at_robust and found.worst_robust == max(at_robust)
