@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import json
 import os
 import sys
@@ -13,6 +14,8 @@ from typing import Any
 
 import typer
 
+from impact_posture.errors import ImpactPostureError, one_line
+from impact_posture.escape import printable
 from impact_posture_cli.checks import UsageError
 
 DEBUG_VARIABLE = "IMPACT_POSTURE_DEBUG"
@@ -54,8 +57,6 @@ def _interrupted(wants_json: bool) -> int:
 
 
 def _explain(error: Exception, wants_json: bool) -> int:
-    from impact_posture.errors import ImpactPostureError
-
     kind = type(error).__name__
     if isinstance(error, ImpactPostureError):
         return _report(error.exit_code, kind, error.what, error.where, error.mend, wants_json=wants_json)
@@ -75,8 +76,10 @@ def _explain(error: Exception, wants_json: bool) -> int:
 def _usage(error: Any, wants_json: bool) -> int:
     """Typer's own message, plain: how to call it, and what was wrong."""
     code = int(getattr(error, "exit_code", 2))
+    shown = io.StringIO()
+    error.show(file=shown)
     with contextlib.suppress(OSError):
-        error.show(file=sys.stderr)
+        sys.stderr.write(printable(shown.getvalue(), keep="\n"))
     if wants_json:
         context = getattr(error, "ctx", None)
         where = context.command_path if context is not None else "command line"
@@ -85,7 +88,7 @@ def _usage(error: Any, wants_json: bool) -> int:
 
 
 def _report(code: int, kind: str, what: str, where: str = "", mend: str = "", *, wants_json: bool) -> int:
-    what, where, mend = (" ".join(part.split()) for part in (what, where, mend))
+    what, where, mend = (one_line(part) for part in (what, where, mend))
     line = f"{where}: {what}" if where else what
     with contextlib.suppress(OSError):
         sys.stderr.write(f"error: {line}; {mend}\n" if mend else f"error: {line}\n")

@@ -7,6 +7,9 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from impact_posture.errors import one_line
+from impact_posture.escape import printable
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -14,6 +17,11 @@ if TYPE_CHECKING:
 def print_json(document: object) -> None:
     """Write one strictly valid JSON document to standard output: NaN and infinity would raise here."""
     sys.stdout.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def complain(line: str) -> None:
+    """Write one line to standard error."""
+    sys.stderr.write(f"{one_line(line)}\n")
 
 
 class Page:
@@ -29,16 +37,16 @@ class Page:
         """A bold line."""
         from rich.text import Text
 
-        line = Text(text, style="bold")
+        line = Text(printable(text), style="bold")
         if detail:
-            line.append(f"  {detail}", style="not bold dim")
+            line.append(f"  {printable(detail)}", style="not bold dim")
         self.console.print(line)
 
     def line(self, text: str, *, style: str = "") -> None:
         """A paragraph, wrapped at words."""
         from rich.text import Text
 
-        self.console.print(Text(text, style=style))
+        self.console.print(Text(printable(text, keep="\n"), style=style))
 
     def gap(self) -> None:
         """An empty line."""
@@ -82,14 +90,14 @@ class Page:
                 overflow="fold",
             )
         for row in rows:
-            table.add_row(*[Text(cell) for cell in row])
+            table.add_row(*[Text(printable(cell, keep="\n")) for cell in row])
         self.console.print(table)
 
     def warnings(self, lines: Iterable[str]) -> None:
         """One line each on standard error, unless quiet."""
         if not self.quiet:
             for line in lines:
-                sys.stderr.write(f"warning: {' '.join(line.split())}\n")
+                complain(f"warning: {line}")
 
 
 def number(value: float | None, unit: str = "", *, missing: str = "undefined") -> str:

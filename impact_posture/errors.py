@@ -9,6 +9,11 @@ import difflib
 from collections.abc import Iterable
 from typing import ClassVar
 
+from impact_posture.escape import printable
+
+# A longer name loses its middle in a message.
+_LONGEST_NAME = 200
+
 
 def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:
     """Return the known names closest to ``name``, best first; the first few known ones if none is close."""
@@ -17,6 +22,11 @@ def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:
     close = [folded[c] for c in difflib.get_close_matches(name.casefold(), folded, n=count, cutoff=0.5)]
     inside = [n for n in names if name.casefold() in n.casefold() and n not in close]
     return (close + inside)[:count] or names[:count]
+
+
+def one_line(text: str) -> str:
+    """Return a message on one line, and nothing in it that steers a terminal."""
+    return printable(" ".join(text.split()))
 
 
 class ImpactPostureError(Exception):
@@ -31,9 +41,7 @@ class ImpactPostureError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __init__(self, what: str, *, where: str = "", mend: str = "") -> None:
-        self.what = " ".join(what.split())
-        self.where = " ".join(where.split())
-        self.mend = " ".join(mend.split())
+        self.what, self.where, self.mend = (one_line(text) for text in (what, where, mend))
         super().__init__(self.line)
 
     @property
@@ -66,8 +74,10 @@ class NameNotFound(InputError):
     def __init__(self, name: str, known: Iterable[str], *, where: str = "", mend: str = "") -> None:
         self.name = name
         self.nearest = nearest(name, known)
-        hint = f"did you mean {', '.join(self.nearest)}?" if self.nearest else "there are none"
-        super().__init__(f"no {self.kind} '{name}'", where=where, mend=f"{hint} {mend}".strip())
+        close = ", ".join(printable(other, longest=_LONGEST_NAME) for other in self.nearest)
+        hint = f"did you mean {close}?" if self.nearest else "there are none"
+        named = printable(name, longest=_LONGEST_NAME)
+        super().__init__(f"no {self.kind} '{named}'", where=where, mend=f"{hint} {mend}".strip())
 
 
 class RobotNotFound(NameNotFound):

@@ -13,6 +13,7 @@ import numpy as np
 
 from impact_posture.codegen.export import Export, export
 from impact_posture.errors import CompilerError, SpecError
+from impact_posture.escape import file_name
 from impact_posture.folder import whole_folder
 from impact_posture.plot import PathData, ResultView, TradeOffData, draw_all
 from impact_posture.posture.path import NullSpacePath, null_space_path
@@ -47,7 +48,7 @@ class Written:
 
 def default_out(prepared: Prepared) -> Path:
     """``./<robot>-<frame>``."""
-    return Path(f"{prepared.impact.robot.name}-{prepared.impact.contact.frame}".replace("/", "_"))
+    return Path(file_name(f"{prepared.impact.robot.name}-{prepared.impact.contact.frame}"))
 
 
 def write_result(

@@ -25,8 +25,8 @@ from impact_posture.codegen.compiler import (
 from impact_posture.codegen.export import Export, export
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.naming import c_identifier
-from impact_posture.codegen.source import plain
 from impact_posture.errors import CompilerError, InputError, MetricError, OutputError, PostureError
+from impact_posture.escape import c_comment
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
@@ -497,4 +497,4 @@ def test_bad_folder_and_posture(pendulum: str, tmp_path: Path) -> None:
 
 
 def test_names_cannot_end_a_comment() -> None:
-    assert plain("a*/ int x; /* \\ ??/ \n ü") == "a_/ int x; /_ _ __/ _ _"
+    assert c_comment("a*/ int x; /* \\ ??/ \n ü") == "a_/ int x; /_ _ __/ _ _"

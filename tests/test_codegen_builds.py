@@ -233,16 +233,40 @@ def test_build_in_the_folder(arm: ImpactObjective, tmp_path: Path, monkeypatch: 
     q = sample_postures(arm.robot, 1, 31)[0]
     H, _ = ImpactGradient.load(tmp_path / "c", robot=arm.robot).objective(q)
     assert pytest.approx(arm.value(q), rel=1e-10) == H
-    monkeypatch.setenv("CC", need("false"))
-    with pytest.raises(CompilerError, match="command: "):
-        write_export([arm], tmp_path / "failed", prefix="arm", build=True)
-    assert (tmp_path / "failed" / "arm.c").is_file()
-    assert not list((tmp_path / "failed").glob("*.so"))
-    monkeypatch.delenv("CC")
+    assert (tmp_path / "c" / "libarm.so.sha256").is_file()
     monkeypatch.setenv("PATH", str(tmp_path))
     without = write_export([arm], tmp_path / "none", prefix="arm", build=True)
     assert without.library is None and "install gcc or clang" in without.verdict
     assert (tmp_path / "none" / "arm.c").is_file()
+
+
+@pytest.mark.parametrize("how", ["compiler fails", "other numbers", "interrupted"])
+def test_a_build_that_fails_leaves_what_was_there(
+    arm: ImpactObjective, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    need_compiler()
+    kept = tmp_path / "kept"
+    write_export([arm], kept, prefix="old")
+    before = {path.name: path.read_bytes() for path in kept.iterdir()}
+    error: type[BaseException] = CompilerError
+    monkeypatch.setenv("CFLAGS", "-O0")
+    if how == "compiler fails":
+        monkeypatch.setenv("CC", need("false"))
+    elif how == "other numbers":
+        monkeypatch.setattr("impact_posture.codegen.compiler._ORACLE_TOLERANCE", -1.0)
+        monkeypatch.setattr("impact_posture.codegen.compiler.self_test_tolerance", lambda *_: -1.0)
+    else:
+        error = KeyboardInterrupt
+
+        def interrupt(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("impact_posture.codegen.build.run_compiler", interrupt)
+    for out in (kept, tmp_path / "none"):
+        with pytest.raises(error):
+            write_export([arm], out, prefix="arm", build=True, force=True)
+    assert {path.name: path.read_bytes() for path in kept.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
 
 
 # ---- the command --------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from pathlib import Path
 
@@ -10,19 +11,28 @@ import numpy as np
 import pytest
 import threadpoolctl
 
-from impact_posture.errors import CompilerError
+from impact_posture import libraries
+from impact_posture.errors import CompilerError, OutputError
 from impact_posture.posture import compiled
 from impact_posture.posture.blas import one_blas_thread
 from impact_posture.posture.nlp import build_nlp
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.settings import make_settings, prepare
+from impact_posture.posture.result import result_document
+from impact_posture.posture.settings import Prepared, make_settings, prepare
+from impact_posture.posture.solve import solve
 from impact_posture.toolchain import run_compilers
+from tests.plot.views import PENDULUM
+from tests.tools import need, need_compiler
 
 
 @pytest.fixture(scope="module")
-def problem() -> PostureProblem:
-    asked = {"robot": "tilthex_arm", "frame": "ee", "normal": (0.0, 0.0, 1.0)}
-    return prepare(make_settings(asked)).problem
+def prepared() -> Prepared:
+    return prepare(make_settings({"robot": "tilthex_arm", "frame": "ee", "normal": (0.0, 0.0, 1.0)}))
+
+
+@pytest.fixture(scope="module")
+def problem(prepared: Prepared) -> PostureProblem:
+    return prepared.problem
 
 
 @pytest.mark.parametrize("optimized", [compiled._OPTIMIZED, 0])
@@ -35,8 +45,8 @@ def test_the_same_answer_from_machine_code(
     interpreted = build_nlp(problem, compile="never").solve(problem.given)
     built = build_nlp(problem, compile="always")
     assert built.compiled
-    (library,) = tmp_path.iterdir()
-    assert library.suffix == ".so"
+    (library,) = tmp_path.glob("*.so")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [library.name, f"{library.name}.sha256"]
     monkeypatch.setattr(compiled, "find_compiler", lambda: None)
     cached = build_nlp(problem, compile="auto")
     assert cached.compiled
@@ -54,6 +64,79 @@ def test_a_broken_library_is_not_used(
     broken.write_text("no library")
     assert not build_nlp(problem, compile="auto").compiled
     assert not broken.exists()
+
+
+@pytest.fixture(scope="module")
+def small() -> PostureProblem:
+    asked = {"robot": PENDULUM, "frame": "link2", "offset": (0.0, 0.1, 0.3), "normal": (0.0, 1.0, 0.0)}
+    return prepare(make_settings(asked | {"contact_pose": "free"})).problem
+
+
+def test_a_damaged_library_is_built_again(
+    small: PostureProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    need_compiler()
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
+    assert build_nlp(small, compile="always").compiled
+    (library,) = tmp_path.glob("*.so")
+    whole = library.stat().st_size
+    # Mapped in this process: another file takes its name.
+    library.write_bytes(library.rename(library.with_suffix(".old")).read_bytes()[: whole // 2])
+    assert build_nlp(small, compile="always").compiled
+    assert library.stat().st_size == whole and libraries.is_cached(library)
+    library.chmod(0o666)
+    with pytest.raises(OutputError, match="can be written by others"):
+        build_nlp(small, compile="always")
+    built = build_nlp(small, compile="auto")
+    assert not built.compiled and "can be written by others" in built.compiler_fault
+
+
+def full_disk(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("how", "words", "error"),
+    [
+        ("compiler", "the C compiler failed", CompilerError),
+        ("disk", "No space left on device", OutputError),
+        ("cache", "cannot be written", OutputError),
+        ("shared", "can be written by others", OutputError),
+    ],
+)
+def test_auto_falls_back_with_one_warning(
+    prepared: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str, words: str, error: type[Exception]
+) -> None:
+    need_compiler()
+    cache = tmp_path / "cache"
+    if how == "compiler":
+        monkeypatch.setenv("CC", need("false"))
+    elif how == "disk":
+        monkeypatch.setattr(libraries, "put_library", full_disk)
+    elif how == "cache":
+        cache.write_text("a file")
+    else:
+        cache.mkdir()
+        cache.chmod(0o777)
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(cache))
+    monkeypatch.setattr(compiled, "_pays", lambda *_: True)
+    monkeypatch.setattr(compiled, "_OPTIMIZED", 0)
+    solution = solve(prepared.problem, starts=1, jobs=1)
+    assert not solution.compiled
+    said = [line for line in result_document(prepared, solution)["warnings"] if "not compiled" in line]  # type: ignore[attr-defined]
+    assert len(said) == 1 and words in said[0]
+    assert not (cache.is_dir() and list(cache.iterdir()))
+    with pytest.raises(error, match=words):
+        build_nlp(prepared.problem, compile="always")
+
+
+def test_no_word_where_compiling_would_not_pay(
+    prepared: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cache").write_text("a file")
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(compiled, "_pays", lambda *_: False)
+    assert build_nlp(prepared.problem, compile="auto").compiler_fault == ""
 
 
 def test_compiling_needs_a_compiler(problem: PostureProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

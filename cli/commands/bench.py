@@ -164,9 +164,11 @@ def _progress(robot: str, *, shown: bool) -> Iterator[Callable[[str], None]]:
     from rich.console import Console
     from rich.text import Text
 
+    from impact_posture.escape import printable
+
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     if not console.is_terminal:
-        yield lambda text: console.print(Text(f"{robot}: {text}"))
+        yield lambda text: console.print(Text(printable(f"{robot}: {text}")))
         return
     with console.status("") as status:
-        yield lambda text: status.update(Text(f"{robot}: {text}"))
+        yield lambda text: status.update(Text(printable(f"{robot}: {text}")))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
@@ -66,7 +65,7 @@ def verify(
         armature=armature, lock=lock,
     )  # fmt: skip
     from impact_posture.verification.verify import verify as verify_objective
-    from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.output import Page, complain, print_json
     from impact_posture_cli.progress import progress_bar
 
     impact = request.resolve()
@@ -90,7 +89,7 @@ def verify(
     if not report.passed:
         failed = [row for row in report.rows if row.verdict == "fail"]
         named = ", ".join(" ".join(filter(None, (row.source, row.quantity))) for row in failed)
-        sys.stderr.write(f"error: {impact.robot.name}: other numbers than Pinocchio's: {named}; please report it\n")
+        complain(f"error: {impact.robot.name}: other numbers than Pinocchio's: {named}; please report it")
         raise typer.Exit(1)
 
 

@@ -12,13 +12,12 @@ import shlex
 import shutil
 import signal
 import subprocess
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from impact_posture.errors import CompilerError
-from impact_posture.posture.compiled import cache_folder
+from impact_posture.errors import CompilerError, OutputError, SpecError
+from impact_posture.libraries import building, cache_folder, is_cached, load_library
 from impact_posture.toolchain import find_compiler
 
 HERE = Path(__file__).parent
@@ -99,14 +98,13 @@ class Workbench:
             Absent: It failed, or took longer than the patience, which is remembered.
         """
         try:
-            folder = cache_folder() / "bench"
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise Absent(f"no cache folder ({error.strerror}); set IMPACT_POSTURE_CACHE") from None
+            folder = cache_folder("bench")
+        except OutputError as error:
+            raise Absent(f"no cache folder: {error.line}") from None
         key = _hash(_version(compiler), shlex.join([*compiler, *flags, *after]), _cpu(flags), *_named(sources))
         library, notes = folder / f"{key}.so", folder / f"{key}.json"
         found = _read(notes)
-        if found is None or not (library.is_file() or found.stopped_after_s >= self.patience_s):
+        if found is None or not (is_cached(library) or found.stopped_after_s >= self.patience_s):
             self.say(f"compiling {what} (kept for the next run)")
             found = _compile(sources, [*compiler, *flags], after, library, self.patience_s)
             beside = notes.with_suffix(f".{os.getpid()}.part")
@@ -115,9 +113,9 @@ class Workbench:
         if found.stopped_after_s:
             raise Absent(f"the compiler was stopped after {found.stopped_after_s:.0f} s; see --patience")
         try:
-            loaded = ctypes.CDLL(str(library))
-        except OSError as error:
-            raise Absent(f"what was built cannot be loaded ({error})") from None
+            loaded = load_library(library)
+        except SpecError as error:
+            raise Absent(f"what was built: {error.what}") from None
         return Built(loaded, shlex.join([*compiler, *_shown(flags)]), found.compile_s)
 
 
@@ -182,13 +180,12 @@ def _compile(
 ) -> _Outcome:
     names = [n for n in sources if not n.endswith((".h", ".hpp"))]
     limit = max(1, int(patience_s))
-    with tempfile.TemporaryDirectory(dir=library.parent) as name:
-        folder = Path(name)
+    with building(library) as folder:
         for file, text in sources.items():
             (folder / file).write_text(text)
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         done = subprocess.run(
-            [*command, "-fPIC", "-shared", *names, "-o", "built.so", *after],
+            [*command, "-fPIC", "-shared", *names, "-o", library.name, *after],
             cwd=folder,
             capture_output=True,
             text=True,
@@ -205,7 +202,6 @@ def _compile(
         if done.returncode:
             lines = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines() or [""]
             raise Absent(f"the compiler failed: {lines[0][:200]}")
-        os.replace(folder / "built.so", library)
     return _Outcome(took)
 
 

@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from impact_posture.errors import CompilerError, OutputError
+from impact_posture.libraries import put_library, seal_path
 from impact_posture.toolchain import find_compiler, run_compiler
 
 # Strict C forbids fused multiply-adds by default.
@@ -21,7 +22,7 @@ def library_path(folder: Path, prefix: str) -> Path:
 
 
 def build_library(folder: Path, prefix: str, target: Path | None = None, extra_flags: tuple[str, ...] = ()) -> Path:
-    """Compile ``<prefix>.c`` in ``folder`` into a shared library; it appears whole or not at all.
+    """Compile ``<prefix>.c`` in ``folder`` into a shared library; it appears whole or not at all, with its seal.
 
     Args:
         folder: The export.
@@ -43,11 +44,12 @@ def build_library(folder: Path, prefix: str, target: Path | None = None, extra_f
     command = [*compiler, *FLAGS, *own, *extra_flags, f"{prefix}.c", "-o", str(beside.absolute()), "-lm"]
     try:
         run_compiler(command, folder)
-        os.replace(beside, target)
+        put_library(beside, target)
     except OSError as error:
         mend = "check the disk and permissions"
         raise OutputError(f"cannot be written ({error.strerror})", where=str(target), mend=mend) from None
     finally:
-        with suppress(OSError):
-            beside.unlink()
+        for left in (beside, seal_path(beside)):
+            with suppress(OSError):
+                left.unlink()
     return target

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
-import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.codegen.build import build_library
+from impact_posture.codegen.build import build_library, library_path
 from impact_posture.codegen.emitter import DOUBLE, Real
 from impact_posture.codegen.functions import ellipsoid_fun, jump_fun, objective_fun
 from impact_posture.codegen.manifest import sample_postures
@@ -25,6 +23,7 @@ from impact_posture.errors import CompilerError
 from impact_posture.impact.contact import heavy_feet_rounding
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.libraries import load_library
 
 Vector = NDArray[np.float64]
 
@@ -55,7 +54,7 @@ class CompiledExport:
         names: Sequence[str] = FUNCTIONS,
     ) -> None:
         self._nq, self._nv, self._real = nq, nv, real.dtype
-        self.library = ctypes.CDLL(str(library)) if isinstance(library, Path) else library
+        self.library = load_library(library) if isinstance(library, Path) else library
         self.real = real
         self._functions = {name: getattr(self.library, f"{stem}_{name}") for name in names}
 
@@ -123,7 +122,7 @@ def compiled(
         CompilerError: No compiler, or it failed: its first error line and the command.
     """
     with tempfile.TemporaryDirectory(prefix="impact-posture-") as folder:
-        library = build_library(export_dir, prefix, Path(folder) / f"lib{prefix}.so", extra_flags)
+        library = build_library(export_dir, prefix, library_path(Path(folder), prefix), extra_flags)
         yield CompiledExport(library, prefix, nq, nv, real)
 
 
@@ -134,7 +133,7 @@ def compile_and_check(
     samples: int = 20,
     *,
     real: Real = DOUBLE,
-    target: Path | None = None,
+    keep: bool = False,
 ) -> float:
     """Build an export and compare it at random postures and normals; return the largest relative difference.
 
@@ -146,7 +145,7 @@ def compile_and_check(
         objective: What it is an export of: one, or one for each frame.
         samples: Postures.
         real: The C type that it computes in.
-        target: Where the library that passed stays; nowhere by default.
+        keep: Leave the library in the export's folder, also one that did not pass.
 
     Raises:
         CompilerError: No compiler, it failed, or what it made computes other numbers.
@@ -154,8 +153,8 @@ def compile_and_check(
     objectives = (objective,) if isinstance(objective, ImpactObjective) else tuple(objective)
     worst = 0.0
     with tempfile.TemporaryDirectory(prefix="impact-posture-") as folder:
-        library = build_library(export_dir, prefix, Path(folder) / f"lib{prefix}.so")
-        loaded = ctypes.CDLL(str(library))
+        target = library_path(export_dir if keep else Path(folder), prefix)
+        loaded = load_library(build_library(export_dir, prefix, target))
         for variant in variants(objectives, prefix):
             one = variant.objective
             if variant.joint:
@@ -168,8 +167,6 @@ def compile_and_check(
                 (oracle_difference(functions, one, samples), _oracle_tolerance(one, real), "Pinocchio's"),
             ):
                 worst = max(worst, _checked(found, tolerance, other, prefix))
-        if target is not None:
-            _install(library, target)
     return worst
 
 
@@ -186,14 +183,6 @@ def _checked(difference: float, tolerance: float, other: str, prefix: str) -> fl
             mend="try another compiler (set CC) without -ffast-math, or double instead of float",
         )
     return difference
-
-
-def _install(library: Path, target: Path) -> None:
-    """Put a library where it stays, whole or not at all."""
-    beside = target.with_name(f".{target.name}.part")
-    shutil.copyfile(library, beside)
-    beside.chmod(0o755)
-    os.replace(beside, target)
 
 
 def casadi_difference(library: CompiledExport, objective: ImpactObjective, samples: int) -> float:

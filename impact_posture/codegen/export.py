@@ -91,7 +91,7 @@ def export(
     code = build_code(exported, prefix, real, portable=portable)
     manifest = build_manifest(objectives, prefix, posture, real, code.stack_bytes)
     texts = build_texts(exported, prefix, manifest, code, real)
-    texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     _write(texts, out, force)
     files = tuple(out / name for name in texts)
     if not check or find_compiler() is None:

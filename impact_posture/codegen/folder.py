@@ -17,6 +17,7 @@ from impact_posture.codegen.emitter import DOUBLE, FLOAT
 from impact_posture.codegen.export import Export, default_prefix, export
 from impact_posture.codegen.naming import check_prefix
 from impact_posture.codegen.reader import is_manifest
+from impact_posture.errors import CompilerError
 from impact_posture.folder import whole_folder
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.toolchain import find_compiler
@@ -102,7 +103,7 @@ def write_export(
 
     Raises:
         OutputError: The folder exists without ``force``, is no export, or cannot be written.
-        CompilerError: The compiler failed, or what it made computes other numbers; the C is there, no library.
+        CompilerError: The compiler failed, or what it made computes other numbers; nothing is written.
         ImpactPostureError: As :func:`~impact_posture.codegen.export.export`.
     """
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
@@ -112,9 +113,12 @@ def write_export(
     marks = tuple(glob.escape(path.name) for path in sorted(out.glob("*.json")) if is_manifest(path))
     with whole_folder(out, force=force, marks=marks) as folder:
         made = export(objectives, folder, prefix=prefix, posture=posture, real=real, portable=portable, check=False)
+        if build and find_compiler() is not None:
+            try:
+                agreement = compile_and_check(folder, prefix, objectives, real=real, keep=True)
+            except CompilerError as error:
+                mend = f"{error.mend}; without --compile the C code is written all the same"
+                raise CompilerError(error.what, where=error.where, mend=mend) from None
+            made = replace(made, compiled=True, agreement=agreement)
     made = replace(made, files=tuple(out / path.name for path in made.files))
-    if not build or find_compiler() is None:
-        return WrittenExport(out, made, None, build)
-    target = library_path(out, prefix)
-    agreement = compile_and_check(out, prefix, objectives, real=real, target=target)
-    return WrittenExport(out, replace(made, compiled=True, agreement=agreement), target, build)
+    return WrittenExport(out, made, library_path(out, prefix) if made.compiled else None, build)

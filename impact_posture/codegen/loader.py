@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.codegen.build import build_library, library_path
-from impact_posture.codegen.reader import check_robot, frame_block, read_manifest
+from impact_posture.codegen.reader import check_library, check_robot, frame_block, read_manifest
 from impact_posture.errors import InputError, ManifestMismatch, MetricError, PostureError, SpecError
+from impact_posture.libraries import load_library
 
 if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot
@@ -80,10 +81,11 @@ class ImpactGradient:
     def load(
         cls, path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
     ) -> ImpactGradient:
-        """Load an export.
+        """Load an export.  **This runs its code**: load an export of others only if you would run their programs.
 
         ``lib<prefix>.so`` beside the manifest is used; where there is none **it is built there** with the user's
-        compiler (``$CC``, cc, gcc or clang).  The library must reproduce the manifest's reference values.
+        compiler (``$CC``, cc, gcc or clang).  A library that was built by this package must be that very file (its
+        SHA-256 lies beside it); any library must be whole, name this very manifest, and reproduce its numbers.
 
         Args:
             path: The export's folder, or its ``<prefix>.json``.
@@ -101,16 +103,17 @@ class ImpactGradient:
         manifest, folder = read_manifest(Path(path))
         if robot is not None:
             check_robot(manifest, robot, where=str(path))
+        frame_block(manifest, frame)
         prefix = str(manifest["prefix"])
         target = library_path(folder, prefix)
         if not target.is_file():
             build_library(folder, prefix)
+        library = load_library(target)
+        check_library(library, manifest, where=str(target))
         try:
-            found = cls(ctypes.CDLL(str(target.absolute())), manifest, frame, free=free)
-        except (OSError, AttributeError) as error:
-            raise SpecError(
-                f"cannot be loaded ({error})", where=str(target), mend="delete it: it is built again"
-            ) from None
+            found = cls(library, manifest, frame, free=free)
+        except AttributeError as error:
+            raise SpecError(f"lacks a function ({error})", where=str(target), mend="run codegen again") from None
         found._self_test(str(target))
         return found
 

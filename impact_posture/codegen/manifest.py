@@ -118,7 +118,9 @@ def build_manifest(
             frames[-1]["free"] = {key: block[key] for key in ("symbols", "self_test")}
         else:
             frames.append(block | {"free": None})
-    symbols = frames[0]["symbols"] | ({} if posture is None else {"posture": f"{prefix}_posture"})
+    symbols = frames[0]["symbols"] | {"manifest": f"{prefix}_manifest"}
+    if posture is not None:
+        symbols |= {"posture": f"{prefix}_posture"}
     if joint is not None:
         symbols |= joint["symbols"]
     return {

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 
 from impact_posture.errors import InputError
+from impact_posture.escape import identifier
 
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
@@ -15,7 +16,7 @@ FUNCTIONS = ("eval", "objective", "value", "jump", "ellipsoid", "eval_batch")
 
 def c_identifier(robot: str, frame: str) -> str:
     """Robot and frame as one C identifier: what is no letter, digit or underscore becomes an underscore."""
-    text = _plain(f"{robot}_{frame}")
+    text = identifier(f"{robot}_{frame}")
     return text if _IDENTIFIER.fullmatch(text) else f"robot_{text}".rstrip("_")
 
 
@@ -46,14 +47,10 @@ def stems(prefix: str, frames: Sequence[str]) -> tuple[str, ...]:
         return (prefix,)
     found: dict[str, str] = {}
     for frame in frames:
-        stem = f"{prefix}_{_plain(frame)}"
+        stem = f"{prefix}_{identifier(frame)}"
         if stem in found:
             other = found[stem]
             what = f"'{frame}' is given twice" if other == frame else f"'{other}' and '{frame}' are one name in C"
             raise InputError(what, where="--frame", mend="give each frame once, or export one by one")
         found[stem] = frame
     return tuple(found)
-
-
-def _plain(text: str) -> str:
-    return re.sub(r"_{2,}", "_", re.sub(r"[^A-Za-z0-9]", "_", text)).strip("_")

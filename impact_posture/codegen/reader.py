@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from impact_posture.errors import FrameNotFound, ManifestMismatch, SpecError
 
@@ -14,7 +18,49 @@ if TYPE_CHECKING:
 
 SCHEMA = "impact-posture/codegen/1"
 
-_NEEDED = {"prefix", "real", "frames", "nq", "nv", "joint_names", "convention", "model_sha256", "armature"}
+Numbers = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
+
+
+class _Loose(BaseModel):
+    """Keys that nobody here reads may be there or not."""
+
+    model_config = ConfigDict(strict=True)
+
+
+class _SelfTest(_Loose):
+    q: Numbers
+    n: Annotated[Numbers, Field(min_length=3, max_length=3)]
+    H: float
+    grad: Numbers
+
+
+class _Variant(_Loose):
+    symbols: dict[str, str]
+    self_test: _SelfTest
+
+
+class _Frame(_Variant):
+    frame: str
+    free: _Variant | None = None
+
+
+class _Several(_Loose):
+    symbols: dict[str, str]
+
+
+class _Manifest(_Loose):
+    """What a loader relies on; that the rest is what codegen wrote says the library (:func:`check_library`)."""
+
+    prefix: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+    real: Literal["double", "float"]
+    nq: Annotated[int, Field(gt=0)]
+    nv: Annotated[int, Field(gt=0)]
+    joint_names: tuple[str, ...]
+    convention: str
+    model_sha256: str
+    armature: Numbers
+    frames: Annotated[tuple[_Frame, ...], Field(min_length=1)]
+    several: _Several | None = None
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
@@ -33,24 +79,77 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
         raise SpecError(what, where=str(path), mend=mend)
     try:
         manifest = json.loads(files[0].read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         words = getattr(error, "strerror", None) or str(error)
         raise SpecError(f"cannot be read ({words})", where=str(files[0]), mend="run codegen again") from None
-    schema = manifest.get("schema") if isinstance(manifest, dict) else None
-    if schema != SCHEMA or not _NEEDED <= manifest.keys():
-        raise SpecError(
-            "is no manifest of an export" if schema != SCHEMA else "lacks keys of a manifest",
-            where=str(files[0]),
-            mend="name the folder that codegen wrote, or run codegen again",
-        )
+    fault = "is no manifest of an export"
+    if isinstance(manifest, dict) and manifest.get("schema") == SCHEMA:
+        fault = _fault(manifest)
+    if fault:
+        mend = "name the folder that codegen wrote, or run codegen again"
+        raise SpecError(fault, where=str(files[0]), mend=mend)
     return manifest, files[0].parent
+
+
+def _fault(manifest: dict[str, Any]) -> str:
+    """The first thing that is wrong with a manifest; empty for none."""
+    try:
+        # As JSON: a list is a tuple there, and nothing else is taken for anything.
+        found = _Manifest.model_validate_json(json.dumps(manifest, allow_nan=False))
+    except ValidationError as error:
+        first = error.errors()[0]
+        return f"is no whole manifest: {'.'.join(map(str, first['loc']))}: {first['msg']}"
+    except (ValueError, RecursionError) as error:
+        return f"is no whole manifest: {error}"
+    sizes = [("armature", len(found.armature), found.nv)]
+    for block in found.frames:
+        for part in filter(None, (block, block.free)):
+            sizes.append((f"self_test.q at {block.frame}", len(part.self_test.q), found.nq))
+            sizes.append((f"self_test.grad at {block.frame}", len(part.self_test.grad), found.nv))
+    wrong = next(((name, size, expected) for name, size, expected in sizes if size != expected), None)
+    return "" if wrong is None else f"is no whole manifest: {wrong[0]} has {wrong[1]} numbers instead of {wrong[2]}"
+
+
+def identity(manifest: Mapping[str, Any]) -> str:
+    """What a library says of its manifest: sizes, number type and the hash of all of it, ``key=value`` each."""
+    content = json.dumps(manifest, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    digest = hashlib.sha256(content.encode()).hexdigest()
+    return f"nq={manifest['nq']} nv={manifest['nv']} real={manifest['real']} sha256={digest}"
+
+
+def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: str) -> None:
+    """Refuse a library that was made with another manifest, before any of its functions is called.
+
+    Raises:
+        SpecError: It does not say which manifest is its own.
+        ManifestMismatch: Sizes, number type or anything else of the manifest.
+    """
+    symbol = f"{manifest['prefix']}_manifest"
+    try:
+        address = ctypes.addressof(ctypes.c_char.in_dll(library, symbol))
+    except ValueError:
+        raise SpecError(
+            f"has no symbol {symbol}", where=where, mend="delete it: it is built again; or run codegen again"
+        ) from None
+    inside = ctypes.string_at(address).decode("ascii", "replace")
+    pairs = [dict(part.partition("=")[::2] for part in text.split()) for text in (identity(manifest), inside)]
+    for key, given in pairs[0].items():
+        if pairs[1].get(key) != given:
+            name = "the manifest's hash" if key == "sha256" else key
+            raise ManifestMismatch(
+                name,
+                given,
+                pairs[1].get(key),
+                where=where,
+                mend="delete the library: it is built again; or run codegen",
+            )
 
 
 def is_manifest(path: Path) -> bool:
     """Whether a file is the manifest of an export."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
     return isinstance(document, dict) and document.get("schema") == SCHEMA
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from impact_posture import __version__
@@ -12,15 +11,18 @@ from impact_posture.codegen.code import Code
 from impact_posture.codegen.compiler import self_test_tolerance
 from impact_posture.codegen.emitter import SHORT_NAMES, Real, c_double, c_vector
 from impact_posture.codegen.manifest import unit_slices
+from impact_posture.codegen.reader import identity
 from impact_posture.codegen.variants import Variant
+from impact_posture.escape import c_comment, markdown
 from impact_posture.impact.objective import ImpactObjective
 
-_PLAIN = str.maketrans({"·": " ", "²": "^2", "×": "x", "λ": "l", "ε": "eps", "⁻": "^-", "¹": "1"})
+# C names among the facts: they stand as they are everywhere.
+_NAMES = {"prefix", "upper", "stem", "real"}
 
 
-def plain(text: str) -> str:
-    """Text that is safe within a C comment, whatever a joint or frame is called."""
-    return re.sub(r"[^A-Za-z0-9 _.,:;+()\[\]=<>^'/|@#%&!-]", "_", text.translate(_PLAIN))
+def _escaped(facts: dict[str, str], escape: Callable[[str], str]) -> dict[str, str]:
+    """The same facts for another language."""
+    return {key: value if key in _NAMES else escape(value) for key, value in facts.items()}
 
 
 def wrapped(words: list[str], indent: str, width: int = 112) -> str:
@@ -49,8 +51,8 @@ def build_texts(
     ]
     facts = each[0] | facts
     together = _joint_texts(joint, facts, manifest, real)
-    comment = {key: plain(value) for key, value in facts.items()}
-    comments = [{key: plain(value) for key, value in block.items()} for block in each]
+    comment, prose = _escaped(facts, c_comment), _escaped(facts, markdown)
+    comments = [_escaped(block, c_comment) for block in each]
     posture = manifest["posture"]
     declaration = "" if posture is None else templates.POSTURE_DECLARATION.substitute(comment)
     definition = (
@@ -60,18 +62,18 @@ def build_texts(
     )
     row = "" if posture is None else f"| `{prefix}_posture` | the impact-robust posture that was found |\n"
     order = {
-        "q_order": wrapped([plain(v) for v in manifest["q_names"]], " *      "),
-        "v_order": wrapped([plain(v) for v in manifest["v_names"]], " *      "),
+        "q_order": wrapped([c_comment(v) for v in manifest["q_names"]], " *      "),
+        "v_order": wrapped([c_comment(v) for v in manifest["v_names"]], " *      "),
         "convention": comment["convention"].replace("; ", ";\n * "),
         "contacts": "\n".join(templates.CONTACT_LINE.substitute(block) for block in comments if not block["free"]),
         "declarations": "".join(templates.DECLARATIONS.substitute(block) for block in comments) + together["header"],
     }
     tables = {
-        key: "\n".join(f"| {k} | {name} |" for k, name in enumerate(manifest[names]))
+        key: "\n".join(f"| {k} | {markdown(name)} |" for k, name in enumerate(manifest[names]))
         for key, names in (("q_table", "q_names"), ("v_table", "v_names"))
     }
     blocks = [b for frame in manifest["frames"] for b in (frame, frame["free"]) if b is not None]
-    checks = [block | _references(m["self_test"], real) for block, m in zip(each, blocks, strict=True)]
+    checks = [block | _references(m["self_test"], real) for block, m in zip(comments, blocks, strict=True)]
     return {
         f"{prefix}.h": templates.HEADER.substitute(comment | order, posture=declaration),
         f"{prefix}.c": templates.SOURCE.substitute(
@@ -81,21 +83,24 @@ def build_texts(
                 "unit_checks": _unit_checks(objectives[0], real),
                 "vectors": code.vectors,
                 "functions": code.functions,
+                "identity": identity(manifest),
                 "undefined": "\n".join(f"#undef {name}" for name in SHORT_NAMES),
             }
         ),
         "example.c": project.EXAMPLE.substitute(
-            facts,
+            comment,
             checks="".join(project.EXAMPLE_CHECK.substitute(block) for block in checks) + together["check"],
             calls="".join(f"  worst = fmax(worst, check_{block['stem']}());\n" for block in each) + together["call"],
         ),
         "example.cpp": _eigen(objectives[0], checks[0], manifest["self_test"], real),
-        "Makefile": project.MAKEFILE.substitute(facts),
-        "CMakeLists.txt": project.CMAKE.substitute(facts),
+        "Makefile": project.MAKEFILE.substitute(comment),
+        "CMakeLists.txt": project.CMAKE.substitute(comment),
         "README.md": project.README.substitute(
-            facts | tables,
+            prose | tables,
             posture=row,
-            rows="".join(project.README_ROWS.substitute(block) for block in each) + together["row"],
+            c_normal_axes=comment["normal_axes"],
+            rows="".join(project.README_ROWS.substitute(_escaped(block, markdown)) for block in each)
+            + together["row"],
         ),
     }
 
@@ -111,13 +116,13 @@ def _joint_texts(
     contacts = [
         f"{c.frame} ({', '.join(f'{v:.9g}' for v in c.normal)}) {c.impulse:g} N s" for c in objective.contacts
     ]
-    names = [plain(f"({scenario.name})") for scenario in objective.scenarios]
+    names = [c_comment(f"({scenario.name})") for scenario in objective.scenarios]
     models = wrapped(["The worst of the models", *names], "") if names else ""
-    own = facts | {
+    own = _escaped(facts, c_comment) | {
         "stem": joint.stem,
         "box": box,
-        "several": wrapped([plain(text) for text in contacts], " * "),
-        "several_line": ", ".join(contacts),
+        "several": wrapped([c_comment(text) for text in contacts], " * "),
+        "several_line": markdown(", ".join(contacts)),
         "models": "".join(f"\n * {line}" for line in models.splitlines()),
         "objective_value": c_double(test["objective"]).strip("()"),
         "objective_grad": c_vector(test["objective_grad"]),
@@ -142,7 +147,7 @@ def _facts(
     weights = {"euclidean": "W = I", "kinetic": "W = M", "weighted": f"W diagonal, {metric.source or 'given'}"}
     return {
         "title": f"Impact-robustness metric of {robot.name} at {', '.join(frames)}",
-        "frames_text": ("frame " if len(frames) == 1 else "frames ") + ", ".join(f"`{f}`" for f in frames),
+        "frames_text": ("frame " if len(frames) == 1 else "frames ") + ", ".join(frames),
         "version": __version__,
         "prefix": prefix,
         "upper": prefix.upper(),

@@ -43,6 +43,9 @@ extern "C" {
 #endif
 
 typedef $real ${prefix}_real;
+
+/* Which $prefix.json this was made with: sizes, number type, and the SHA-256 of what it holds. */
+extern const char ${prefix}_manifest[];
 $declarations$posture
 #ifdef __cplusplus
 }
@@ -97,6 +100,8 @@ SOURCE = Template("""\
 
 #include <math.h>
 #include <string.h>
+
+const char ${prefix}_manifest[] = "$identity";
 
 $vectors$posture
 static int ${prefix}_finite(const $real *x, int count)

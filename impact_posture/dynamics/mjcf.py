@@ -19,6 +19,7 @@ from impact_posture.dynamics.chart import Chart, JointSlot
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.dynamics.mjcf_text import numbers, pose
 from impact_posture.errors import InputError, UnsupportedJoint
+from impact_posture.escape import xml_name
 
 Vector = NDArray[np.float64]
 
@@ -114,7 +115,7 @@ def write_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
     order = _depth_first(model)
     slots = {slot.index: slot for slot in Chart(model).slots}
     free = frozenset(i for i in order if _is_free(model, slots[i]))
-    root = ET.Element("mujoco", model=name)
+    root = ET.Element("mujoco", model=xml_name(name))
     ET.SubElement(root, "compiler", _COMPILER)
     ET.SubElement(root, "option", gravity=numbers(model.gravity.linear))
     elements = {0: ET.SubElement(root, "worldbody")}
@@ -166,6 +167,7 @@ def _link_name(model: pin.Model, joint: int) -> str:
 
 
 def _unique(name: str, taken: set[str]) -> str:
+    name = xml_name(name)
     found, count = name, 1
     while found in taken:
         count += 1
@@ -249,11 +251,13 @@ def _add_inertia(body: ET.Element, inertia: pin.Inertia) -> Vector | None:
 def _add_sites(elements: dict[int, ET.Element], model: pin.Model) -> dict[int, str]:
     links_first = sorted(range(model.nframes), key=lambda k: (model.frames[k].type != pin.FrameType.BODY, k))
     sites: dict[int, str] = {}
+    there, taken = {"universe"}, set[str]()
     for k in links_first:
         frame = model.frames[k]
-        if frame.name == "universe" or frame.name in sites.values():
+        if frame.name in there:
             continue
-        sites[k] = str(frame.name)
+        there.add(str(frame.name))
+        sites[k] = _unique(str(frame.name), taken)
         element = elements[int(frame.parentJoint)]
         ET.SubElement(element, "site", {"name": sites[k], **pose(frame.placement)})
     return sites

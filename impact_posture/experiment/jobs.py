@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from impact_posture.errors import InputError
+from impact_posture.escape import file_name
 from impact_posture.posture.result import versions
 from impact_posture.simulation.controllers import Mode, Workshop
 from impact_posture.simulation.metrics import Metrics, measure
@@ -50,8 +51,7 @@ class Job:
     @property
     def name(self) -> str:
         """For files."""
-        scenario = self.scenario.replace("/", "_")
-        return f"{scenario}-{self.label.replace(':', '-')}-{self.seed}"
+        return f"{file_name(self.scenario)}-{file_name(self.label.replace(':', '-'))}-{self.seed}"
 
 
 def parse_controller(text: str) -> tuple[str, Mode, bool]:

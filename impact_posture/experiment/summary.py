@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from impact_posture.escape import markdown
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction, targets_of
 from impact_posture.experiment.statistics import Interval, Row
@@ -39,7 +40,7 @@ def table_one(found: Reproduction) -> str:
             _q(nominal), _q(robust), reduction_text(robust), "–" if best is None else best.controller,
             reduction_text(best),
         ]  # fmt: skip
-        lines.append("| " + " | ".join([scenario, *printed, *ours]) + " |")
+        lines.append("| " + " | ".join([markdown(scenario), *printed, *ours]) + " |")
     return "\n".join(lines)
 
 
@@ -52,7 +53,7 @@ def scenario_table(rows: Sequence[Row]) -> str:
     ]
     for row in rows:
         if not row.metrics:
-            lines.append(f"| {row.controller} | failed: {'; '.join(row.failed)} |" + " |" * 9)
+            lines.append(f"| {row.controller} | failed: {markdown('; '.join(row.failed))} |" + " |" * 9)
             continue
         cells = [
             row.controller,
@@ -87,7 +88,7 @@ def summary(found: Reproduction) -> str:
         "every controller; contacts are summed, pushes are the mean of both signs.",
     ]
     for scenario in found.scenarios:
-        parts += [f"## {scenario}", scenario_table(found.of(scenario)), "\n".join(remarks(found, scenario))]
+        parts += [f"## {markdown(scenario)}", scenario_table(found.of(scenario)), "\n".join(remarks(found, scenario))]
     return "\n\n".join(parts) + "\n"
 
 
@@ -102,12 +103,12 @@ def advice(found: Reproduction, beside: Reproduction | None = None) -> list[str]
     for scenario in found.scenarios:
         best, robust = found.best(scenario), next((r for r in found.of(scenario) if r.controller == "robust"), None)
         if best is None or best.reduction is None:
-            lines.append(f"**{scenario}**: nothing was better than nominal.")
+            lines.append(f"**{markdown(scenario)}**: nothing was better than nominal.")
             continue
         targets = targets_of(best)
         met = targets is not None and targets.met
         line = (
-            f"**{scenario}**: `{best.controller}` ({MEANING[best.controller.partition(':')[0]]}) moves "
+            f"**{markdown(scenario)}**: `{best.controller}` ({MEANING[best.controller.partition(':')[0]]}) moves "
             f"{reduction_text(best)} less than nominal"
         )
         line += ", every target met." if met or targets is None else f", but with {_misses(targets.missed)}."
@@ -166,9 +167,9 @@ def remarks(found: Reproduction, scenario: str) -> list[str]:
         if not row.rested:
             lines.append(f"`{row.controller}` does not come to rest: its own motion is in what is measured.")
         if row.stops:
-            lines.append(f"`{row.controller}` reaches the stops of {', '.join(row.stops)}.")
+            lines.append(f"`{row.controller}` reaches the stops of {markdown(', '.join(row.stops))}.")
         if row.failed:
-            lines.append(f"`{row.controller}`: {'; '.join(row.failed)}.")
+            lines.append(f"`{row.controller}`: {markdown('; '.join(row.failed))}.")
     return lines
 
 

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from impact_posture.errors import InputError
+from impact_posture.escape import plot_label
 from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.style import (
     AFTER_BAR,
@@ -108,11 +109,11 @@ def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
         axes.annotate(_words(row), (1.0, place), (5, 0), **look)
     axes.set_xlim(0.0, end)
     axes.set_ylim(room - 0.4, -0.6)
-    axes.set_yticks(range(len(group)), [row.controller for row in group])
+    axes.set_yticks(range(len(group)), [plot_label(row.controller) for row in group])
     axes.tick_params(axis="y", length=0)
     axes.locator_params(axis="x", nbins=5)
     axes.grid(True, axis="x")
-    axes.set_title(name)
+    axes.set_title(plot_label(name))
     axes.set_xlabel("∫‖ν‖dt  [m, rad]")
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from impact_posture.escape import plot_label
 from impact_posture.plot.run_axes import (
     beside,
     common_handles,
@@ -68,7 +69,9 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
     hit = all(view.impacts for view in views)
     notes = HINT
     if hit and not views[0].pushed:
-        notes += f" Windows above: those of {views[0].name}. Below, time counts from each one's own touch."
+        notes += (
+            f" Windows above: those of {plot_label(views[0].name)}. Below, time counts from each one's own touch."
+        )
     spans = [_since_blow(view) for view in views]
     span = Clip(
         min(one.begin - one.origin for one in spans), max(one.end - one.origin for one in spans), label=spans[0].label
@@ -79,7 +82,7 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
         # What is shaded is the first one's, on the axis of all.
         shade(panels[0], views[0], spans[0])
         for view, own, look in zip(views, spans, cycle(RUNS), strict=False):
-            curve(panels[0], view, view.objective, own, label=view.name, **look)
+            curve(panels[0], view, view.objective, own, label=plot_label(view.name), **look)
         panels[0].set_xlim(span.begin, span.end)
         panels[0].grid(True, axis="y")
         scale_metric(panels[0], [view.objective for view in views])
@@ -135,7 +138,7 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
                 continue
             draw_panel(axes, panel, which, views[which], blows(views[which]))
             if row % len(rows) == 0:
-                axes.set_title(views[which].name, fontweight="bold")
+                axes.set_title(plot_label(views[which].name), fontweight="bold")
             if row % len(rows) == len(rows) - 1:
                 axes.set_xlabel(blows(views[which]).label)
             if column == 0:

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from impact_posture.escape import plot_label
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, BLUE, INK, VERMILLION, framed, style
@@ -46,7 +47,7 @@ def jump_figure(view: ResultView) -> Figure:
             for axes, (_, per, jumps, points, _) in zip(row, columns, strict=True):
                 _bars(axes, [jump[indices] for jump in jumps], [p if p is None else p[indices] for p in points])
                 axes.set_xlabel(f"{unit} {per}".strip(), labelpad=1)
-            row[0].set_yticks(range(len(names)), names)
+            row[0].set_yticks(range(len(names)), [plot_label(name) for name in names])
             row[0].set_ylim(len(names) - 0.4, -0.6)
             row[0].set_ylabel(name)
         for axes, (title, _, _, _, norm) in zip(panels[0], columns, strict=True):

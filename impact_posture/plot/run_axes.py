@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
 
+from impact_posture.escape import plot_label
 from impact_posture.plot.path import log_axis, spreads
 from impact_posture.plot.run_panels import LINES, Clip, Panel, first_blow, whole
 from impact_posture.plot.run_view import RunView
@@ -42,7 +43,7 @@ def draw_panel(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) -
         _band(axes, view, panel.ranges[which], clip)
     for k, name in enumerate(panel.names):
         look = LINES[k % len(LINES)]
-        curve(axes, view, panel.values[which][:, k], clip, label=name, **look)
+        curve(axes, view, panel.values[which][:, k], clip, label=plot_label(name), **look)
         if panel.stopped is not None and panel.stopped[which][:, k].any():
             at_stop = np.where(panel.stopped[which][:, k], panel.values[which][:, k], np.nan)
             axes.plot(clip.x(view.t), at_stop, **STOP)

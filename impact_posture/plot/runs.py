@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from impact_posture.escape import plot_label
 from impact_posture.plot.run_axes import (
     beside,
     common_handles,
@@ -125,7 +126,7 @@ def joints_figure(views: Sequence[RunView]) -> Figure:
                 draw_panel(axes, panel, which, views[which], clip)
             axes_row[0].set_ylabel(panel.label)
             if len(views) > 1:
-                axes_row[0].set_title(views[which].name, loc="left", fontweight="bold")
+                axes_row[0].set_title(plot_label(views[which].name), loc="left", fontweight="bold")
             beside(axes_row[-1], axes_row[0])
         name_time(panels, clips[-1][:columns])
         finish(body, list(panels[:, 0]), common_handles(views, rows))

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from impact_posture.escape import plot_label
 from impact_posture.plot.robot import depth_of, draw_sticks, side_plane
 from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.run_view import RunView, check_same, run_header
@@ -87,7 +88,7 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
                 axes.locator_params(nbins=5)
                 first = f"{word}\n" * (view is views[0])
                 axes.set_title(f"{first}t = {max(time, 0.0):.2f} s", fontsize=8)
-            axes_row[0].set_ylabel(f"{view.name}\n{plane.up} [m]")
+            axes_row[0].set_ylabel(f"{plot_label(view.name)}\n{plane.up} [m]")
         for axes in panels[-1]:
             axes.set_xlabel(f"{plane.right} [m]")
         # The lowest panels say what the eye looks along.

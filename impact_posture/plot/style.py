@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
 from impact_posture.errors import InputError, OutputError
+from impact_posture.escape import printable
 from impact_posture.plot.view import SEPARATOR
 
 # Okabe and Ito's palette, "Color Universal Design", 2008.
@@ -39,6 +41,7 @@ FORMATS = ("png", "svg", "pdf")
 # Width of a two-column page, inches.
 WIDTH = 7.2
 _SMALL = 7.0
+_LONGEST_TITLE = 110
 _LINE = 0.15
 _RC: dict[str, Any] = {
     "font.family": "DejaVu Sans",
@@ -65,7 +68,9 @@ _RC: dict[str, Any] = {
 @contextmanager
 def style() -> Iterator[None]:
     """Draw and save with our settings, whatever the user's matplotlibrc says; theirs are put back afterwards."""
-    with matplotlib.rc_context():
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        # A letter that the font lacks is drawn as a box.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_RC)
         yield
@@ -80,7 +85,8 @@ def framed(title: str, lines: Sequence[str], height: float, notes: Sequence[str]
         height: Height of the part to draw in, inches.
         notes: Sentences below the picture.
     """
-    small = [part for line in lines for part in wrap(line, SEPARATOR)]
+    title = printable(title, longest=_LONGEST_TITLE)
+    small = [part for line in lines for part in wrap(printable(line), SEPARATOR)]
     below = [part for line in notes for part in wrap(line, " ")]
     head, foot = 0.26 + _LINE * len(small), 0.06 + _LINE * len(below)
     figure = Figure(figsize=(WIDTH, head + height + foot), layout="constrained")

@@ -18,8 +18,9 @@ _BEHIND = 0.01
 
 
 def caveats(prepared: Prepared, solution: PostureSolution) -> list[str]:
-    """Lines about hovering, about the surface that is touched and about the ground."""
+    """Lines about hovering, about the surface that is touched, about the ground and about the compiler."""
     return [
+        *([solution.compiler_fault] if solution.compiler_fault else []),
         *_hover_warnings(prepared, solution),
         *_surface_warnings(prepared, solution),
         *_ground_warnings(prepared, solution),

@@ -8,16 +8,15 @@ once.
 from __future__ import annotations
 
 import hashlib
-import os
 import platform
-import tempfile
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 
 from impact_posture import __version__
-from impact_posture.errors import CompilerError
+from impact_posture.errors import CompilerError, OutputError
+from impact_posture.libraries import building, cache_folder, cache_path, is_cached
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.toolchain import find_compiler, run_compiler, run_compilers
 
@@ -33,33 +32,55 @@ _ITERATIONS = 35
 _OPTIMIZED = 100_000
 
 
-def cache_folder() -> Path:
-    """Where compiled programs are kept: ``$IMPACT_POSTURE_CACHE``, else the user's cache folder."""
-    own = os.environ.get("IMPACT_POSTURE_CACHE")
-    if own:
-        return Path(own)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "impact-posture"
+class BuiltSolver(NamedTuple):
+    """``nlpsol``, whether it runs as machine code, and why it does not although it should; empty if it does."""
+
+    solver: ca.Function
+    compiled: bool
+    fault: str = ""
 
 
 def compiled_solver(
     problem: PostureProblem, symbols: dict[str, ca.SX], options: dict[str, Any], mode: CompileMode, starts: int
-) -> tuple[ca.Function, bool]:
-    """``nlpsol`` on the expressions, compiled or interpreted, and which of the two."""
-    compiler = find_compiler()
-    if mode == "always" and compiler is None:
-        raise CompilerError("no C compiler found", where="compile", mend="install gcc or clang, or set CC")
-    library = cache_folder() / f"{_key(problem)}.so"
-    if mode != "never" and library.is_file():
-        try:
-            return ca.nlpsol("posture", "ipopt", str(library), options), True
-        except RuntimeError:
-            # Broken, or made by another machine that shares the folder.
-            library.unlink(missing_ok=True)
-    solver = ca.nlpsol("posture", "ipopt", symbols, options)
-    if mode == "never" or compiler is None or (mode == "auto" and not _pays(solver, starts)):
-        return solver, False
-    _compile(solver, compiler, library)
-    return ca.nlpsol("posture", "ipopt", str(library), options), True
+) -> BuiltSolver:
+    """Build ``nlpsol`` on the expressions, compiled or interpreted.
+
+    Raises:
+        CompilerError: ``always``, and there is no compiler or it fails.
+        OutputError: ``always``, and the cache cannot be written or is not the user's alone.
+    """
+    interpreted: ca.Function | None = None
+    try:
+        if mode != "never" and (found := _cached(problem, options)) is not None:
+            return BuiltSolver(found, True)
+        interpreted = ca.nlpsol("posture", "ipopt", symbols, options)
+        compiler = find_compiler()
+        if mode == "always" and compiler is None:
+            raise CompilerError("no C compiler found", where="compile", mend="install gcc or clang, or set CC")
+        if mode == "never" or compiler is None or (mode == "auto" and not _pays(interpreted, starts)):
+            return BuiltSolver(interpreted, False)
+        _compile(interpreted, compiler, f"{_key(problem)}.so")
+        if (found := _cached(problem, options)) is None:
+            raise CompilerError("what was built cannot be loaded", where="compile", mend="set CC to another compiler")
+        return BuiltSolver(found, True)
+    except (CompilerError, OutputError) as error:
+        if mode == "always":
+            raise
+        if interpreted is None:
+            interpreted = ca.nlpsol("posture", "ipopt", symbols, options)
+        return BuiltSolver(interpreted, False, f"interpreted, not compiled: {error.line}")
+
+
+def _cached(problem: PostureProblem, options: dict[str, Any]) -> ca.Function | None:
+    library = cache_path() / f"{_key(problem)}.so"
+    if not is_cached(library):
+        return None
+    try:
+        return ca.nlpsol("posture", "ipopt", str(library), options)
+    except RuntimeError:
+        # Made by another machine that shares the folder.
+        library.unlink(missing_ok=True)
+        return None
 
 
 def _pays(solver: ca.Function, starts: int) -> bool:
@@ -93,18 +114,17 @@ def own_source(*packages: str) -> str:
     return digest.hexdigest()
 
 
-def _compile(solver: ca.Function, compiler: list[str], library: Path) -> None:
-    """Each function in a file of its own, as many compilers at once as there are cores."""
-    library.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
+def _compile(solver: ca.Function, compiler: list[str], name: str) -> None:
+    """Compile into the cache: each function in a file of its own, as many compilers at once as there are cores."""
+    library = cache_folder() / name
+    with building(library) as folder:
         functions = [solver.oracle(), *[_shared(solver.get_function(name)) for name in solver.get_function()]]
         # The largest first: nothing waits for it in the end.
         functions.sort(key=lambda function: -int(function.n_instructions()))
         commands = [_command(function, compiler, folder) for function in functions]
-        run_compilers(commands, Path(folder))
+        run_compilers(commands, folder)
         objects = [f"{function.name()}.o" for function in functions]
-        run_compiler([*compiler, "-shared", *objects, "-o", "program.so", "-lm"], Path(folder))
-        os.replace(Path(folder) / "program.so", library)
+        run_compiler([*compiler, "-shared", *objects, "-o", library.name, "-lm"], folder)
 
 
 def _shared(function: ca.Function) -> ca.Function:
@@ -114,11 +134,11 @@ def _shared(function: ca.Function) -> ca.Function:
     return ca.Function(function.name(), inputs, function.call(inputs), *names, {"cse": True})
 
 
-def _command(function: ca.Function, compiler: list[str], folder: str) -> list[str]:
+def _command(function: ca.Function, compiler: list[str], folder: Path) -> list[str]:
     """Write the function's C, and say how it is compiled."""
     name = function.name()
     generator = ca.CodeGenerator(f"{name}.c")
     generator.add(function)
-    generator.generate(f"{folder}{os.sep}")
+    (folder / f"{name}.c").write_text(generator.dump(), encoding="utf-8")
     level = "-O1" if function.n_instructions() <= _OPTIMIZED else "-O0"
     return [*compiler, level, "-fPIC", "-c", f"{name}.c", "-o", f"{name}.o"]

@@ -93,6 +93,7 @@ class PostureNLP:
         bounded: How many of its rows, the last ones, are inequalities ``≤ 0`` of the objective.
         build_time_s: Time to build (and compile) it.
         compiled: Whether its functions run as machine code.
+        compiler_fault: Why they do not although they should; empty else.
     """
 
     problem: PostureProblem
@@ -102,6 +103,7 @@ class PostureNLP:
     bounded: int
     build_time_s: float
     compiled: bool
+    compiler_fault: str = ""
 
     def solve(self, start: Vector, *, scale: float | None = None, attempt: int = 0) -> SolveRecord:
         """Solve from ``start``; the objective is divided by ``scale``, its value there unless given.
@@ -162,9 +164,10 @@ def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts:
     chart = Chart(problem.robot.model)
     symbols, bounded = program(problem, chart)
     options = IPOPT_OPTIONS | (_WORST_OPTIONS if problem.objective.attempts > 1 else {})
-    solver, compiled = compiled_solver(problem, symbols, options, compile, starts)
+    built = compiled_solver(problem, symbols, options, compile, starts)
     size = int(symbols["x"].numel())
-    return PostureNLP(problem, chart, solver, size, bounded, time.perf_counter() - began, compiled)
+    took = time.perf_counter() - began
+    return PostureNLP(problem, chart, built.solver, size, bounded, took, built.compiled, built.fault)
 
 
 def program(problem: PostureProblem, chart: Chart) -> tuple[dict[str, ca.SX], int]:

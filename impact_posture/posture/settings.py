@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from impact_posture.errors import InputError, SpecError
+from impact_posture.escape import toml_string
 from impact_posture.impact.metric import Metric, MetricKind, ObjectiveKind
 from impact_posture.impact.request import ImpactRequest, ResolvedImpact
 from impact_posture.posture.build_problem import build_problem
@@ -255,21 +256,32 @@ def _armature_by_joint(impact: ResolvedImpact) -> str | dict[str, float]:
 
 
 def dump_settings(settings: ProblemSettings) -> str:
-    """Write settings as TOML, keys in the model's order, what is ``None`` left out."""
+    """Write settings as TOML, keys in the model's order, what is ``None`` left out.
+
+    Raises:
+        SpecError: The path of a file is not UTF-8.
+    """
     lines = [f"schema = {_toml(SCHEMA)}"]
     for key in ProblemSettings.model_fields:
         value = getattr(settings, key)
         if key != "schema_" and value is not None:
-            lines.append(f"{key} = {_toml(value)}")
+            try:
+                lines.append(f"{key} = {_toml(value)}")
+            except UnicodeEncodeError:
+                raise SpecError(
+                    f"'{value}' is not UTF-8, as TOML has to be", where=key, mend="rename the file or folder"
+                ) from None
     return "\n".join(lines) + "\n"
 
 
 def _toml(value: object) -> str:
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + " }"
+        return "{ " + ", ".join(f"{toml_string(k)} = {_toml(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_toml(v) for v in value) + "]"
     if isinstance(value, float):
         return repr(value)
-    # JSON's strings, integers and booleans are TOML's.
+    if isinstance(value, str):
+        return toml_string(value)
+    # JSON's integers and booleans are TOML's.
     return json.dumps(value)

@@ -71,6 +71,7 @@ class PostureSolution:
         build_time_s: Time to build the program.
         compiled: Whether it ran as machine code.
         notes: What a user should know about the answer.
+        compiler_fault: Why it did not run as machine code although it should; empty else.
     """
 
     problem: PostureProblem
@@ -89,6 +90,7 @@ class PostureSolution:
     build_time_s: float
     compiled: bool
     notes: tuple[str, ...]
+    compiler_fault: str = ""
 
     @property
     def reduction(self) -> float:
@@ -168,6 +170,7 @@ def solve(
         build_time_s=nlp.build_time_s,
         compiled=nlp.compiled,
         notes=(*problem.notes, *notes),
+        compiler_fault=nlp.compiler_fault,
     )
 
 

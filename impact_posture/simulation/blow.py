@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture import __version__
+from impact_posture.codegen.build import library_path
 from impact_posture.codegen.folder import write_export
 from impact_posture.codegen.loader import ImpactGradient
 from impact_posture.errors import CompilerError, MetricError, OutputError
@@ -22,7 +23,8 @@ from impact_posture.impact.contact import Contact
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
-from impact_posture.posture.compiled import cache_folder, own_source
+from impact_posture.libraries import cache_folder, is_cached
+from impact_posture.posture.compiled import own_source
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
 from impact_posture.toolchain import find_compiler
 
@@ -79,18 +81,16 @@ def compiled(objective: ImpactObjective) -> Gradient:
 
     Raises:
         CompilerError: The compiler failed, or what it made computes other numbers.
-        OutputError: The cache folder cannot be written.
+        OutputError: The cache folder cannot be written, or is not the user's alone.
     """
     if find_compiler() is None:
         return interpreted(objective)
-    folder = cache_folder() / "gradients" / _key(objective)
+    folder = cache_folder("gradients") / _key(objective)
     with _locked(folder.with_suffix(".lock")):
-        if not (folder / "built").is_file():
-            # What an interrupted build left is an export like any other: it may be replaced.
+        if not is_cached(library_path(folder, "blow")):
             written = write_export([objective], folder, prefix="blow", portable=True, build=True, force=True)
             if written.library is None:
                 raise CompilerError("has gone", where="C compiler", mend="try again")
-            (folder / "built").touch()
     return ImpactGradient.load(folder, robot=objective.robot).objective
 
 
@@ -114,7 +114,6 @@ def _key(objective: ImpactObjective) -> str:
 def _locked(path: Path) -> Iterator[None]:
     """One process at a time: the others find the work done."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("w")
     except OSError as error:
         raise OutputError(

@@ -1,0 +1,209 @@
+"""Shared libraries: sealed where they are built, checked before they are loaded, kept in the user's own cache.
+
+Loading a library runs its code, and a damaged one ends the process.  So a library of ours has its SHA-256 beside it,
+another one must at least be as long as its header says, and the cache is the user's alone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+import stat
+import struct
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from impact_posture.errors import OutputError, SpecError
+
+_DAY = 86400.0
+_REBUILD = "delete it: it is built again"
+# ELF's header behind its 16 bytes of identity, and the entries of its program header up to the length in the file.
+_HEADER = {1: "HHIIIIIHHHHHH", 2: "HHIQQQIHHHHHH"}
+_SEGMENT = {1: "IIIII", 2: "IIQQQQ"}
+
+
+# ---- seals --------------------------------------------------------------------------------------------------------
+
+
+def seal_path(library: Path) -> Path:
+    """Where the seal of a library is: ``sha256sum --check`` reads it too."""
+    return library.with_name(f"{library.name}.sha256")
+
+
+def put_library(built: Path, library: Path) -> None:
+    """Move a library that was built beside into its place, with its seal; interrupted, it is there without a seal."""
+    seal, beside = seal_path(library), built.with_name(f"{built.name}.sha256")
+    beside.write_text(f"{_digest(built)}  {library.name}\n", encoding="utf-8")
+    seal.unlink(missing_ok=True)
+    os.replace(built, library)
+    os.replace(beside, seal)
+
+
+def is_sealed(library: Path) -> bool | None:
+    """Whether a library is what was sealed; ``None`` where there is no seal."""
+    try:
+        words = seal_path(library).read_text(encoding="utf-8", errors="replace").split()
+    except FileNotFoundError:
+        return None
+    return bool(words) and words[0] == _digest(library)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# ---- loading ------------------------------------------------------------------------------------------------------
+
+
+def load_library(library: Path) -> ctypes.CDLL:
+    """Load a library that is whole, which runs its code.
+
+    Raises:
+        SpecError: It is not what was sealed, has no seal and is shorter than its header says, is for another
+            processor, or cannot be loaded.
+    """
+    try:
+        sealed = is_sealed(library)
+        fault = "is not the library that was built here (another SHA-256)" if sealed is False else ""
+        fault = fault or ("" if sealed else _fault(library))
+        if not fault:
+            return ctypes.CDLL(str(library.absolute()))
+    except OSError as error:
+        fault = f"cannot be loaded ({error.strerror or error})"
+    mend = f"{_REBUILD}; if you built it yourself, delete {seal_path(library).name}" if sealed is False else _REBUILD
+    raise SpecError(fault, where=str(library), mend=mend)
+
+
+def _fault(library: Path) -> str:
+    """What a header says against loading; nothing of formats other than ELF, whose loaders check themselves."""
+    size = library.stat().st_size
+    with library.open("rb") as file:
+        start = file.read(64)
+        if start[:4] != b"\x7fELF":
+            return "is no shared library" if sys.platform == "linux" or not start else ""
+        try:
+            order = {1: "<", 2: ">"}[start[5]]
+            header, segment = order + _HEADER[start[4]], order + _SEGMENT[start[4]]
+            found = struct.unpack_from(header, start, 16)
+            machine, segments, sections = found[1], found[4], found[5]
+            segment_size, segment_count, section_size, section_count = found[8:12]
+            end = max(segments + segment_size * segment_count, sections + section_size * section_count)
+            for k in range(segment_count if end <= size else 0):
+                file.seek(segments + k * segment_size)
+                entry = struct.unpack(segment, file.read(struct.calcsize(segment)))
+                offset, length = (entry[1], entry[4]) if start[4] == 1 else (entry[2], entry[5])
+                end = max(end, offset + length)
+        except (KeyError, IndexError, struct.error):
+            return "is damaged: its header is none of a shared library"
+    if end > size:
+        return f"is damaged: {size} bytes, where its header speaks of {end}"
+    ours = _machine()
+    return f"is for another processor (ELF machine {machine}, here {ours})" if ours not in (None, machine) else ""
+
+
+def _machine() -> int | None:
+    """ELF's number of the processor that runs this; ``None`` where the interpreter is no ELF file."""
+    with suppress(OSError), open(os.path.realpath(sys.executable), "rb") as file:
+        start = file.read(20)
+        if start[:4] == b"\x7fELF":
+            return int.from_bytes(start[18:20], "little" if start[5] == 1 else "big")
+    return None
+
+
+# ---- the cache ----------------------------------------------------------------------------------------------------
+
+
+def cache_path() -> Path:
+    """Where compiled code is kept: ``$IMPACT_POSTURE_CACHE``, else in the user's cache folder; it need not exist."""
+    own = os.environ.get("IMPACT_POSTURE_CACHE")
+    if own:
+        return Path(own).absolute()
+    # A relative path is to be ignored, says the XDG specification.
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    try:
+        return (base if base.is_absolute() else Path.home() / ".cache") / "impact-posture"
+    except RuntimeError:
+        raise OutputError("there is no home folder", where="cache", mend="set IMPACT_POSTURE_CACHE") from None
+
+
+def cache_folder(*parts: str) -> Path:
+    """Return a folder of the cache, made where it is missing, for its user alone.
+
+    Raises:
+        OutputError: It cannot be made, or is not the user's alone.
+    """
+    folder = cache_path()
+    try:
+        for part in ("", *parts):
+            folder = folder / part
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            check_private(folder)
+    except OSError as error:
+        raise OutputError(
+            f"cannot be written ({error.strerror})", where=str(folder), mend="set IMPACT_POSTURE_CACHE to a folder"
+        ) from None
+    return folder
+
+
+@contextmanager
+def building(library: Path) -> Iterator[Path]:
+    """Yield a folder to build in; a library of that name in it then takes its place in the cache, sealed.
+
+    Raises:
+        OutputError: The cache cannot be written, for example because the disk is full.
+    """
+    try:
+        for left in library.parent.glob("building-*"):
+            # Of a build that was killed.
+            if time.time() - left.stat().st_mtime > _DAY:
+                shutil.rmtree(left, ignore_errors=True)
+        with tempfile.TemporaryDirectory(prefix="building-", dir=library.parent) as folder:
+            yield Path(folder)
+            if (built := Path(folder) / library.name).is_file():
+                put_library(built, library)
+    except OSError as error:
+        raise OutputError(
+            f"cannot be written ({error.strerror or error})",
+            where=str(library.parent),
+            mend="free some space, or set IMPACT_POSTURE_CACHE to another folder",
+        ) from None
+
+
+def check_private(path: Path) -> None:
+    """Refuse what another user could have put there: who owns or may write it chooses the code that runs.
+
+    Raises:
+        OutputError: Another user owns it or may write it.
+    """
+    found = path.stat()
+    if found.st_uid not in (os.geteuid(), 0):
+        raise OutputError("belongs to another user", where=str(path), mend="set IMPACT_POSTURE_CACHE to a folder")
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise OutputError("can be written by others", where=str(path), mend=f"chmod go-w {path}, if you trust it")
+
+
+def is_cached(library: Path) -> bool:
+    """Whether the cache has a library as it was built; what is damaged goes.
+
+    Raises:
+        OutputError: The library, or a folder of the cache on the way to it, is not the user's alone.
+    """
+    root = cache_path()
+    try:
+        for path in (library, *library.parents):
+            check_private(path)
+            if path == root:
+                break
+        if is_sealed(library):
+            return True
+        library.unlink()
+    except OSError:
+        pass
+    return False
