@@ -136,7 +136,7 @@ def solve(
         raise _failure(runs)
     # The first of equally good ones: the answer does not hang on which process was faster.
     best = min(good, key=lambda r: round(r.minimized, 9))
-    assert best.record is not None and best.certificate is not None
+    assert best.record is not None and best.certificate is not None  # noqa: S101 (narrows types)
     q, certificate, notes = best.record.q, best.certificate, []
     numeric = Numeric(problem.robot.model)
     redundancy = problem.robot.nv - rank(equality_jacobian(problem, numeric.at(q)))
