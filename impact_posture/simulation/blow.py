@@ -23,6 +23,7 @@ from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
 from impact_posture.posture.compiled import cache_folder, own_source
+from impact_posture.progress import tell
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
 from impact_posture.toolchain import find_compiler
 
@@ -86,6 +87,7 @@ def compiled(objective: ImpactObjective) -> Gradient:
     folder = cache_folder() / "gradients" / _key(objective)
     with _locked(folder.with_suffix(".lock")):
         if not (folder / "built").is_file():
+            tell("compiling the gradient")
             # What an interrupted build left is an export like any other: it may be replaced.
             written = write_export([objective], folder, prefix="blow", portable=True, build=True, force=True)
             if written.library is None:
