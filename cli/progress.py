@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+# Seconds from one picture of the line to the next.
+_REFRESH = 0.1
 
 
 @contextmanager
@@ -29,3 +33,42 @@ def progress_bar(doing: str, what: str = "", *, shown: bool) -> Iterator[Callabl
         yield advance
     finally:
         bar.stop()
+
+
+@contextmanager
+def progress_line(*, shown: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Show on a line of standard error what the library is at, and how many runs are done; on a terminal only.
+
+    Yield what is told of ``(done, all)`` runs; ``None`` where nothing is to be shown.
+    """
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if not (shown and console.is_terminal):
+        yield None
+        return
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    from impact_posture.progress import listening
+
+    # Drawn when something is told, by no thread of its own: runs fork.
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[runs]}"))
+    line = Progress(*columns, console=console, transient=True, auto_refresh=False)
+    task = line.add_task("", total=None, runs="")
+    drawn, words = 0.0, ""
+
+    def show(doing: str, share: float | None = None) -> None:
+        nonlocal drawn, words
+        now = time.monotonic()
+        if doing == words and now - drawn < _REFRESH:
+            return
+        drawn, words = now, doing
+        line.update(task, description=doing, completed=share or 0.0, total=None if share is None else 1.0)
+        line.refresh()
+
+    def advance(done: int, total: int) -> None:
+        line.update(task, runs=f"{done}/{total} runs")
+        show("running", done / total)
+
+    with listening(show), line:
+        yield advance

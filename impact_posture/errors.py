@@ -211,6 +211,8 @@ class SolverFailed(ImpactPostureError):
 class SimulationDiverged(ImpactPostureError):
     """A simulation's state ran away; carries the time."""
 
+    exit_code = 4
+
     def __init__(self, time: float, *, where: str = "simulation") -> None:
         self.time = time
         super().__init__(

@@ -46,7 +46,7 @@ def reproduce(
     from impact_posture.experiment.summary import advice
     from impact_posture.folder import check_output
     from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_bar
+    from impact_posture_cli.progress import progress_line
 
     scenarios = list(dict.fromkeys(scenario)) if scenario else list(PAPER)
     for name in scenarios:
@@ -55,11 +55,11 @@ def reproduce(
     folder = Path(out)
     check_output(folder, force=force, marks=(REPRODUCTION,))
     store = store_beside(folder)
-    with progress_bar("running", "runs", shown=not (quiet or json)) as progress:
+    with progress_line(shown=not (quiet or json)) as progress:
         found = reproduce_all(scenarios, seeds=seeds, everything=all_, processes=jobs, store=store, progress=progress)
-    plan = [job for name in scenarios for job in jobs_of(name, controllers_of(name, all_), seeds)]
-    formats = [f.value for f in format or ()] or FORMATS
-    document = write_reproduction(folder, found, plan, store, force=force, formats=formats)
+        plan = [job for name in scenarios for job in jobs_of(name, controllers_of(name, all_), seeds)]
+        formats = [f.value for f in format or ()] or FORMATS
+        document = write_reproduction(folder, found, plan, store, force=force, formats=formats)
     if json:
         print_json(document)
         return
