@@ -67,7 +67,7 @@ def simulate(
     quiet: options.Quiet = False,
 ) -> None:
     """Run a controller through an experiment in MuJoCo; write metrics, time series and figures."""
-    from impact_posture.experiment.folders import FORMATS, SIMULATION, write_simulation
+    from impact_posture.experiment.folders import FORMATS, write_simulation
     from impact_posture.experiment.jobs import Job, execute
     from impact_posture.folder import check_output
     from impact_posture.posture.blas import one_blas_thread
@@ -77,7 +77,7 @@ def simulate(
     name = read_scenario(scenario).name
     job = Job(scenario, controller, seed, mode, free, gain, None if sign is None else int(sign))
     folder = Path(out) if out else Path(f"{name}-{job.label.replace(':', '-')}".replace("/", "_"))
-    check_output(folder, force=force, marks=(SIMULATION,))
+    check_output(folder, force=force, kind="run")
     with one_blas_thread():
         runs, document = execute(job)
     formats = [f.value for f in format or ()] or FORMATS

@@ -12,12 +12,12 @@ import shlex
 import shutil
 import signal
 import subprocess
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from impact_posture.errors import CompilerError
+from impact_posture.folder import scratch_folder
 from impact_posture.posture.compiled import cache_folder
 from impact_posture.toolchain import find_compiler
 
@@ -182,8 +182,7 @@ def _compile(
 ) -> _Outcome:
     names = [n for n in sources if not n.endswith((".h", ".hpp"))]
     limit = max(1, int(patience_s))
-    with tempfile.TemporaryDirectory(dir=library.parent) as name:
-        folder = Path(name)
+    with scratch_folder(library.parent) as folder:
         for file, text in sources.items():
             (folder / file).write_text(text)
         before = resource.getrusage(resource.RUSAGE_CHILDREN)

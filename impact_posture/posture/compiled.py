@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-import tempfile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +17,7 @@ import casadi as ca
 
 from impact_posture import __version__
 from impact_posture.errors import CompilerError
+from impact_posture.folder import scratch_folder
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.toolchain import find_compiler, run_compiler, run_compilers
 
@@ -101,15 +101,15 @@ def own_source(*packages: str) -> str:
 def _compile(solver: ca.Function, compiler: list[str], library: Path) -> None:
     """Each function in a file of its own, as many compilers at once as there are cores."""
     library.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
+    with scratch_folder(library.parent) as folder:
         functions = [solver.oracle(), *[_shared(solver.get_function(name)) for name in solver.get_function()]]
         # The largest first: nothing waits for it in the end.
         functions.sort(key=lambda function: -int(function.n_instructions()))
         commands = [_command(function, compiler, folder) for function in functions]
-        run_compilers(commands, Path(folder))
+        run_compilers(commands, folder)
         objects = [f"{function.name()}.o" for function in functions]
-        run_compiler([*compiler, "-shared", *objects, "-o", "program.so", "-lm"], Path(folder))
-        os.replace(Path(folder) / "program.so", library)
+        run_compiler([*compiler, "-shared", *objects, "-o", "program.so", "-lm"], folder)
+        os.replace(folder / "program.so", library)
 
 
 def _shared(function: ca.Function) -> ca.Function:
@@ -119,7 +119,7 @@ def _shared(function: ca.Function) -> ca.Function:
     return ca.Function(function.name(), inputs, function.call(inputs), *names, {"cse": True})
 
 
-def _command(function: ca.Function, compiler: list[str], folder: str) -> list[str]:
+def _command(function: ca.Function, compiler: list[str], folder: Path) -> list[str]:
     """Write the function's C, and say how it is compiled."""
     name = function.name()
     generator = ca.CodeGenerator(f"{name}.c")
