@@ -8,6 +8,7 @@ import os
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
+import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
 # The same examples on every run and on every worker; a slow machine is no failure.
@@ -15,3 +16,12 @@ settings.register_profile(
     "impact-posture", deadline=None, derandomize=True, max_examples=20, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("impact-posture")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--hostile-full", action="store_true", help="attack at length: minutes instead of seconds")
+
+
+@pytest.fixture
+def hostile_full(request: pytest.FixtureRequest) -> bool:
+    return bool(request.config.getoption("--hostile-full"))
