@@ -6,6 +6,7 @@ import contextlib
 import errno
 import io
 import json
+import logging
 import os
 import sys
 import traceback
@@ -28,6 +29,8 @@ def run(command: Any, arguments: Sequence[str]) -> int:
     0 done; 1 an error to act on; 2 a wrong command line; other codes as the error says; 130 interrupted.  One line on
     standard error, and with ``--json`` the same as ``{"error": {code, kind, what, where, mend}}`` on standard output.
     """
+    # Where no folder for its caches can be written, matplotlib logs what it does about that.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             # λ and × must not crash a terminal that has no letter for them.
@@ -114,8 +117,9 @@ def _closed_pipe() -> int:
 
 def _discard_output() -> None:
     """What could not be written must not fail again when the interpreter flushes it."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

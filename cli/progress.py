@@ -19,6 +19,8 @@ def progress_bar(doing: str, what: str = "", *, shown: bool) -> Iterator[Callabl
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from impact_posture.processes import undone
+
     counted = (MofNCompleteColumn(), TextColumn(what)) if what else ()
     columns = (TextColumn(doing), BarColumn(), *counted, TimeElapsedColumn())
     # The bar starts with the first result: worker processes are forked before its thread runs.
@@ -29,10 +31,9 @@ def progress_bar(doing: str, what: str = "", *, shown: bool) -> Iterator[Callabl
         bar.start()
         bar.update(task, completed=done, total=total)
 
-    try:
+    # Also when a signal ends the process: the bar hides the cursor.
+    with undone(bar.stop):
         yield advance
-    finally:
-        bar.stop()
 
 
 @contextmanager

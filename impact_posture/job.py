@@ -11,10 +11,11 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from impact_posture.codegen.build import products
 from impact_posture.codegen.export import Export, export
 from impact_posture.errors import CompilerError, SpecError
 from impact_posture.escape import file_name
-from impact_posture.folder import whole_folder
+from impact_posture.folder import whole_folder, write_record
 from impact_posture.plot import PathData, ResultView, TradeOffData, draw_all
 from impact_posture.posture.path import NullSpacePath, null_space_path
 from impact_posture.posture.result import result_arrays, result_document
@@ -24,8 +25,6 @@ from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
 from impact_posture.robot.postures import write_posture
 
-# What makes a folder an earlier result, which --force may replace.
-MARKS = ("result.json",)
 FORMATS = ("png", "svg", "pdf")
 
 
@@ -71,7 +70,7 @@ def write_result(
     path = null_space_path(solution.problem, solution.initial, solution.q)
     made: Export | None = None
     failure = ""
-    with whole_folder(out, force=force, marks=MARKS) as folder:
+    with whole_folder(out, force=force, kind="result") as folder:
         _write_json(folder / "result.json", document)
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff))  # type: ignore[arg-type]
         _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
@@ -85,6 +84,8 @@ def write_result(
                 # The posture is worth keeping whatever the compiler says; the user hears of it.
                 failure = error.line
                 made = export(prepared.impact.objective, folder / "c", posture=solution.q, force=True, check=False)
+            # The export may be replaced alone, and what its Makefile makes counts as ours.
+            write_record(folder / "c", "export", products(made.prefix))
     return Written(out, document, made, failure)
 
 

@@ -23,6 +23,12 @@ settings.load_profile("impact-posture")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--rounding", type=int, metavar="SEED", help="linear algebra as another processor may round it")
+    parser.addoption("--hostile-full", action="store_true", help="attack at length: minutes instead of seconds")
+
+
+@pytest.fixture
+def hostile_full(request: pytest.FixtureRequest) -> bool:
+    return bool(request.config.getoption("--hostile-full"))
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -41,7 +41,7 @@ def compare(
     labels = [text.strip() for text in controllers.split(",") if text.strip()]
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
-    from impact_posture.experiment.folders import COMPARISON, FORMATS, store_beside, write_comparison
+    from impact_posture.experiment.folders import FORMATS, store_beside, write_comparison
     from impact_posture.experiment.reproduction import compare as run_all
     from impact_posture.experiment.reproduction import comparison_document, jobs_of
     from impact_posture.folder import check_output
@@ -51,7 +51,7 @@ def compare(
     labels = list(dict.fromkeys(labels))
     folder = None if out is None else Path(out)
     if folder is not None:
-        check_output(folder, force=force, marks=(COMPARISON,))
+        check_output(folder, force=force, kind="comparison")
     store = None if folder is None else store_beside(folder)
     with progress_line(shown=not (quiet or json)) as progress:
         rows = run_all(scenario, labels, seeds=seeds, processes=jobs, store=store, progress=progress)

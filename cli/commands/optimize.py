@@ -84,7 +84,7 @@ def optimize(
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
     from impact_posture.folder import check_output
-    from impact_posture.job import FORMATS, MARKS, default_out, write_result
+    from impact_posture.job import FORMATS, default_out, write_result
     from impact_posture.posture.follow import trade_off
     from impact_posture.posture.robustness import solve_robustly
     from impact_posture.posture.settings import prepare
@@ -94,7 +94,7 @@ def optimize(
     page = Page(quiet=quiet or json)
     prepared = prepare(settings)
     folder = Path(out) if out else default_out(prepared)
-    check_output(folder, force=force, marks=MARKS)
+    check_output(folder, force=force, kind="result")
     if not json:
         _announce(page, prepared)
     with progress_bar("solving", "starts", shown=not (quiet or json)) as progress:

@@ -39,7 +39,7 @@ def reproduce(
 ) -> None:
     """Run the paper's experiments: its table beside ours, figures, a summary. Goes on where it was interrupted."""
     from impact_posture.errors import ScenarioNotFound
-    from impact_posture.experiment.folders import FORMATS, REPRODUCTION, store_beside, write_reproduction
+    from impact_posture.experiment.folders import FORMATS, store_beside, write_reproduction
     from impact_posture.experiment.paper import PAPER
     from impact_posture.experiment.reproduction import controllers_of, jobs_of
     from impact_posture.experiment.reproduction import reproduce as reproduce_all
@@ -53,7 +53,7 @@ def reproduce(
         if name not in PAPER:
             raise ScenarioNotFound(name, PAPER, mend="(others: simulate and compare)")
     folder = Path(out)
-    check_output(folder, force=force, marks=(REPRODUCTION,))
+    check_output(folder, force=force, kind="reproduction")
     store = store_beside(folder)
     with progress_line(shown=not (quiet or json)) as progress:
         found = reproduce_all(scenarios, seeds=seeds, everything=all_, processes=jobs, store=store, progress=progress)

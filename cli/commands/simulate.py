@@ -72,7 +72,7 @@ def simulate(
 ) -> None:
     """Run a controller through an experiment in MuJoCo; write metrics, time series and figures."""
     from impact_posture.escape import file_name
-    from impact_posture.experiment.folders import FORMATS, SIMULATION, write_simulation
+    from impact_posture.experiment.folders import FORMATS, write_simulation
     from impact_posture.experiment.jobs import Job, execute
     from impact_posture.experiment.statistics import fate
     from impact_posture.folder import check_output
@@ -84,7 +84,7 @@ def simulate(
     name = read_scenario(scenario).name
     job = Job(scenario, controller, seed, mode, free, gain, None if sign is None else int(sign))
     folder = Path(out) if out else Path(file_name(f"{name}-{job.label.replace(':', '-')}"))
-    check_output(folder, force=force, marks=(SIMULATION,))
+    check_output(folder, force=force, kind="run")
     with progress_line(shown=not (quiet or json)):
         with one_blas_thread():
             runs, document = execute(job)

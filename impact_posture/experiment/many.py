@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -14,6 +16,7 @@ from typing import Any
 from impact_posture import __version__
 from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError, SpecError
 from impact_posture.experiment.jobs import SCHEMA, Job, execute, workshop
+from impact_posture.folder import is_ours, write_record
 from impact_posture.posture.blas import one_blas_thread
 from impact_posture.posture.compiled import own_source
 from impact_posture.processes import shared_out
@@ -37,6 +40,17 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+
+    def make(self) -> None:
+        """Make the folder where there is none."""
+        with suppress(FileExistsError):
+            self.folder.mkdir(parents=True)
+            write_record(self.folder, "runs")
+
+    def remove(self) -> None:
+        """Remove the folder, if it was made by :meth:`make`."""
+        if is_ours(self.folder, "runs"):
+            shutil.rmtree(self.folder, ignore_errors=True)
 
     def find(self, job: Job) -> Document | None:
         """The document of a job that is done; a file that is not whole, or another's, is none."""
@@ -62,7 +76,7 @@ class Store:
         path = self._path(job)
         beside = path.with_suffix(f".{os.getpid()}.part")
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            self.make()
             text = json.dumps(document)
             beside.write_text(f"{_seal(job, text)}\n{text}", encoding="utf-8")
             os.replace(beside, path)
@@ -163,7 +177,7 @@ def _one(job: Job, store: Store | None) -> Document:
                 "free": job.free, "seed": job.seed, "status": "control lost", "events": [event], "metrics": None,
                 "prediction": None, "windows": [], "runs": []}  # fmt: skip
     if store is not None:
-        store.folder.mkdir(parents=True, exist_ok=True)
+        store.make()
         for one in runs:
             one.series.save(store.series(job, one.sign))
     return document

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from matplotlib.textpath import text_to_path
 
 from impact_posture.errors import InputError, OutputError
 from impact_posture.escape import printable
+from impact_posture.folder import scratch_folder
 from impact_posture.plot.view import SEPARATOR
 
 # Okabe and Ito's palette, "Color Universal Design", 2008.
@@ -140,7 +142,7 @@ def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
 
 
 def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = FORMATS) -> list[Path]:
-    """Write ``figure`` as ``out_dir/name.<format>`` for each format; return the paths.
+    """Write ``figure`` as ``out_dir/name.<format>`` for each format, each file whole or not at all; return the paths.
 
     Raises:
         InputError: An unknown format.
@@ -156,8 +158,9 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = FORM
         metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(extension, {})
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with style():
-                figure.savefig(path, metadata=metadata)
+            with scratch_folder(path.parent) as beside, style():
+                figure.savefig(beside / path.name, metadata=metadata)
+                os.replace(beside / path.name, path)
         except OSError as error:
             raise OutputError(
                 f"cannot be written ({error.strerror or error})", where=str(path), mend="choose another folder"

@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
+from typing import IO
 
 import pinocchio as pin
 
@@ -125,11 +126,16 @@ def _parse(path: Path) -> ET.Element:
     return root
 
 
+def _nameless_file() -> IO[bytes]:
+    """A file in memory where the system has such: to read a robot, no folder need be writable."""
+    return os.fdopen(os.memfd_create("words"), "w+b") if hasattr(os, "memfd_create") else tempfile.TemporaryFile()
+
+
 @contextlib.contextmanager
 def _quiet_stderr() -> Iterator[list[str]]:
     """Keep the URDF parser's own words off the terminal; hand back the first line of them."""
     words = [""]
-    with tempfile.TemporaryFile() as sink:
+    with _nameless_file() as sink:
         saved = os.dup(2)
         os.dup2(sink.fileno(), 2)
         try:
