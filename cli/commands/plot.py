@@ -35,11 +35,12 @@ def plot(
     from impact_posture.job import FORMATS, load_view
     from impact_posture.plot import draw_all
     from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.progress import progress_bar
 
     folder = Path(result_dir)
-    written = draw_all(
-        load_view(folder), Path(out) if out else folder, [f.value for f in format or ()] or FORMATS, figure
-    )
+    formats = [f.value for f in format or ()] or FORMATS
+    with progress_bar("drawing", shown=not (quiet or json)):
+        written = draw_all(load_view(folder), Path(out) if out else folder, formats, figure)
     if json:
         print_json({"schema": "impact-posture/plot/1", "files": [str(path) for path in written]})
         return

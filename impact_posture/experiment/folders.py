@@ -18,7 +18,7 @@ from impact_posture.simulation.runs import Run
 
 # What makes a folder one that --force may replace.
 SIMULATION, COMPARISON, REPRODUCTION = "run.json", "comparison.json", "reproduction.json"
-FORMATS = ("png", "svg", "pdf")
+FORMATS = ("png",)
 
 
 def write_simulation(

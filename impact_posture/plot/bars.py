@@ -17,7 +17,7 @@ from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.style import (
     AFTER_BAR,
     BEFORE_BAR,
-    FORMATS,
+    DEFAULT_FORMATS,
     INK,
     VERMILLION,
     check_formats,
@@ -54,7 +54,7 @@ class Bar:
     paper: float | None = None
 
 
-def draw_bars(rows: Sequence[Bar], out_dir: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+def draw_bars(rows: Sequence[Bar], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
     """Write ``bars`` into ``out_dir``; return the paths.
 
     Raises:

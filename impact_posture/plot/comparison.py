@@ -26,14 +26,14 @@ from impact_posture.plot.run_axes import (
 from impact_posture.plot.run_panels import RUNS, Clip, blows, control_panels, first_blow, joint_panels, whole
 from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.runs import HINT, METRIC, joints_figure
-from impact_posture.plot.style import FORMATS, check_formats, framed, save, style
+from impact_posture.plot.style import DEFAULT_FORMATS, check_formats, framed, save, style
 from impact_posture.plot.view import mixed_unit
 
 # Columns of controllers side by side.
 COLUMNS = 3
 
 
-def draw_comparison(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+def draw_comparison(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
     """Write the pictures of several controllers in one scenario; return the paths.
 
     ``comparison-metric``, ``comparison-controls`` and ``comparison-joints``.

@@ -24,7 +24,7 @@ from impact_posture.plot.run_axes import (
 )
 from impact_posture.plot.run_panels import LINES, control_panels, first_blow, joint_panels, whole
 from impact_posture.plot.run_view import RunView, check_same, run_header
-from impact_posture.plot.style import FORMATS, check_formats, framed, save, style
+from impact_posture.plot.style import DEFAULT_FORMATS, check_formats, framed, save, style
 from impact_posture.plot.view import mixed_unit
 
 METRIC = "H  [‖Δν‖²/(N·s)²]"
@@ -32,7 +32,7 @@ HINT = "Less H is better: it is the squared velocity jump of an impulse of 1 N·
 LEFT = "Left: the whole run; right: the first blow."
 
 
-def draw_run(view: RunView, out_dir: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+def draw_run(view: RunView, out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
     """Write the pictures of one run, ``metric``, ``controls`` and ``joints``, into ``out_dir``; return the paths.
 
     Those that the robot has nothing for (no actuators, no joints) are left out.

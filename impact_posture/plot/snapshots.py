@@ -16,7 +16,7 @@ from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.shapes import Plane, Vector
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
-from impact_posture.plot.style import BLUE, FORMATS, GRAY, INK, PALE, VERMILLION, check_formats, framed, save, style
+from impact_posture.plot.style import BLUE, DEFAULT_FORMATS, GRAY, INK, PALE, VERMILLION, check_formats, framed, save, style
 
 NOTES = ("Sticks join joint origins; they are not the links' shapes. Gray: where the robot was when the run began.",)
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
@@ -25,7 +25,7 @@ _START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0
 _BEFORE = 0.005
 
 
-def draw_snapshots(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+def draw_snapshots(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
     """Write ``snapshots`` of one run of each controller (nominal first) into ``out_dir``; return the paths.
 
     Raises:
