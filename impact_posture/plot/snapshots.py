@@ -98,7 +98,7 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
 
 
 def _skeleton(view: RunView, tick: int) -> Skeleton:
-    return build_skeleton(view.robot, view.q[tick], view.contact, view.supports)
+    return build_skeleton(view.robot, view.q[tick], [view.contact], view.supports)
 
 
 def _window(low: Vector, high: Vector, view: RunView, plane: Plane) -> tuple[Vector, Vector]:
