@@ -23,6 +23,7 @@ from impact_posture.plot.style import (
     check_formats,
     framed,
     save,
+    shared_legend,
     style,
 )
 from impact_posture.plot.view import number
@@ -86,7 +87,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
             axes.set_visible(False)
         for axes, name, group in zip(panels.flat, scenarios, groups, strict=False):
             _panel(axes, name, group, max(len(other) for other in groups))
-        body.legend(handles=_handles(rows), loc="outside lower center", ncols=4)
+        shared_legend(body, _handles(rows), "lower")
     return figure
 
 

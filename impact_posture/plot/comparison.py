@@ -12,12 +12,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from impact_posture.plot.run_axes import (
-    beside,
     common_handles,
     curve,
     draw_panel,
     finish,
     frame_time,
+    headed,
     scale_metric,
     shade,
     share_height,
@@ -85,10 +85,9 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
         scale_metric(panels[0], [view.objective for view in views])
         panels[0].set_ylabel(METRIC)
         panels[0].set_xlabel(span.label)
-        beside(panels[0], panels[0])
         if hit:
             _blow_panel(panels[1], views)
-        finish(body, list(panels), common_handles(views))
+        finish(body, list(panels), common_handles(views), [("", panels[0])])
     return figure
 
 
@@ -144,7 +143,5 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
                 axes.tick_params(labelleft=False)
         for k in range(len(rows)):
             share_height([axes for axes in panels[k :: len(rows)].flat if axes.axison])
-            for line in panels[k :: len(rows)]:
-                beside(line[-1], line[0])
-        finish(body, list(panels[:, 0]), common_handles(views, rows))
+        finish(body, list(panels[:, 0]), common_handles(views, rows), headed(rows, panels[:, 0]))
     return figure

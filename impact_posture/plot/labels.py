@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d import proj3d
 from impact_posture.plot.shapes import Plane, Vector
 
 # Distances from the point to try, points; directions to try; how far a letter stays from what is drawn, pixels.
-_GAPS = (2.0, 5.0, 9.0, 14.0, 20.0)
+_GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0)
 _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
 _CLEAR = 2.0
 
@@ -24,10 +24,12 @@ class Label(Annotation):  # type: ignore[misc]
     ``toward`` is the direction in the picture in which it stands best.
     """
 
-    def __init__(self, text: str, point: Vector, toward: tuple[float, float] = (0.0, 1.0)) -> None:
+    def __init__(
+        self, text: str, point: Vector, toward: tuple[float, float] = (0.0, 1.0), color: str = "black"
+    ) -> None:
         super().__init__(
             text, (0.0, 0.0), (0.0, 0.0), textcoords="offset points", fontstyle="italic", ha="center", va="center",
-            zorder=7, annotation_clip=False,
+            color=color, zorder=7, annotation_clip=False,
         )  # fmt: skip
         self.point = np.asarray(point, dtype=float)
         self.toward = toward
@@ -35,13 +37,13 @@ class Label(Annotation):  # type: ignore[misc]
         self.set_in_layout(False)
 
 
-def draw_end_on(axes: Any, name: str, plane: Plane, n: Vector, at: Vector) -> None:
+def draw_end_on(axes: Any, name: str, plane: Plane, n: Vector, at: Vector, color: str = "black") -> None:
     """Draw a normal across the picture plane as a dot (towards the reader) or a cross (away) in a ring."""
     toward = float(np.cross(plane.axes[0], plane.axes[1]) @ n)
-    look = {"linestyle": "", "markeredgecolor": "black", "zorder": 6.5}
+    look = {"linestyle": "", "markeredgecolor": color, "zorder": 6.5}
     axes.plot(*at[:, None], marker="o", markersize=8, markerfacecolor="white", markeredgewidth=1, **look)
-    axes.plot(*at[:, None], marker="." if toward > 0 else "x", markersize=4, color="black", **look)
-    axes.add_artist(Label(name, at, (1.0, 1.0)))
+    axes.plot(*at[:, None], marker="." if toward > 0 else "x", markersize=4, color=color, **look)
+    axes.add_artist(Label(name, at, (1.0, 1.0), color))
 
 
 def place_labels(figure: Figure) -> None:

@@ -23,7 +23,7 @@ NOTES = (
     "Sticks join joint origins and the last frame of each link (its center of mass where it has no other frame); "
     "they are not the links' shapes. n points out of the surface, towards the robot."
 )
-_BODY = "Body: the box between the hips; its height is not the robot's."
+BODY = "Body: the box between the hips; its height is not the robot's."
 HATCH = "/////"
 
 
@@ -75,7 +75,7 @@ def postures_figure(view: ResultView) -> Figure:
     surfaces = surfaces_of(first, second, contact_letters(view), 0.3 * max(float(np.ptp(points, axis=0).max()), 1e-3))
     plane = side_plane(first, second)
     states = ((first, BEFORE), (second, AFTER))
-    notes = [f"{NOTES} {_BODY}" if len(first.body) else NOTES]
+    notes = [f"{NOTES} {BODY}" if len(first.body) else NOTES]
     with style():
         low, high = _window([first, second], plane, surfaces)
         # As high as the view from the side needs, within a page's reason.
@@ -184,7 +184,7 @@ def _fill(axes: Any, faces: list[Vector], plane: Plane | None, color: str, zorde
 
 
 def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane | None) -> None:
-    """Draw bones, body, rotors, joints, base, feet and contact points; in 3-D, or projected where there is a plane."""
+    """Draw links, body, rotors, joints, base, feet and contacts; in 3-D, or projected where there is a plane."""
     for bone in state.bones:
         _draw(axes, bone.T, plane, solid_capstyle="round", **line)
     color, thin = line["color"], line | {"linewidth": 0.8, "zorder": 2.0}
@@ -226,7 +226,7 @@ def _plane_3d(axes: Any, surface: Surface) -> None:
     color = INK if surface.color == GRAY else surface.color
     n = surface.tip - surface.contact
     axes.quiver(*surface.contact, *n, color=color, linewidth=1.2, arrow_length_ratio=0.2)
-    axes.add_artist(Label(surface.name, surface.tip))
+    axes.add_artist(Label(surface.name, surface.tip, color=color))
 
 
 def _plane_2d(axes: Any, surface: Surface, plane: Plane) -> None:
@@ -234,7 +234,7 @@ def _plane_2d(axes: Any, surface: Surface, plane: Plane) -> None:
     if np.linalg.norm(plane.axes @ surface.normal) < 0.05:
         # Seen face on: n comes towards the reader or goes away.
         axes.plot(*(plane.axes @ square(surface.point, surface.normal, surface.side)), color=color, linewidth=0.8)
-        draw_end_on(axes, surface.name, plane, surface.normal, plane.axes @ surface.contact)
+        draw_end_on(axes, surface.name, plane, surface.normal, plane.axes @ surface.contact, color)
         return
     outline = surface.outline(plane)
     axes.fill(*outline.T, facecolor="none", edgecolor=surface.color, hatch=HATCH, linewidth=0, zorder=1)
@@ -242,7 +242,7 @@ def _plane_2d(axes: Any, surface: Surface, plane: Plane) -> None:
     contact, tip = plane.axes @ surface.contact, plane.axes @ surface.tip
     arrow = {"arrowstyle": "-|>", "color": color, "linewidth": 1.2, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", tuple(tip), tuple(contact), arrowprops=arrow, zorder=7)
-    axes.add_artist(Label(surface.name, tip, tuple(plane.axes @ surface.normal)))
+    axes.add_artist(Label(surface.name, tip, tuple(plane.axes @ surface.normal), color))
 
 
 def _handles(state: Skeleton, surfaces: list[Surface]) -> list[Any]:

@@ -10,13 +10,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from impact_posture.plot.run_axes import (
-    beside,
     common_handles,
     curve,
     draw_panel,
     finish,
     frame_time,
     grid,
+    headed,
     name_time,
     scale_metric,
     share_height,
@@ -56,16 +56,16 @@ def metric_figure(view: RunView) -> Figure:
     n = np.array(view.contact.normal)
     normal = view.force @ n
     across = np.linalg.norm(view.force - normal[:, None] * n, axis=1)
-    force = [(normal, "", LINES[0])] if view.pushed else [(view.peak, "normal, peak", LINES[0])]
+    force = [(normal, "", LINES[0])] if view.pushed else [(view.peak, "force: normal, peak", LINES[0])]
     if not view.pushed:
-        force.append((across, "friction", LINES[1]))
+        force.append((across, "force: friction", LINES[1]))
     rows: list[tuple[str, list[tuple[Any, str, dict[str, Any]]]]] = [
         (METRIC, [(view.objective, "", LINES[0])]),
         (f"‖ν‖  [{unit.strip('()')}]", [(view.speed, "", LINES[0])]),
         ("push  [N]" if view.pushed else "force  [N]", force),
     ]
     if np.ptp(view.level) > 1e-9:
-        rows.append(("level of\nthe term", [(view.level, "", LINES[0])]))
+        rows.append(("level of\nthe term  [1]", [(view.level, "", LINES[0])]))
     notes = [HINT] if view.pushed else [HINT, "Normal: the largest within each tick of the controller."]
     notes = [" ".join([*notes, *([LEFT] if view.impacts else [])])]
     with style():
@@ -77,11 +77,10 @@ def metric_figure(view: RunView) -> Figure:
                 for values, name, look in curves:
                     curve(axes, view, values, clip, label=name or None, **look)
             axes_row[0].set_ylabel(label)
-            beside(axes_row[-1], axes_row[0])
         for axes in panels[0]:
             scale_metric(axes, [view.objective])
         name_time(panels, clips)
-        finish(body, list(panels[:, 0]), common_handles([view]))
+        finish(body, list(panels[:, 0]), common_handles([view]), [("", panels[2, 0])])
     return figure
 
 
@@ -96,9 +95,8 @@ def controls_figure(view: RunView) -> Figure:
             for axes, clip in zip(axes_row, clips, strict=True):
                 draw_panel(axes, panel, 0, view, clip)
             axes_row[0].set_ylabel(panel.label)
-            beside(axes_row[-1], axes_row[0])
         name_time(panels, clips)
-        finish(body, list(panels[:, 0]), common_handles([view], rows))
+        finish(body, list(panels[:, 0]), common_handles([view], rows), headed(rows, panels[:, 0]))
     return figure
 
 
@@ -126,9 +124,8 @@ def joints_figure(views: Sequence[RunView]) -> Figure:
             axes_row[0].set_ylabel(panel.label)
             if len(views) > 1:
                 axes_row[0].set_title(views[which].name, loc="left", fontweight="bold")
-            beside(axes_row[-1], axes_row[0])
         name_time(panels, clips[-1][:columns])
-        finish(body, list(panels[:, 0]), common_handles(views, rows))
+        finish(body, list(panels[:, 0]), common_handles(views, rows), headed(rows, panels[:, 0]))
         for k in range(len(rows)):
             share_height(list(panels[k :: len(rows)].flat))
     return figure

@@ -71,8 +71,9 @@ def build_skeleton(
 ) -> Skeleton:
     """Place the sticks at ``q``, shape (nq,).
 
-    A bone joins a joint's origin to its parent's; a base that carries four joints or more is a box instead.  The contact and the feet hang on their links; the last link of a
-    chain without one goes on to its farthest frame, or to its center of mass where it has none.
+    A bone joins a joint's origin to its parent's; a base that carries four joints or more is a box instead.  Contacts
+    and feet hang on their links; the last link of a chain without one goes on to its farthest frame, or to its center
+    of mass where it has none.
     """
     model = robot.model
     data = model.createData()
