@@ -346,5 +346,5 @@ Jobs = Annotated[int, _option("--jobs", panel=OUTPUT, min=1, help="Processes tha
 Compile = Annotated[CompileMode, _option("--compile", panel=OUTPUT, help="Whether the program becomes machine code.")]
 Formats = Annotated[
     list[PictureFormat] | None,
-    _option("--format", panel=OUTPUT, show_default="png svg pdf", help="Of the pictures; repeatable."),
+    _option("--format", panel=OUTPUT, show_default="png", help="Of the pictures: png, svg or pdf; repeatable."),
 ]

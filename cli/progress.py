@@ -1,4 +1,4 @@
-"""A bar on standard error while something takes long."""
+"""What is being done, on standard error, while something takes long; nothing where that is no terminal."""
 
 from __future__ import annotations
 
@@ -11,8 +11,17 @@ _REFRESH = 0.1
 
 
 @contextmanager
-def progress_bar(doing: str, what: str = "", *, shown: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """Yield what is told of ``(done, all)``; ``None`` where nothing is to be shown."""
+def progress_bar(
+    doing: str, what: str = "", *, shown: bool, first: str = ""
+) -> Iterator[Callable[[int, int], None] | None]:
+    """Yield what is told of ``(done, all)``; ``None`` where nothing is to be shown.
+
+    Args:
+        doing: What is being done.
+        what: What is counted.
+        shown: Whether to show anything.
+        first: What is being done until the first is done; ``doing`` if empty.
+    """
     if not shown:
         yield None
         return
@@ -22,17 +31,18 @@ def progress_bar(doing: str, what: str = "", *, shown: bool) -> Iterator[Callabl
     from impact_posture.processes import undone
 
     counted = (MofNCompleteColumn(), TextColumn(what)) if what else ()
-    columns = (TextColumn(doing), BarColumn(), *counted, TimeElapsedColumn())
-    # The bar starts with the first result: worker processes are forked before its thread runs.
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = bar.add_task(doing, total=None)
+    text = TextColumn("{task.description}")
+    # No thread redraws it: worker processes are forked meanwhile, and what takes long in C holds Python's lock.
+    bar = Progress(text, console=Console(stderr=True), transient=True, auto_refresh=False)
+    task = bar.add_task(f"{first or doing} …", total=None)
 
     def advance(done: int, total: int) -> None:
-        bar.start()
-        bar.update(task, completed=done, total=total)
+        bar.columns = (text, BarColumn(), *counted, TimeElapsedColumn())
+        bar.update(task, description=doing, completed=done, total=total, refresh=True)
 
     # Also when a signal ends the process: the bar hides the cursor.
-    with undone(bar.stop):
+    with undone(bar.stop), bar:
+        bar.refresh()
         yield advance
 
 

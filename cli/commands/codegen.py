@@ -67,6 +67,7 @@ def codegen(
     supports = options.check_supports(support, no_support)
     from impact_posture.codegen.folder import write_export
     from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.progress import progress_bar
 
     posture = None
     objectives: list[ImpactObjective]
@@ -97,16 +98,17 @@ def codegen(
             impact = request.resolve()
             objectives.append(impact.objective)
             warnings = impact.warnings
-    written = write_export(
-        objectives,
-        Path(out) if out else None,
-        prefix=prefix,
-        posture=posture,
-        single=float_,
-        portable=portable,
-        build=compile,
-        force=force,
-    )
+    with progress_bar("writing and compiling" if compile else "writing", shown=not (quiet or json)):
+        written = write_export(
+            objectives,
+            Path(out) if out else None,
+            prefix=prefix,
+            posture=posture,
+            single=float_,
+            portable=portable,
+            build=compile,
+            force=force,
+        )
     if json:
         print_json(written.to_dict())
         return

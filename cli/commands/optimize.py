@@ -86,6 +86,7 @@ def optimize(
     from impact_posture.folder import check_output
     from impact_posture.job import FORMATS, default_out, write_result
     from impact_posture.posture.follow import trade_off
+    from impact_posture.posture.result import result_document
     from impact_posture.posture.robustness import solve_robustly
     from impact_posture.posture.settings import prepare
     from impact_posture_cli.output import Page, print_json
@@ -97,7 +98,8 @@ def optimize(
     check_output(folder, force=force, kind="result")
     if not json:
         _announce(page, prepared)
-    with progress_bar("solving", "starts", shown=not (quiet or json)) as progress:
+    shown = not (quiet or json)
+    with progress_bar("solving", "starts", shown=shown, first="building the expressions") as progress:
         # With each scenario alone beside it: how far the optimum moves with the model.
         found = solve_robustly(
             prepared.problem,
@@ -110,24 +112,32 @@ def optimize(
     solution, robustness = found.solution, found.robustness
     curve = None
     if settings.tradeoff:
-        with progress_bar("solving", "points", shown=not (quiet or json)) as progress:
+        with progress_bar("solving", "points", shown=shown) as progress:
             curve = trade_off(solution, settings.tradeoff, compile=compile, progress=progress)
-    written = write_result(
-        prepared,
-        solution,
-        folder,
-        robustness=robustness,
-        tradeoff=curve,
-        force=force,
-        codegen=not no_codegen,
-        formats=[f.value for f in format or ()] or FORMATS,
-    )
+    document: dict[str, Any] = result_document(prepared, solution, robustness, curve)
+    if not json:
+        # Pictures and C code take longer than the answer: nobody waits for it because of them.
+        _summarize(page, prepared, solution, document)
+    with progress_bar("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as progress:
+        written = write_result(
+            prepared,
+            solution,
+            document,
+            folder,
+            tradeoff=curve,
+            force=force,
+            codegen=not no_codegen,
+            formats=[f.value for f in format or ()] or FORMATS,
+            jobs=jobs,
+            progress=progress,
+        )
     if written.compiler_error:
         page.warnings([f"the C code in c/ is written but could not be built: {written.compiler_error}"])
     if json:
-        print_json(written.document)
-        return
-    _summarize(page, prepared, solution, written)
+        print_json(document)
+    elif not quiet:
+        page.gap()
+        page.line(f"written to {written.out}: {_contents(written)}")
 
 
 def _given(context: typer.Context) -> dict[str, Any]:
@@ -213,11 +223,10 @@ def _announce(page: Page, prepared: Prepared) -> None:
     page.gap()
 
 
-def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, written: Written) -> None:
+def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
     from impact_posture_cli.output import number, worst_normal
     from impact_posture_cli.worst import contact_names, contacts_table, impulses_line, scenarios_table
 
-    document: dict[str, Any] = written.document
     initial, optimal = document["initial"], document["optimal"]
     rows = []
     for key, unit, words in (
@@ -269,9 +278,6 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, writte
         _tradeoff(page, document["tradeoff"], [n for n in document["notes"] if n.startswith("trade-off:")])
     # Those of the robot stood above the solving.
     page.warnings(document["warnings"][len(prepared.impact.warnings) :])
-    if not page.quiet:
-        page.gap()
-        page.line(f"written to {written.out}: {_contents(written)}")
 
 
 def _footings(frames: list[str], block: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:

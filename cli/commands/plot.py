@@ -36,10 +36,13 @@ def plot(
     from impact_posture.job import FORMATS, load_view
     from impact_posture.plot import draw_all
     from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.progress import progress_bar
 
     folder = Path(result_dir)
     into = Path(out) if out else folder
-    written = draw_all(load_view(folder), into, [f.value for f in format or ()] or FORMATS, figure)
+    formats = [f.value for f in format or ()] or FORMATS
+    with progress_bar("drawing", shown=not (quiet or json)):
+        written = draw_all(load_view(folder), into, formats, figure)
     # In a result's folder they are ours, too.
     add_to_record(into, written)
     if json:

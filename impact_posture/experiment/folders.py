@@ -16,7 +16,7 @@ from impact_posture.folder import whole_folder
 from impact_posture.simulation.runs import Run
 
 SIMULATION, COMPARISON, REPRODUCTION = "run.json", "comparison.json", "reproduction.json"
-FORMATS = ("png", "svg", "pdf")
+FORMATS = ("png",)
 
 
 def write_simulation(

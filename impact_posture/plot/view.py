@@ -208,10 +208,23 @@ def jump_unit(view: ResultView) -> str:
     return mixed_unit(view.robot)
 
 
+def objective_unit(view: ResultView) -> str:
+    """Unit of the objective's values."""
+    jump = jump_unit(view)
+    square = "J" if jump == "√J" else f"{jump}²"
+    return {"impulse": square, "energy": "kg"}.get(view.objective.kind, f"{square}/(m/s)²")
+
+
 def mixed_unit(robot: Robot) -> str:
     """Unit of the Euclidean ``‖ν‖``: both units where it mixes them."""
     kinds = [u for u in ("m/s", "rad/s") if u in velocity_units(robot)]
     return kinds[0] if len(kinds) == 1 else f"({', '.join(kinds)})"
+
+
+def contact_letters(view: ResultView) -> list[str]:
+    """What tells the contacts of a picture apart: nothing where there is one, else a letter each."""
+    count = len(view.objective.contacts)
+    return [f" {letter}" for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[:count]] if count > 1 else [""]
 
 
 def header_lines(view: ResultView) -> tuple[str, list[str]]:
@@ -220,7 +233,9 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
     H never stands alone: G, V, S and E stand beside it.
     """
     contact, robot = view.objective.contact, view.robot
-    title = view.title or f"{robot.name}, impact at {contact.frame}"
+    named = zip(view.objective.contacts, contact_letters(view), strict=True)
+    frames = ", ".join(f"{one.frame}{letter and f' ({letter.strip()})'}" for one, letter in named)
+    title = view.title or f"{robot.name}, impact at {frames}"
     normal = ", ".join(number(v) for v in contact.normal)
     axes = "world" if contact.normal_frame == "world" else "contact frame"
     facts = [f"robot {robot.name}", f"contact {contact.frame}"] if view.title else []
@@ -234,8 +249,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
         f"armature {_armature(robot)}",
     ]
     if view.objective.others:
-        others = ", ".join(other.frame for other in view.objective.others)
-        facts.insert(0, f"drawn and in numbers: this contact alone; objective also of {others}")
+        facts.insert(0, f"numbers and ellipsoids: {contact.frame} alone; objective: all contacts together")
     if view.objective.scenarios:
         facts.insert(
             0, f"drawn and in numbers: the model as it stands; objective the worst of {len(view.objective.scenarios)}"

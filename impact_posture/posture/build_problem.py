@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
@@ -197,8 +197,8 @@ def _com_constraint(
                 corner = placement.act(np.array([sx * support.size[0], sy * support.size[1], 0.0]))
                 corners.append(corner[:2])
     try:
-        equations = ConvexHull(np.array(corners)).equations
-    except (QhullError, ValueError):
+        equations = scipy.spatial.ConvexHull(np.array(corners)).equations
+    except (scipy.spatial.QhullError, ValueError):
         raise InputError(
             "the feet span no area to keep the center of mass above",
             where="com_over_feet",
