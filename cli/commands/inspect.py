@@ -18,6 +18,7 @@ def inspect(
     config: options.Config = None,
     armature: options.Armature = None,
     lock: options.Lock = None,
+    lock_massless: options.LockMassless = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -27,7 +28,15 @@ def inspect(
     from impact_posture_cli.asked import load_options
     from impact_posture_cli.output import Page, print_json
 
-    load = load_options(root=root, package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock)
+    load = load_options(
+        root=root,
+        package_dir=package_dir,
+        srdf=srdf,
+        config=config,
+        armature=armature,
+        lock=lock,
+        lock_massless=lock_massless,
+    )
     summary = summarize(load_robot(robot, load))
     if json:
         print_json(summary)

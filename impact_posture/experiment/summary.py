@@ -188,7 +188,8 @@ def reduction_text(row: Row | None) -> str:
     if row is None or row.reduction is None or row.controller == "nominal":
         return "–"
     half = row.reduction.half_width if row.reduction.samples > 2 else None
-    return f"{100 * row.reduction.mean:.1f}" + ("" if half is None else f" ± {100 * half:.1f}") + " %"
+    # Adding zero turns -0.0 into 0.0.
+    return f"{round(100 * row.reduction.mean, 1) + 0.0:.1f}" + ("" if half is None else f" ± {100 * half:.1f}") + " %"
 
 
 def targets_text(row: Row) -> str:
