@@ -39,7 +39,7 @@ _SOLE = 0.01
 _UPRIGHT = float(np.cos(np.radians(1.0)))
 
 
-def _chain(robot: Robot, joint: int) -> list[int]:
+def chain(robot: Robot, joint: int) -> list[int]:
     """The joint and its ancestors, the free-flyer left out."""
     found, first = [], 2 if robot.floating else 1
     while joint >= first:
@@ -82,12 +82,12 @@ def feet(robot: Robot, named: Sequence[str] = ()) -> tuple[str, ...]:
     height = {str(f.name): float(data.oMf[i].translation[2]) for i, f in enumerate(model.frames)}
     found: dict[str, bool] = {}
     for joint in _leaves(robot):
-        chain = _chain(robot, joint)
-        words = [str(model.names[i]) for i in chain] + [n for i in chain for n in _links(robot, i)]
+        line = chain(robot, joint)
+        words = [str(model.names[i]) for i in line] + [n for i in line for n in _links(robot, i)]
         own = [n for n in _links(robot, joint) if not _SENSOR.search(n) and not _ROTOR.search(n)]
         by_name = [n for n in own if _FOOT.search(n)]
         other = (_WHEEL, _FINGER) if by_name else (_WHEEL, _FINGER, _ARM)
-        if len(chain) < 2 or not own or any(part.search(word) for part in other for word in words):
+        if len(line) < 2 or not own or any(part.search(word) for part in other for word in words):
             continue
         # A sole lies in a foot, an ankle above it.
         best = min(by_name or own, key=lambda n: ("sole" not in n.lower(), round(height[n], 3), own.index(n)))
@@ -113,7 +113,7 @@ def tips(robot: Robot, feet: Sequence[str] = ()) -> tuple[str, ...]:
 
     def rank(frame: pin.Frame) -> tuple[int, int]:
         name, joint = str(frame.name), int(frame.parentJoint)
-        depth = -len(_chain(robot, joint))
+        depth = -len(chain(robot, joint))
         if frame.type != pin.FrameType.BODY:
             return 9, depth
         if _SENSOR.search(name) or _WHEEL.search(name) or _ROTOR.search(name):
@@ -138,8 +138,14 @@ def fingers(robot: Robot) -> tuple[str, ...]:
     return tuple(
         joint
         for joint in robot.joint_names
-        if any(_FINGER.search(str(names[i])) for i in _chain(robot, robot.joint_id(joint)))
+        if any(_FINGER.search(str(names[i])) for i in chain(robot, robot.joint_id(joint)))
     )
+
+
+def base_frame(robot: Robot) -> str:
+    """The root link's frame."""
+    joint = 1 if robot.floating else 0
+    return str(next(f.name for f in robot.model.frames if f.parentJoint == joint and f.type == pin.FrameType.BODY))
 
 
 def wheels(robot: Robot) -> tuple[str, ...]:
@@ -183,7 +189,8 @@ def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> SupportSpec:
 def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Vector:
     """Lowest points (world) of the primitive collision shapes that move with a frame; meshes are not opened."""
     model = robot.model
-    joint, found = model.frames[index].parentJoint, []
+    joint = model.frames[index].parentJoint
+    found: list[Vector] = []
     for link in ET.parse(urdf).getroot().iter("link"):
         name = link.get("name", "")
         if not model.existFrame(name, pin.FrameType.BODY):

@@ -40,8 +40,8 @@ class LoadOptions:
         armature: ``"none"``, a TOML file's path, or values by joint; ``None``: robot.toml's, else the rotor data of
             the SRDF, else zero.
         lock: Joints made rigid at the default posture: names, or patterns such as ``gripper_*``.
-        lock_massless: Make those joints rigid, too, that move no mass.
         mounting: How far joints sit from where the URDF has them, by joint: meters, in the parent joint's axes.
+        lock_massless: Make those joints rigid, too, that move no mass.
     """
 
     root: Root | None = None
@@ -50,8 +50,8 @@ class LoadOptions:
     config: str | None = None
     armature: ArmatureOption = None
     lock: tuple[str, ...] = field(default=())
-    lock_massless: bool = False
     mounting: Mapping[str, Vector3] = field(default_factory=dict)
+    lock_massless: bool = False
 
 
 def known_robots() -> tuple[str, ...]:
