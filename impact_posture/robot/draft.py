@@ -133,9 +133,11 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     draft.key("name", robot.name, "the URDF's file name")
     kind, reason = _kind(robot, feet)
     draft.key("kind", kind, reason, guessed=True)
-    if default != "neutral":
-        states = ", ".join(name for name in robot.postures if name != "neutral")
-        draft.key("default_posture", default, f"of the SRDF's: {states}", guessed=True)
+    if states := ", ".join(name for name in robot.postures if name != "neutral"):
+        chosen = (
+            f"of the SRDF's: {states}" if default != "neutral" else f"the SRDF's leave the joint limits: {states}"
+        )
+        draft.key("default_posture", default, chosen, guessed=True)
     draft.lines += ["", "[model]"]
     if srdf is not None:
         draft.key("srdf", _path(srdf, folder), "as --srdf says" if options.srdf else "found near the URDF")
