@@ -8,6 +8,7 @@ import io
 import json
 import logging
 import os
+import re
 import sys
 import traceback
 from collections.abc import Sequence
@@ -79,6 +80,7 @@ def _explain(error: Exception, wants_json: bool) -> int:
 def _usage(error: Any, wants_json: bool) -> int:
     """Typer's own message, plain: how to call it, and what was wrong."""
     code = int(getattr(error, "exit_code", 2))
+    _in_our_words(error)
     shown = io.StringIO()
     error.show(file=shown)
     with contextlib.suppress(OSError):
@@ -88,6 +90,16 @@ def _usage(error: Any, wants_json: bool) -> int:
         where = context.command_path if context is not None else "command line"
         _document(code, "UsageError", error.format_message(), where, f"see {where} --help")
     return code
+
+
+def _in_our_words(error: Any) -> None:
+    """Say of an option with few values what the library says of such a key in a file."""
+    # Typer has no hook for this, and its words differ from version to version; the two lists are in all of them.
+    given = re.search(r"'(.*?)' is not one of (.*)", str(getattr(error, "message", "")))
+    if given:
+        from impact_posture.errors import not_one_of
+
+        error.message = "; ".join(not_one_of(given[1], re.findall(r"'(.*?)'", given[2])))
 
 
 def _report(code: int, kind: str, what: str, where: str = "", mend: str = "", *, wants_json: bool) -> int:

@@ -98,6 +98,16 @@ def test_plot_draws_again(result: Path, tmp_path: Path) -> None:
     assert refused.returncode == 1 and "result.json" in refused.stderr
 
 
+def test_verify_takes_the_problem_of_a_result(result: Path, tmp_path: Path) -> None:
+    done = run("verify", result, "--samples", 1, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    document, known = json.loads(done.stdout), json.loads((result / "result.json").read_text())
+    assert document["passed"] and document["robot"]["model_sha256"] == known["robot"]["model_sha256"]
+    assert document["contacts"] == known["contacts"] and document["supports"] == known["supports"]
+    refused = run("verify", result, "--frame", "ee", cwd=tmp_path)
+    assert refused.returncode == 2 and "--frame contradicts RESULT_DIR" in " ".join(refused.stderr.split())
+
+
 def test_posture_file_starts_the_next_optimization(result: Path, tmp_path: Path) -> None:
     done = run(
         "optimize",

@@ -63,6 +63,7 @@ def optimize(
     regularization: options.Regularization = 0.0,
     tradeoff: options.Tradeoff = 0,
     lock: options.Lock = None,
+    lock_massless: options.LockMassless = False,
     root: options.Root = None,
     armature: options.Armature = None,
     config: options.Config = None,
@@ -224,6 +225,7 @@ def _announce(page: Page, prepared: Prepared) -> None:
 
 
 def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
+    from impact_posture.posture.notes import percent
     from impact_posture_cli.output import number, worst_normal
     from impact_posture_cli.worst import contact_names, contacts_table, impulses_line, scenarios_table
 
@@ -254,7 +256,7 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     for when, block in (("before", initial), ("after", optimal)):
         for name, feet in _footings(frames, block):
             page.line(f"feet {when}{name}: {feet['verdict']}")
-    page.line(f"reduction {solution.reduction:.1%}; {_redundancy(solution.redundancy)} left by the constraints")
+    page.line(f"reduction {percent(solution.reduction)}; {_redundancy(solution.redundancy)} left by the constraints")
     if "robustness" in document:
         page.line(document["robustness"]["line"])
     for note in solution.notes[len(prepared.problem.notes) :]:
@@ -290,6 +292,7 @@ def _footings(frames: list[str], block: dict[str, Any]) -> list[tuple[str, dict[
 
 def _tradeoff(page: Page, points: list[dict[str, Any]], notes: list[str]) -> None:
     """What a smaller change would buy."""
+    from impact_posture.posture.notes import percent
     from impact_posture_cli.output import number
 
     page.gap()
@@ -297,7 +300,7 @@ def _tradeoff(page: Page, points: list[dict[str, Any]], notes: list[str]) -> Non
     first, last = points[0]["objective"], points[-1]["objective"]
     rows = []
     for point in points:
-        gain = f"{(first - point['objective']) / (first - last):.1%}" if last < first else ""
+        gain = percent((first - point["objective"]) / (first - last)) if last < first else ""
         marks = (["knee"] if point["knee"] else []) + ([] if point["certified"] else ["not certified"])
         keys = ("objective", "H", "G", "V", "S")
         rows.append((f"  {point['within']:.3f}", gain, *(number(point[key]) for key in keys), ", ".join(marks)))

@@ -205,7 +205,8 @@ def percent(value: Interval | None, unit: str = " %") -> str:
     if value is None:
         return "–"
     half = value.half_width if value.samples > 2 else None
-    return f"{100 * value.mean:.1f}" + ("" if half is None else f" ± {100 * half:.1f}") + unit
+    # Adding zero turns -0.0 into 0.0.
+    return f"{round(100 * value.mean, 1) + 0.0:.1f}" + ("" if half is None else f" ± {100 * half:.1f}") + unit
 
 
 def status_text(row: Row) -> str:

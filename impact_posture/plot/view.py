@@ -261,7 +261,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
         ("G", "1/kg", lambda f: f.G),
         ("V", "‖Δν‖²/(m/s)²", lambda f: f.V),
         ("S", "‖Δν‖²/(m/s)²", lambda f: f.S),
-        ("E", "J/(m/s)²", lambda f: f.E),
+        ("E", "kg", lambda f: f.E),
     ]
     numbers = [
         f"{name} {number(get(view.before))} → {number(get(view.after))}"

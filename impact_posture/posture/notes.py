@@ -13,6 +13,15 @@ Vector = NDArray[np.float64]
 _LOCKED = 0.05
 
 
+def percent(share: float) -> str:
+    """Return a share in percent: digits enough never to read 100 where it is less, and no minus before a zero."""
+    for digits in range(1, 15):
+        text = f"{100 * share:.{digits}f}"
+        if abs(share) >= 1 or abs(float(text)) != 100:
+            break
+    return f"{text.removeprefix('-') if float(text) == 0 else text}%"
+
+
 def notes_on_impacts(objective: Objective, initial: Vector, q: Vector) -> list[str]:
     """Where a smaller jump per impulse is no smaller jump per speed, and contacts that lock; one line each."""
     notes: list[str] = []

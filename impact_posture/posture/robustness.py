@@ -14,6 +14,7 @@ from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.compiled import CompileMode
+from impact_posture.posture.notes import percent
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.solve import SAME_POSTURE, PostureSolution, Progress, solve, wrapped_difference
 from impact_posture.robot.scenario import between
@@ -104,13 +105,13 @@ class Robustness:
             parts.append(f"the optimum of the model as it stands breaks {', '.join(self.broken)}")
         elif self.gain < -_NOISE:
             parts.append(
-                f"the worst case is {-self.gain:.1%} higher than {here}: more --starts will find a better one"
+                f"the worst case is {percent(-self.gain)} higher than {here}: more --starts will find a better one"
             )
         else:
-            parts.append(f"the worst case is {max(self.gain, 0.0):.1%} lower than {here}")
+            parts.append(f"the worst case is {percent(max(self.gain, 0.0))} lower than {here}")
         lower = self.price < -_NOISE
         parts.append(
-            f"the model as it stands is {abs(self.price):.1%} {'below' if lower else 'above'} its own optimum"
+            f"the model as it stands is {percent(abs(self.price))} {'below' if lower else 'above'} its own optimum"
         )
         if self.between > self.worst_robust * (1 + _NOISE):
             parts.append(f"between the scenarios it reaches {self.between:.4g}, above the worst of them")

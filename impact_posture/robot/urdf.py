@@ -59,10 +59,15 @@ def resolve_path(text: str, base: Path) -> Path:
     root = example_robot_data()
     path = root / text.removeprefix(EXAMPLE_PREFIX)
     if not path.is_file():
-        known = [p.relative_to(root).as_posix() for p in sorted(root.rglob("*.[us]rdf"))]
-        fitting = [k for k in known if k.endswith(path.suffix)]
+        fitting = example_models(path.suffix)
         raise PackageNotFound(text.removeprefix(EXAMPLE_PREFIX), fitting, where=EXAMPLE_PREFIX.rstrip(":"))
     return path
+
+
+def example_models(suffix: str = ".urdf") -> list[str]:
+    """Paths below the ``robots/`` folder of example-robot-data, sorted."""
+    root = example_robot_data()
+    return [p.relative_to(root).as_posix() for p in sorted(root.rglob("*.[us]rdf")) if str(p).endswith(suffix)]
 
 
 def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) -> tuple[pin.Model, tuple[str, ...]]:
