@@ -27,6 +27,7 @@ def load_options(
     config: str | None,
     armature: list[str] | None,
     lock: list[str] | None,
+    lock_massless: bool,
 ) -> LoadOptions:
     """How to load the robot."""
     from impact_posture.impact.texts import parse_armature
@@ -39,6 +40,7 @@ def load_options(
         config=config,
         armature=parse_armature(armature or ()),
         lock=tuple(lock or ()),
+        lock_massless=lock_massless,
     )
 
 
@@ -69,6 +71,7 @@ def impact_request(
     config: str | None,
     armature: list[str] | None,
     lock: list[str] | None,
+    lock_massless: bool,
 ) -> ImpactRequest:
     """What impact is meant.
 
@@ -82,7 +85,15 @@ def impact_request(
 
     return ImpactRequest(
         robot=robot,
-        load=load_options(root=root, package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock),
+        load=load_options(
+            root=root,
+            package_dir=package_dir,
+            srdf=srdf,
+            config=config,
+            armature=armature,
+            lock=lock,
+            lock_massless=lock_massless,
+        ),
         frame=frame,
         normal=normal,
         offset=offset,

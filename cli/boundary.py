@@ -6,7 +6,9 @@ import contextlib
 import errno
 import io
 import json
+import logging
 import os
+import re
 import sys
 import traceback
 from collections.abc import Sequence
@@ -28,6 +30,8 @@ def run(command: Any, arguments: Sequence[str]) -> int:
     0 done; 1 an error to act on; 2 a wrong command line; other codes as the error says; 130 interrupted.  One line on
     standard error, and with ``--json`` the same as ``{"error": {code, kind, what, where, mend}}`` on standard output.
     """
+    # Where no folder for its caches can be written, matplotlib logs what it does about that.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             # λ and × must not crash a terminal that has no letter for them.
@@ -76,6 +80,7 @@ def _explain(error: Exception, wants_json: bool) -> int:
 def _usage(error: Any, wants_json: bool) -> int:
     """Typer's own message, plain: how to call it, and what was wrong."""
     code = int(getattr(error, "exit_code", 2))
+    _in_our_words(error)
     shown = io.StringIO()
     error.show(file=shown)
     with contextlib.suppress(OSError):
@@ -85,6 +90,16 @@ def _usage(error: Any, wants_json: bool) -> int:
         where = context.command_path if context is not None else "command line"
         _document(code, "UsageError", error.format_message(), where, f"see {where} --help")
     return code
+
+
+def _in_our_words(error: Any) -> None:
+    """Say of an option with few values what the library says of such a key in a file."""
+    # Typer has no hook for this, and its words differ from version to version; the two lists are in all of them.
+    given = re.search(r"'(.*?)' is not one of (.*)", str(getattr(error, "message", "")))
+    if given:
+        from impact_posture.errors import not_one_of
+
+        error.message = "; ".join(not_one_of(given[1], re.findall(r"'(.*?)'", given[2])))
 
 
 def _report(code: int, kind: str, what: str, where: str = "", mend: str = "", *, wants_json: bool) -> int:
@@ -114,8 +129,9 @@ def _closed_pipe() -> int:
 
 def _discard_output() -> None:
     """What could not be written must not fail again when the interpreter flushes it."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

@@ -28,29 +28,27 @@ Processes = Annotated[
 
 def rows_table(page: Page, rows: tuple[Row, ...] | list[Row]) -> None:
     """Controllers of a scenario, a row each."""
-    from impact_posture.experiment.summary import interval_text, reduction_text
+    from impact_posture.experiment.summary import interval_text, percent
 
     lines = []
     for row in rows:
-        if not row.metrics:
-            lines.append((row.controller, "failed", "", "", "", ""))
-            continue
-        lines.append(
-            (
-                row.controller + ("" if row.rested else " *"),
-                interval_text(row.metrics["q_total_impact"]),
-                reduction_text(row),
-                interval_text(row.metrics["peak_jump"]),
-                interval_text(row.metrics["saturation_inside"], 2),
-                "" if row.H is None else f"{row.H:.3g}",
-            )
-        )
-    page.table(("  controller", "q_total", "reduction", "peak jump", "saturated s", "H before"), [
-        (f"  {line[0]}", *line[1:]) for line in lines
-    ], right=(1, 2, 3, 4, 5))  # fmt: skip
+        numbers = [""] * 4
+        if row.metrics:
+            less = [percent(None if row.controller == "nominal" else of, "") for of in (row.reduction, row.recovery)]
+            peak = f"{row.metrics['peak_jump'].mean:.3g}"
+            numbers = [interval_text(row.metrics["q_total_impact"]), *less, peak]
+        whole = row.completed == row.runs
+        status = row.status if whole else f"{row.status} {row.runs - row.completed}/{row.runs}"
+        lines.append((f"  {row.controller}{'' if row.rested else ' *'}", *numbers, status))
+    head = ("  controller", "q_total", "less %", "in 1 s %", "peak jump", "status")
+    page.table(head, lines, right=(1, 2, 3, 4))
+    page.line("  less %: reduction within the windows; in 1 s %: until 1 s after each impact began", style="dim")
+    if any(row.failed for row in rows):
+        page.line("  no reduction where a run did not complete, of either controller; means are of those that did",
+                  style="dim")  # fmt: skip
     for row in rows:
-        for error in row.failed:
-            page.line(f"  {row.controller}: {error}")
+        for line in row.failed:
+            page.line(f"  {row.controller}: {line}")
         if row.stops:
             page.line(f"  {row.controller} reaches the stops of {', '.join(row.stops)}")
     if not all(row.rested for row in rows):

@@ -1,47 +1,20 @@
-"""The ``impact-posture`` command: its subcommands and its one way out."""
+"""The ``impact-posture`` command: what concerns the process comes first, then everything else."""
 
 from __future__ import annotations
 
 import sys
-from typing import Annotated
 
-import typer
-
-from impact_posture_cli.boundary import run
-from impact_posture_cli.commands import COMMANDS
-from impact_posture_cli.words import put_right
-
-app = typer.Typer(
-    name="impact-posture",
-    help="Find the posture in which a redundant robot takes an impact best, see why, and hand it to the controller.",
-    epilog="Each command has its own --help. ROBOT: a name from 'impact-posture robots', or a path to a .urdf.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-
-
-def _version(value: bool) -> None:
-    if value:
-        from impact_posture import __version__
-
-        typer.echo(f"impact-posture {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
-) -> None:
-    """Carry the options that stand before a command."""
-
-
-for name, command in COMMANDS.items():
-    app.command(name)(command)
+from impact_posture_cli.process import prepare
 
 
 def main() -> None:
     """Run the command line and exit with its code."""
+    prepare()
+    # Not before: a signal that comes while these are imported ends the process quietly, too.
+    import typer
+
+    from impact_posture_cli.app import app
+    from impact_posture_cli.boundary import run
+    from impact_posture_cli.words import put_right
+
     sys.exit(run(typer.main.get_command(app), put_right(sys.argv[1:])))

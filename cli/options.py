@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
@@ -73,12 +75,38 @@ def check_supports(support: list[str] | None, no_support: bool) -> tuple[str, ..
     return () if no_support else tuple(support) if support else None
 
 
+def is_result(robot: str) -> bool:
+    """Whether ROBOT|RESULT_DIR is a folder that optimize wrote."""
+    return (Path(robot) / "result.json").is_file()
+
+
+def refuse_beside_result(context: typer.Context, free: Collection[str]) -> None:
+    """Refuse options that say what a result folder says already; ``free`` are those that do not.
+
+    Raises:
+        UsageError: Exit code 2.
+    """
+    for name in context.params:
+        source = context.get_parameter_source(name)
+        if name not in free and source is not None and source.name == "COMMANDLINE":
+            option = f"--{name.replace('_', '-')}"
+            raise UsageError(f"{option} contradicts RESULT_DIR, which says what the problem is: leave it out.")
+
+
 def _option(*names: str, panel: str, help: str, **more: Any) -> Any:
     return typer.Option(*names, help=help, rich_help_panel=panel, **more)
 
 
 RobotName = Annotated[
     str, typer.Argument(metavar="ROBOT", help="Known name, path to a .urdf, or example-robot-data:PATH.")
+]
+
+RobotOrResult = Annotated[
+    str,
+    typer.Argument(
+        metavar="ROBOT|RESULT_DIR",
+        help="Known name, path to a .urdf, example-robot-data:PATH, or a folder that optimize wrote.",
+    ),
 ]
 
 # ---- contact ----------------------------------------------------------------------------------------------------
@@ -180,7 +208,14 @@ SupportList = Annotated[
 ]  # fmt: skip
 NoSupport = Annotated[bool, _option("--no-support", panel=ROBOT, help="Nothing stays on the ground.")]
 Lock = Annotated[
-    list[str] | None, _option("--lock", metavar="JOINT", panel=ROBOT, help="Joint made rigid; repeatable.")
+    list[str] | None,
+    _option(
+        "--lock", metavar="JOINT", panel=ROBOT,
+        help="Joint made rigid, or a pattern in quotes such as 'gripper_*'; repeatable.",
+    ),
+]  # fmt: skip
+LockMassless = Annotated[
+    bool, _option("--lock-massless", panel=ROBOT, help="Joints that move no mass are made rigid, all of them.")
 ]
 Root = Annotated[
     RootKind | None, _option("--root", panel=ROBOT, show_default="robot.toml's", help="What the base hangs on.")
@@ -199,7 +234,13 @@ Config = Annotated[
         help="What URDF cannot say about the robot.",
     ),
 ]  # fmt: skip
-Srdf = Annotated[str | None, _option("--srdf", metavar="FILE", panel=ROBOT, help="Named postures, rotor data.")]
+Srdf = Annotated[
+    str | None,
+    _option(
+        "--srdf", metavar="FILE", panel=ROBOT, show_default="robot.toml's",
+        help="Named postures, rotor data: a path, or example-robot-data:PATH.",
+    ),
+]  # fmt: skip
 PackageDirs = Annotated[
     list[str] | None,
     _option("--package-dir", metavar="DIR", panel=ROBOT, help="Where package:// leads; repeatable."),
@@ -346,5 +387,5 @@ Jobs = Annotated[int, _option("--jobs", panel=OUTPUT, min=1, help="Processes tha
 Compile = Annotated[CompileMode, _option("--compile", panel=OUTPUT, help="Whether the program becomes machine code.")]
 Formats = Annotated[
     list[PictureFormat] | None,
-    _option("--format", panel=OUTPUT, show_default="png svg pdf", help="Of the pictures; repeatable."),
+    _option("--format", panel=OUTPUT, show_default="png", help="Of the pictures: png, svg or pdf; repeatable."),
 ]

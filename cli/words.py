@@ -8,13 +8,18 @@ from itertools import zip_longest
 
 from impact_posture_cli.options import TRADEOFF_POINTS
 
-# Whole or not: what is no whole number is for the option itself to refuse.
-_NUMBER = re.compile(r"[+-]?[0-9.]+$")
-
 
 def put_right(arguments: Sequence[str]) -> list[str]:
     """Apply all of the below."""
     return fill_optional(in_pairs(arguments))
+
+
+# Options whose value may be left out: what a value looks like, and what stands for none.
+_OPTIONAL = {
+    # Whole or not: what is no whole number is for the option itself to refuse.
+    "--tradeoff": (re.compile(r"[+-]?[0-9.]+$"), str(TRADEOFF_POINTS)),
+    "--write-robot-toml": (re.compile(r".*\.toml$"), ""),
+}
 
 
 def in_pairs(arguments: Sequence[str]) -> list[str]:
@@ -29,10 +34,10 @@ def in_pairs(arguments: Sequence[str]) -> list[str]:
 
 
 def fill_optional(arguments: Sequence[str]) -> list[str]:
-    """Give ``--tradeoff`` its number where none follows: Typer has no options whose value may be left out."""
+    """Give options of ``_OPTIONAL`` a value where none follows: Typer has none whose value may be left out."""
     filled: list[str] = []
     for word, following in zip_longest(arguments, arguments[1:], fillvalue=""):
         filled.append(word)
-        if word == "--tradeoff" and not _NUMBER.match(following):
-            filled.append(str(TRADEOFF_POINTS))
+        if word in _OPTIONAL and not _OPTIONAL[word][0].match(following):
+            filled.append(_OPTIONAL[word][1])
     return filled

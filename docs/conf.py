@@ -31,7 +31,7 @@ smartquotes = False
 html_show_copyright = False
 html_theme = "furo"
 html_static_path = ["_static"]
-html_css_files = ["math.css"]
+html_css_files = ["site.css"]
 html_title = f"impact-posture {release}"
 exclude_patterns = ["_build", "generated"]
 

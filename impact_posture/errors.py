@@ -29,6 +29,17 @@ def one_line(text: str) -> str:
     return printable(" ".join(text.split()))
 
 
+def not_one_of(value: object, choices: Iterable[str]) -> tuple[str, str]:
+    """Say that a value is none of the few that there are: what is wrong, and what to do."""
+    names = list(choices)
+    folded = {name.casefold(): name for name in names}
+    text = str(value).casefold()
+    begun = [name for name in folded if text and name.startswith(text)]
+    close = begun or difflib.get_close_matches(text, folded, n=1, cutoff=0.5)
+    what = f"'{value}' is none of {', '.join(names)}"
+    return what, f"did you mean {folded[close[0]]}?" if close else "choose one of them"
+
+
 class ImpactPostureError(Exception):
     """Root of all errors of this package.
 
@@ -210,6 +221,8 @@ class SolverFailed(ImpactPostureError):
 
 class SimulationDiverged(ImpactPostureError):
     """A simulation's state ran away; carries the time."""
+
+    exit_code = 4
 
     def __init__(self, time: float, *, where: str = "simulation") -> None:
         self.time = time

@@ -61,17 +61,22 @@ def c_comment(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9 _.,:;+()\[\]=<>^'/|@#%&!-]", "_", text.translate(_ASCII))
 
 
-def toml_string(text: str) -> str:
-    """Return a quoted string of TOML, which reads back as the same text.
+def toml(value: object) -> str:
+    """Return a value of TOML, on one line, which reads back as the same.
 
     Raises:
-        UnicodeEncodeError: The text holds half a surrogate pair (a path that is not UTF-8), which TOML cannot.
+        UnicodeEncodeError: A text holds half a surrogate pair (a path that is not UTF-8), which TOML cannot.
     """
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{toml(str(key))} = {toml(one)}" for key, one in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    if isinstance(value, float):
+        return repr(value)
+    # JSON's integers and booleans are TOML's, and its strings but for pairs of surrogates, which TOML has none of.
+    text = json.dumps(value, ensure_ascii=False)
     text.encode("utf-8")
-    # JSON's escapes are TOML's, but for pairs of surrogates, which TOML has none of.
-    return "".join(
-        c if _is_visible(c) or c < " " else rf"\U{ord(c):08X}" for c in json.dumps(text, ensure_ascii=False)
-    )
+    return "".join(c if _is_visible(c) else rf"\U{ord(c):08X}" for c in text)
 
 
 def xml_name(text: str) -> str:

@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
 
+from impact_posture.codegen.build import products
 from impact_posture.codegen.export import Export, export
 from impact_posture.errors import CompilerError, SpecError
 from impact_posture.escape import file_name
-from impact_posture.folder import whole_folder
-from impact_posture.plot import PathData, ResultView, TradeOffData, draw_all
+from impact_posture.folder import whole_folder, write_record
 from impact_posture.posture.path import NullSpacePath, null_space_path
-from impact_posture.posture.result import result_arrays, result_document
-from impact_posture.posture.robustness import Robustness
+from impact_posture.posture.result import result_arrays
 from impact_posture.posture.settings import Prepared, dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
+from impact_posture.processes import shared_out
 from impact_posture.robot.postures import write_posture
 
-# What makes a folder an earlier result, which --force may replace.
-MARKS = ("result.json",)
-FORMATS = ("png", "svg", "pdf")
+# Matplotlib is imported where something is drawn: it takes longer than a small robot's answer.
+if TYPE_CHECKING:
+    from impact_posture.plot import ResultView, TradeOffData
+
+FORMATS = ("png",)
 
 
 @dataclass(frozen=True)
@@ -35,13 +38,11 @@ class Written:
 
     Attributes:
         out: The folder.
-        document: The content of ``result.json``.
         export: The C export, or ``None``.
         compiler_error: Why the C code could not be built and compared; empty if it was, or no compiler is there.
     """
 
     out: Path
-    document: dict[str, object]
     export: Export | None
     compiler_error: str = ""
 
@@ -54,38 +55,73 @@ def default_out(prepared: Prepared) -> Path:
 def write_result(
     prepared: Prepared,
     solution: PostureSolution,
+    document: dict[str, Any],
     out: Path,
     *,
-    robustness: Robustness | None = None,
     tradeoff: TradeOff | None = None,
     force: bool = False,
     codegen: bool = True,
     formats: Sequence[str] = FORMATS,
+    jobs: int = 1,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Written:
     """Write the result folder, whole or not at all.
+
+    Args:
+        prepared: The problem.
+        solution: Its solution.
+        document: The content of ``result.json``, from :func:`~impact_posture.posture.result.result_document`.
+        out: The folder.
+        tradeoff: The trade-off, if it was computed.
+        force: Replace an earlier result.
+        codegen: Export, build and check the C code, too.
+        formats: Of the pictures.
+        jobs: Processes that draw and compile side by side.
+        progress: Told of each figure and of the C code: done, all.
 
     Raises:
         OutputError: It exists without ``force``, or cannot be written.
     """
-    document = result_document(prepared, solution, robustness, tradeoff)
     path = null_space_path(solution.problem, solution.initial, solution.q)
     made: Export | None = None
     failure = ""
-    with whole_folder(out, force=force, marks=MARKS) as folder:
+    with whole_folder(out, force=force, kind="result") as folder:
         _write_json(folder / "result.json", document)
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff))  # type: ignore[arg-type]
         _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
         (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
-        draw_all(_view(prepared, solution.initial, solution.q, path, document), folder, formats)
-        if codegen:
-            (folder / "c").mkdir()
-            try:
-                made = export(prepared.impact.objective, folder / "c", posture=solution.q)
-            except CompilerError as error:
-                # The posture is worth keeping whatever the compiler says; the user hears of it.
-                failure = error.line
-                made = export(prepared.impact.objective, folder / "c", posture=solution.q, force=True, check=False)
-    return Written(out, document, made, failure)
+        # The C code first: it takes longest.
+        tasks: list[Callable[[], Any]] = [partial(_export, prepared, solution, folder / "c")] if codegen else []
+        tasks += _drawings(_view(prepared, solution.initial, solution.q, path, document), folder, formats)
+        with shared_out(lambda index: tasks[index](), len(tasks), jobs) as results:
+            for done, (index, result) in enumerate(results, start=1):
+                if codegen and index == 0:
+                    made, failure = result
+                if progress:
+                    progress(done, len(tasks))
+    return Written(out, made, failure)
+
+
+def _export(prepared: Prepared, solution: PostureSolution, folder: Path) -> tuple[Export, str]:
+    """The C export, and why it could not be built."""
+    folder.mkdir()
+    failure = ""
+    try:
+        made = export(prepared.impact.objective, folder, posture=solution.q)
+    except CompilerError as error:
+        # The posture is worth keeping whatever the compiler says; the user hears of it.
+        failure = error.line
+        made = export(prepared.impact.objective, folder, posture=solution.q, force=True, check=False)
+    # The export may be replaced alone, and what its Makefile makes counts as ours.
+    write_record(folder, "export", products(made.prefix))
+    return made, failure
+
+
+def _drawings(view: ResultView, folder: Path, formats: Sequence[str]) -> list[Callable[[], Any]]:
+    """What draws each figure."""
+    from impact_posture.plot import draw_all, drawable
+
+    return [partial(draw_all, view, folder, formats, [name]) for name in drawable(view)]
 
 
 def _view(
@@ -95,6 +131,8 @@ def _view(
     path: NullSpacePath,
     document: dict[str, Any],
 ) -> ResultView:
+    from impact_posture.plot import PathData, ResultView
+
     impact = prepared.impact
     return ResultView(
         robot=impact.robot,
@@ -110,6 +148,8 @@ def _view(
 
 def _tradeoff_data(points: Sequence[dict[str, Any]]) -> TradeOffData | None:
     """``tradeoff`` of a ``result.json`` as it is drawn; ``None`` where there is nothing to trade."""
+    from impact_posture.plot import TradeOffData
+
     if len(points) < 2:
         return None
     keys = ("within", "distance", "objective", "H", "G", "V", "S")

@@ -9,19 +9,16 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
-import shutil
 import stat
 import struct
 import sys
-import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from impact_posture.errors import OutputError, SpecError
+from impact_posture.folder import scratch_folder
 
-_DAY = 86400.0
 _REBUILD = "delete it: it is built again"
 # ELF's header behind its 16 bytes of identity, and the entries of its program header up to the length in the file.
 _HEADER = {1: "HHIIIIIHHHHHH", 2: "HHIQQQIHHHHHH"}
@@ -160,13 +157,9 @@ def building(library: Path) -> Iterator[Path]:
         OutputError: The cache cannot be written, for example because the disk is full.
     """
     try:
-        for left in library.parent.glob("building-*"):
-            # Of a build that was killed.
-            if time.time() - left.stat().st_mtime > _DAY:
-                shutil.rmtree(left, ignore_errors=True)
-        with tempfile.TemporaryDirectory(prefix="building-", dir=library.parent) as folder:
-            yield Path(folder)
-            if (built := Path(folder) / library.name).is_file():
+        with scratch_folder(library.parent) as folder:
+            yield folder
+            if (built := folder / library.name).is_file():
                 put_library(built, library)
     except OSError as error:
         raise OutputError(

@@ -1,10 +1,12 @@
-"""Work that is shared among forked processes, and what a process does twice from one state."""
+"""Work that is shared among forked processes, what a process does twice from one state, and how it ends early."""
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.pool import Pool
@@ -12,8 +14,74 @@ from typing import Any, NoReturn, TypeVar
 
 _Result = TypeVar("_Result")
 
+# What a user or a system ends a process with; a closed terminal sends SIGHUP.
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 # Workers are forked and find the function here: what it holds (a CasADi solver) cannot be sent to them.
 _WORK: dict[str, Callable[[int], Any]] = {}
+
+# What a process that ends early must undo, and which process has begun it: a fork inherits the list.
+_UNFINISHED: list[tuple[int, Callable[[], None]]] = []
+
+# How many blocks hold signals, and what came meanwhile.
+_HELD = [0]
+_LATER: list[Callable[[], None]] = []
+
+_PR_SET_PDEATHSIG = 1
+
+
+# ---- ending early --------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def undone(undo: Callable[[], None]) -> Iterator[None]:
+    """Call ``undo`` when the block is left, also when a signal ends the process within it (:func:`end_early`).
+
+    A signal may come while ``undo`` runs: it must bear being called twice.
+    """
+    entry = (os.getpid(), undo)
+    _UNFINISHED.append(entry)
+    try:
+        yield
+    finally:
+        undo()
+        _UNFINISHED.remove(entry)
+
+
+@contextmanager
+def signals_held() -> Iterator[None]:
+    """Let no signal end the process within the block; one that comes takes effect behind it."""
+    # The mask for what is forked here; the count for this process, where another thread takes the signal.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    _HELD[0] += 1
+    try:
+        yield
+    finally:
+        _HELD[0] -= 1
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if _LATER and not _HELD[0]:
+            end_early(_LATER[0])
+
+
+def end_early(leave: Callable[[], None]) -> None:
+    """Kill the workers, undo what this process has not finished, newest first, and ``leave``.
+
+    For a signal's handler; ``leave`` calls ``os._exit``.  An exception would not do: the wrappers of C++ libraries
+    take a ``KeyboardInterrupt`` for a failed conversion and go on.
+    """
+    if _HELD[0]:
+        _LATER.append(leave)
+        return
+    for child in multiprocessing.active_children():
+        child.kill()
+    for pid, undo in reversed(_UNFINISHED):
+        if pid == os.getpid():
+            with suppress(Exception):
+                undo()
+    leave()
+
+
+# ---- workers -------------------------------------------------------------------------------------------------------
 
 
 def _worker(index: int) -> tuple[int, Any]:
@@ -25,18 +93,15 @@ def shared_out(function: Callable[[int], _Result], count: int, jobs: int) -> Ite
     """``(index, function(index))`` for each index below ``count``, as they finish.
 
     In forked processes where ``jobs`` is more than one and the system can fork; else one after the other, here.  When
-    the block is left, in peace or by Ctrl-C, no process is left running.
+    the block is left, in peace or by Ctrl-C, no process is left running; nor, on Linux, when this process is killed.
     """
     if min(jobs, count) < 2 or "fork" not in multiprocessing.get_all_start_methods():
         yield ((index, function(index)) for index in range(count))
         return
     _WORK["function"] = function
-    # Ctrl-C reaches every process of the terminal's group: workers must never see it, not even at birth.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        pool: Pool = multiprocessing.get_context("fork").Pool(min(jobs, count), initializer=_ignore_interrupt)
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    # Signals reach every process of the terminal's group: workers must not act on them, not even at birth.
+    with signals_held():
+        pool: Pool = multiprocessing.get_context("fork").Pool(min(jobs, count), _depend, (os.getpid(),))
     try:
         yield pool.imap_unordered(_worker, range(count))
     finally:
@@ -56,9 +121,11 @@ def in_a_copy(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
         OSError: The system cannot fork.
     """
     reader, writer = multiprocessing.Pipe(duplex=False)
-    child = os.fork()
-    if child == 0:
-        _answer(function, writer)
+    with signals_held():
+        parent, child = os.getpid(), os.fork()
+        if child == 0:
+            _depend(parent)
+            _answer(function, writer)
     writer.close()
 
     def collect() -> _Result:
@@ -71,13 +138,16 @@ def in_a_copy(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
         result: _Result = answer
         return result
 
-    try:
-        yield collect
-    finally:
-        reader.close()
-        with suppress(ProcessLookupError):
+    def kill() -> None:
+        with suppress(ProcessLookupError, ChildProcessError):
             os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+            os.waitpid(child, 0)
+
+    with undone(kill):
+        try:
+            yield collect
+        finally:
+            reader.close()
 
 
 def _answer(function: Callable[[], Any], writer: Any) -> NoReturn:
@@ -92,5 +162,12 @@ def _answer(function: Callable[[], Any], writer: Any) -> NoReturn:
         os._exit(0)
 
 
-def _ignore_interrupt() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _depend(parent: int) -> None:
+    """Leave signals to the parent, except SIGTERM, which a pool ends its workers with; end when the parent ends."""
+    for number in ENDING:
+        signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)

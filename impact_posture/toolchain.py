@@ -12,6 +12,14 @@ from contextlib import suppress
 from pathlib import Path
 
 from impact_posture.errors import CompilerError
+from impact_posture.processes import undone
+
+# A compiler is several processes.  They are one group, which ends when the pipe on standard input does: when this
+# process closes it, and when this process is killed.
+_GUARD = (
+    "exec 3<&0 </dev/null; { read -r _ <&3; kill -KILL 0; } >/dev/null 2>&1 & "
+    '"$@" 3<&-; code=$?; kill -KILL $!; exit $code'
+)
 
 
 def find_compiler() -> list[str] | None:
@@ -39,37 +47,40 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
         CompilerError: With the first error line of the first one that failed, and its command.
     """
     waiting, running = list(commands), list[tuple[list[str], subprocess.Popen[str]]]()
-    try:
-        while waiting or running:
-            while waiting and len(running) < (os.cpu_count() or 1):
-                command = waiting.pop(0)
-                running.append((command, _start(command, folder)))
-            command, process = running[0]
-            said = "".join(reversed(process.communicate()))
-            running.pop(0)
-            _check(command, folder, process.returncode, said)
-    finally:
-        # After an error or Ctrl-C: none is left behind, nor what it has started itself.
+    reader, writer = os.pipe()
+
+    def stop() -> None:
+        """Leave none behind, nor what it has started itself."""
         for _, process in running:
-            _kill(process)
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            with suppress(ChildProcessError):
+                os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
 
-
-def _kill(process: subprocess.Popen[str]) -> None:
-    with suppress(ProcessLookupError):
-        if hasattr(os, "killpg"):
-            os.killpg(process.pid, signal.SIGKILL)
-        else:
-            process.kill()
-    process.communicate()
-
-
-def _start(command: list[str], folder: Path) -> subprocess.Popen[str]:
-    pipe = subprocess.PIPE
     try:
-        # In a session of its own, as a whole to be killed: a compiler is several processes.
+        with os.fdopen(reader), os.fdopen(writer, "w"), undone(stop):
+            while waiting or running:
+                while waiting and len(running) < (os.cpu_count() or 1):
+                    command = waiting.pop(0)
+                    running.append((command, _start(command, folder, reader)))
+                command, process = running[0]
+                said = "".join(reversed(process.communicate()))
+                running.pop(0)
+                _check(command, folder, process.returncode, said)
+    finally:
+        for _, process in running:
+            process.communicate()
+
+
+def _start(command: list[str], folder: Path, tied_to: int) -> subprocess.Popen[str]:
+    pipe = subprocess.PIPE
+    # What a killed compiler leaves goes with the folder that it was to write into.
+    beside = (folder / command[command.index("-o") + 1]).absolute().parent
+    try:
         return subprocess.Popen(
-            command, cwd=folder, stdout=pipe, stderr=pipe, text=True, errors="replace", start_new_session=True
-        )
+            ["sh", "-c", _GUARD, "sh", *command], cwd=folder, stdin=tied_to, stdout=pipe, stderr=pipe, text=True,
+            errors="replace", start_new_session=True, env=os.environ | {"TMPDIR": str(beside)},
+        )  # fmt: skip
     except OSError as error:
         raise CompilerError(f"{error.strerror} ({shlex.join(command)})", where="C compiler", mend="set CC") from None
 

@@ -141,14 +141,21 @@ class ExactImpact:
         return self.H / self.G**2
 
     @cached_property
-    def mobility(self) -> Exact:
-        return self.J @ self.answer(self.J.T)[0]
+    def K_held(self) -> Exact:
+        """K with the contact point held too: ``J a = v`` in three more rows, ``−Jᵀs`` in three more columns."""
+        size = len(self.K)
+        K = exact(np.zeros((size + 3, size + 3)))
+        K[:size, :size], K[: self.nv, size:], K[size:, : self.nv] = self.K, -self.J.T, self.J
+        return K
+
+    def _held(self, right: Exact) -> tuple[Exact, Exact, Exact]:
+        found = solve(self.K_held, right[:, None])[:, 0]
+        return found[-3:], found[: self.nv], found[self.nv : -3]
 
     @cached_property
     def sticking(self) -> tuple[Exact, Exact, Exact]:
         """The impulse ``s``, and the jump and the feet's impulses that belong to it."""
-        s = solve(self.mobility, self.n[:, None])[:, 0]
-        return s, *self.answer(self.J.T @ s)
+        return self._held(np.concatenate([exact(np.zeros(len(self.K))), self.n]))
 
     @property
     def S(self) -> Decimal:
@@ -194,9 +201,7 @@ class ExactImpact:
     def grad_S(self) -> Exact:
         """``2 ∂_q[sᵀJb + rᵀJa + fᵀJ_s b + gᵀJ_s a − bᵀMa]``."""
         s, a, f = self.sticking
-        b, _ = self.answer(a)
-        r = -solve(self.mobility, (self.J @ b)[:, None])[:, 0]
-        b, g = self.answer(a + self.J.T @ r)
+        r, b, g = self._held(np.concatenate([a, exact(np.zeros(len(self.K_held) - self.nv))]))
         feet = bracket(self.dJs, f, b) + bracket(self.dJs, g, a)
         return 2 * (bracket(self.dJ, s, b) + bracket(self.dJ, r, a) + feet - bracket(self.dM, b, a))
 

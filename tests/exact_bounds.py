@@ -8,7 +8,9 @@ to sixty digits:
   ``d_i² = M̃_ii`` (theorem 10.4): the most that a factorization with 1/ε added to the feet can promise, as is the
   articulated bodies' of the kernel.
 
-Each bound is the condition of a quantity with respect to such a change of its matrix.
+Each bound is the condition of a quantity with respect to such a change of its matrix.  Where a quantity takes several
+solves, one after the other, the sum of their bounds is far from what can happen: its condition then is how far the
+exact quantity moves when the doubles that it is computed from are rounded once more.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from tests.exact import Exact, ExactImpact, Vector, bracket, rounded
+from impact_posture.impact.oracle import ImpactOracle
+from tests.exact import Exact, ExactImpact, Vector, bracket, exact, rounded
 
 _UNIT = 2.0**-53
 
@@ -27,6 +30,22 @@ _UNIT = 2.0**-53
 def gamma(count: int) -> float:
     """Higham's ``γ_n = nu/(1 − nu)``."""
     return count * _UNIT / (1 - count * _UNIT)
+
+
+def eliminated(matrix: Exact) -> Vector:
+    """``|L||U|`` in the rows of the matrix: what elimination rounds."""
+    P, L, U = scipy.linalg.lu(rounded(matrix))
+    return np.asarray(P @ np.abs(L) @ np.abs(U))
+
+
+class RoundedOnce(ExactImpact):
+    """The exact impact where ``|L||U|`` of the held point's system is rounded once, up or down as the seed says."""
+
+    def __init__(self, oracle: ImpactOracle, compliance: float, seed: int) -> None:
+        super().__init__(oracle, compliance)
+        size = eliminated(super().K_held)
+        off = _UNIT * size * np.random.default_rng(seed).choice([-1.0, 1.0], size.shape)
+        self.__dict__["K_held"] = super().K_held + exact(off)
 
 
 class Bounded(ExactImpact):
@@ -44,8 +63,7 @@ class Bounded(ExactImpact):
     @cached_property
     def _backward(self) -> Vector:
         """``γ_3n |L||U|`` in the rows of K."""
-        P, L, U = scipy.linalg.lu(rounded(self.K))
-        return np.asarray(gamma(3 * len(self.K)) * (P @ np.abs(L) @ np.abs(U)))
+        return gamma(3 * len(self.K)) * eliminated(self.K)
 
     @cached_property
     def lost_by_elimination(self) -> Vector:
@@ -84,6 +102,15 @@ class Bounded(ExactImpact):
     def _split(self, values: Any) -> tuple[Vector, Vector]:
         sizes = np.abs(rounded(values))
         return sizes[: self.nv], sizes[self.nv :]
+
+    @cached_property
+    def sticking_by_elimination(self) -> tuple[float, float]:
+        """Largest errors of S and of ∇S's entries: ``γ_3n`` is 3n roundings, each of the effect of the worst of five."""
+        others = [RoundedOnce(self.oracle, self.compliance, seed) for seed in range(5)]
+        roundings = 3 * len(self.K_held)
+        moved_S = max(abs(float(o.S - self.S)) for o in others)
+        moved_gradient = max(float(rounded(abs(o.grad_S - self.grad_S)).max()) for o in others)
+        return roundings * moved_S, roundings * moved_gradient
 
     # ---- what a factorization of M̃ may lose -------------------------------------------------------------------
 

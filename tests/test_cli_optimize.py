@@ -98,6 +98,16 @@ def test_plot_draws_again(result: Path, tmp_path: Path) -> None:
     assert refused.returncode == 1 and "result.json" in refused.stderr
 
 
+def test_verify_takes_the_problem_of_a_result(result: Path, tmp_path: Path) -> None:
+    done = run("verify", result, "--samples", 1, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    document, known = json.loads(done.stdout), json.loads((result / "result.json").read_text())
+    assert document["passed"] and document["robot"]["model_sha256"] == known["robot"]["model_sha256"]
+    assert document["contacts"] == known["contacts"] and document["supports"] == known["supports"]
+    refused = run("verify", result, "--frame", "ee", cwd=tmp_path)
+    assert refused.returncode == 2 and "--frame contradicts RESULT_DIR" in " ".join(refused.stderr.split())
+
+
 def test_posture_file_starts_the_next_optimization(result: Path, tmp_path: Path) -> None:
     done = run(
         "optimize",
@@ -267,7 +277,8 @@ def test_existing_output_is_kept(tmp_path: Path) -> None:
     out.mkdir()
     (out / "thesis.txt").write_text("ten years")
     refused(run(*BASE, "--out", "out", cwd=tmp_path), 1, "out", "--force")
-    refused(run(*BASE, "--out", "out", "--force", cwd=tmp_path), 1, "does not look like an earlier result")
+    written = "out: holds thesis.txt, which this command did not write"
+    refused(run(*BASE, "--out", "out", "--force", cwd=tmp_path), 1, written)
     assert (out / "thesis.txt").read_text() == "ten years"
     (out / "thesis.txt").unlink()
     assert run(*BASE, "--out", "out", cwd=tmp_path).returncode == 0

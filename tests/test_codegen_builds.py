@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from impact_posture.codegen.build import products
 from impact_posture.codegen.compiler import casadi_difference, compiled, oracle_difference, self_test_tolerance
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
@@ -20,6 +21,7 @@ from impact_posture.codegen.folder import write_export
 from impact_posture.codegen.loader import ImpactGradient
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.errors import CompilerError, InputError, OutputError
+from impact_posture.folder import RECORD
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
@@ -223,7 +225,7 @@ def test_folder_is_replaced_only_if_it_is_an_export(arm: ImpactObjective, tmp_pa
         write_export([arm], ours, prefix="second")
     assert (ours / "first.c").is_file()
     written = write_export([arm], ours, prefix="second", force=True)
-    assert sorted(p.name for p in ours.iterdir()) == sorted(p.name for p in written.export.files)
+    assert sorted(p.name for p in ours.iterdir()) == sorted([RECORD, *(p.name for p in written.export.files)])
 
 
 def test_build_in_the_folder(arm: ImpactObjective, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,6 +234,7 @@ def test_build_in_the_folder(arm: ImpactObjective, tmp_path: Path, monkeypatch: 
     assert written.library is not None and written.library.is_file()
     q = sample_postures(arm.robot, 1, 31)[0]
     H, _ = ImpactGradient.load(tmp_path / "c", robot=arm.robot).objective(q)
+    assert {path.name for path in (tmp_path / "c").glob("lib*")} <= set(products("arm")), "--force replaces them"
     assert pytest.approx(arm.value(q), rel=1e-10) == H
     assert (tmp_path / "c" / "libarm.so.sha256").is_file()
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -286,7 +289,8 @@ def test_command_for_a_robot(tmp_path: Path) -> None:
     document = json.loads(done.stdout)
     assert document["library"] == "libtwo.so" and document["real"] == "float"
     assert (tmp_path / "two-c" / "libtwo.so").is_file()
-    assert set(document["files"]) == {p.name for p in (tmp_path / "two-c").iterdir()} - {"libtwo.so", "libtwo.so.sha256"}
+    built = {"libtwo.so", "libtwo.so.sha256", RECORD}
+    assert set(document["files"]) == {p.name for p in (tmp_path / "two-c").iterdir()} - built
     assert "two_ee_eval_batch" in document["functions"]
     again = call(tmp_path, *push)
     assert again.returncode == 1 and "exists" in again.stderr and again.stderr.count("\n") == 1

@@ -22,10 +22,11 @@ from impact_posture.impact.cone_symbolic import worst_normal_symbolic
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.metric import Metric, ObjectiveKind
+from impact_posture.impact.normal_cone import NormalCone
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.uncertain import worst_case
+from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.nlp import build_nlp
-from impact_posture.posture.problem import Requirements, build_problem
+from impact_posture.posture.problem import Requirements
 from impact_posture.posture.settings import make_settings, prepare
 from impact_posture.posture.solve import run_start, solve
 from impact_posture.robot.loader import load_robot
@@ -46,6 +47,11 @@ COMMAND = Path(sys.executable).parent / "impact-posture"
 ANGLES = (1.0, 5.0, 20.0, 45.0, 80.0)
 ROBOTS = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "solo8": "base_link", "talos": "gripper_right_base_link"}
 CONE_KINDS: tuple[ObjectiveKind, ...] = ("impulse", "sticking", "energy")
+
+
+def cone_of(objective: ImpactObjective) -> NormalCone:
+    assert objective.normal_cone is not None
+    return objective.normal_cone
 
 
 def cone_samples(axis: np.ndarray, degrees: float, count: int = 100_000) -> np.ndarray:
@@ -192,7 +198,7 @@ def test_gradient_where_the_worst_normal_is_unique(name: str, axes: str, kind: O
         contact = Contact.create(ROBOTS[name], tuple(unit(rng(name, axes, kind))), (0.02, 0, 0.01), axes)  # type: ignore[arg-type]
         objective = ImpactObjective(found, contact, Metric(metric), kind, feet, normal_cone_deg=degrees)  # type: ignore[arg-type]
         (q,) = random_configurations(found.model, 1, name, axes, kind, degrees, spread=0.4)
-        assert not worst_case(objective, q).tied
+        assert not cone_of(objective).worst(q).tied
         gradient = objective.gradient(q)
         where = f"{kind} {axes} {degrees} {metric}"
         assert_close(gradient, central_gradient(objective.value, found.model, q, 1e-4), 2e-6, where)
@@ -209,7 +215,7 @@ def test_subgradients_at_a_mirror_symmetric_posture() -> None:
     found = robot("solo8")
     objective = ImpactObjective(found, Contact.create("base_link", (1.0, 0.0, 0.0)), normal_cone_deg=20.0)
     q = found.posture()
-    worst = worst_case(objective, q)
+    worst = cone_of(objective).worst(q)
     assert worst.tied and np.allclose(worst.normals[0], worst.normals[1] * [1, 1, -1], atol=1e-9)
     points = objective.subgradients(q)
     assert relative(points.gradients[0], points.gradients[1]) > 0.1
@@ -291,12 +297,12 @@ def test_solved_from_and_at_mirror_symmetric_postures() -> None:
     """solo8 starts at a tie and ends at one: no gradient there is zero, but a mixture of them balances."""
     settings = {"robot": "solo8", "frame": "base_link", "normal": (1, 0, 0), "normal_cone": 20.0}
     problem = prepare(make_settings(settings)).problem
-    assert worst_case(problem.objective, problem.given).tied
+    assert cone_of(problem.impact).worst(problem.given).tied
     nlp = build_nlp(problem, compile="never")
     scale = problem.objective.value(problem.given)
     record, certificate = run_start(nlp, problem.given, scale)
     assert certificate.holds()
-    assert worst_case(problem.objective, record.q).tied
+    assert cone_of(problem.impact).worst(record.q).tied
 
 
 # ---- what is refused, and what comes out --------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from impact_posture_cli.main import app
+from impact_posture_cli.app import app
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -20,7 +20,7 @@ from impact_posture.posture.settings import ProblemSettings, make_settings, prep
 from impact_posture.posture.solve import solve
 from impact_posture.robot.spec import ContactPose, RobotSpec
 from impact_posture.simulation.scenario_file import ScenarioFile
-from impact_posture_cli.main import app
+from impact_posture_cli.app import app
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -15,6 +15,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.footing import footing
+from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
@@ -34,7 +35,7 @@ def standing(name: str) -> tuple[Robot, tuple[Support, ...]]:
 
 def oracle_of(name: str, normal: tuple[float, float, float], frame: str = "base_link") -> ImpactOracle:
     found, supports = standing(name)
-    return ImpactOracle(found, Contact.create(frame, normal), Metric(), supports, 1e-6)
+    return ImpactOracle(ImpactCase(found, Contact.create(frame, normal), Metric(), supports, 1e-6))
 
 
 @pytest.mark.parametrize("name", ["solo8", "solo12"])
@@ -79,7 +80,7 @@ def test_impulses_are_those_of_impulse_dynamics(name: str, normal: tuple[float, 
     found, supports = standing(name)
     frame = "base_link"
     q = np.asarray(pin.integrate(found.model, found.posture(), 0.05 * np.random.default_rng(0).normal(size=found.nv)))
-    oracle = ImpactOracle(found, Contact.create(frame, normal), Metric(), supports, 1e-9)
+    oracle = ImpactOracle(ImpactCase(found, Contact.create(frame, normal), Metric(), supports, 1e-9))
     result = footing(oracle, supports, q)
     assert result.freedom == 0
     Js = np.vstack([frame_jacobian(found.model, q, found.frame_id(s.frame), s.offset)[: s.rows] for s in supports])
@@ -116,7 +117,7 @@ def test_soles_tip_over_their_edges() -> None:
     found, supports = standing("talos")
     q = found.posture()
     frame = "torso_2_link"
-    oracle = ImpactOracle(found, Contact.create(frame, (1.0, 0.0, -0.2)), Metric(), supports, 1e-6)
+    oracle = ImpactOracle(ImpactCase(found, Contact.create(frame, (1.0, 0.0, -0.2)), Metric(), supports, 1e-6))
     wide = tuple(Support(s.frame, "surface", s.offset, (5.0, 5.0)) for s in supports)
     narrow = tuple(Support(s.frame, "surface", s.offset, (1e-4, 1e-4)) for s in supports)
     assert footing(oracle, narrow, q).friction is None
@@ -159,7 +160,7 @@ def test_kept_feet_change_the_optimum() -> None:
     without = solve(free.problem, starts=2, jobs=1)
     found = solve(kept.problem, starts=2, jobs=1)
     assert found.certificate.holds()
-    oracle = kept.problem.objective.oracle
+    oracle = kept.problem.impact.oracle
     before, after = footing(oracle, supports, without.q), footing(oracle, supports, found.q)
     assert before.friction is None or before.friction > 1.0
     assert after.friction is not None and after.friction <= 1.02

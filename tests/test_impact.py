@@ -12,6 +12,7 @@ import pytest
 
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.contact import Contact, Support, default_compliance
+from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.metric import Metric, ObjectiveKind, build_metric
 from impact_posture.impact.objective import ImpactObjective
@@ -73,13 +74,13 @@ def test_symbolic_oracle_and_differences_agree(name: str) -> None:
     for found, contact, metric, supports in combinations(name):
         compliance = default_compliance(found)
         q, n = ca.SX.sym("q", found.nq), ca.SX.sym("n", 3)
-        k = ImpactKernel(found, contact, metric, supports, compliance, q, n)
+        k = ImpactKernel(ImpactCase(found, contact, metric, supports, compliance), q, n)
         kernel_fun = ca.Function(
             "kernel", [q, n],
             [k.H, k.G, k.V, k.S, k.E, k.ellipsoid, k.mobility, k.jump.a, k.world_normal,
              k.grad_H, k.grad_G, k.grad_V, k.grad_S, k.grad_E],
         )  # fmt: skip
-        oracle = ImpactOracle(found, contact, metric, supports, compliance)
+        oracle = ImpactOracle(ImpactCase(found, contact, metric, supports, compliance))
 
         def values(at: Vector, oracle: ImpactOracle = oracle) -> Vector:
             o = oracle.quantities(at)
@@ -126,7 +127,7 @@ def test_oracle_by_its_definition(name: str) -> None:
         ellipsoid, mobility = A.T @ W @ A, J @ A
         s = np.linalg.solve(mobility, n)
         G = n @ mobility @ n
-        o = ImpactOracle(found, contact, metric, supports, epsilon).quantities(q)
+        o = ImpactOracle(ImpactCase(found, contact, metric, supports, epsilon)).quantities(q)
         # Forming M + JᵀJ/ε loses what the oracle's own system keeps.
         tolerance = 1e-8 if supports else 1e-10
         assert o.S is not None

@@ -11,6 +11,7 @@ import pytest
 
 from impact_posture.errors import ContactError, MetricError
 from impact_posture.impact.contact import Contact, Support, default_compliance, support_inertia
+from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
@@ -47,7 +48,7 @@ def quantities(
     frame = frame or found.spec.contact.frame
     assert frame is not None
     contact = Contact.create(frame, tuple(normal), OFFSET)
-    return ImpactOracle(found, contact, metric, supports, compliance or default_compliance(found)).quantities(q)
+    return ImpactOracle(ImpactCase(found, contact, metric, supports, compliance or 0.0)).quantities(q)
 
 
 def feet(found: Robot) -> tuple[Support, ...]:

@@ -306,12 +306,3 @@ def test_what_is_damaged_goes(kept: Path) -> None:
     kept.write_bytes(b"code")
     libraries.seal_path(kept).unlink()
     assert not libraries.is_cached(kept), "without a seal it may be anything"
-
-
-def test_leftovers_are_swept(kept: Path) -> None:
-    old, new = kept.parent / "building-old", kept.parent / "building-new"
-    old.mkdir(), new.mkdir()
-    os.utime(old, (0, 0))
-    with libraries.building(kept):
-        pass
-    assert new.is_dir() and not old.exists()

@@ -21,7 +21,7 @@ from impact_posture.errors import (
     nearest,
 )
 from impact_posture.impact.contact import Contact
-from impact_posture.impact.metric import Metric
+from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.urdf import example_robot_data
@@ -284,13 +284,13 @@ def test_locking_reduces(name: str, lock: tuple[str, ...]) -> None:
     assert whole.spec.contact.frame is not None
     contact = Contact.create(whole.spec.contact.frame, (0.3, -0.5, 0.8))
     resisting = load_robot(name, LoadOptions(armature=dict.fromkeys(lock, 1e9)))
-    found = ImpactOracle(locked, contact, Metric()).quantities(q_locked)
-    expected = ImpactOracle(resisting, contact, Metric()).quantities(q)
+    found = ImpactOracle(ImpactCase(locked, contact)).quantities(q_locked)
+    expected = ImpactOracle(ImpactCase(resisting, contact)).quantities(q)
     assert_close(found.H, expected.H, 1e-6, "H")
     assert_close(found.G, expected.G, 1e-6, "G")
     assert_close(found.jump, expected.jump[kept], 1e-6, "jump")
     assert np.abs(expected.jump[dropped_v]).max() < 1e-8
-    free = ImpactOracle(whole, contact, Metric()).quantities(q)
+    free = ImpactOracle(ImpactCase(whole, contact)).quantities(q)
     assert free.G > found.G
 
 

@@ -11,7 +11,6 @@ import unicodedata
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
@@ -31,15 +30,16 @@ from impact_posture.codegen.variants import variants
 from impact_posture.dynamics.mjcf import write_mjcf
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.plot import ResultView, draw_all, jump_figure, save
+from impact_posture.plot import ResultView, jump_figure, save
 from impact_posture.posture.settings import ProblemSettings, dump_settings, read_settings
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.draft import write_draft
+from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import RobotSpec
+from impact_posture.robot.spec import RobotSpec, read_spec
 from impact_posture.simulation.build import build_scene
 from impact_posture.simulation.scene import Scene, Shape, Surface
+from impact_posture_cli.app import app
 from impact_posture_cli.boundary import run
-from impact_posture_cli.main import app
 from impact_posture_cli.words import put_right
 from tests.tools import need_compiler
 
@@ -214,6 +214,13 @@ def test_problem_toml_reads_back(tmp_path: Path) -> None:
     assert read_settings(tmp_path / "problem.toml").keep == NASTY
 
 
+def test_a_drafted_robot_toml_reads_back(many: Robot, tmp_path: Path) -> None:
+    path, _ = write_draft(many.source, LoadOptions(), tmp_path / "draft.toml")
+    assert_plain(path.read_text(encoding="utf-8"))
+    again = load_robot(many.source, LoadOptions(config=str(path)))
+    assert again.joint_names == many.joint_names and again.spec == read_spec(path)
+
+
 def test_a_path_that_is_not_utf8_is_refused() -> None:
     settings = ProblemSettings(robot="panda").model_copy(update={"srdf": "caf\udce9.srdf"})
     with pytest.raises(errors.SpecError, match=r"srdf: 'caf\\udce9.srdf' is not UTF-8"):
@@ -338,7 +345,7 @@ def test_every_error_is_one_safe_line() -> None:
 def test_optimize_and_codegen_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiler = need_compiler()
     monkeypatch.setenv("CFLAGS", "-O0")
-    monkeypatch.setattr("impact_posture.job.draw_all", partial(draw_all, only=["jump"]))
+    monkeypatch.setattr("impact_posture.plot.drawable", lambda _: ["jump"])
     names = ["base", '*/ #error "out"\n#include <x>', "$\\frac{$", "[red]|`<script>", "??/\\"]
     folder = tmp_path / "\x1b]0;x\x07 *\n"
     folder.mkdir()

@@ -318,7 +318,7 @@ def test_blow_that_moves_nothing_is_refused() -> None:
     frame = "link2" if "link2" in prepare_frames(urdf) else prepare_frames(urdf)[-1]
     for objective in ("impulse", "speed"):
         problem = problem_of(urdf, (1, 0, 0), frame=frame, contact_pose="free", objective=objective)
-        G = problem.objective.oracle.quantities(problem.given).G
+        G = problem.impact.oracle.quantities(problem.given).G
         if G > 1e-12:
             problem = problem_of(urdf, (0, 1, 0), frame=frame, contact_pose="free", objective=objective)
         with pytest.raises(InputError, match="cannot move along the normal"):

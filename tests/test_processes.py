@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError, SimulationDiverged
-from impact_posture.processes import in_a_copy, shared_out
+from impact_posture.processes import end_early, in_a_copy, shared_out, signals_held, undone
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs /proc to look at processes")
 
@@ -157,6 +157,85 @@ def test_ctrl_c_leaves_no_process_and_no_noise(tmp_path: Path, send: Callable[[i
         # Its own session: nothing else is in that group.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
+
+
+KILLED = """
+import os, signal, sys, time
+from pathlib import Path
+from impact_posture.processes import in_a_copy, shared_out
+from impact_posture.toolchain import run_compilers
+
+folder = Path(sys.argv[2])
+
+def linger(index=0):
+    Path(folder, str(os.getpid())).touch()
+    time.sleep(60)
+
+if sys.argv[1] == "workers":
+    with shared_out(linger, 4, 2) as results:
+        list(results)
+elif sys.argv[1] == "a copy":
+    with in_a_copy(linger) as collect:
+        collect()
+else:
+    # Like a compiler, it starts others.
+    script = 'touch $1/$$; sh -c "touch $1/\\$\\$; sleep 60; :"; :'
+    run_compilers([["sh", "-c", script, "cc", str(folder), "-o", f"{folder}/none"]] * 2, folder)
+"""
+
+
+@pytest.mark.parametrize(("what", "count"), [("workers", 2), ("a copy", 1), ("compilers", 4)])
+def test_nobody_outlives_a_killed_parent(what: str, count: int, tmp_path: Path) -> None:
+    if what == "compilers" and (os.cpu_count() or 1) < 2:
+        count = 2
+    process = subprocess.Popen([sys.executable, "-c", KILLED, what, str(tmp_path)], start_new_session=True)
+    pids: list[int] = []
+    try:
+        end = time.monotonic() + 60
+        while len(pids) < count and time.monotonic() < end:
+            time.sleep(0.02)
+            pids = [int(path.name) for path in tmp_path.iterdir()]
+        assert len(pids) == count and all(alive(pid) for pid in pids)
+        process.kill()
+        process.wait()
+        assert gone(pids)
+    finally:
+        for pid in (process.pid, *pids):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+# ---- ending early --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def ended(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.setattr("impact_posture.processes._LATER", [])
+    return []
+
+
+def test_what_is_unfinished_is_undone_newest_first_whatever_fails(ended: list[str]) -> None:
+    with undone(lambda: ended.append("old")), contextlib.suppress(ZeroDivisionError), undone(lambda: [][1 // 0]):
+        with undone(lambda: ended.append("done")):
+            pass
+        with undone(lambda: ended.append("new")):
+            end_early(lambda: ended.append("left"))
+    assert ended == ["done", "new", "old", "left", "new", "old"]
+
+
+def test_a_copy_does_not_undo_what_its_original_has_begun(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with undone((tmp_path / "folder").rmdir), in_a_copy(lambda: end_early(lambda: None)) as collect:
+        collect()
+        assert (tmp_path / "folder").is_dir()
+
+
+def test_nothing_ends_the_process_while_signals_are_held(ended: list[str]) -> None:
+    with signals_held():
+        with signals_held():
+            end_early(lambda: ended.append("left"))
+        assert ended == []
+    assert ended == ["left"]
 
 
 # ---- a copy of this process ----------------------------------------------------------------------------------------

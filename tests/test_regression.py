@@ -19,7 +19,7 @@ def test_result_is_reproduced(case: Case) -> None:
     assert solution.certificate.holds()
     assert solution.redundancy == expected["redundancy"]
     assert solution.reduction == pytest.approx(expected["reduction"], abs=1e-6)
-    after = prepared.problem.objective.oracle.quantities(solution.q)
+    after = prepared.problem.impact.oracle.quantities(solution.q)
     assert pytest.approx(expected["after"]["H"], rel=1e-5) == after.H
     assert [s.frame for s in prepared.impact.supports] == expected["supports"]
 

@@ -24,8 +24,8 @@ from impact_posture.errors import FrameNotFound, ImpactPostureError, InputError,
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.metric import Metric
+from impact_posture.impact.model_set import ModelSet
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.scenarios import FewModels
 from impact_posture.posture.constraint import CenterOfMassOverFeet
 from impact_posture.posture.feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem
@@ -173,9 +173,9 @@ def objective_of(name: str, more: dict[str, object], *, feet: bool = False) -> I
     )
 
 
-def few(objective: ImpactObjective) -> FewModels:
-    assert isinstance(objective.inner, FewModels)
-    return objective.inner
+def few(objective: ImpactObjective) -> ModelSet:
+    assert isinstance(objective.worst_case, ModelSet)
+    return objective.worst_case
 
 
 # All kinds on the smallest robot, and on the others what differs with feet or a fixed root.
@@ -260,7 +260,7 @@ def problem_of(task: dict[str, object], **more: object) -> PostureProblem:
 @pytest.mark.parametrize("name", TASKS)
 def test_optima_certify(name: str) -> None:
     problem = problem_of(TASKS[name])
-    nominal = solve(replace(problem, objective=few(problem.objective).members[0]), starts=2, jobs=1, compile="never")
+    nominal = solve(replace(problem, objective=problem.impact.by_scenario[0]), starts=2, jobs=1, compile="never")
     solution = solve(problem, starts=2, jobs=1, compile="never", guesses=(nominal.q,))
     assert solution.certificate.holds() and solution.certified_starts == solution.feasible_starts
     assert problem.objective.value(solution.q) <= problem.objective.value(nominal.q) * (1 + 1e-9)
@@ -273,9 +273,9 @@ def test_how_far_the_optimum_moves() -> None:
     both = solve_robustly(problem, starts=3, seed=4, jobs=1, compile="never")
     found, q = both.robustness, both.solution.q
     assert found is not None and both.solution.certificate.holds()
-    members = few(problem.objective).members
+    members = problem.impact.by_scenario
     at_robust = [member.value(q) for member in members]
-    assert [s.name for s in found.scenarios] == [s.name for s in problem.objective.scenarios]
+    assert [s.name for s in found.scenarios] == [s.name for s in problem.impact.scenarios]
     assert [s.at_robust for s in found.scenarios] == at_robust and found.worst_robust == max(at_robust)
     for one, member in zip(found.scenarios, members, strict=True):
         assert one.q is not None and one.own is not None and one.own == member.value(one.q)
@@ -288,7 +288,7 @@ def test_how_far_the_optimum_moves() -> None:
     assert found.gain == pytest.approx(1 - found.worst_robust / found.worst_nominal)
     drawn = [
         replace(problem.objective, robot=one, scenarios=()).value(q)
-        for one in between(problem.objective.scenarios, found.drawn, 4)
+        for one in between(problem.impact.scenarios, found.drawn, 4)
     ]
     assert found.between == max(drawn)
     words = found.line
@@ -332,7 +332,7 @@ def test_balance_and_feet_hold_in_every_scenario() -> None:
         "center of mass over the feet", f"center of mass over the feet with 16 kg at {frame}"
     ]  # fmt: skip
     solution = solve(problem, starts=2, jobs=1, compile="never")
-    for scenario in problem.objective.scenarios:
+    for scenario in problem.impact.scenarios:
         model = scenario.robot.model
         center = pin.centerOfMass(model, model.createData(), solution.q)[:2]
         assert (centers[0].normals @ center - centers[0].offsets).max() <= -centers[0].margin + 1e-8
@@ -358,7 +358,7 @@ def test_a_resolved_problem_gives_the_same_again(tmp_path: Path) -> None:
     assert 'payload = [["ee", 0.3]]' in text and "armature_range = [0.25, 1.0]" in text
     (tmp_path / "problem.toml").write_text(text)
     again = prepare(read_settings(tmp_path / "problem.toml"))
-    names = [[s.name for s in p.problem.objective.scenarios] for p in (prepared, again)]
+    names = [[s.name for s in p.problem.impact.scenarios] for p in (prepared, again)]
     assert names[0] == names[1] and len(names[0]) == 4
     one, two = (solve(p.problem, starts=2, jobs=1, compile="never") for p in (prepared, again))
     np.testing.assert_array_equal(one.q, two.q)

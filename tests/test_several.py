@@ -24,9 +24,9 @@ from impact_posture.codegen.manifest import sample_postures
 from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.evaluation import evaluate
+from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses, corners
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.several import BoxOfImpulses, WorstImpulses, corners
 from impact_posture.posture.feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.settings import (
@@ -72,9 +72,9 @@ def random_robot(generator: np.random.Generator, *, floating: bool) -> Robot:
     return Robot("tree", "", model, root, {"neutral": pin.neutral(model)}, "neutral", RobotSpec())  # type: ignore[arg-type]
 
 
-def box_of(objective: ImpactObjective) -> BoxOfImpulses:
-    assert isinstance(objective.inner, BoxOfImpulses)
-    return objective.inner
+def box_of(objective: ImpactObjective) -> ImpulseBox:
+    assert isinstance(objective.worst_case, ImpulseBox)
+    return objective.worst_case
 
 
 def jumps_of(objective: ImpactObjective, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -262,7 +262,7 @@ def test_every_start_certifies(name: str) -> None:
     assert solution.certified_starts == solution.feasible_starts == 3
     assert solution.reduction > 0 and solution.certificate.holds()
     # What one contact alone would do at its own best is a bound from below.
-    first = problem.objective.singles[0]
+    first = problem.impact.singles[0]
     alone = solve(replace(problem, objective=first), starts=3, jobs=1, compile="never", guesses=(solution.q,))
     assert problem.objective.value(solution.q) >= first.value(alone.q) * (1 - 1e-9)
     assert problem.objective.value(solution.q) <= problem.objective.value(alone.q) * (1 + 1e-6)
@@ -357,7 +357,7 @@ def test_a_resolved_problem_gives_the_same_again(tmp_path: Path) -> None:
     (tmp_path / "problem.toml").write_text(dump_settings(resolved_settings(prepared)))
     again = prepare(read_settings(tmp_path / "problem.toml"))
     assert again.problem.objective.contacts == prepared.problem.objective.contacts
-    assert again.problem.objective.bilateral and again.problem.objective.contact.impulse == 0.7
+    assert again.problem.impact.bilateral and again.problem.impact.contact.impulse == 0.7
     one, two = (solve(p.problem, starts=2, seed=3, jobs=1, compile="never") for p in (prepared, again))
     np.testing.assert_array_equal(one.q, two.q)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
@@ -27,6 +28,7 @@ from tests.exact import Exact, ExactImpact, digits, distance, exact, rounded
 from tests.exact_bounds import Bounded
 from tests.helpers import Vector, central_gradient, random_configurations, rng, robot, unit
 from tests.rigid import Rigid
+from tests.rounding import other_rounding
 
 # Compliance times the robot's mass: the default, and stiffer.
 STIFFNESS = (1e-4, 1e-6, 1e-9)
@@ -35,6 +37,9 @@ ENDS = STIFFNESS[::2]
 SOLO8 = {"straight": 9, "equal knees": 10, "one knee moved by 1e-6": 11, "one knee moved by 1e-3": 11, "random": 11}
 CASES = [*[("solo8", posture) for posture in SOLO8], ("solo12", "random"), ("bolt", "random"), ("talos", "random")]
 STIFFENED = [(*case, e) for case in CASES for e in (ENDS if case[0] == "talos" else STIFFNESS)]
+
+# As this processor rounds, and as others may.
+SEEDS = (None, 1, 2)
 
 
 @pytest.fixture(autouse=True)
@@ -82,6 +87,10 @@ def within(found: object, expected: Exact | Decimal, bound: Vector | float, what
     assert (error <= bound).all(), f"{what}: error {error.max():.1e}, allowed {np.max(bound):.1e}"
 
 
+def elsewhere(seed: int | None) -> AbstractContextManager[None]:
+    return nullcontext() if seed is None else other_rounding(seed)
+
+
 def size(values: object) -> float:
     return float(np.abs(np.asarray(values, dtype=float)).max())
 
@@ -96,11 +105,16 @@ def test_solo8_has_every_rank(label: str, rank: int) -> None:
     assert np.linalg.matrix_rank(Js, tol=1e-12) == rank
 
 
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("name", "label", "relative_compliance"), STIFFENED)
-def test_the_oracle_solves_what_it_is_given(name: str, label: str, relative_compliance: float) -> None:
+def test_the_oracle_solves_what_it_is_given(
+    name: str, label: str, relative_compliance: float, seed: int | None
+) -> None:
     """Each quantity within what elimination on the KKT system may lose by its condition; the jump to nine digits."""
     x = bounded(name, label, relative_compliance)
-    found = x.oracle.quantities(x.oracle.numeric.q)
+    with elsewhere(seed):
+        oracle = objective(name, relative_compliance).oracle
+        found, gradient = oracle.quantities(x.oracle.numeric.q), oracle.gradient_H(x.oracle.numeric.q)
     lost, nv = x.lost_by_elimination, x.nv
     within(found.jump, x.jump, lost[:nv], "jump")
     within(found.support_impulse, x.impulse, lost[nv:], "support impulses")
@@ -108,23 +122,23 @@ def test_the_oracle_solves_what_it_is_given(name: str, label: str, relative_comp
     within(found.G, x.G, x.G_by_elimination, "G")
     lost_V = float(x.V) * (x.H_by_elimination / float(x.H) + 2 * x.G_by_elimination / float(x.G))
     within(found.V, x.V, 1.01 * lost_V, "V")
-    within(x.oracle.gradient_H(x.oracle.numeric.q), x.grad_H, x.gradient_by_elimination, "∇H")
+    within(gradient, x.grad_H, x.gradient_by_elimination, "∇H")
     # The condition of the jump is that of the motion, not 1/ε; between ranks it is its square root at most.
     assert size(distance(found.jump, x.jump)) <= 1e-9 * size(x.jump)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("name", "label"), CASES)
-def test_the_oracles_sticking_impact(name: str, label: str) -> None:
-    """S and ∇S lose by the condition of ``JM⁻¹Jᵀ``: once in the impulse, twice in the gradient."""
+def test_the_oracles_sticking_impact(name: str, label: str, seed: int | None) -> None:
+    """S and ∇S lose what rounding their matrices loses, whatever the processor; not the square of a condition."""
     x = bounded(name, label, 1e-4)
-    condition = float(np.linalg.cond(rounded(x.mobility)))
-    share = size(x.lost_by_elimination[: x.nv]) / size(x.jump)
-    found = x.oracle.quantities(x.oracle.numeric.q)
+    with elsewhere(seed):
+        oracle = objective(name, 1e-4).oracle
+        found, gradient = oracle.quantities(x.oracle.numeric.q), oracle.gradient_S(x.oracle.numeric.q)
+    lost_S, lost_gradient = x.sticking_by_elimination
     assert found.S is not None
-    within(found.S, x.S, 4 * condition * share * float(x.S), "S")
-    gradient = x.oracle.gradient_S(x.oracle.numeric.q)
-    within(gradient, x.grad_S, 8 * condition**2 * share * max(size(x.grad_S), float(x.S)), "∇S")
-    assert size(distance(gradient, x.grad_S)) <= 1e-8 * max(size(x.grad_S), float(x.S))
+    within(found.S, x.S, lost_S, "S")
+    within(gradient, x.grad_S, lost_gradient, "∇S")
 
 
 def heavy_feet(x: Bounded, H: object, gradient: object, jump: object, G: object) -> None:
@@ -224,7 +238,8 @@ def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
     base = replace(objective(name, 1e-4), supports=supports)
     (q,) = random_configurations(found.model, 1, name, count, "full rank", spread=0.5)
     rigid = Rigid(base, q)
-    oracles = [ImpactOracle(found, base.contact, base.metric, supports, base.compliance / k) for k in (1, 2, 4)]
+    case = replace(base.case, robot=found, supports=supports)
+    oracles = [ImpactOracle(replace(case, compliance=base.compliance / k)) for k in (1, 2, 4)]
     M, n = oracles[0].at(q).M, oracles[0].n
     held = np.linalg.svd(np.linalg.solve(np.linalg.cholesky(M), rigid.Js.T), compute_uv=False)[-1] ** 2
     all_of_them = [oracle.quantities(q) for oracle in oracles]

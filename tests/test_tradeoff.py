@@ -132,7 +132,7 @@ def test_every_point_is_where_it_says_and_certified(case: str) -> None:
     solution, curve = solved(case)
     projector = Projector(solution.problem)
     for point in curve.points:
-        found = solution.problem.objective.oracle.quantities(point.q)
+        found = solution.problem.impact.oracle.quantities(point.q)
         assert (point.H, point.G, point.V, point.S) == (found.H, found.G, found.V, found.S)
         assert point.objective == solution.problem.objective.value(point.q)
         assert point.distance == pytest.approx(moved(solution.problem, point.q, solution.initial), abs=1e-6)

@@ -17,7 +17,8 @@ from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.contact import Contact as Blow
 from impact_posture.impact.contact import Support
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.posture.problem import PostureProblem, Requirements, build_problem
+from impact_posture.posture.build_problem import build_problem
+from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.solve import solve
 from impact_posture.tsid.activation import Activation, Phase
 from impact_posture.tsid.controller import Controller, Status

@@ -110,7 +110,6 @@ def test_a_urdf_of_ones_own(root: str, tmp_path: Path) -> None:
     ("name", "build", "mend"),
     [
         ("panda", aerial_program, "arm_program"),
-        ("hextilt", aerial_program, "propulsion"),
         ("talos", aerial_program, "propulsion"),
         ("talos", arm_program, "legged_program"),
         ("panda", legged_program, "supports"),

@@ -25,6 +25,7 @@ from impact_posture.codegen.sums import rebuilt
 from impact_posture.codegen.variants import variants
 from impact_posture.dynamics.twins import Twins
 from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
@@ -146,9 +147,8 @@ def test_random_twins_against_pinocchio(
     assert max(shares(graph)) == (4 if count > 3 else 2)
     for q in random_configurations(loaded.model, 2, "twins", seed):
         n = unit(generator)
-        oracle = ImpactOracle(
-            loaded, replace(contact, normal=tuple(n)), objective.metric, supports, objective.compliance
-        )
+        turned = replace(contact, normal=tuple(n))
+        oracle = ImpactOracle(ImpactCase(loaded, turned, objective.metric, supports, objective.compliance))
         expected = oracle.quantities(q)
         values = values_of(graph, {"q": q, "n": n})
         tolerance = 1e-6 if supports else 1e-9
@@ -157,7 +157,7 @@ def test_random_twins_against_pinocchio(
         assert_close(values["o0_a"], expected.jump, tolerance, "jump")
         assert_close(values["o0_L"], expected.ellipsoid.ravel(), tolerance, "ellipsoid")
         n0 = np.array(contact.normal)
-        own = ImpactOracle(loaded, contact, objective.metric, supports, objective.compliance)
+        own = ImpactOracle(ImpactCase(loaded, contact, objective.metric, supports, objective.compliance))
         at = values_of(graph, {"q": q, "n": n0})
         assert_close(at["o0_value"], [own.quantities(q).V], tolerance, "objective")
 
@@ -260,7 +260,7 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
         for angle in (0.0, 1e-9, math.pi / 4, math.pi / 2, 3.0, -2.5, 100.0, 1e4, 9.99e5, 1.01e6, 1e15, -1e20):
             q = np.full(loaded.nq, angle)
             reduced = np.full(loaded.nq, math.atan2(math.sin(angle), math.cos(angle)))
-            expected = ImpactOracle(loaded, objective.contact, objective.metric).quantities(reduced)
+            expected = ImpactOracle(ImpactCase(loaded, objective.contact, objective.metric)).quantities(reduced)
             code, H, _ = built.eval(q, n)
             assert code == 0
             # An angle's own last digit is what is left of it.

@@ -329,8 +329,8 @@ def report_like(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def test_a_failure_is_exit_code_1_and_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    from impact_posture_cli.app import app
     from impact_posture_cli.boundary import run
-    from impact_posture_cli.main import app
 
     typer_main = pytest.importorskip("typer.main")
 

@@ -89,7 +89,7 @@ def bench(
             name, frame=frame, normal=(0.0, 0.0, 1.0), offset=None, normal_frame="world", contact=None, impulse=1.0,
             posture=None, support=None, no_support=True, metric="euclidean", weights=None, objective="impulse",
             speed=1.0, restitution=0.0, root=root, package_dir=package_dir, srdf=srdf, config=config,
-            armature=armature, lock=lock, normal_cone=0.0,
+            armature=armature, lock=lock, lock_massless=False, normal_cone=0.0,
         ).resolve()
         for name in robot or DEFAULT_ROBOTS
     ]  # fmt: skip

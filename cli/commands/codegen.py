@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from impact_posture_cli import options
-from impact_posture_cli.checks import UsageError
 
 if TYPE_CHECKING:
     from impact_posture.impact.objective import ImpactObjective
@@ -16,18 +15,10 @@ if TYPE_CHECKING:
 # What a result folder leaves to be said.
 _FREE = {"robot", "prefix", "out", "float_", "portable", "compile", "force", "json", "quiet"}
 
-RobotOrResult = Annotated[
-    str,
-    typer.Argument(
-        metavar="ROBOT|RESULT_DIR",
-        help="Known name, path to a .urdf, example-robot-data:PATH, or a folder that optimize wrote.",
-    ),
-]
-
 
 def codegen(
     context: typer.Context,
-    robot: RobotOrResult,
+    robot: options.RobotOrResult,
     frame: options.FrameList = None,
     normal: options.Normal = None,
     offset: options.Offset = None,
@@ -44,6 +35,7 @@ def codegen(
     support: options.SupportList = None,
     no_support: options.NoSupport = False,
     lock: options.Lock = None,
+    lock_massless: options.LockMassless = False,
     root: options.Root = None,
     armature: options.Armature = None,
     config: options.Config = None,
@@ -59,14 +51,15 @@ def codegen(
     quiet: options.Quiet = False,
 ) -> None:
     """Write the metric and its gradient as C code for a controller."""
-    from_result = (Path(robot) / "result.json").is_file()
+    from_result = options.is_result(robot)
     if from_result:
-        _refuse_options(context)
+        options.refuse_beside_result(context, _FREE)
     else:
         options.check_contact(frame[0] if frame else None, normal, contact)
     supports = options.check_supports(support, no_support)
     from impact_posture.codegen.folder import write_export
     from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.progress import progress_bar
 
     posture = None
     objectives: list[ImpactObjective]
@@ -82,7 +75,13 @@ def codegen(
         from impact_posture_cli.asked import load_options
 
         load = load_options(
-            root=root, package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock
+            root=root,
+            package_dir=package_dir,
+            srdf=srdf,
+            config=config,
+            armature=armature,
+            lock=lock,
+            lock_massless=lock_massless,
         )
         objectives = []
         frames: list[str | None] = [*frame] if frame else [None]
@@ -97,16 +96,17 @@ def codegen(
             impact = request.resolve()
             objectives.append(impact.objective)
             warnings = impact.warnings
-    written = write_export(
-        objectives,
-        Path(out) if out else None,
-        prefix=prefix,
-        posture=posture,
-        single=float_,
-        portable=portable,
-        build=compile,
-        force=force,
-    )
+    with progress_bar("writing and compiling" if compile else "writing", shown=not (quiet or json)):
+        written = write_export(
+            objectives,
+            Path(out) if out else None,
+            prefix=prefix,
+            posture=posture,
+            single=float_,
+            portable=portable,
+            build=compile,
+            force=force,
+        )
     if json:
         print_json(written.to_dict())
         return
@@ -124,17 +124,3 @@ def codegen(
         ]
     )
     page.line(written.verdict)
-
-
-def _refuse_options(context: typer.Context) -> None:
-    """A result folder says what the problem is: options that say it otherwise are a mistake."""
-    given: list[Any] = [
-        name
-        for name in context.params
-        if name not in _FREE
-        and (source := context.get_parameter_source(name)) is not None
-        and source.name == "COMMANDLINE"
-    ]
-    if given:
-        option = f"--{given[0].replace('_', '-')}"
-        raise UsageError(f"{option} contradicts RESULT_DIR, which says what the problem is: leave it out.")

@@ -41,24 +41,24 @@ def compare(
     labels = [text.strip() for text in controllers.split(",") if text.strip()]
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
-    from impact_posture.experiment.folders import COMPARISON, FORMATS, store_beside, write_comparison
+    from impact_posture.experiment.folders import FORMATS, store_beside, write_comparison
     from impact_posture.experiment.reproduction import compare as run_all
     from impact_posture.experiment.reproduction import comparison_document, jobs_of
     from impact_posture.folder import check_output
     from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_bar
+    from impact_posture_cli.progress import progress_line
 
     labels = list(dict.fromkeys(labels))
     folder = None if out is None else Path(out)
     if folder is not None:
-        check_output(folder, force=force, marks=(COMPARISON,))
+        check_output(folder, force=force, kind="comparison")
     store = None if folder is None else store_beside(folder)
-    with progress_bar("running", "runs", shown=not (quiet or json)) as progress:
+    with progress_line(shown=not (quiet or json)) as progress:
         rows = run_all(scenario, labels, seeds=seeds, processes=jobs, store=store, progress=progress)
-    document = comparison_document(rows, seeds)
-    if folder is not None and store is not None:
-        formats = [f.value for f in format or ()] or FORMATS
-        write_comparison(folder, document, jobs_of(scenario, labels, seeds), store, force=force, formats=formats)
+        document = comparison_document(rows, seeds)
+        if folder is not None and store is not None:
+            formats = [f.value for f in format or ()] or FORMATS
+            write_comparison(folder, document, jobs_of(scenario, labels, seeds), store, force=force, formats=formats)
     if json:
         print_json(document)
         return

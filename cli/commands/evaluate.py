@@ -34,6 +34,7 @@ def evaluate(
     support: options.SupportList = None,
     no_support: options.NoSupport = False,
     lock: options.Lock = None,
+    lock_massless: options.LockMassless = False,
     root: options.Root = None,
     armature: options.Armature = None,
     config: options.Config = None,
@@ -50,7 +51,7 @@ def evaluate(
         impulse=impulse, posture=posture, support=support, no_support=no_support, metric=metric, weights=weights,
         objective=objective, normal_cone=normal_cone, speed=speed, restitution=restitution, root=root,
         package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock, bilateral=bilateral,
-        armature_range=armature_range, payload=payload,
+        lock_massless=lock_massless, armature_range=armature_range, payload=payload,
     )  # fmt: skip
     from impact_posture.impact.classical import classical_ellipsoids
     from impact_posture.impact.evaluation import evaluate as evaluate_impact

@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from impact_posture_cli import options
+from impact_posture_cli.checks import UsageError
 
 if TYPE_CHECKING:
+    from impact_posture.robot.loader import LoadOptions
     from impact_posture_cli.output import Page
+
+
+WriteRobotToml = Annotated[
+    str | None,
+    typer.Option(
+        "--write-robot-toml", metavar="[FILE.toml]", rich_help_panel=options.OUTPUT,
+        help="Draft the robot.toml of a URDF, every guess marked; without FILE beside the URDF, or here as NAME.toml "
+        "where the URDF is in a package.",
+    ),
+]  # fmt: skip
+ForceFile = Annotated[
+    bool, typer.Option("--force", rich_help_panel=options.OUTPUT, help="Replace an existing robot.toml.")
+]
 
 
 def inspect(
@@ -18,6 +36,9 @@ def inspect(
     config: options.Config = None,
     armature: options.Armature = None,
     lock: options.Lock = None,
+    lock_massless: options.LockMassless = False,
+    write_robot_toml: WriteRobotToml = None,
+    force: ForceFile = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -27,7 +48,20 @@ def inspect(
     from impact_posture_cli.asked import load_options
     from impact_posture_cli.output import Page, print_json
 
-    load = load_options(root=root, package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock)
+    load = load_options(
+        root=root,
+        package_dir=package_dir,
+        srdf=srdf,
+        config=config,
+        armature=armature,
+        lock=lock,
+        lock_massless=lock_massless,
+    )
+    if write_robot_toml is not None:
+        if config is not None:
+            raise UsageError("--config contradicts --write-robot-toml, which drafts one: leave it out.")
+        _write(robot, load, write_robot_toml, force=force, json=json, quiet=quiet)
+        return
     summary = summarize(load_robot(robot, load))
     if json:
         print_json(summary)
@@ -40,6 +74,25 @@ def inspect(
     if summary["actuation"] is not None:
         _actuation(page, summary["actuation"])
     page.warnings(summary["warnings"])
+
+
+def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, quiet: bool) -> None:
+    """Draft the robot's robot.toml."""
+    from impact_posture.robot.draft import write_draft
+    from impact_posture_cli.output import Page, print_json
+
+    path, draft = write_draft(robot, load, Path(out) if out else None, force=force)
+    if json:
+        print_json({"file": str(path), "guesses": draft.guesses, "text": draft.text})
+        return
+    page = Page(quiet=quiet)
+    page.line(f"written: {path}")
+    if not quiet:
+        page.line("Check what was guessed:")
+        page.table((), [("  -", line) for line in dict.fromkeys(draft.guesses)])
+        page.line("Then leave the options out that it answers, as in")
+        beside = path.name == "robot.toml" and path.parent == Path(robot).parent
+        page.line(f"  impact-posture optimize {robot}{'' if beside else f' --config {path}'} --normal X Y Z")
 
 
 def _head(page: Page, summary: dict[str, Any]) -> None:

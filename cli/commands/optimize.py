@@ -63,6 +63,7 @@ def optimize(
     regularization: options.Regularization = 0.0,
     tradeoff: options.Tradeoff = 0,
     lock: options.Lock = None,
+    lock_massless: options.LockMassless = False,
     root: options.Root = None,
     armature: options.Armature = None,
     config: options.Config = None,
@@ -84,8 +85,9 @@ def optimize(
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
     from impact_posture.folder import check_output
-    from impact_posture.job import FORMATS, MARKS, default_out, write_result
+    from impact_posture.job import FORMATS, default_out, write_result
     from impact_posture.posture.follow import trade_off
+    from impact_posture.posture.result import result_document
     from impact_posture.posture.robustness import solve_robustly
     from impact_posture.posture.settings import prepare
     from impact_posture_cli.output import Page, print_json
@@ -94,10 +96,11 @@ def optimize(
     page = Page(quiet=quiet or json)
     prepared = prepare(settings)
     folder = Path(out) if out else default_out(prepared)
-    check_output(folder, force=force, marks=MARKS)
+    check_output(folder, force=force, kind="result")
     if not json:
         _announce(page, prepared)
-    with progress_bar("solving", "starts", shown=not (quiet or json)) as progress:
+    shown = not (quiet or json)
+    with progress_bar("solving", "starts", shown=shown, first="building the expressions") as progress:
         # With each scenario alone beside it: how far the optimum moves with the model.
         found = solve_robustly(
             prepared.problem,
@@ -110,24 +113,32 @@ def optimize(
     solution, robustness = found.solution, found.robustness
     curve = None
     if settings.tradeoff:
-        with progress_bar("solving", "points", shown=not (quiet or json)) as progress:
+        with progress_bar("solving", "points", shown=shown) as progress:
             curve = trade_off(solution, settings.tradeoff, compile=compile, progress=progress)
-    written = write_result(
-        prepared,
-        solution,
-        folder,
-        robustness=robustness,
-        tradeoff=curve,
-        force=force,
-        codegen=not no_codegen,
-        formats=[f.value for f in format or ()] or FORMATS,
-    )
+    document: dict[str, Any] = result_document(prepared, solution, robustness, curve)
+    if not json:
+        # Pictures and C code take longer than the answer: nobody waits for it because of them.
+        _summarize(page, prepared, solution, document)
+    with progress_bar("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as progress:
+        written = write_result(
+            prepared,
+            solution,
+            document,
+            folder,
+            tradeoff=curve,
+            force=force,
+            codegen=not no_codegen,
+            formats=[f.value for f in format or ()] or FORMATS,
+            jobs=jobs,
+            progress=progress,
+        )
     if written.compiler_error:
         page.warnings([f"the C code in c/ is written but could not be built: {written.compiler_error}"])
     if json:
-        print_json(written.document)
-        return
-    _summarize(page, prepared, solution, written)
+        print_json(document)
+    elif not quiet:
+        page.gap()
+        page.line(f"written to {written.out}: {_contents(written)}")
 
 
 def _given(context: typer.Context) -> dict[str, Any]:
@@ -213,11 +224,11 @@ def _announce(page: Page, prepared: Prepared) -> None:
     page.gap()
 
 
-def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, written: Written) -> None:
+def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
+    from impact_posture.posture.notes import percent
     from impact_posture_cli.output import number, worst_normal
     from impact_posture_cli.worst import contact_names, contacts_table, impulses_line, scenarios_table
 
-    document: dict[str, Any] = written.document
     initial, optimal = document["initial"], document["optimal"]
     rows = []
     for key, unit, words in (
@@ -245,7 +256,7 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, writte
     for when, block in (("before", initial), ("after", optimal)):
         for name, feet in _footings(frames, block):
             page.line(f"feet {when}{name}: {feet['verdict']}")
-    page.line(f"reduction {solution.reduction:.1%}; {_redundancy(solution.redundancy)} left by the constraints")
+    page.line(f"reduction {percent(solution.reduction)}; {_redundancy(solution.redundancy)} left by the constraints")
     if "robustness" in document:
         page.line(document["robustness"]["line"])
     for note in solution.notes[len(prepared.problem.notes) :]:
@@ -269,9 +280,6 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, writte
         _tradeoff(page, document["tradeoff"], [n for n in document["notes"] if n.startswith("trade-off:")])
     # Those of the robot stood above the solving.
     page.warnings(document["warnings"][len(prepared.impact.warnings) :])
-    if not page.quiet:
-        page.gap()
-        page.line(f"written to {written.out}: {_contents(written)}")
 
 
 def _footings(frames: list[str], block: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
@@ -284,6 +292,7 @@ def _footings(frames: list[str], block: dict[str, Any]) -> list[tuple[str, dict[
 
 def _tradeoff(page: Page, points: list[dict[str, Any]], notes: list[str]) -> None:
     """What a smaller change would buy."""
+    from impact_posture.posture.notes import percent
     from impact_posture_cli.output import number
 
     page.gap()
@@ -291,7 +300,7 @@ def _tradeoff(page: Page, points: list[dict[str, Any]], notes: list[str]) -> Non
     first, last = points[0]["objective"], points[-1]["objective"]
     rows = []
     for point in points:
-        gain = f"{(first - point['objective']) / (first - last):.1%}" if last < first else ""
+        gain = percent((first - point["objective"]) / (first - last)) if last < first else ""
         marks = (["knee"] if point["knee"] else []) + ([] if point["certified"] else ["not certified"])
         keys = ("objective", "H", "G", "V", "S")
         rows.append((f"  {point['within']:.3f}", gain, *(number(point[key]) for key in keys), ", ".join(marks)))

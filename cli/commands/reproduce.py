@@ -39,27 +39,27 @@ def reproduce(
 ) -> None:
     """Run the paper's experiments: its table beside ours, figures, a summary. Goes on where it was interrupted."""
     from impact_posture.errors import ScenarioNotFound
-    from impact_posture.experiment.folders import FORMATS, REPRODUCTION, store_beside, write_reproduction
+    from impact_posture.experiment.folders import FORMATS, store_beside, write_reproduction
     from impact_posture.experiment.paper import PAPER
     from impact_posture.experiment.reproduction import controllers_of, jobs_of
     from impact_posture.experiment.reproduction import reproduce as reproduce_all
     from impact_posture.experiment.summary import advice
     from impact_posture.folder import check_output
     from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_bar
+    from impact_posture_cli.progress import progress_line
 
     scenarios = list(dict.fromkeys(scenario)) if scenario else list(PAPER)
     for name in scenarios:
         if name not in PAPER:
             raise ScenarioNotFound(name, PAPER, mend="(others: simulate and compare)")
     folder = Path(out)
-    check_output(folder, force=force, marks=(REPRODUCTION,))
+    check_output(folder, force=force, kind="reproduction")
     store = store_beside(folder)
-    with progress_bar("running", "runs", shown=not (quiet or json)) as progress:
+    with progress_line(shown=not (quiet or json)) as progress:
         found = reproduce_all(scenarios, seeds=seeds, everything=all_, processes=jobs, store=store, progress=progress)
-    plan = [job for name in scenarios for job in jobs_of(name, controllers_of(name, all_), seeds)]
-    formats = [f.value for f in format or ()] or FORMATS
-    document = write_reproduction(folder, found, plan, store, force=force, formats=formats)
+        plan = [job for name in scenarios for job in jobs_of(name, controllers_of(name, all_), seeds)]
+        formats = [f.value for f in format or ()] or FORMATS
+        document = write_reproduction(folder, found, plan, store, force=force, formats=formats)
     if json:
         print_json(document)
         return

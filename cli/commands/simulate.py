@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,6 +14,9 @@ from impact_posture_cli.experiments import RUN, Mode, ScenarioName
 
 if TYPE_CHECKING:
     from impact_posture_cli.output import Page
+
+# The exit code of a run that did not complete.
+_FAILED = 4
 
 Controller = Annotated[
     str,
@@ -68,25 +72,32 @@ def simulate(
 ) -> None:
     """Run a controller through an experiment in MuJoCo; write metrics, time series and figures."""
     from impact_posture.escape import file_name
-    from impact_posture.experiment.folders import FORMATS, SIMULATION, write_simulation
+    from impact_posture.experiment.folders import FORMATS, write_simulation
     from impact_posture.experiment.jobs import Job, execute
+    from impact_posture.experiment.statistics import fate
     from impact_posture.folder import check_output
     from impact_posture.posture.blas import one_blas_thread
     from impact_posture.simulation.scenario_file import read_scenario
     from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.progress import progress_line
 
     name = read_scenario(scenario).name
     job = Job(scenario, controller, seed, mode, free, gain, None if sign is None else int(sign))
     folder = Path(out) if out else Path(file_name(f"{name}-{job.label.replace(':', '-')}"))
-    check_output(folder, force=force, marks=(SIMULATION,))
-    with one_blas_thread():
-        runs, document = execute(job)
-    formats = [f.value for f in format or ()] or FORMATS
-    write_simulation(folder, job, runs, document, force=force, formats=formats)
+    check_output(folder, force=force, kind="run")
+    with progress_line(shown=not (quiet or json)):
+        with one_blas_thread():
+            runs, document = execute(job)
+        formats = [f.value for f in format or ()] or FORMATS
+        write_simulation(folder, job, runs, document, force=force, formats=formats)
     if json:
         print_json(document)
-        return
-    _show(Page(quiet=quiet), document, job.label, folder)
+    else:
+        _show(Page(quiet=quiet), document, job.label, folder)
+    if document["status"] != "completed":
+        sys.stdout.flush()
+        sys.stderr.write(f"error: {name}, {job.label}: {fate(document)}; its numbers are no result\n")
+        raise typer.Exit(_FAILED)
 
 
 def _rigid(prediction: dict[str, Any]) -> str:
@@ -101,35 +112,62 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
     from impact_posture_cli.output import number
 
     page.title(f"{document['scenario']}, {label}", f"seed {document['seed']}")
-    metrics, prediction = document["metrics"], document["prediction"]
-    saturation = metrics["saturation_s"]
-    joints = f"base {number(metrics['q_total_impact_base'])}, joints {number(metrics['q_total_impact_joints'])}"
-    rows = [
-        ("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints})"),
-        ("peak jump", f"{number(metrics['peak_jump'])}, at most {number(metrics['peak_jump_max'])}"),
-        ("rigid model", _rigid(prediction)),
-        ("H before", number(prediction["H"], missing="–")),
-        ("peak force", f"{number(metrics['peak_force'])} N"),
-        ("saturated", f"{number(saturation['inside'])} s in the windows, {number(saturation['outside'])} s outside"),
-        ("relaxed ticks", f"{metrics['relaxed_ticks']}, held {metrics['failed_ticks']}"),
-    ]  # fmt: skip
-    if metrics["q_total_dwell"]:
-        rows.insert(1, ("q_total_dwell", number(metrics["q_total_dwell"])))
-        rows.append(("contacts", f"{metrics['contacts']} of {prediction['blows']}"))
-    if metrics["stops"]:
-        rows.append(("at stops", ", ".join(metrics["stops"])))
+    runs = document["runs"]
+    rows = [("status", document["status"])]
+    if document["metrics"] is not None:
+        rows += _numbers(document["metrics"], document["prediction"])
+    relaxed, held, ticks, made, asked = (
+        sum(values)
+        for values in zip(
+            *[[part["metrics"]["relaxed_ticks"], part["metrics"]["failed_ticks"], part["ticks"],
+               part["metrics"]["contacts"], part["metrics"]["contacts_asked"]] for part in runs],
+            strict=True,
+        )
+    )  # fmt: skip
+    rows.append(("relaxed", f"{relaxed} of {ticks} ticks: limits made a task give way"))
+    rows.append(("held", f"{held} ticks: no command was found, the last one was kept"))
+    if any(window["kind"] == "dwell" for window in document["windows"]):
+        rows.append(("contacts", f"{made} of {asked}"))
     page.pairs(rows)
-    if len(document["runs"]) > 1:
+    if len(runs) > 1 and document["metrics"] is not None:
         page.gap()
         parts = [
             (f"  {part['sign']:+d}", number(part["metrics"]["q_total_impact"]), number(part["metrics"]["peak_jump"]),
              number(part["waited"]))
-            for part in document["runs"]
+            for part in runs
         ]  # fmt: skip
         page.table(("  push", "q_total_impact", "peak jump", "pushed after s"), parts, right=(1, 2, 3))
+    if document["events"]:
+        page.gap()
+        several = len(runs) > 1
+        for event in document["events"]:
+            which = f" (push {event['sign']:+d})" if several else ""
+            page.line(f"  t = {event['time']:.2f} s: {event['status']}{which}: {event['what']}")
     page.gap()
     notes = [document["offline"]["note"]] if document["offline"] and document["offline"]["note"] else []
-    if not metrics["rested"]:
+    if document["metrics"] is not None and not document["metrics"]["rested"]:
         notes.append("the robot was not at rest before the push: its own motion is in what is measured")
     page.warnings(notes)
     page.line(f"written: {folder}")
+
+
+def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[str, str]]:
+    """What a run that completed is measured by."""
+    from impact_posture_cli.output import number
+
+    saturation = metrics["saturation_s"]
+    joints = f"base {number(metrics['q_total_impact_base'])}, joints {number(metrics['q_total_impact_joints'])}"
+    rows = [("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints})")]
+    if metrics["q_total_dwell"]:
+        rows.append(("q_total_dwell", number(metrics["q_total_dwell"])))
+    return [
+        *rows,
+        ("q_total_recovery", f"{number(metrics['q_total_recovery'])}, until 1 s after each impact began"),
+        ("peak jump", f"{number(metrics['peak_jump'])}, at most {number(metrics['peak_jump_max'])}"),
+        ("peak, recovery", number(metrics["peak_recovery"])),
+        ("rigid model", _rigid(prediction)),
+        ("H before", number(prediction["H"], missing="–")),
+        ("peak force", f"{number(metrics['peak_force'])} N"),
+        ("saturated", f"{number(saturation['inside'])} s in the windows, {number(saturation['outside'])} s outside"),
+        *([("at stops", ", ".join(metrics["stops"]))] if metrics["stops"] else []),
+    ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -30,8 +31,13 @@ SampleSeed = Annotated[
 ]
 
 
+# What a result folder leaves to be said.
+_FREE = {"robot", "samples", "seed", "json", "quiet"}
+
+
 def verify(
-    robot: options.RobotName,
+    context: typer.Context,
+    robot: options.RobotOrResult,
     frame: options.Frame = None,
     normal: NormalOfFirst = None,
     offset: options.Offset = None,
@@ -42,6 +48,7 @@ def verify(
     support: options.SupportList = None,
     no_support: options.NoSupport = False,
     lock: options.Lock = None,
+    lock_massless: options.LockMassless = False,
     root: options.Root = None,
     armature: options.Armature = None,
     config: options.Config = None,
@@ -53,6 +60,9 @@ def verify(
     quiet: options.Quiet = False,
 ) -> None:
     """Compute H, G, Λ_c and ∇H in every way there is and compare: pass or fail."""
+    from_result = options.is_result(robot)
+    if from_result:
+        options.refuse_beside_result(context, _FREE)
     from impact_posture_cli.asked import impact_request
 
     if contact is None and normal is None:
@@ -62,15 +72,15 @@ def verify(
         robot, frame=frame, normal=normal, offset=offset, normal_frame=normal_frame, contact=contacts, impulse=1.0,
         posture=None, support=support, no_support=no_support, metric=metric, weights=weights, objective="impulse",
         normal_cone=0.0, speed=1.0, restitution=0.0, root=root, package_dir=package_dir, srdf=srdf, config=config,
-        armature=armature, lock=lock,
+        armature=armature, lock=lock, lock_massless=lock_massless,
     )  # fmt: skip
     from impact_posture.verification.verify import verify as verify_objective
     from impact_posture_cli.output import Page, complain, print_json
     from impact_posture_cli.progress import progress_bar
 
-    impact = request.resolve()
+    impact = _of_result(Path(robot)) if from_result else request.resolve()
     with progress_bar("comparing", shown=not (quiet or json)) as progress:
-        report = verify_objective(impact.objective, samples, seed, progress)
+        report = verify_objective(impact.objective.singles[0], samples, seed, progress)
     if json:
         asked = {key: value for key, value in impact.to_dict().items() if key != "metric"}
         measure = {"name": impact.metric.kind, "weights": impact.metric.weights}
@@ -86,11 +96,22 @@ def verify(
             fold=5,
         )
         page.warnings(impact.warnings)
+        others = [contact.frame for contact in impact.objective.others]
+        page.warnings([f"{impact.contact.frame} alone is compared, not {', '.join(others)}"] if others else [])
     if not report.passed:
         failed = [row for row in report.rows if row.verdict == "fail"]
         named = ", ".join(" ".join(filter(None, (row.source, row.quantity))) for row in failed)
         complain(f"error: {impact.robot.name}: other numbers than Pinocchio's: {named}; please report it")
         raise typer.Exit(1)
+
+
+def _of_result(folder: Path) -> ResolvedImpact:
+    """The impact that a result folder is about, at its optimum."""
+    from impact_posture.impact.request import ResolvedImpact
+    from impact_posture.job import load_view
+
+    view = load_view(folder)
+    return ResolvedImpact(view.objective, view.q_optimal, "the result's optimum", view.speed, view.restitution)
 
 
 def _asked(title: Callable[[str, str], None], impact: ResolvedImpact, report: VerificationReport) -> None:

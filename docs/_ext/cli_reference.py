@@ -39,7 +39,7 @@ class Parameter:
 
 def commands() -> dict[str, Callable[..., None]]:
     """The subcommands by name, in the order of ``--help``."""
-    from impact_posture_cli.main import app
+    from impact_posture_cli.app import app
 
     return {info.name or "": info.callback for info in app.registered_commands if info.callback}
 

@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.impact.contact import Contact, point_on
-from impact_posture.impact.metric import Metric
+from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.robot.robot import Robot
@@ -80,7 +80,7 @@ class Case:
         H, gradients = [], []
         for q, n in zip(self.q, self.n, strict=True):
             x, y, z = (float(v) for v in n)
-            oracle = ImpactOracle(self.robot, Contact.create(self.frame, (x, y, z)), Metric())
+            oracle = ImpactOracle(ImpactCase(self.robot, Contact.create(self.frame, (x, y, z))))
             H.append(oracle.quantities(q).H)
             gradients.append(oracle.gradient_H(q))
         return np.array(H), np.array(gradients)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
-
 import casadi as ca
 
 from impact_posture.benchmark.count import count_operations, reachable_kb
 from impact_posture.benchmark.peer import Group, Peer
 from impact_posture.benchmark.workbench import CONTRACT, Absent, Workbench, c_compiler
+from impact_posture.folder import scratch_folder
 
 _WRAPPER = """
 int kernel_eval(const double *q, const double *n, double *H, double *grad)
@@ -50,11 +48,11 @@ def function_of(q: ca.SX, n: ca.SX, step: ca.SX, H: ca.SX) -> ca.Function:
 
 def c_source(function: ca.Function) -> str:
     """CasADi's C of the function with the wrapper."""
-    with tempfile.TemporaryDirectory() as name:
+    with scratch_folder() as folder:
         generator = ca.CodeGenerator("peer.c", {"with_header": False})
         generator.add(function)
-        generator.generate(f"{name}/")
-        text = (Path(name) / "peer.c").read_text()
+        generator.generate(f"{folder}/")
+        text = (folder / "peer.c").read_text()
     sizes = {"arg": function.sz_arg(), "res": function.sz_res(), "iw": function.sz_iw(), "w": function.sz_w()}
     return text + _WRAPPER.format(**{key: max(1, size) for key, size in sizes.items()})
 

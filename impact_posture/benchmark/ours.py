@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
-
 from impact_posture.benchmark.case import Case
 from impact_posture.benchmark.count import reachable_kb
 from impact_posture.benchmark.peer import Peer
 from impact_posture.benchmark.work import eval_operations
 from impact_posture.benchmark.workbench import CONTRACT, Absent, Workbench, c_compiler, processor
 from impact_posture.codegen.export import export
+from impact_posture.folder import scratch_folder
 
 PREFIX = "kernel"
 # What gcc and clang mean by x86-64-v3, as the kernel calls it.
@@ -32,8 +30,7 @@ def peers(case: Case, bench: Workbench) -> list[Peer]:
         CompilerError: No C compiler.
     """
     compiler = c_compiler()
-    with tempfile.TemporaryDirectory(prefix="impact-posture-") as name:
-        folder = Path(name)
+    with scratch_folder() as folder:
         export(case.objective, folder, prefix=PREFIX, check=False)
         sources = {file: (folder / file).read_text() for file in (f"{PREFIX}.c", f"{PREFIX}.h")}
     text = sources[f"{PREFIX}.c"]

@@ -21,6 +21,12 @@ def library_path(folder: Path, prefix: str) -> Path:
     return folder / f"lib{prefix}.so"
 
 
+def products(prefix: str) -> tuple[str, ...]:
+    """What the Makefile of an export, and whoever loads it, make beside it."""
+    library = f"lib{prefix}.so"
+    return ("example", "example_cpp", f"{prefix}.o", library, f"{library}.sha256")
+
+
 def build_library(folder: Path, prefix: str, target: Path | None = None, extra_flags: tuple[str, ...] = ()) -> Path:
     """Compile ``<prefix>.c`` in ``folder`` into a shared library; it appears whole or not at all, with its seal.
 

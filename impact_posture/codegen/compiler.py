@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,6 +19,7 @@ from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.naming import FUNCTIONS
 from impact_posture.codegen.variants import Variant, variants
 from impact_posture.errors import CompilerError
+from impact_posture.folder import scratch_folder
 from impact_posture.impact.contact import heavy_feet_rounding
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
@@ -121,8 +121,8 @@ def compiled(
     Raises:
         CompilerError: No compiler, or it failed: its first error line and the command.
     """
-    with tempfile.TemporaryDirectory(prefix="impact-posture-") as folder:
-        library = build_library(export_dir, prefix, library_path(Path(folder), prefix), extra_flags)
+    with scratch_folder() as folder:
+        library = build_library(export_dir, prefix, library_path(folder, prefix), extra_flags)
         yield CompiledExport(library, prefix, nq, nv, real)
 
 
@@ -152,8 +152,8 @@ def compile_and_check(
     """
     objectives = (objective,) if isinstance(objective, ImpactObjective) else tuple(objective)
     worst = 0.0
-    with tempfile.TemporaryDirectory(prefix="impact-posture-") as folder:
-        target = library_path(export_dir if keep else Path(folder), prefix)
+    with scratch_folder() as folder:
+        target = library_path(export_dir if keep else folder, prefix)
         loaded = load_library(build_library(export_dir, prefix, target))
         for variant in variants(objectives, prefix):
             one = variant.objective
@@ -206,7 +206,7 @@ def oracle_difference(library: CompiledExport, objective: ImpactObjective, sampl
     contact, worst = objective.contact, 0.0
     for q, n in _samples(objective, samples, library.real):
         turned = replace(contact, normal=(float(n[0]), float(n[1]), float(n[2])))
-        oracle = ImpactOracle(objective.robot, turned, objective.metric, objective.supports, objective.compliance)
+        oracle = ImpactOracle(replace(objective.case, contact=turned))
         found, gradient = oracle.quantities(q), oracle.gradient_H(q)
         worst = _worst(worst, library.eval(q, n), found.H, gradient)
         worst = _worst(worst, library.objective(q), objective.value(q), objective.gradient(q))

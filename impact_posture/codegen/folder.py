@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.codegen.build import GET_ONE, library_path
+from impact_posture.codegen.build import GET_ONE, library_path, products
 from impact_posture.codegen.compiler import compile_and_check
 from impact_posture.codegen.emitter import DOUBLE, FLOAT
 from impact_posture.codegen.export import Export, default_prefix, export
 from impact_posture.codegen.naming import check_prefix
-from impact_posture.codegen.reader import is_manifest
 from impact_posture.errors import CompilerError
 from impact_posture.folder import whole_folder
 from impact_posture.impact.objective import ImpactObjective
@@ -109,9 +107,7 @@ def write_export(
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     out = Path(f"{prefix}-c") if out is None else out
     real = FLOAT if single else DOUBLE
-    # A folder is ours by a manifest in it, whatever that is called: not by any .json.
-    marks = tuple(glob.escape(path.name) for path in sorted(out.glob("*.json")) if is_manifest(path))
-    with whole_folder(out, force=force, marks=marks) as folder:
+    with whole_folder(out, force=force, kind="export", products=products(prefix)) as folder:
         made = export(objectives, folder, prefix=prefix, posture=posture, real=real, portable=portable, check=False)
         if build and find_compiler() is not None:
             try:

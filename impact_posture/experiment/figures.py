@@ -12,6 +12,7 @@ from impact_posture.experiment.many import Document, Store
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction
 from impact_posture.plot import Bar, RunView, Span, draw_bars, draw_comparison, draw_run, draw_snapshots
+from impact_posture.progress import tell
 from impact_posture.simulation.runs import Run
 from impact_posture.simulation.scenario import RepeatedContacts
 from impact_posture.simulation.series import Series, Window
@@ -21,6 +22,7 @@ def draw_runs(job: Job, runs: Sequence[Run], folder: Path, formats: Sequence[str
     """Figures of one job; those of a push the other way in ``minus/``."""
     for one in runs:
         into = folder if one is runs[0] else folder / "minus"
+        tell("drawing")
         view = run_view(job, one.series, one.windows, one.sign)
         draw_run(view, into, formats)
         draw_snapshots([view], into, formats)
@@ -28,6 +30,7 @@ def draw_runs(job: Job, runs: Sequence[Run], folder: Path, formats: Sequence[str
 
 def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]) -> None:
     """Figures of several controllers in one scenario; of pushes, those the first way."""
+    tell("drawing")
     views = [view for job in jobs if (view := _kept(job, store)) is not None]
     if views:
         draw_comparison(views, folder, formats)
@@ -75,7 +78,7 @@ def run_view(job: Job, series: Series, windows: Sequence[Window], sign: int) -> 
         objective=series.objective,
         level=series.level,
         at_stop=series.at_stop,
-        windows=tuple(Span(w.kind, w.begin, w.end, w.contact, w.touched) for w in windows),
+        windows=tuple(Span(w.kind, w.begin, w.end, w.contact, w.touched) for w in windows if w.kind != "recovery"),
         surface=np.array(setup.world.built.points[scenario.surface.name]) if hits else None,
         supports=objective.supports,
         label=job.label,
@@ -86,7 +89,7 @@ def run_view(job: Job, series: Series, windows: Sequence[Window], sign: int) -> 
 def _kept(job: Job, store: Store) -> RunView | None:
     """The first run of a job whose series was kept; ``None`` where it came to no end."""
     document: Document | None = store.find(job)
-    if document is None or "error" in document:
+    if document is None or not document["runs"]:
         return None
     part = document["runs"][0]
     return run_view(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,8 @@ from impact_posture.experiment.summary import summary
 from impact_posture.folder import whole_folder
 from impact_posture.simulation.runs import Run
 
-# What makes a folder one that --force may replace.
 SIMULATION, COMPARISON, REPRODUCTION = "run.json", "comparison.json", "reproduction.json"
-FORMATS = ("png", "svg", "pdf")
+FORMATS = ("png",)
 
 
 def write_simulation(
@@ -35,7 +33,7 @@ def write_simulation(
     Raises:
         OutputError: The folder exists without ``force``, is not ours, or cannot be written.
     """
-    with whole_folder(out, force=force, marks=(SIMULATION,)) as folder:
+    with whole_folder(out, force=force, kind="run") as folder:
         _write_json(folder / SIMULATION, document)
         for one in runs:
             one.series.save(folder / f"series{'' if one.sign > 0 else '-minus'}.npz")
@@ -56,10 +54,10 @@ def write_comparison(
     Raises:
         OutputError: As :func:`write_simulation`.
     """
-    with whole_folder(out, force=force, marks=(COMPARISON,)) as folder:
+    with whole_folder(out, force=force, kind="comparison") as folder:
         _write_json(folder / COMPARISON, document)
         draw_side_by_side([job for job in jobs if job.seed == 0], store, folder, formats)
-    shutil.rmtree(store.folder, ignore_errors=True)
+    store.remove()
 
 
 def write_reproduction(
@@ -80,14 +78,14 @@ def write_reproduction(
         OutputError: As :func:`write_simulation`.
     """
     document = {**found.to_dict(), "summary": summary(found)}
-    with whole_folder(out, force=force, marks=(REPRODUCTION,)) as folder:
+    with whole_folder(out, force=force, kind="reproduction") as folder:
         _write_json(folder / REPRODUCTION, document)
         (folder / "SUMMARY.md").write_text(summary(found), encoding="utf-8")
         (folder / "runs").mkdir()
         for job in jobs:
             _write_json(folder / "runs" / f"{job.name}.json", store.find(job))
         draw_reproduction(found, [job for job in jobs if job.seed == 0], store, folder, formats)
-    shutil.rmtree(store.folder, ignore_errors=True)
+    store.remove()
     return document
 
 

@@ -13,12 +13,13 @@ from impact_posture.escape import file_name
 from impact_posture.posture.result import versions
 from impact_posture.simulation.controllers import Mode, Workshop
 from impact_posture.simulation.metrics import Metrics, measure
+from impact_posture.simulation.outcome import gravest, judge
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.runs import Run, run
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 
-SCHEMA = "impact-posture/simulation/1"
+SCHEMA = "impact-posture/simulation/2"
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,10 @@ def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
     if job.sign is not None and job.sign not in getattr(scenario.task, "signs", ()):
         raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, mend="leave --sign out")
     runs = run(shop, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
-    found = [_of_run(shop, one) for one in runs]
+    metrics, found = [measure(shop.setup, one) for one in runs], []
+    for one, measured in zip(runs, metrics, strict=True):
+        found.append(_of_run(shop, one, measured))
+    status = gravest(part["status"] for part in found)
     document = {
         "schema": SCHEMA,
         "scenario": scenario.name,
@@ -98,9 +102,13 @@ def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
         "free": job.free,
         "gain": scenario.control.robust.gain if job.gain is None else job.gain,
         "seed": job.seed,
-        "metrics": together([measure(shop.setup, one) for one in runs]).to_dict(),
+        "status": status,
+        "events": [{**event, "sign": part["sign"]} for part in found for event in part["events"]],
+        "metrics": together(metrics).to_dict() if status == "completed" else None,
         "windows": [{**window, "sign": part["sign"]} for part in found for window in part["windows"]],
-        "prediction": _mean_prediction([p for part in found for p in part["prediction"]]),
+        "prediction": (
+            _mean_prediction([p for part in found for p in part["prediction"]]) if status == "completed" else None
+        ),
         "runs": found,
         "offline": _offline(shop) if job.controller == "posture" else None,
         "model_sha256": shop.setup.robot.model_sha256,
@@ -126,17 +134,22 @@ def together(metrics: list[Metrics]) -> Metrics:
     if len(metrics) == 1:
         return first
     values = {key: float(np.mean([getattr(m, key) for m in metrics])) for key in asdict(first) if key != "stops"}
-    ticks = {key: sum(getattr(m, key) for m in metrics) for key in ("relaxed_ticks", "failed_ticks", "contacts")}
+    counts = ("relaxed_ticks", "failed_ticks", "contacts", "contacts_asked")
+    ticks = {key: sum(getattr(m, key) for m in metrics) for key in counts}
     largest = {key: max(getattr(m, key) for m in metrics) for key in ("peak_jump_max", "peak_force")}
     stops = tuple(dict.fromkeys(stop for m in metrics for stop in m.stops))
     return Metrics(**{**values, **ticks, **largest, "stops": stops, "rested": all(m.rested for m in metrics)})
 
 
-def _of_run(shop: Workshop, one: Run) -> dict[str, Any]:
+def _of_run(shop: Workshop, one: Run, metrics: Metrics) -> dict[str, Any]:
+    events = judge(shop.setup, one)
     return {
         "sign": one.sign,
         "waited": None if np.isnan(one.waited) else one.waited,
-        "metrics": measure(shop.setup, one).to_dict(),
+        "status": gravest(event.status for event in events),
+        "events": [event.to_dict() for event in events],
+        "ticks": int(one.series.t.size),
+        "metrics": metrics.to_dict(),
         "windows": [window.to_dict() for window in one.windows],
         "prediction": [p.to_dict() for p in predict(shop.setup, shop.objective(), one)],
     }

@@ -5,20 +5,24 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from impact_posture import __version__
-from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError
-from impact_posture.experiment.jobs import Job, execute, workshop
+from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError, SpecError
+from impact_posture.experiment.jobs import SCHEMA, Job, execute, workshop
+from impact_posture.folder import is_ours, write_record
 from impact_posture.posture.blas import one_blas_thread
 from impact_posture.posture.compiled import own_source
 from impact_posture.processes import shared_out
 from impact_posture.simulation.controllers import CONTROLLERS
 from impact_posture.simulation.scenario_file import scenario_path
+from impact_posture.simulation.series import Series
 
 Document = dict[str, Any]
 Progress = Callable[[int, int], None]
@@ -37,16 +41,27 @@ class Store:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
+    def make(self) -> None:
+        """Make the folder where there is none."""
+        with suppress(FileExistsError):
+            self.folder.mkdir(parents=True)
+            write_record(self.folder, "runs")
+
+    def remove(self) -> None:
+        """Remove the folder, if it was made by :meth:`make`."""
+        if is_ours(self.folder, "runs"):
+            shutil.rmtree(self.folder, ignore_errors=True)
+
     def find(self, job: Job) -> Document | None:
-        """The document of a job that is done."""
+        """The document of a job that is done; a file that is not whole, or another's, is none."""
         try:
-            kept = json.loads(self._path(job).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            seal, _, text = self._path(job).read_text(encoding="utf-8").partition("\n")
+        except (OSError, UnicodeDecodeError):
             return None
-        if not isinstance(kept, dict) or kept.get("key") != key_of(job):
+        if seal != _seal(job, text):
             return None
-        document = kept.get("document")
-        return document if isinstance(document, dict) else None
+        document: Document = json.loads(text)
+        return document
 
     def series(self, job: Job, sign: int) -> Path:
         """Where the time series of a run is kept."""
@@ -61,8 +76,9 @@ class Store:
         path = self._path(job)
         beside = path.with_suffix(f".{os.getpid()}.part")
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            beside.write_text(json.dumps({"key": key_of(job), "document": document}), encoding="utf-8")
+            self.make()
+            text = json.dumps(document)
+            beside.write_text(f"{_seal(job, text)}\n{text}", encoding="utf-8")
             os.replace(beside, path)
         except OSError as error:
             words = error.strerror or str(error)
@@ -72,6 +88,11 @@ class Store:
 
     def _path(self, job: Job) -> Path:
         return self.folder / f"{job.name}.json"
+
+
+def _seal(job: Job, text: str) -> str:
+    """What a kept document begins with: no other text, and no other job, has it."""
+    return hashlib.sha256(f"{key_of(job)}\0{text}".encode()).hexdigest()
 
 
 def key_of(job: Job) -> str:
@@ -101,7 +122,8 @@ def run_many(
 ) -> list[Document]:
     """Run jobs, those first that are not done yet; documents in the jobs' order.
 
-    A job that fails on its own (the robot ran away) has a document with ``error`` instead of ``metrics``.
+    A job that fails on its own (a metric that does not exist where it went) has a document without runs, of the
+    status ``control lost``.
 
     Args:
         jobs: What to run.
@@ -150,14 +172,21 @@ def _one(job: Job, store: Store | None) -> Document:
         if isinstance(error, InputError) and not isinstance(error, MetricError):
             # The user's, and the same for all seeds: not a result.
             raise
-        return {"scenario": job.scenario, "controller": job.controller, "mode": job.mode, "free": job.free,
-                "seed": job.seed, "error": f"{type(error).__name__}: {error}"}  # fmt: skip
+        event = {"status": "control lost", "time": getattr(error, "time", None), "what": str(error), "sign": None}
+        return {"schema": SCHEMA, "scenario": job.scenario, "controller": job.controller, "mode": job.mode,
+                "free": job.free, "seed": job.seed, "status": "control lost", "events": [event], "metrics": None,
+                "prediction": None, "windows": [], "runs": []}  # fmt: skip
     if store is not None:
-        store.folder.mkdir(parents=True, exist_ok=True)
+        store.make()
         for one in runs:
             one.series.save(store.series(job, one.sign))
     return document
 
 
 def _has_series(store: Store, job: Job, document: Document) -> bool:
-    return "error" in document or all(store.series(job, part["sign"]).is_file() for part in document["runs"])
+    try:
+        for part in document["runs"]:
+            Series.load(store.series(job, part["sign"]))
+    except SpecError:
+        return False
+    return True

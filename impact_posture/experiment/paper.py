@@ -38,7 +38,7 @@ PAPER: dict[str, PaperRow] = {
 # Found best by `reproduce --all`; whether they still are, every reproduction says.
 RECOMMENDED: dict[str, str] = {
     "aerial-vertical": "posture",
-    "aerial-lateral": "posture",
-    "solo8-push": "walker",
+    "aerial-lateral": "robust",
+    "solo8-push": "stiff",
     "talos-push": "posture",
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -13,6 +13,7 @@ from impact_posture.impact.classical import Ellipsoid, ellipsoid_of
 from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.footing import Footing, footing
+from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses
 from impact_posture.impact.jump import Dominance, Jump, find_dominance, weighed_jump
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
@@ -24,8 +25,6 @@ from impact_posture.impact.scalars import (
     scenario_values,
     worst_member,
 )
-from impact_posture.impact.several import BoxOfImpulses, WorstImpulses
-from impact_posture.impact.uncertain import worst_in_world
 
 Vector = NDArray[np.float64]
 
@@ -191,17 +190,17 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
         compliance_effect=effect,
         footing=footing(oracle, objective.supports, q) if objective.supports else None,
         contacts=tuple(evaluate(single, q, speed, restitution) for single in singles),
-        impulses=member.inner.worst(q) if isinstance(member.inner, BoxOfImpulses) else None,
+        impulses=member.worst_case.worst(q) if isinstance(member.worst_case, ImpulseBox) else None,
         scenarios=scenarios,
         warnings=_warnings(scalars, effect),
     )  # fmt: skip
 
 
 def _worst(objective: ImpactObjective, q: Vector) -> WorstNormal | None:
-    if not objective.normal_cone_deg:
+    if objective.normal_cone is None:
         return None
     try:
-        return worst_in_world(objective, q)
+        return objective.normal_cone.worst_in_world(q)
     except MetricError:
         return None
 
@@ -209,9 +208,9 @@ def _worst(objective: ImpactObjective, q: Vector) -> WorstNormal | None:
 def _without_supports(objective: ImpactObjective, q: Vector, H: float) -> tuple[Scalars | None, float | None]:
     if not objective.supports:
         return None, None
-    parts = (objective.robot, objective.contact, objective.metric)
-    free = Scalars.of(ImpactOracle(*parts).quantities(q))
-    stiffer = ImpactOracle(*parts, objective.supports, objective.compliance / 10).quantities(q).H
+    case = objective.case
+    free = Scalars.of(ImpactOracle(replace(case, supports=())).quantities(q))
+    stiffer = ImpactOracle(replace(case, compliance=case.compliance / 10)).quantities(q).H
     return free, abs(stiffer - H) / H if H > 0 else 0.0
 
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import ByJoint, PointOnLink, Product, Response, Tree, Wrench
 from impact_posture.dynamics.twins import Twins
-from impact_posture.impact.contact import Contact, Support, point_on, support_inertia
-from impact_posture.impact.metric import Metric
+from impact_posture.impact.contact import support_inertia
+from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.robot.robot import Robot
 
 # Singular values of stacked Jacobians below this part of the largest are rounding.
@@ -26,47 +26,31 @@ _FROZEN = 1e-9
 
 
 class ImpactKernel:
-    """Symbolic ``H, G, V, S, E, Λ_c`` and gradients of one contact.
+    """Symbolic ``H, G, V, S, E, Λ_c`` and gradients of one impact.
 
     Args:
-        robot: The robot.
-        contact: Frame, offset and the frame that the normal is given in.
-        metric: Weight of the jump.
-        supports: Feet that stay; empty for a robot that flies or is bolted down.
-        compliance: ε of the supports, 1/kg.
+        case: Robot, contact, metric and supports.
         q: Configuration symbols, shape (nq, 1).
-        n: Normal symbols, shape (3, 1), in ``contact.normal_frame``.
+        n: Normal symbols, shape (3, 1), in the axes that the contact's normal is given in.
         twins: Branches whose expressions are to be alike (:class:`~impact_posture.dynamics.twins.Twins`).
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        contact: Contact,
-        metric: Metric,
-        supports: tuple[Support, ...],
-        compliance: float,
-        q: ca.SX,
-        n: ca.SX,
-        twins: Twins | None = None,
-    ) -> None:
-        self.robot, self.contact, self.metric = robot, contact, metric
-        self.q, self.n = q, n
-        self.tree = Tree(robot.model, q, extra_inertia=support_inertia(robot, supports, compliance), twins=twins)
-        self.point: PointOnLink = point_on(robot, contact.frame, contact.offset)
-        self._supported = bool(supports)
+    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, twins: Twins | None = None) -> None:
+        self.case, self.metric, self.q, self.n = case, case.metric, q, n
+        extra = support_inertia(case.robot, case.supports, case.compliance)
+        self.tree = Tree(case.robot.model, q, extra_inertia=extra, twins=twins)
+        self.point = case.point
+        self._supported = bool(case.supports)
 
     @cached_property
     def blow(self) -> Wrench:
         """The unit impulse along the normal."""
-        return Wrench(self.point, self.n, ca.SX.zeros(3), in_frame=self.contact.normal_frame == "contact")
+        return Wrench(self.point, self.n, ca.SX.zeros(3), in_frame=self.case.in_contact_frame)
 
     @cached_property
     def world_normal(self) -> ca.SX:
         """The normal in world axes, shape (3,)."""
-        if self.contact.normal_frame == "world":
-            return self.n
-        return self.tree.rotation(self.point) @ self.n
+        return self.tree.rotation(self.point) @ self.n if self.case.in_contact_frame else self.n
 
     @cached_property
     def jump(self) -> Response:
@@ -168,7 +152,7 @@ class ImpactKernel:
     @cached_property
     def _mobility_inverse(self) -> ca.SX:
         """``(JM⁻¹Jᵀ)⁻¹``; the pseudo-inverse of a planar robot's."""
-        frozen = frozen_directions(self.robot, self.point)
+        frozen = frozen_directions(self.case.robot, self.point)
         return _inverse3(self.mobility + frozen if frozen.any() else self.mobility)
 
     @cached_property
@@ -196,7 +180,7 @@ class ImpactKernel:
         r = -self._mobility_inverse @ self.tree.point_velocity(self.point, free.velocities)[:3]
         adjoint = self.tree.respond(tau=weighed, wrenches=self._alike(self._force(r)))
         gradient = 2 * self.tree.pair_gradient(x, adjoint) + self._metric_gradient(x.velocities)
-        if self.contact.normal_frame == "contact":
+        if self.case.in_contact_frame:
             gradient = gradient - 2 * self.tree.turning_gradient(self.point, self.world_normal, r)
         return gradient
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import Tree, Wrench
-from impact_posture.impact.contact import Contact, point_on
-
-if TYPE_CHECKING:
-    from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.contact import point_on
+from impact_posture.impact.impact_case import ImpactCase
+from impact_posture.impact.metric import Metric
 
 Vector = NDArray[np.float64]
 
@@ -71,17 +69,17 @@ class UnknownJump:
     contact_velocity: ca.SX
 
 
-def unknown_jump(objective: ImpactObjective, tree: Tree, blow: Wrench, label: str = "") -> UnknownJump:
-    """Unknowns and equations of the answer to one blow."""
+def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") -> UnknownJump:
+    """Unknowns and equations of the velocity jump under one impulse."""
     a = ca.SX.sym(f"a{label}", tree.nv)
     velocities = tree.velocities(a)
-    wrenches, held, f = [blow], [], ca.SX(0, 1)
-    for k, support in enumerate(objective.supports):
-        foot = point_on(objective.robot, support.frame, support.offset)
+    wrenches, held, f = [impact], [], ca.SX(0, 1)
+    for k, support in enumerate(case.supports):
+        foot = point_on(case.robot, support.frame, support.offset)
         f_k = ca.SX.sym(f"f{label}_{k}", support.rows)
         full = ca.vertcat(f_k, ca.SX.zeros(6 - support.rows))
         wrenches.append(Wrench(foot, full[:3], full[3:]))
-        held.append(tree.point_velocity(foot, velocities)[: support.rows] + objective.compliance * f_k)
+        held.append(tree.point_velocity(foot, velocities)[: support.rows] + case.compliance * f_k)
         f = ca.vertcat(f, f_k)
     mass_a = tree.mass_times(a)
     momentum = mass_a - tree.generalized_force(wrenches)
@@ -90,22 +88,26 @@ def unknown_jump(objective: ImpactObjective, tree: Tree, blow: Wrench, label: st
         variables=ca.vertcat(a, f),
         residual=ca.vertcat(momentum, *held),
         mass_a=mass_a,
-        contact_velocity=tree.point_velocity(blow.point, velocities)[:3],
+        contact_velocity=tree.point_velocity(impact.point, velocities)[:3],
     )
 
 
-def blow_at(objective: ImpactObjective, contact: Contact, impulse: ca.SX) -> Wrench:
-    """An impulse at a contact's point, in the axes that its normal is given in."""
-    point = point_on(objective.robot, contact.frame, contact.offset)
-    return Wrench(point, impulse, ca.SX.zeros(3), in_frame=contact.normal_frame == "contact")
+def impact_at(case: ImpactCase, impulse: ca.SX) -> Wrench:
+    """An impulse at the contact point, in the axes that the normal is given in."""
+    return Wrench(case.point, impulse, ca.SX.zeros(3), in_frame=case.in_contact_frame)
 
 
-def weighed(objective: ImpactObjective, one: UnknownJump, other: UnknownJump) -> ca.SX:
+def in_world(case: ImpactCase, tree: Tree, directions: ca.SX) -> ca.SX:
+    """Directions (columns) from the axes that the normal is given in to world axes."""
+    return tree.rotation(case.point) @ directions if case.in_contact_frame else directions
+
+
+def weighed(metric: Metric, one: UnknownJump, other: UnknownJump) -> ca.SX:
     """``a₁ᵀWa₂``."""
-    if objective.metric.kind == "kinetic":
+    if metric.kind == "kinetic":
         # Not sᵀJa − ε|f|², equal on the equations: stiff feet make that a small difference of large numbers.
         return ca.dot(one.a, other.mass_a)
-    return ca.dot(one.a, ca.SX(objective.metric.diagonal(one.a.numel())) * other.a)
+    return ca.dot(one.a, ca.SX(metric.diagonal(one.a.numel())) * other.a)
 
 
 def worst_of(parts: Sequence[Lifted], values: Sequence[ca.SX], scale: ca.SX) -> Lifted:

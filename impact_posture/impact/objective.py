@@ -1,7 +1,9 @@
-"""The one ``Objective`` protocol: what the program, the C export, the certificate and TSID see of an impact.
+"""What is minimized: the ``Objective`` protocol, and the worst case of an impact that implements it.
 
-An objective is a metric × a kind × supports × contacts × a cone × scenarios; none of the combinations is a class of
-its own: what they ask of the inner maximum is (:mod:`impact_posture.impact.inner`).
+:class:`Objective` is all that the program, its starts, the solver and the certificate know.
+:class:`ImpactObjective` combines a kind (:mod:`impact_posture.impact.kinds`), a metric, supports, contacts, a cone of
+normals and model variants.  No combination is a class of its own: the shapes of the inner maximum are
+(:mod:`impact_posture.impact.worst_case`).
 """
 
 from __future__ import annotations
@@ -17,26 +19,34 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.tree import Tree
 from impact_posture.dynamics.twins import Twins
 from impact_posture.impact.contact import Contact, Support, default_compliance
-from impact_posture.impact.inner import InnerMaximum, Subgradients
+from impact_posture.impact.impact_case import ImpactCase
+from impact_posture.impact.impact_kind import ImpactKind, QuadraticKind
+from impact_posture.impact.impulse_box import ImpulseBox, check_contacts
 from impact_posture.impact.kernel import ImpactKernel
+from impact_posture.impact.kinds import KINDS
 from impact_posture.impact.lifted import Guess, Lifted
-from impact_posture.impact.lifted_cone import ConeOfNormals
 from impact_posture.impact.metric import Metric, ObjectiveKind
-from impact_posture.impact.one_blow import OneBlow
+from impact_posture.impact.model_set import ModelSet
+from impact_posture.impact.normal_cone import NormalCone, check_cone
 from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.impact.scenarios import FewModels
-from impact_posture.impact.several import BoxOfImpulses, check_contacts
-from impact_posture.impact.uncertain import check_cone
+from impact_posture.impact.single_impact import SingleImpact
+from impact_posture.impact.worst_case import Subgradients, WorstCase
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.scenario import Scenario
 
 Vector = NDArray[np.float64]
 
+# A contact whose 1/m_eff along the normal is below this share of the largest mobility cannot move along it.
+_BLOCKED = 1e-12
+
 
 class Objective(Protocol):
-    """What can be minimized: a value with units, its tangent gradient, an oracle, and a lifted form."""
+    """What a posture problem minimizes."""
 
-    robot: Robot
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        ...
 
     @property
     def name(self) -> str:
@@ -44,19 +54,26 @@ class Objective(Protocol):
         ...
 
     @property
-    def units(self) -> str:
-        """Units of the value."""
+    def contacts(self) -> tuple[Contact, ...]:
+        """Contacts whose frames the problem holds; empty for none."""
         ...
 
-    def value_fun(self) -> ca.Function:
-        """``(q, n) → value``."""
+    @property
+    def supports(self) -> tuple[Support, ...]:
+        """Feet that the problem holds; empty for none."""
         ...
 
-    def gradient_fun(self) -> ca.Function:
-        """``(q, n) → value, tangent gradient (nv)``."""
+    @property
+    def structure(self) -> str:
+        """What its expressions depend on besides the robot's dynamics; part of the compile cache's key."""
         ...
 
-    def lift(self, tree: Tree, n: ca.SX, scale: ca.SX) -> Lifted:
+    @property
+    def parameters(self) -> Vector:
+        """Numbers of the lifted form that may change without rebuilding the program, shape (k,)."""
+        ...
+
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
         """The value in terms of auxiliaries and equations at ``tree.q``; ``scale`` is a typical value of it."""
         ...
 
@@ -70,11 +87,11 @@ class Objective(Protocol):
         ...
 
     def value(self, q: Vector) -> float:
-        """The value from Pinocchio's numbers."""
-        ...
+        """The value from Pinocchio's numbers, > 0.
 
-    def gradient(self, q: Vector) -> Vector:
-        """The tangent gradient (where there is none: a subgradient) from Pinocchio's numbers, shape (nv,)."""
+        Raises:
+            MetricError: It does not exist at ``q``.
+        """
         ...
 
     def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
@@ -84,13 +101,13 @@ class Objective(Protocol):
         """
         ...
 
+    def movable(self, q: Vector) -> bool:
+        """Whether the value at ``q`` is more than rounding."""
+        ...
 
-_UNITS = {
-    "impulse": "(N·s)² × jump² per impulse²",
-    "speed": "jump² per (m/s)² of approach, frictionless",
-    "sticking": "jump² per (m/s)² of approach, no slip",
-    "energy": "J per (m/s)² of approach",
-}
+    def blind_motions(self) -> Vector:
+        """Motions of the whole robot that change nothing: twists of the base, world axes, linear first, (k, 6)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -99,7 +116,7 @@ class ImpactObjective:
 
     Attributes:
         robot: The robot.
-        contact: Where and along what the blow comes.
+        contact: Where the impact acts, and along which normal.
         metric: How the jump is weighed.
         kind: Which of the four.
         supports: Feet that stay.
@@ -122,10 +139,15 @@ class ImpactObjective:
     scenarios: tuple[Scenario, ...] = ()
 
     def __post_init__(self) -> None:
-        check_cone(self)
-        check_contacts(self)
+        check_cone(self.impact_kind, self.normal_cone_deg)
+        check_contacts(self.contacts, self.impact_kind, bilateral=self.bilateral, cone=self.normal_cone_deg != 0)
         if self.compliance <= 0:
             object.__setattr__(self, "compliance", default_compliance(self.robot))
+
+    @property
+    def impact_kind(self) -> ImpactKind:
+        """The kind's own formulas."""
+        return KINDS[self.kind]
 
     @property
     def name(self) -> str:
@@ -135,12 +157,31 @@ class ImpactObjective:
     @property
     def units(self) -> str:
         """Units in words."""
-        return _UNITS[self.kind]
+        return self.impact_kind.units
 
     @property
     def scale(self) -> float:
-        """λ̄² for ``impulse``, else 1."""
-        return self.contact.impulse**2 if self.kind == "impulse" else 1.0
+        """The value over the scalar H, V, S or E that the kind is a multiple of: λ̄² for ``impulse``, else 1."""
+        return self.impact_kind.factor(self.case)
+
+    @property
+    def structure(self) -> str:
+        """See :class:`Objective`; the leading contact's normal is a parameter."""
+        contact = self.contact
+        return repr(
+            (
+                (self.kind, self.metric, self.supports, self.compliance),
+                (self.normal_cone_deg, self.others, self.bilateral),
+                [scenario.robot.model_sha256 for scenario in self.scenarios],
+                (contact.frame, contact.offset, contact.normal_frame),
+                self.scale,
+            )
+        )
+
+    @property
+    def parameters(self) -> Vector:
+        """The leading contact's normal, shape (3,)."""
+        return np.array(self.contact.normal)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -157,6 +198,11 @@ class ImpactObjective:
         return (self.contact, *self.others)
 
     @cached_property
+    def case(self) -> ImpactCase:
+        """The impact at the leading contact, on the robot as modeled."""
+        return ImpactCase(self.robot, self.contact, self.metric, self.supports, self.compliance)
+
+    @cached_property
     def singles(self) -> tuple[ImpactObjective, ...]:
         """The objective of each contact alone, on the robot as modeled."""
         if not self.others:
@@ -166,18 +212,34 @@ class ImpactObjective:
         )
 
     @cached_property
-    def inner(self) -> InnerMaximum:
+    def by_scenario(self) -> tuple[ImpactObjective, ...]:
+        """The objective on each scenario's robot; itself alone without scenarios."""
+        if not self.scenarios:
+            return (self,)
+        return tuple(replace(self, robot=scenario.robot, scenarios=()) for scenario in self.scenarios)
+
+    @cached_property
+    def worst_case(self) -> WorstCase:
         """What the worst is taken over."""
         if self.scenarios:
-            return FewModels(self)
+            return ModelSet(tuple(member.worst_case for member in self.by_scenario))
         if self.others:
-            return BoxOfImpulses(self)
-        return ConeOfNormals(self) if self.normal_cone_deg else OneBlow(self)
+            return ImpulseBox(tuple(single.oracle for single in self.singles), self.bilateral)
+        cone = self.normal_cone
+        return SingleImpact(self.oracle, self.impact_kind) if cone is None else cone
+
+    @cached_property
+    def normal_cone(self) -> NormalCone | None:
+        """The cone of normals around the leading contact's own, on the robot as modeled."""
+        kind = self.impact_kind
+        if not self.normal_cone_deg or not isinstance(kind, QuadraticKind):
+            return None
+        return NormalCone(self.oracle, kind, self.normal_cone_deg)
 
     @property
     def is_multiple_of_H(self) -> bool:
         """Whether it is ``λ̄²H`` of the leading contact."""
-        return self.kind == "impulse" and isinstance(self.inner, OneBlow)
+        return self.impact_kind.symbol == "H" and isinstance(self.worst_case, SingleImpact)
 
     # ---- symbolic ---------------------------------------------------------------------------------------------
 
@@ -188,11 +250,11 @@ class ImpactObjective:
 
     def kernel_of(self, q: ca.SX, n: ca.SX, twins: Twins | None = None) -> ImpactKernel:
         """The expressions on given symbols; with ``twins``, alike for twin branches."""
-        return ImpactKernel(self.robot, self.contact, self.metric, self.supports, self.compliance, q, n, twins)
+        return ImpactKernel(self.case, q, n, twins)
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Value and tangent gradient (nv) in the symbols of a kernel of this contact, metric and supports."""
-        return self.inner.expressions(k)
+        return self.worst_case.expressions(k)
 
     def value_fun(self) -> ca.Function:
         """``(q, n) → value``; ``n`` in the contact's normal frame, as in :meth:`gradient_fun`."""
@@ -216,25 +278,25 @@ class ImpactObjective:
         k = self.kernel
         return ca.Function("eval", [k.q, k.n], [k.H, k.grad_H], ["q", "n"], ["H", "grad"], {"cse": True})
 
-    def lift(self, tree: Tree, n: ca.SX, scale: ca.SX) -> Lifted:
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
         """The objective with its linear solves as equations of the program."""
-        return self.inner.lift(tree, n, scale)
+        return self.worst_case.lift(tree, parameters, scale)
 
     @property
     def attempts(self) -> int:
         """Guesses that :meth:`guess` knows: one where its equations are linear in what it guesses."""
-        return self.inner.attempts
+        return self.worst_case.attempts
 
     def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
         """The auxiliaries of :meth:`lift` that solve its equations at ``q``."""
-        return self.inner.guess(q, scale, attempt)
+        return self.worst_case.guess(q, scale, attempt)
 
     # ---- numeric ----------------------------------------------------------------------------------------------
 
     @cached_property
     def oracle(self) -> ImpactOracle:
         """Pinocchio's numbers for the leading contact, the same metric and supports, the robot as modeled."""
-        return ImpactOracle(self.robot, self.contact, self.metric, self.supports, self.compliance)
+        return ImpactOracle(self.case)
 
     def value(self, q: Vector) -> float:
         """The objective at ``q`` from Pinocchio's numbers.
@@ -242,12 +304,32 @@ class ImpactObjective:
         Raises:
             MetricError: ``sticking`` where S does not exist.
         """
-        return self.inner.value(q)
+        return self.worst_case.value(q)
 
     def gradient(self, q: Vector) -> Vector:
         """The tangent gradient at ``q`` from Pinocchio's numbers, shape (nv,); a subgradient where tied."""
-        return self.inner.gradient(q)
+        return self.worst_case.gradient(q)
 
     def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
         """The gradient, or those of all that tie or lie at most ``within`` below."""
-        return self.inner.subgradients(q, within)
+        return self.worst_case.subgradients(q, within)
+
+    def movable(self, q: Vector) -> bool:
+        """Whether a contact can move along its normal at ``q``, or along another normal of its cone."""
+        if self.normal_cone_deg:
+            return True
+        found = [single.oracle.quantities(q) for single in self.singles]
+        return any(one.G > _BLOCKED * float(np.linalg.eigvalsh(one.mobility)[-1]) for one in found)
+
+    def blind_motions(self) -> Vector:
+        """Translations, and turns about the normal: the objective depends on the base through ``R_bᵀn`` alone.
+
+        Where the normal turns with the robot these are all turns; none where contacts have different normals.
+        """
+        n = np.array(self.contact.normal)
+        turns = n[None, :]
+        if self.contact.normal_frame == "contact":
+            turns = np.eye(3)
+        elif any(np.linalg.norm(np.cross(n, other.normal)) > 1e-9 for other in self.others):
+            turns = np.zeros((0, 3))
+        return np.vstack([np.eye(6)[:3], np.hstack([np.zeros_like(turns), turns])])

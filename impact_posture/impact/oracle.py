@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import MetricError
-from impact_posture.impact.contact import Contact, Support, point_on
-from impact_posture.impact.metric import Metric
-from impact_posture.robot.robot import Robot
+from impact_posture.impact.contact import point_on
+from impact_posture.impact.impact_case import ImpactCase
 
 Vector = NDArray[np.float64]
 
@@ -70,29 +69,16 @@ class Answer:
     a: Vector
     f: Vector
 
-    def __matmul__(self, combination: Vector) -> Answer:
-        return Answer(np.asarray(self.a @ combination), np.asarray(self.f @ combination))
-
-    def __add__(self, other: Answer) -> Answer:
-        return Answer(self.a + other.a, self.f + other.f)
-
 
 class ImpactOracle:
-    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one contact."""
+    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        contact: Contact,
-        metric: Metric,
-        supports: tuple[Support, ...] = (),
-        compliance: float = 1.0,
-    ) -> None:
-        self.robot, self.contact, self.metric = robot, contact, metric
-        self.numeric = Numeric(robot.model)
-        self.point = point_on(robot, contact.frame, contact.offset)
-        self.feet = [(point_on(robot, s.frame, s.offset), s.rows) for s in supports]
-        self.compliance = compliance
+    def __init__(self, case: ImpactCase) -> None:
+        self.case, self.robot, self.contact, self.metric = case, case.robot, case.contact, case.metric
+        self.numeric = Numeric(case.robot.model)
+        self.point = case.point
+        self.feet = [(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
+        self.compliance = case.compliance
         self._q: Vector | None = None
 
     def at(self, q: Vector) -> ImpactOracle:
@@ -106,8 +92,8 @@ class ImpactOracle:
         parts = [num.jacobian(point)[:rows] for point, rows in self.feet]
         self.Js = np.vstack(parts) if parts else np.zeros((0, self.robot.nv))
         rows, nv = self.Js.shape
-        kkt = np.block([[self.M, -self.Js.T], [self.Js, self.compliance * np.eye(rows)]])
-        self._lu = scipy.linalg.lu_factor(kkt)
+        self._kkt = np.block([[self.M, -self.Js.T], [self.Js, self.compliance * np.eye(rows)]])
+        self._lu = scipy.linalg.lu_factor(self._kkt)
         self.n = self._normals(None)[1]
         self._nv = nv
         return self
@@ -139,8 +125,11 @@ class ImpactOracle:
         ellipsoid = A.T @ self.weigh(A)
         a = A @ self.n
         H, G = float(a @ self.weigh(a)), float(self.n @ mobility @ self.n)
-        s = _Inverse.of(mobility).solve(self.n)
-        stuck = None if s is None else A @ s
+        held = _HeldPoint.of(self._kkt, self.J, mobility)
+        stuck, s = None, None
+        if held.can_move(self.n):
+            found, s = held.answer(velocity=self.n)
+            stuck = found.a
         return ImpactQuantities(
             H=H,
             G=G,
@@ -156,6 +145,10 @@ class ImpactOracle:
             support_impulse=np.asarray(answers.f @ self.n),
         )
 
+    def with_support_impulses(self, a: Vector) -> Vector:
+        """``a`` and the impulses ``−J_s a/ε`` that it means at the supports, at the last posture, one vector."""
+        return np.concatenate([a, -self.Js @ a / self.compliance])
+
     # ---- gradients --------------------------------------------------------------------------------------------
 
     def gradient_H(self, q: Vector, normal: Vector | None = None) -> Vector:
@@ -164,7 +157,7 @@ class ImpactOracle:
         own, n = self._normals(normal)
         x = self.answer(self.J.T @ n)
         y = self.answer(self.weigh(x.a))
-        gradient = 2 * (self.coupling(own, y.a, self._in_frame) - self.inertial(y, x))
+        gradient = 2 * (self.coupling(own, y.a, self.case.in_contact_frame) - self.inertial(y, x))
         return gradient + self.metric_gradient(x.a)
 
     def gradient_G(self, q: Vector, normal: Vector | None = None) -> Vector:
@@ -172,41 +165,33 @@ class ImpactOracle:
         self.at(q)
         own, n = self._normals(normal)
         x = self.answer(self.J.T @ n)
-        return 2 * self.coupling(own, x.a, self._in_frame) - self.inertial(x, x)
+        return 2 * self.coupling(own, x.a, self.case.in_contact_frame) - self.inertial(x, x)
 
     def gradient_S(self, q: Vector, normal: Vector | None = None) -> Vector:
         """Tangent gradient of S, shape (nv,); ``normal`` as for H.
 
-        Where ``JM⁻¹Jᵀ`` is singular its pseudo-inverse stands for the inverse: right where the directions that the
-        contact can move in stay the same, as in a planar robot.
+        Where ``JM⁻¹Jᵀ`` is singular the point is held in its range: right where the directions that the contact can
+        move in stay the same, as in a planar robot.
 
         Raises:
             MetricError: S does not exist here.
         """
         self.at(q)
         _, n = self._normals(normal)
-        axes = self.answer(self.J.T)
-        inverse = _Inverse.of(self.J @ axes.a)
-        s = inverse.solve(n)
-        if s is None:
+        held = _HeldPoint.of(self._kkt, self.J, self.J @ self.solve(self.J.T))
+        if not held.can_move(n):
             raise no_sticking()
-        x = axes @ s
-        free = self.answer(self.weigh(x.a))
-        r = np.asarray(-inverse.matrix @ (self.J @ free.a))
-        y = free + axes @ r
+        x, s = held.answer(velocity=n)
+        y, r = held.answer(tau=self.weigh(x.a))
         gradient = 2 * (self.coupling(s, y.a, False) + self.coupling(r, x.a, False) - self.inertial(y, x))
-        if self._in_frame:
+        if self.case.in_contact_frame:
             gradient = gradient - 2 * self.numeric.turning_gradient(self.point, n, r)
         return gradient + self.metric_gradient(x.a)
-
-    @property
-    def _in_frame(self) -> bool:
-        return self.contact.normal_frame == "contact"
 
     def _normals(self, given: Vector | None) -> tuple[Vector, Vector]:
         """A normal (the contact's own if none is given) in the axes that it is given in, and in world axes."""
         own = np.array(self.contact.normal) if given is None else given
-        return own, self.numeric.placement(self.point).rotation @ own if self._in_frame else own
+        return own, self.numeric.placement(self.point).rotation @ own if self.case.in_contact_frame else own
 
     def support_gradient(self, q: Vector) -> Vector:
         """Tangent Jacobian of the supports' impulses ``f``, shape (rows, nv).
@@ -218,7 +203,8 @@ class ImpactOracle:
         rows = len(self.Js)
         adjoints = self.answer(np.zeros((self._nv, rows)), -np.eye(rows))
         found = [
-            self.coupling(np.array(self.contact.normal), p, self._in_frame) - self.inertial(Answer(p, r), x)
+            self.coupling(np.array(self.contact.normal), p, self.case.in_contact_frame)
+            - self.inertial(Answer(p, r), x)
             for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
         ]
         return np.array(found).reshape(rows, self._nv)
@@ -245,25 +231,45 @@ class ImpactOracle:
         return self.numeric.inertial_gradient(a, a) if self.metric.kind == "kinetic" else np.zeros(self._nv)
 
 
-@dataclass(frozen=True)
-class _Inverse:
-    """``(JM⁻¹Jᵀ)⁺`` and the projector out of its range."""
+@dataclass(frozen=True, eq=False)
+class _HeldPoint:
+    """The contact point held beside the feet, in the directions that it can move in.
 
-    matrix: Vector
+    ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is factorized as it stands.  By way of ``(JM⁻¹Jᵀ)⁻¹`` the
+    second answer of ∇S would be a small difference of large ones, and lose by the square of that matrix's condition.
+    """
+
+    lu: tuple[Vector, Vector]
+    axes: Vector
     outside: Vector
+    nv: int
 
     @staticmethod
-    def of(mobility: Vector) -> _Inverse:
+    def of(kkt: Vector, J: Vector, mobility: Vector) -> _HeldPoint:
         values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
         kept = values > _RANK * max(float(values[-1]), 1e-300)
-        reciprocal = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
-        return _Inverse((vectors * reciprocal) @ vectors.T, vectors[:, ~kept] @ vectors[:, ~kept].T)
+        axes = np.eye(3) if kept.all() else vectors[:, kept]
+        size, nv = len(kkt), J.shape[1]
+        system = np.zeros((size + axes.shape[1],) * 2)
+        system[:size, :size] = kkt
+        system[size:, :nv] = axes.T @ J
+        system[:nv, size:] = -system[size:, :nv].T
+        return _HeldPoint(scipy.linalg.lu_factor(system), axes, vectors[:, ~kept], nv)
 
-    def solve(self, n: Vector) -> Vector | None:
-        """The impulse per unit approach speed, or ``None`` where ``n`` leaves the range."""
-        if np.linalg.norm(self.outside @ n) > np.sqrt(_RANK):
-            return None
-        return np.asarray(self.matrix @ n)
+    def can_move(self, n: Vector) -> bool:
+        """Whether the point can move along ``n``."""
+        return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(_RANK))
+
+    def answer(self, *, tau: Vector | None = None, velocity: Vector | None = None) -> tuple[Answer, Vector]:
+        """The robot's answer to ``τ`` where the point is to move at ``v``, and the point's impulse ``s``."""
+        right = np.zeros(len(self.lu[1]))
+        size = len(right) - self.axes.shape[1]
+        if tau is not None:
+            right[: self.nv] = tau
+        if velocity is not None:
+            right[size:] = self.axes.T @ velocity
+        found = np.asarray(scipy.linalg.lu_solve(self.lu, right))
+        return Answer(found[: self.nv], found[self.nv : size]), np.asarray(self.axes @ found[size:])
 
 
 def no_sticking() -> MetricError:

@@ -10,12 +10,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.errors import ContactError, InputError
+from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.contact import Contact, NormalFrame, Support, least_compliance, point_on
 from impact_posture.impact.metric import Metric, MetricKind, ObjectiveKind, build_metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import refuse_held, resolve_supports
 from impact_posture.impact.texts import parse_contact
+from impact_posture.robot.guess import feet, tips
 from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot
@@ -23,6 +24,8 @@ from impact_posture.robot.scenario import Payload, build_scenarios
 from impact_posture.robot.spec import Vector3
 
 Vector = NDArray[np.float64]
+
+FLOATS = "because its data name neither feet nor rotors"
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,9 @@ class ImpactRequest:
             self.bilateral,
             build_scenarios(robot, self.armature_range, self.payloads),
         )
-        return ResolvedImpact(objective, q, self.posture or robot.default_posture, self.speed, self.restitution)
+        held_by = _missing_support(robot) if self.supports is None and not supports else ""
+        posture = self.posture or robot.default_posture
+        return ResolvedImpact(objective, q, posture, self.speed, self.restitution, held_by)
 
     def _contacts(self, robot: Robot) -> list[Contact]:
         if not self.contacts:
@@ -122,6 +127,8 @@ class ImpactRequest:
         return [self._contact(robot, *parse_contact(text)) for text in self.contacts]
 
     def _contact(self, robot: Robot, frame: str, normal: Vector3, impulse: float | None) -> Contact:
+        if frame not in robot.frame_names:
+            raise FrameNotFound(frame, tips(robot, feet(robot)), where=robot.name)
         offset = self.offset
         if offset is None:
             offset = robot.spec.contact.offset if frame == robot.spec.contact.frame else (0.0, 0.0, 0.0)
@@ -141,6 +148,7 @@ class ResolvedImpact:
         posture: Its name or file.
         speed: Approach speed, m/s.
         restitution: Coefficient of restitution.
+        missing_support: How to say what holds a floating robot up, where nothing does; else empty.
     """
 
     objective: ImpactObjective
@@ -148,6 +156,7 @@ class ResolvedImpact:
     posture: str
     speed: float
     restitution: float
+    missing_support: str = ""
 
     @property
     def robot(self) -> Robot:
@@ -172,7 +181,10 @@ class ResolvedImpact:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What to know about the robot and about this objective."""
-        return (*self.robot.warnings, *self.objective.warnings)
+        found = (*self.robot.warnings, *self.objective.warnings)
+        if not self.missing_support:
+            return found
+        return (*found, f"{self.robot.name} is taken as floating freely, {FLOATS}; {self.missing_support}")
 
     def to_dict(self, q: Vector | None = None) -> dict[str, object]:
         """The blocks of ``result.json`` that say what was asked: robot, contacts, supports, metric.
@@ -228,12 +240,25 @@ def robot_block(robot: Robot) -> dict[str, object]:
     }
 
 
+def _missing_support(robot: Robot) -> str:
+    """How to say what holds the robot up, if it floats and its data name neither feet nor rotors; else empty."""
+    spec = robot.spec
+    known = spec.propulsion is not None or spec.kind == "aerial" or spec.constraints.level_base
+    if not robot.floating or known:
+        return ""
+    found = feet(robot)
+    stand = " ".join(f"--support {frame}" for frame in found) + " (its feet by name or geometry)"
+    return (
+        f"give {stand if found else '--support FRAME for each foot'}, --no-support if it floats indeed, --base, or a "
+        "robot.toml (inspect --write-robot-toml drafts one)"
+    )
+
+
 def _default_frame(robot: Robot) -> str:
     if robot.spec.contact.frame is not None:
         return robot.spec.contact.frame
-    moving = [f.name for f in robot.model.frames if f.parentJoint > 0]
     raise ContactError(
         f"{robot.name} has no default contact frame",
         where="--frame",
-        mend=f"give one, for example {', '.join(dict.fromkeys(moving[:-4:-1]))}",
+        mend=f"give one, for example {', '.join(tips(robot, feet(robot))[:3])}",
     )

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import MetricError
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.one_blow import OneBlow
 from impact_posture.impact.oracle import ImpactQuantities
-from impact_posture.impact.scenarios import FewModels
+from impact_posture.impact.single_impact import SingleImpact
 
 Vector = NDArray[np.float64]
 
@@ -80,9 +79,7 @@ def _blocked(found: ImpactQuantities) -> bool:
 
 def scenario_values(objective: ImpactObjective, q: Vector) -> tuple[ScenarioValue, ...]:
     """The objective and its parts in each scenario."""
-    if not isinstance(objective.inner, FewModels):
-        return ()
-    pairs = zip(objective.scenarios, objective.inner.members, strict=True)
+    pairs = zip(objective.scenarios, objective.by_scenario, strict=True) if objective.scenarios else ()
     return tuple(
         ScenarioValue(scenario.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
         for scenario, member in pairs
@@ -91,20 +88,20 @@ def scenario_values(objective: ImpactObjective, q: Vector) -> tuple[ScenarioValu
 
 def worst_member(objective: ImpactObjective, scenarios: tuple[ScenarioValue, ...]) -> ImpactObjective:
     """The objective in the worst of its scenarios as evaluated, one where it does not exist before all others."""
-    if not isinstance(objective.inner, FewModels):
+    if not scenarios:
         return objective
     values = [np.inf if scenario.objective is None else scenario.objective for scenario in scenarios]
-    return objective.inner.members[int(np.argmax(values))]
+    return objective.by_scenario[int(np.argmax(values))]
 
 
 def objective_value(objective: ImpactObjective, q: Vector) -> float | None:
     """The objective; ``None`` where it does not exist: in any of its scenarios, of any normal of its cone."""
-    if isinstance(objective.inner, FewModels):
-        values = [objective_value(member, q) for member in objective.inner.members]
+    if objective.scenarios:
+        values = [objective_value(member, q) for member in objective.by_scenario]
         return None if None in values else max(v for v in values if v is not None)
-    if isinstance(objective.inner, OneBlow):
+    if isinstance(objective.worst_case, SingleImpact):
         scalars = Scalars.of(objective.oracle.quantities(q))
-        alone = {"impulse": scalars.H, "speed": scalars.V, "sticking": scalars.S, "energy": scalars.E}[objective.kind]
+        alone: float | None = getattr(scalars, objective.impact_kind.symbol)
         return None if alone is None else objective.scale * alone
     try:
         value = objective.value(q)

@@ -9,6 +9,7 @@ import numpy as np
 
 from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.contact import Contact, Support, point_on
+from impact_posture.robot.guess import feet
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import SupportKind
 
@@ -40,7 +41,8 @@ def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
         if text.endswith(f":{candidate}"):
             frame, kind = text.removesuffix(f":{candidate}"), candidate
     if frame not in robot.frame_names:
-        raise FrameNotFound(frame, robot.frame_names, where="--support", mend="(or FRAME:point, FRAME:surface)")
+        names = dict.fromkeys((*feet(robot), *robot.frame_names))
+        raise FrameNotFound(frame, names, where="--support", mend="(or FRAME:point, FRAME:surface)")
     base = known.get(frame, Support(frame))
     return Support(frame, kind or base.kind, base.offset, base.size)
 

@@ -24,7 +24,7 @@ from impact_posture.plot.robot import postures_figure
 from impact_posture.plot.run_view import RunView, Span
 from impact_posture.plot.runs import controls_figure, draw_run, joints_figure, metric_figure
 from impact_posture.plot.snapshots import draw_snapshots, snapshots_figure
-from impact_posture.plot.style import FORMATS, check_formats, save
+from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save
 from impact_posture.plot.tradeoff import tradeoff_figure
 from impact_posture.plot.view import PathData, ResultView, TradeOffData, sample_path
 
@@ -48,6 +48,7 @@ __all__ = [
     "draw_comparison",
     "draw_run",
     "draw_snapshots",
+    "drawable",
     "ellipsoid_figure",
     "joints_figure",
     "jump_figure",
@@ -70,6 +71,12 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
 }
 
 
+def drawable(view: ResultView) -> list[str]:
+    """Names of :data:`FIGURES` that the view has data for (``nullspace``: a path; ``tradeoff``: a trade-off)."""
+    lacking = {"nullspace": view.path is None, "tradeoff": view.tradeoff is None}
+    return [name for name in FIGURES if not lacking.get(name)]
+
+
 class FigureNotFound(NameNotFound):
     """There is no figure of that name."""
 
@@ -79,7 +86,7 @@ class FigureNotFound(NameNotFound):
 def draw_all(
     view: ResultView,
     out: Path,
-    formats: Iterable[str] = FORMATS,
+    formats: Iterable[str] = DEFAULT_FORMATS,
     only: Collection[str] | None = None,
 ) -> list[Path]:
     """Write the figures of ``view`` into ``out`` as ``<name>.<format>``; return the paths.
@@ -88,8 +95,7 @@ def draw_all(
         view: The result.
         out: Folder, made if missing; files of the same name are replaced.
         formats: Of ``png``, ``svg`` and ``pdf``.
-        only: Names of :data:`FIGURES` to draw; all that the view has data for if ``None`` (``nullspace``: a path;
-            ``tradeoff``: a trade-off).
+        only: Names of :data:`FIGURES` to draw; all of :func:`drawable` if ``None``.
 
     Raises:
         FigureNotFound: An unknown name in ``only``.
@@ -97,11 +103,8 @@ def draw_all(
         OutputError: The folder or a file cannot be written.
     """
     wanted = check_formats(formats)
-    names = list(FIGURES if only is None else dict.fromkeys(only))
+    names = drawable(view) if only is None else list(dict.fromkeys(only))
     for name in names:
         if name not in FIGURES:
             raise FigureNotFound(name, FIGURES, where="plot")
-    if only is None:
-        lacking = {"nullspace": view.path is None, "tradeoff": view.tradeoff is None}
-        names = [name for name in names if not lacking.get(name)]
     return [path for name in names for path in save(FIGURES[name](view), out, name, wanted)]

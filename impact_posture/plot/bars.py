@@ -18,12 +18,13 @@ from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.style import (
     AFTER_BAR,
     BEFORE_BAR,
-    FORMATS,
+    DEFAULT_FORMATS,
     INK,
     VERMILLION,
     check_formats,
     framed,
     save,
+    shared_legend,
     style,
 )
 from impact_posture.plot.view import number
@@ -55,7 +56,7 @@ class Bar:
     paper: float | None = None
 
 
-def draw_bars(rows: Sequence[Bar], out_dir: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+def draw_bars(rows: Sequence[Bar], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
     """Write ``bars`` into ``out_dir``; return the paths.
 
     Raises:
@@ -87,7 +88,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
             axes.set_visible(False)
         for axes, name, group in zip(panels.flat, scenarios, groups, strict=False):
             _panel(axes, name, group, max(len(other) for other in groups))
-        body.legend(handles=_handles(rows), loc="outside lower center", ncols=4)
+        shared_legend(body, _handles(rows), "lower")
     return figure
 
 

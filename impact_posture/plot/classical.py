@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from impact_posture.plot.ellipsoid import draw_normals, normal_label, normals, square_panel
 from impact_posture.plot.shapes import COORDINATE_PLANES, Plane, Vector, polar, shadow
-from impact_posture.plot.style import BLUE, GREEN, INK, VERMILLION, framed, style
+from impact_posture.plot.style import BLUE, GREEN, INK, VERMILLION, framed, shared_legend, style
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
 NOTES = (
@@ -96,16 +96,16 @@ def classical_figure(view: ResultView) -> Figure:
         for row, word, which in ((panels[0], "before", 0), (panels[1], "after", 1)):
             own = named[min(which, len(named) - 1)]
             for axes, plane in zip(row, COORDINATE_PLANES, strict=True):
-                square_panel(axes, plane, limit, "")
+                square_panel(axes, plane, limit, "1")
                 axes.set_title(f"{word},  shadow on {plane.name}")
                 for kind in kinds:
                     points = 721 if kind.endless[which].size else 181
                     axes.plot(*shadow(kind.matrices[which], plane.axes, points), **_LOOKS[kind.name])
                 draw_normals(axes, plane, [own], limit)
-                axes.set_xlabel(plane.right + "".join(_unbounded(plane, kind, which) for kind in kinds))
+                axes.set_xlabel(axes.get_xlabel() + "".join(_unbounded(plane, kind, which) for kind in kinds))
         handles = [Line2D([], [], label=kind.label, **_LOOKS[kind.name]) for kind in kinds]
         handles.append(Line2D([], [], label=normal_label(named).split(", out")[0], color=INK, linewidth=1.1))
-        body.legend(handles=handles, loc="outside upper center", ncols=4, columnspacing=1.4, handlelength=2.4)
+        shared_legend(body, handles, "upper")
     return figure
 
 

@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 
 from impact_posture.escape import plot_label
 from impact_posture.plot.run_axes import (
-    beside,
     common_handles,
     curve,
     draw_panel,
     finish,
     frame_time,
+    headed,
     scale_metric,
     shade,
     share_height,
@@ -27,14 +27,14 @@ from impact_posture.plot.run_axes import (
 from impact_posture.plot.run_panels import RUNS, Clip, blows, control_panels, first_blow, joint_panels, whole
 from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.runs import HINT, METRIC, joints_figure
-from impact_posture.plot.style import FORMATS, check_formats, framed, save, style
+from impact_posture.plot.style import DEFAULT_FORMATS, check_formats, framed, save, style
 from impact_posture.plot.view import mixed_unit
 
 # Columns of controllers side by side.
 COLUMNS = 3
 
 
-def draw_comparison(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+def draw_comparison(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
     """Write the pictures of several controllers in one scenario; return the paths.
 
     ``comparison-metric``, ``comparison-controls`` and ``comparison-joints``.
@@ -88,10 +88,9 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
         scale_metric(panels[0], [view.objective for view in views])
         panels[0].set_ylabel(METRIC)
         panels[0].set_xlabel(span.label)
-        beside(panels[0], panels[0])
         if hit:
             _blow_panel(panels[1], views)
-        finish(body, list(panels), common_handles(views))
+        finish(body, list(panels), common_handles(views), [("", panels[0])])
     return figure
 
 
@@ -147,7 +146,5 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
                 axes.tick_params(labelleft=False)
         for k in range(len(rows)):
             share_height([axes for axes in panels[k :: len(rows)].flat if axes.axison])
-            for line in panels[k :: len(rows)]:
-                beside(line[-1], line[0])
-        finish(body, list(panels[:, 0]), common_handles(views, rows))
+        finish(body, list(panels[:, 0]), common_handles(views, rows), headed(rows, panels[:, 0]))
     return figure

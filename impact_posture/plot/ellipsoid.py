@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.plot.labels import Label, draw_end_on
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
     Plane,
@@ -21,7 +22,8 @@ from impact_posture.plot.shapes import (
     surface,
     upright_plane,
 )
-from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, PLATE, framed, style
+from impact_posture.plot.space import Space, frame_space
+from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, framed, style
 from impact_posture.plot.uncertain import draw_uncertainty, draw_uncertainty_3d, has_cone, uncertainty_handles
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
@@ -61,8 +63,8 @@ def ellipsoid_figure(view: ResultView) -> Figure:
     n = view.after.normal
     notes = " ".join([*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if has_cone(view) else [])])
     with style():
-        figure, body = framed(*header_lines(view), 5.5, [notes])
-        grid = body.add_gridspec(2, 3, height_ratios=[1, 1.2])
+        figure, body = framed(*header_lines(view), 5.8, [notes])
+        grid = body.add_gridspec(2, 3, height_ratios=[1, 1.4])
         oblique = not any(plane.contains(n) for plane in COORDINATE_PLANES)
         panels = [(grid[0, column], plane) for column, plane in enumerate(COORDINATE_PLANES)]
         panels += [(grid[1, 0], upright_plane(n))] if oblique else []
@@ -71,7 +73,7 @@ def ellipsoid_figure(view: ResultView) -> Figure:
             _panel(axes, plane, states, limit, unit)
             draw_uncertainty(axes, plane, view, limit)
             draw_normals(axes, plane, normals(view.before, view.after), limit)
-        space = body.add_subplot(grid[1, 1] if oblique else grid[1, :2], projection="3d")
+        space = body.add_subplot(grid[1, 1] if oblique else grid[1, :2], axes_class=Space)
         _space(space, states, limit, unit)
         draw_uncertainty_3d(space, view, limit)
         _legend(body.add_subplot(grid[1, 2]), states, unit, view)
@@ -92,9 +94,8 @@ def square_panel(axes: Any, plane: Plane, limit: float, unit: str) -> None:
     axes.locator_params(nbins=5)
     axes.axhline(0.0, color="#d9d9d9", linewidth=0.6, zorder=0)
     axes.axvline(0.0, color="#d9d9d9", linewidth=0.6, zorder=0)
-    suffix = f"  [{unit}]" if unit else ""
-    axes.set_xlabel(f"{plane.right}{suffix}")
-    axes.set_ylabel(f"{plane.up}{suffix}", labelpad=1)
+    axes.set_xlabel(f"{plane.right}  [{unit}]")
+    axes.set_ylabel(f"{plane.up}  [{unit}]", labelpad=1)
     axes.set_title(f"shadow on {plane.name}")
 
 
@@ -102,30 +103,13 @@ def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Vector]], limit
     """Draw each normal's projection as an arrow, or a dot (towards the reader) or cross (away) where it has none."""
     for name, n in named:
         flat = plane.axes @ n
-        toward = float(np.cross(plane.axes[0], plane.axes[1]) @ n)
-        look: dict[str, Any] = {"textcoords": "offset points", "fontstyle": "italic", "bbox": PLATE, "zorder": 6}
         if np.linalg.norm(flat) < 0.05:
-            ring = {"markerfacecolor": "white", "markeredgecolor": INK, "markeredgewidth": 1}
-            axes.plot(0, 0, "o", markersize=8, zorder=5, **ring)
-            axes.plot(0, 0, "." if toward > 0 else "x", markersize=4, color=INK, zorder=6)
-            axes.annotate(name, (0, 0), (6, 5), **look)
+            draw_end_on(axes, name, plane, n, np.zeros(2))
             continue
         tip = flat * limit * 0.92
         arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", tuple(tip), (0, 0), arrowprops=arrow, zorder=5)
-        if len(named) > 1:
-            # Beside the tip, on the side away from the other one.
-            left = np.array([-flat[1], flat[0]]) / np.linalg.norm(flat)
-            others = sum(float(left @ (plane.axes @ m)) for _, m in named if m is not n)
-            side = -1.0 if others > 0 or (others == 0 and name == named[0][0]) else 1.0
-            axes.annotate(name, tuple(0.92 * tip), tuple(8 * side * left), ha="center", va="center", **look)
-            continue
-        # The name beside the shaft: above a lying one, right of a standing one (left where that leans far right).
-        lying = abs(flat[0]) > abs(flat[1])
-        right = tip[0] < 0.5 * limit
-        shift = (0, 4) if lying else (5 if right else -5, 0)
-        look |= {"ha": "center" if lying else ("left" if right else "right"), "va": "bottom" if lying else "center"}
-        axes.annotate(name, tuple(tip * (0.85 if lying else 0.88)), shift, **look)
+        axes.add_artist(Label(name, tip, (flat[0], flat[1])))
 
 
 def _panel(axes: Any, plane: Plane, states: list[_State], limit: float, unit: str) -> None:
@@ -160,7 +144,7 @@ def normal_label(named: list[tuple[str, Vector]]) -> str:
 
 
 def _space(axes: Any, states: list[_State], limit: float, unit: str) -> None:
-    set_cube(axes, limit)
+    frame_space(axes, np.full(3, -limit), np.full(3, limit), unit, 4, azimuth=-55)
     axes.plot_surface(
         *surface(states[1].found.ellipsoid), color=BLUE, alpha=0.12, shade=False, linewidth=0, antialiased=True
     )
@@ -177,19 +161,8 @@ def _space(axes: Any, states: list[_State], limit: float, unit: str) -> None:
     for name, n in normals(states[0].found, states[1].found):
         axes.plot(*np.outer(n, [-limit, limit]), color=GRAY, linewidth=0.6)
         axes.quiver(0, 0, 0, *(n * limit), color=INK, linewidth=1.1, arrow_length_ratio=0.12)
-        axes.text(*(n * limit * 1.14), name, fontstyle="italic", ha="center", va="center", bbox=PLATE)
-    axes.set_title(f"Λ$_c$ and its tangent planes along n\n[{unit}]")
-
-
-def set_cube(axes: Any, limit: float) -> None:
-    """Equal 3-D axes from ``-limit`` to ``limit`` with few ticks."""
-    for name in "xyz":
-        getattr(axes, f"set_{name}lim")(-limit, limit)
-        getattr(axes, f"set_{name}label")(name, labelpad=-6)
-        axes.tick_params(axis=name, pad=0 if name == "z" else -2, labelsize=6.5)
-        axes.locator_params(axis=name, nbins=4)
-    axes.set_box_aspect((1, 1, 1), zoom=1.03)
-    axes.view_init(elev=22, azim=-55)
+        axes.add_artist(Label(name, n * limit))
+    axes.set_title("Λ$_c$ and its tangent planes along n")
 
 
 def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> None:

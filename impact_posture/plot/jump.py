@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from impact_posture.escape import plot_label
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.plot.shapes import Vector
-from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, BLUE, INK, VERMILLION, framed, style
+from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, BLUE, INK, VERMILLION, framed, shared_legend, style
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number, velocity_units
 
 _ROW = 0.17
@@ -29,7 +29,7 @@ def jump_figure(view: ResultView) -> Figure:
     states = (view.before, view.after)
     stuck = [None if state.sticking_jump is None else gain * state.sticking_jump for state in states]
     columns: list[tuple[str, str, list[Vector], list[Vector | None], str]] = [
-        ("per impulse of 1 N·s", "per N·s", [state.jump for state in states], [None, None], _norms(view, "H", 1.0)),
+        ("per impulse of 1 N·s", "/(N·s)", [state.jump for state in states], [None, None], _norms(view, "H", 1.0)),
         (
             f"for an approach at {view.speed:g} m/s, e = {view.restitution:g}",
             "",
@@ -46,14 +46,14 @@ def jump_figure(view: ResultView) -> Figure:
             names = [view.robot.tangent_names[k].removeprefix("base ") for k in indices]
             for axes, (_, per, jumps, points, _) in zip(row, columns, strict=True):
                 _bars(axes, [jump[indices] for jump in jumps], [p if p is None else p[indices] for p in points])
-                axes.set_xlabel(f"{unit} {per}".strip(), labelpad=1)
+                axes.set_xlabel(f"Δν  [{unit}{per}]", labelpad=1)
             row[0].set_yticks(range(len(names)), [plot_label(name) for name in names])
             row[0].set_ylim(len(names) - 0.4, -0.6)
             row[0].set_ylabel(name)
         for axes, (title, _, _, _, norm) in zip(panels[0], columns, strict=True):
             axes.set_title(f"{title}\n{norm}", parse_math=False)
         body.align_ylabels(list(panels[:, 0]))
-        body.legend(handles=_handles(stuck), loc="outside upper center", ncols=4)
+        shared_legend(body, _handles(stuck), "upper")
     return figure
 
 

@@ -58,7 +58,7 @@ def draw_shares(axes: Any, x: Vector, data: PathData | TradeOffData) -> bool:
     else:
         axes.set_ylim(0.0, 1.12 * max(float(values.max()), 1.0))
     axes.grid(True)
-    axes.set_ylabel("value / value at start" + ("  (log)" if log else ""))
+    axes.set_ylabel("value / value at start  [1]" + (", log" if log else ""))
     return bool(drawn)
 
 

@@ -1,66 +1,97 @@
-"""Figure ``postures``: the robot's links in both postures, with the contact plane and the normal."""
+"""Figure ``postures``: the robot's links in both postures, with the contact planes and the normals."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from impact_posture.plot.labels import Label, draw_end_on
 from impact_posture.plot.shapes import COORDINATE_PLANES, XY, XZ, YZ, Plane, Vector, square, upright_plane
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
-from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, PALE, PLATE, VERMILLION, framed, style
-from impact_posture.plot.view import ResultView, header_lines
+from impact_posture.plot.space import Space, frame_space
+from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, VERMILLION, framed, shared_legend, style
+from impact_posture.plot.view import ResultView, contact_letters, header_lines
 
 NOTES = (
     "Sticks join joint origins and the last frame of each link (its center of mass where it has no other frame); "
-    "they are not the links' shapes. n points out of the surface, towards the robot.",
+    "they are not the links' shapes. n points out of the surface, towards the robot."
 )
-# The letter n, legible over sticks.
-_LETTER: dict[str, Any] = {"fontstyle": "italic", "ha": "center", "va": "center"}
+BODY = "Body: the box between the hips; its height is not the robot's."
+HATCH = "/////"
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A contact plane to draw.
+
+    Attributes:
+        point: Its middle, shape (3,).
+        normal: Unit normal, shape (3,).
+        side: Of the square, m.
+        contact: Where n begins, shape (3,).
+        reach: Length of n, m.
+        name: Of n.
+        color: Of the posture that it belongs to; gray of one that belongs to both.
+    """
+
+    point: Vector
+    normal: Vector
+    side: float
+    contact: Vector
+    reach: float
+    name: str
+    color: str
+
+    @property
+    def tip(self) -> Vector:
+        """Where n ends, shape (3,)."""
+        return np.asarray(self.contact + self.reach * self.normal)
+
+    def outline(self, plane: Plane) -> Vector:
+        """Corners of the strip of matter below it as seen from the side, shape (4, 2)."""
+        middle, n = plane.axes @ self.point, plane.axes @ self.normal
+        along, deep = np.array([-n[1], n[0]]) * self.side / 2, -0.22 * self.side * n
+        return np.array([middle + along, middle - along, middle - along + deep, middle + along + deep])
 
 
 def postures_figure(view: ResultView) -> Figure:
     """Draw both postures in the same axes: in 3-D, and from the side that shows n and most of the motion.
 
-    Equal axes in meters; the contact plane as a square (from the side: an edge with hatched matter below it), feet
-    and rotors where there are any.
+    Equal axes in meters; each contact plane as a square (from the side: an edge with hatched matter below it), both
+    where it moves or turns; feet and rotors where there are any.
     """
     first, second = (
-        build_skeleton(view.robot, q, view.objective.contact, view.objective.supports)
+        build_skeleton(view.robot, q, view.objective.contacts, view.objective.supports)
         for q in (view.q_initial, view.q_optimal)
     )
     points = np.vstack([first.points, second.points])
-    side = max(float(np.ptp(points, axis=0).max()), 1e-3)
-    patch = 0.3 * side
+    surfaces = surfaces_of(first, second, contact_letters(view), 0.3 * max(float(np.ptp(points, axis=0).max()), 1e-3))
     plane = side_plane(first, second)
-    states = ((first, BEFORE | {"color": VERMILLION}), (second, AFTER))
+    states = ((first, BEFORE), (second, AFTER))
+    notes = [f"{NOTES} {BODY}" if len(first.body) else NOTES]
     with style():
-        surfaces = _surfaces(first, second, side)
-        low, high = _window([first, second], plane, surfaces, patch)
+        low, high = _window([first, second], plane, surfaces)
         # As high as the view from the side needs, within a page's reason.
         height = float(np.clip(3.1 * (high - low)[1] / (high - low)[0], 2.3, 3.6)) + 1.0
-        figure, body = framed(*header_lines(view), height, NOTES)
-        # The empty column keeps the 3-D axes' labels, which the layout does not know of, off the others.
-        grid = body.add_gridspec(1, 3, width_ratios=[1, 0.06, 1])
-        space = body.add_subplot(grid[0, 0], projection="3d")
-        flat = body.add_subplot(grid[0, 2])
-        corners = [square(s.contact, s.normal, patch).T for s in surfaces]
-        arrows = [(s.contact + patch * s.normal)[None] for s in surfaces]
-        _box(space, np.vstack([points, *corners, *arrows]))
-        turned = float(np.linalg.norm(first.normal - second.normal)) > 0.01
-        for state in surfaces:
-            named = turned or state is second
-            _plane_3d(space, state, patch, named)
-            _plane_2d(flat, state, plane, patch, named)
+        figure, body = framed(*header_lines(view), height, notes)
+        grid = body.add_gridspec(1, 2)
+        space, flat = body.add_subplot(grid[0, 0], axes_class=Space), body.add_subplot(grid[0, 1])
+        _box(space, np.vstack([points, *[np.vstack([square(s.point, s.normal, s.side).T, s.tip]) for s in surfaces]]))
+        for surface in surfaces:
+            _plane_3d(space, surface)
+            _plane_2d(flat, surface, plane)
         for state, line in states:
             draw_sticks(space, state, line, None)
             draw_sticks(flat, state, line, plane)
         _frame_2d(flat, plane, low, high)
-        look = {"ncols": 7, "handlelength": 2.2, "columnspacing": 1.4}
-        body.legend(handles=_handles(second), loc="outside lower center", **look)
+        shared_legend(body, _handles(second, surfaces), "lower")
     return figure
 
 
@@ -74,19 +105,29 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
     size = second.points - second.points.mean(axis=0)
 
     def shown(plane: Plane) -> float:
-        # The robot's own spread decides where the motion does not.
-        seen = float(np.linalg.norm(motion @ plane.axes.T) + 1e-3 * np.linalg.norm(size @ plane.axes.T))
+        # The robot's own spread decides where there is little motion.
+        seen = float(np.linalg.norm(motion @ plane.axes.T) + 0.2 * np.linalg.norm(size @ plane.axes.T))
         # A plan is harder to read than an elevation: it has to show much more.
         return seen / 2 if plane is XY else seen
 
     return max(candidates, key=shown)
 
 
-def _surfaces(first: Skeleton, second: Skeleton, side: float) -> list[Skeleton]:
-    """The postures whose contact planes differ: one if the contact stays where it is."""
-    moved = float(np.linalg.norm(first.contact - second.contact)) > 0.01 * side
-    turned = float(np.linalg.norm(first.normal - second.normal)) > 0.01
-    return [first, second] if moved or turned else [second]
+def surfaces_of(first: Skeleton, second: Skeleton, letters: list[str], side: float) -> list[Surface]:
+    """The planes of each contact: one if it is the same before and after, two if it moves along n or turns."""
+    found = []
+    pairs = zip(first.contacts, second.contacts, first.normals, second.normals, letters, strict=True)
+    for before, after, n_before, n_after, letter in pairs:
+        way, turned = after - before, float(np.linalg.norm(n_before - n_after)) > 0.01
+        if not turned and abs(float(way @ n_after)) < 0.03 * side:
+            # The same surface, touched at another place of it: wide enough for both.
+            wide = side + float(np.linalg.norm(way))
+            found.append(Surface((before + after) / 2, n_after, wide, after, 0.8 * side, f"n{letter}", GRAY))
+            continue
+        names = (f"n₀{letter}", f"n₁{letter}")
+        found.append(Surface(before, n_before, side, before, 0.8 * side, names[0], VERMILLION))
+        found.append(Surface(after, n_after, side, after, 0.8 * side, names[1], BLUE))
+    return found
 
 
 def _box(axes: Any, points: Vector) -> None:
@@ -94,32 +135,20 @@ def _box(axes: Any, points: Vector) -> None:
     low, high = points.min(axis=0), points.max(axis=0)
     # A planar robot's box keeps some depth.
     half = np.maximum(0.54 * (high - low), 0.2 * float((high - low).max()))
-    for name, middle, reach in zip("xyz", (low + high) / 2, half, strict=True):
-        getattr(axes, f"set_{name}lim")(middle - reach, middle + reach)
-        getattr(axes, f"set_{name}label")(f"{name} [m]", labelpad=-5)
-        axes.tick_params(axis=name, pad=0 if name == "z" else -2, labelsize=6.5)
-        axes.locator_params(axis=name, nbins=max(2, round(5 * float(reach / half.max()))))
-    axes.set_box_aspect(tuple(half))
-    axes.view_init(elev=20, azim=-60)
+    middle = (low + high) / 2
+    frame_space(axes, middle - half, middle + half, "m", 5, azimuth=-60)
 
 
-def _window(states: list[Skeleton], plane: Plane, surfaces: list[Skeleton], patch: float) -> tuple[Vector, Vector]:
+def _window(states: list[Skeleton], plane: Plane, surfaces: list[Surface]) -> tuple[Vector, Vector]:
     """Lower left and upper right corner of what the side view shows: everything drawn, with a margin."""
     drawn = [plane.axes @ state.points.T for state in states]
     for s in surfaces:
-        drawn += [_outline(s, plane, patch).T, plane.axes @ (s.contact + patch * s.normal)[:, None]]
+        drawn += [s.outline(plane).T, plane.axes @ s.tip[:, None]]
     low, high = np.hstack(drawn).min(axis=1), np.hstack(drawn).max(axis=1)
     # Never a narrow strip: the shorter side shows at least 0.6 of the longer.
     longest = float((high - low).max())
     middle, half = (low + high) / 2, np.maximum(high - low, 0.6 * longest) / 2 + 0.05 * longest
     return middle - half, middle + half
-
-
-def _outline(state: Skeleton, plane: Plane, patch: float) -> Vector:
-    """Corners of the strip of matter below the contact plane as seen from the side, shape (4, 2)."""
-    contact, n = plane.axes @ state.contact, plane.axes @ state.normal
-    along, deep = np.array([-n[1], n[0]]) * patch / 2, -0.25 * patch * n
-    return np.array([contact + along, contact - along, contact - along + deep, contact + along + deep])
 
 
 def _frame_2d(axes: Any, plane: Plane, low: Vector, high: Vector) -> None:
@@ -128,8 +157,8 @@ def _frame_2d(axes: Any, plane: Plane, low: Vector, high: Vector) -> None:
     axes.set_aspect("equal", adjustable="box")
     axes.grid(True)
     axes.locator_params(nbins=6)
-    axes.set_xlabel(f"{plane.right} [m]")
-    axes.set_ylabel(f"{plane.up} [m]")
+    axes.set_xlabel(f"{plane.right}  [m]")
+    axes.set_ylabel(f"{plane.up}  [m]")
     axes.set_title("seen along " + depth_of(plane))
 
 
@@ -145,65 +174,97 @@ def _draw(axes: Any, points: Vector, plane: Plane | None, **look: Any) -> None:
     axes.plot(*(points if plane is None else plane.axes @ points), **look)
 
 
+def _fill(axes: Any, faces: list[Vector], plane: Plane | None, color: str, zorder: float) -> None:
+    """Fill polygons of shape (3, k) faintly, projected where there is a plane."""
+    if plane is None:
+        axes.add_collection3d(Poly3DCollection([face.T for face in faces], facecolor=color, alpha=0.1, linewidth=0))
+        return
+    for face in faces:
+        axes.fill(*(plane.axes @ face), facecolor=color, alpha=0.1, linewidth=0, zorder=zorder)
+
+
 def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane | None) -> None:
-    """Draw bones, rotors, joints, base, feet and the contact point; in 3-D, or projected where there is a plane."""
+    """Draw links, body, rotors, joints, base, feet and contacts; in 3-D, or projected where there is a plane."""
     for bone in state.bones:
         _draw(axes, bone.T, plane, solid_capstyle="round", **line)
-    color = line["color"]
-    for circle in state.rotors:
-        closed = np.hstack([circle, circle[:, :1]])
-        _draw(axes, closed, plane, **(line | {"linewidth": 0.7, "zorder": 2.0}))
+    color, thin = line["color"], line | {"linewidth": 0.8, "zorder": 2.0}
+    if len(state.body):
+        _body(axes, state.body, line, plane)
+    for circle, arm in zip(state.rotors, state.arms, strict=True):
+        _fill(axes, [circle], plane, color, 1.5)
+        _draw(axes, np.hstack([circle, circle[:, :1]]), plane, **thin)
+        # One straight line each, thinner than a link: seen from the side they lie on each other.
+        _draw(axes, arm.T, plane, **(thin | {"linestyle": "-"}))
     _draw(axes, state.joints.T, plane, linestyle="", marker="o", markersize=2.6, color=color, zorder=4)
-    _cross(axes, state, color, plane)
+    look = {"linestyle": "", "markeredgecolor": "white", "color": color}
+    origin = np.asarray(state.base.translation)[:, None]
+    _draw(axes, origin, plane, marker="P", markersize=7, markeredgewidth=0.6, zorder=5, **look)
     feet = {"linestyle": "", "marker": "^", "markersize": 6, "markerfacecolor": "white", "markeredgecolor": color}
     _draw(axes, state.feet.T, plane, zorder=5, **feet)
-    _draw(axes, state.contact[:, None], plane, linestyle="", marker="o", markersize=5.5, color=color,
-          markeredgecolor="white", markeredgewidth=0.8, zorder=6)  # fmt: skip
+    _draw(axes, state.contacts.T, plane, marker="o", markersize=5.5, markeredgewidth=0.8, zorder=6, **look)
 
 
-def _cross(axes: Any, state: Skeleton, color: str, plane: Plane | None) -> None:
-    origin = np.asarray(state.base.translation)[:, None]
-    _draw(axes, origin, plane, linestyle="", marker="P", markersize=7, color=color, markeredgecolor="white",
-          markeredgewidth=0.6, zorder=5)  # fmt: skip
-
-
-def _plane_3d(axes: Any, state: Skeleton, patch: float, named: bool) -> None:
-    corners = square(state.contact, state.normal, patch)
-    grid = np.array([[corners[:, 0], corners[:, 1]], [corners[:, 3], corners[:, 2]]]).transpose(2, 0, 1)
-    axes.plot_surface(*grid, color=GRAY, alpha=0.25, shade=False, linewidth=0)
-    axes.plot(*corners, color=GRAY, linewidth=0.7)
-    if not named:
+def _body(axes: Any, corners: Vector, line: dict[str, Any], plane: Plane | None) -> None:
+    """Draw a box by its corners; from the side its outline."""
+    if plane is not None:
+        flat = plane.axes @ corners.T
+        edge = scipy.spatial.ConvexHull(flat.T).vertices
+        axes.fill(*flat[:, edge], facecolor=line["color"], alpha=0.12, linewidth=0, zorder=1.5)
+        axes.plot(*flat[:, [*edge, edge[0]]], **(line | {"linewidth": 1.1}))
         return
-    axes.quiver(*state.contact, *(0.8 * patch * state.normal), color=INK, linewidth=1.2, arrow_length_ratio=0.2)
-    axes.text(*(state.contact + 0.97 * patch * state.normal), "n", bbox=PLATE, **_LETTER)
+    low, high = [0, 1, 2, 3], [4, 5, 6, 7]
+    sides = [[k, (k + 1) % 4, 4 + (k + 1) % 4, 4 + k] for k in range(4)]
+    _fill(axes, [corners[face].T for face in (low, high, *sides)], None, line["color"], 1.5)
+    for edge in ([*low, 0], [*high, 4], *[[k, k + 4] for k in low]):
+        axes.plot(*corners[edge].T, **(line | {"linewidth": 1.1}))
 
 
-def _plane_2d(axes: Any, state: Skeleton, plane: Plane, patch: float, named: bool) -> None:
-    contact, n = plane.axes @ state.contact, plane.axes @ state.normal
-    outline = _outline(state, plane, patch)
-    axes.fill(outline[:, 0], outline[:, 1], facecolor="white", edgecolor=GRAY, hatch="/////", linewidth=0, zorder=1)
-    axes.plot(*outline[:2].T, color=INK, linewidth=1.0, zorder=1)
-    if not named:
+def _plane_3d(axes: Any, surface: Surface) -> None:
+    corners = square(surface.point, surface.normal, surface.side)
+    _fill(axes, [corners], None, surface.color, 1.0)
+    axes.plot(*corners, color=surface.color, linewidth=0.8)
+    color = INK if surface.color == GRAY else surface.color
+    n = surface.tip - surface.contact
+    axes.quiver(*surface.contact, *n, color=color, linewidth=1.2, arrow_length_ratio=0.2)
+    axes.add_artist(Label(surface.name, surface.tip, color=color))
+
+
+def _plane_2d(axes: Any, surface: Surface, plane: Plane) -> None:
+    color = INK if surface.color == GRAY else surface.color
+    if np.linalg.norm(plane.axes @ surface.normal) < 0.05:
+        # Seen face on: n comes towards the reader or goes away.
+        axes.plot(*(plane.axes @ square(surface.point, surface.normal, surface.side)), color=color, linewidth=0.8)
+        draw_end_on(axes, surface.name, plane, surface.normal, plane.axes @ surface.contact, color)
         return
-    tip = contact + 0.8 * patch * n
-    arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.2, "shrinkA": 0, "shrinkB": 0}
+    outline = surface.outline(plane)
+    axes.fill(*outline.T, facecolor="none", edgecolor=surface.color, hatch=HATCH, linewidth=0, zorder=1)
+    axes.plot(*outline[:2].T, color=color, linewidth=1.0, zorder=1)
+    contact, tip = plane.axes @ surface.contact, plane.axes @ surface.tip
+    arrow = {"arrowstyle": "-|>", "color": color, "linewidth": 1.2, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", tuple(tip), tuple(contact), arrowprops=arrow, zorder=7)
-    axes.text(*(contact + 0.93 * patch * n), "n", bbox=PLATE, zorder=7, **_LETTER)
+    axes.add_artist(Label(surface.name, tip, tuple(plane.axes @ surface.normal), color))
 
 
-def _handles(state: Skeleton) -> list[Any]:
+def _handles(state: Skeleton, surfaces: list[Surface]) -> list[Any]:
     def mark(label: str, marker: str, **look: Any) -> Line2D:
         return Line2D([], [], linestyle="", marker=marker, color=GRAY, label=label, **look)
 
+    words = {GRAY: "surface", VERMILLION: "surface before", BLUE: "surface after"}
     handles: list[Any] = [
         Line2D([], [], label="before", **BEFORE),
         Line2D([], [], label="after", **AFTER),
         mark("base", "P", markersize=7),
         mark("contact point", "o", markersize=5.5),
-        Patch(facecolor=PALE, edgecolor=GRAY, hatch="/////", linewidth=0, label="surface"),
+        *[
+            Patch(facecolor="none", edgecolor=color, hatch=HATCH, linewidth=0, label=word)
+            for color, word in words.items()
+            if any(s.color == color for s in surfaces)
+        ],
     ]
     if len(state.feet):
         handles.append(mark("foot that stays", "^", markersize=6, markerfacecolor="white"))
+    if len(state.body):
+        handles.append(Patch(facecolor=BLUE, alpha=0.12, label="body"))
     if len(state.rotors):
-        handles.append(Line2D([], [], color=BLUE, linewidth=0.7, label="rotors"))
+        handles.append(Line2D([], [], color=BLUE, linewidth=0.8, label="rotors"))
     return handles

@@ -1,4 +1,4 @@
-"""Axes over time, for the pictures of runs: shaded windows, curves thinned to what can be seen, legends beside."""
+"""Axes over time, for the pictures of runs: shaded windows, curves thinned to what can be seen, one legend."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from impact_posture.plot.path import log_axis, spreads
 from impact_posture.plot.run_panels import LINES, Clip, Panel, first_blow, whole
 from impact_posture.plot.run_view import RunView
 from impact_posture.plot.shapes import Vector
-from impact_posture.plot.style import GRAY, INK
+from impact_posture.plot.style import GRAY, INK, shared_legend
 
 # Pink and light gray: far enough apart in a gray print, too.
 SHADES: dict[str, dict[str, Any]] = {
@@ -28,7 +28,7 @@ AT_LIMIT: dict[str, Any] = {
     "linestyle": "", "marker": "D", "markersize": 3.2, "color": INK, "markeredgecolor": "white",
     "markeredgewidth": 0.4, "zorder": 5,
 }  # fmt: skip
-BAND: dict[str, Any] = {"facecolor": "#bdbdbd", "edgecolor": "none", "zorder": 1.2}
+BAND: dict[str, Any] = {"facecolor": "#dcdcdc", "edgecolor": "none", "zorder": 1.2}
 # Points across a page's width; each shows the lowest and the highest value in it.
 _BINS = 1000
 
@@ -42,7 +42,8 @@ def draw_panel(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) -
     if panel.ranges is not None:
         _band(axes, view, panel.ranges[which], clip)
     for k, name in enumerate(panel.names):
-        look = LINES[k % len(LINES)]
+        # Commands carry the sensors' noise: dashes of it are a blot.
+        look = LINES[k % len(LINES)] | ({"linestyle": "-", "linewidth": 0.7} if panel.noisy else {})
         curve(axes, view, panel.values[which][:, k], clip, label=plot_label(name), **look)
         if panel.stopped is not None and panel.stopped[which][:, k].any():
             at_stop = np.where(panel.stopped[which][:, k], panel.values[which][:, k], np.nan)
@@ -117,14 +118,6 @@ def scale_metric(axes: Any, values: Sequence[Vector]) -> None:
         axes.text(0.5, 0.5, "H was not evaluated", ha="center", va="center", transform=axes.transAxes, color=GRAY)
 
 
-def beside(axes: Any, named: Any) -> None:
-    """Legend of the curves of panel ``named``, right of the last panel of its row; none where none has a name."""
-    handles, labels = named.get_legend_handles_labels()
-    if handles:
-        look = {"handlelength": 2.6, "borderaxespad": 0.2, "fontsize": 7}
-        axes.legend(handles, labels, loc="center left", bbox_to_anchor=(1.01, 0.5), **look)
-
-
 def common_handles(views: Sequence[RunView], panels: Sequence[Panel] = ()) -> list[Any]:
     """Legend entries of what all panels share: shades, limits, stops."""
     words = {"impact": "impact window" if not views[0].pushed else "push", "dwell": "dwell"}
@@ -168,8 +161,32 @@ def share_height(panels: Sequence[Any]) -> None:
         axes.set_ylim(low, high)
 
 
-def finish(body: Any, left: Sequence[Any], handles: Sequence[Any]) -> None:
-    """Align the labels on the left, and put the legend of what all panels share below them."""
+def headed(rows: Sequence[Panel], axes: Sequence[Any]) -> list[tuple[str, Any]]:
+    """For :func:`finish`: what each row's curves are, and a panel that has them."""
+    return [(row.label.split("  [")[0] + ":", own) for row, own in zip(rows, axes, strict=False)]
+
+
+def finish(body: Any, left: Sequence[Any], shared: Sequence[Any], named: Sequence[tuple[str, Any]] = ()) -> None:
+    """Align the labels on the left, and put the one legend right of the panels, or below where no curve has a name.
+
+    Args:
+        body: The part of the figure that the panels are in.
+        left: The panels at its left edge.
+        shared: Legend entries of what all panels share.
+        named: What curves are, and a panel that has them; as there are several kinds, each has its heading.
+    """
     body.align_ylabels(left)
-    if handles:
-        body.legend(handles=list(handles), loc="outside lower center", ncols=5, handlelength=2.2, columnspacing=1.4)
+    groups = [(what, axes.get_legend_handles_labels()[0]) for what, axes in named]
+    groups = [(what, handles) for what, handles in groups if handles]
+    entries: list[Any] = []
+    for what, handles in groups:
+        entries += [_heading(what), *handles] if what and len(groups) > 1 else handles
+    if entries:
+        entries += [_heading(""), *shared] if len(groups) > 1 else shared
+        body.legend(handles=entries, loc="outside right center", handlelength=2.6, fontsize=7)
+    elif shared:
+        shared_legend(body, shared, "lower")
+
+
+def _heading(text: str) -> Line2D:
+    return Line2D([], [], linestyle="", label=text or " ")

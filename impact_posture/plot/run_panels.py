@@ -96,6 +96,7 @@ class Panel:
         ranges: Of each run, a lower and an upper bound to shade between, shape (n, 2).
         stopped: When a curve's joint was at its stop, of each run, shape (n, curves).
         note: To be said below the picture.
+        noisy: Whether the curves carry noise.
     """
 
     label: str
@@ -105,6 +106,7 @@ class Panel:
     ranges: Sequence[Vector] | None = None
     stopped: Sequence[Flags] | None = None
     note: str = ""
+    noisy: bool = False
 
     def saturated(self, which: int) -> list[Flags]:
         """For each limit when a command of run ``which`` was at it, up to a thousandth of the range, shape (n,)."""
@@ -117,20 +119,23 @@ class Panel:
 
 
 def rotor_panel(views: Sequence[RunView]) -> Panel | None:
-    """Rotor speeds, the range of their commands, and the limits; ``None`` of a robot without rotors.
+    """Rotor speeds, the range of their commands, and the limits, as shares of the highest speed.
 
+    ``None`` of a robot without rotors.
     Commands carry the sensors' noise: six of them over each other cannot be told apart.
     """
     one = views[0]
     count = one.rotor_command.shape[1]
     if not count:
         return None
-    label = f"rotor speed  [{one.rotor_unit}]" if one.rotor_unit else "rotor speed"
+    # A robot.toml does not name the unit of its rotors' speeds.
+    low, high = one.rotor_limits or (0.0, 1.0)
     names = [f"rotor {k + 1}" for k in range(count)]
-    ranges = [np.stack([view.rotor_command.min(axis=1), view.rotor_command.max(axis=1)], axis=1) for view in views]
+    commands = [view.rotor_command / high for view in views]
+    ranges = [np.stack([command.min(axis=1), command.max(axis=1)], axis=1) for command in commands]
     note = "Rotors: lines as they turn; the band holds all commands."
-    note += "" if one.rotor_unit else " Their speeds are in the unit of the robot's speed_max."
-    return Panel(label, names, [view.rotor_speed for view in views], one.rotor_limits or (), ranges, note=note)
+    speeds, limits = [view.rotor_speed / high for view in views], (low / high, 1.0) if one.rotor_limits else ()
+    return Panel("rotor speed / highest  [1]", names, speeds, limits, ranges, note=note, noisy=True)
 
 
 def control_panels(views: Sequence[RunView]) -> list[Panel]:
@@ -162,7 +167,7 @@ def torque_panel(views: Sequence[RunView]) -> Panel | None:
     own, unit = limits[shown], ", ".join(units)
     if bounded.size and (len(set(own)) > 1 or len(units) > 1):
         notes.append("Each torque is divided by the joint's own limit.")
-        scale, label, unit, limit = own, "torque / limit", "", 1.0
+        scale, label, unit, limit = own, "torque / limit  [1]", "", 1.0
     else:
         scale, label, limit = np.ones(len(shown)), f"joint torque  [{unit}]", float(own[0])
     values = [view.torque[:, shown] / scale for view in views]
@@ -172,7 +177,7 @@ def torque_panel(views: Sequence[RunView]) -> Panel | None:
         named = f"The torque limits (±{number(limit)} {unit}) lie outside of the panels."
         notes.append(named if unit else f"All stay within {number(100 * peak)} % of it.")
         lines = ()
-    return Panel(label, [one.joint_names[k] for k in shown], values, lines, note=" ".join(notes))
+    return Panel(label, [one.joint_names[k] for k in shown], values, lines, note=" ".join(notes), noisy=True)
 
 
 def joint_panels(views: Sequence[RunView]) -> list[Panel]:

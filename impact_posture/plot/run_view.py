@@ -66,7 +66,6 @@ class RunView:
         label: What the run is called beside others; the controller's name if empty.
         title: First line of its pictures; scenario and controller if empty.
         facts: For the small print below the title: seed, sign of the push, metrics.
-        rotor_unit: Unit of the rotors' speeds, such as ``Hz``, where it is known: a ``robot.toml`` does not name it.
     """
 
     scenario: str
@@ -90,7 +89,6 @@ class RunView:
     label: str = ""
     title: str = ""
     facts: tuple[str, ...] = ()
-    rotor_unit: str = ""
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together.

@@ -11,13 +11,13 @@ from matplotlib.figure import Figure
 
 from impact_posture.escape import plot_label
 from impact_posture.plot.run_axes import (
-    beside,
     common_handles,
     curve,
     draw_panel,
     finish,
     frame_time,
     grid,
+    headed,
     name_time,
     scale_metric,
     share_height,
@@ -25,7 +25,7 @@ from impact_posture.plot.run_axes import (
 )
 from impact_posture.plot.run_panels import LINES, control_panels, first_blow, joint_panels, whole
 from impact_posture.plot.run_view import RunView, check_same, run_header
-from impact_posture.plot.style import FORMATS, check_formats, framed, save, style
+from impact_posture.plot.style import DEFAULT_FORMATS, check_formats, framed, save, style
 from impact_posture.plot.view import mixed_unit
 
 METRIC = "H  [‖Δν‖²/(N·s)²]"
@@ -33,7 +33,7 @@ HINT = "Less H is better: it is the squared velocity jump of an impulse of 1 N·
 LEFT = "Left: the whole run; right: the first blow."
 
 
-def draw_run(view: RunView, out_dir: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+def draw_run(view: RunView, out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
     """Write the pictures of one run, ``metric``, ``controls`` and ``joints``, into ``out_dir``; return the paths.
 
     Those that the robot has nothing for (no actuators, no joints) are left out.
@@ -57,16 +57,16 @@ def metric_figure(view: RunView) -> Figure:
     n = np.array(view.contact.normal)
     normal = view.force @ n
     across = np.linalg.norm(view.force - normal[:, None] * n, axis=1)
-    force = [(normal, "", LINES[0])] if view.pushed else [(view.peak, "normal, peak", LINES[0])]
+    force = [(normal, "", LINES[0])] if view.pushed else [(view.peak, "force: normal, peak", LINES[0])]
     if not view.pushed:
-        force.append((across, "friction", LINES[1]))
+        force.append((across, "force: friction", LINES[1]))
     rows: list[tuple[str, list[tuple[Any, str, dict[str, Any]]]]] = [
         (METRIC, [(view.objective, "", LINES[0])]),
         (f"‖ν‖  [{unit.strip('()')}]", [(view.speed, "", LINES[0])]),
         ("push  [N]" if view.pushed else "force  [N]", force),
     ]
     if np.ptp(view.level) > 1e-9:
-        rows.append(("level of\nthe term", [(view.level, "", LINES[0])]))
+        rows.append(("level of\nthe term  [1]", [(view.level, "", LINES[0])]))
     notes = [HINT] if view.pushed else [HINT, "Normal: the largest within each tick of the controller."]
     notes = [" ".join([*notes, *([LEFT] if view.impacts else [])])]
     with style():
@@ -78,11 +78,10 @@ def metric_figure(view: RunView) -> Figure:
                 for values, name, look in curves:
                     curve(axes, view, values, clip, label=name or None, **look)
             axes_row[0].set_ylabel(label)
-            beside(axes_row[-1], axes_row[0])
         for axes in panels[0]:
             scale_metric(axes, [view.objective])
         name_time(panels, clips)
-        finish(body, list(panels[:, 0]), common_handles([view]))
+        finish(body, list(panels[:, 0]), common_handles([view]), [("", panels[2, 0])])
     return figure
 
 
@@ -97,9 +96,8 @@ def controls_figure(view: RunView) -> Figure:
             for axes, clip in zip(axes_row, clips, strict=True):
                 draw_panel(axes, panel, 0, view, clip)
             axes_row[0].set_ylabel(panel.label)
-            beside(axes_row[-1], axes_row[0])
         name_time(panels, clips)
-        finish(body, list(panels[:, 0]), common_handles([view], rows))
+        finish(body, list(panels[:, 0]), common_handles([view], rows), headed(rows, panels[:, 0]))
     return figure
 
 
@@ -127,9 +125,8 @@ def joints_figure(views: Sequence[RunView]) -> Figure:
             axes_row[0].set_ylabel(panel.label)
             if len(views) > 1:
                 axes_row[0].set_title(plot_label(views[which].name), loc="left", fontweight="bold")
-            beside(axes_row[-1], axes_row[0])
         name_time(panels, clips[-1][:columns])
-        finish(body, list(panels[:, 0]), common_handles(views, rows))
+        finish(body, list(panels[:, 0]), common_handles(views, rows), headed(rows, panels[:, 0]))
         for k in range(len(rows)):
             share_height(list(panels[k :: len(rows)].flat))
     return figure

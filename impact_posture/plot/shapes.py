@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 Vector = NDArray[np.float64]
 
@@ -135,7 +135,7 @@ def cone_rim(axis: Vector, degrees: float, length: float, points: int = 73) -> V
 def cone_shadow(axis: Vector, degrees: float, length: float, axes: Vector) -> Vector:
     """Outline of the projection of the cone from the origin to :func:`cone_rim`, closed, shape (2, k)."""
     flat = np.column_stack([np.zeros(2), axes @ cone_rim(axis, degrees, length)[:, :-1]])
-    edge = ConvexHull(flat.T).vertices
+    edge = scipy.spatial.ConvexHull(flat.T).vertices
     return np.asarray(flat[:, [*edge, edge[0]]])
 
 

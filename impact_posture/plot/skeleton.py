@@ -13,6 +13,10 @@ from impact_posture.impact.contact import Contact, Support, point_on
 from impact_posture.plot.shapes import Vector
 from impact_posture.robot.robot import Robot
 
+# Of a body, as a part of its shorter side.
+_LEAST_HEIGHT = 0.35
+_AROUND = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
@@ -22,8 +26,9 @@ class Skeleton:
         bones: Pairs of points to join, shape (k, 2, 3).
         joints: Origins of the moving joints, shape (j, 3).
         base: Placement of the base: the free-flyer, or the world for a fixed root.
-        contact: The contact point, shape (3,).
-        normal: World unit normal, shape (3,).
+        body: Corners of the box between a base's hips, low ones first, around; shape (8, 3), or (0, 3) without.
+        contacts: The contact points, shape (c, 3).
+        normals: World unit normals, shape (c, 3).
         feet: Contact points of the supports, shape (f, 3).
         rotors: Circles of the propellers, shape (r, 3, points).
     """
@@ -31,24 +36,44 @@ class Skeleton:
     bones: Vector
     joints: Vector
     base: pin.SE3
-    contact: Vector
-    normal: Vector
+    body: Vector
+    contacts: Vector
+    normals: Vector
     feet: Vector
     rotors: Vector
+
+    @property
+    def contact(self) -> Vector:
+        """The first contact point, shape (3,)."""
+        return np.asarray(self.contacts[0])
+
+    @property
+    def normal(self) -> Vector:
+        """The first contact's normal, shape (3,)."""
+        return np.asarray(self.normals[0])
+
+    @property
+    def arms(self) -> Vector:
+        """From the base to the rotors' centers, shape (r, 2, 3)."""
+        centers = self.rotors.mean(axis=2)
+        return np.stack([np.broadcast_to(np.asarray(self.base.translation), centers.shape), centers], axis=1)
 
     @property
     def points(self) -> Vector:
         """Everything that has to be in the picture, shape (m, 3)."""
         circles = self.rotors.transpose(0, 2, 1).reshape(-1, 3)
         origin = np.asarray(self.base.translation)[None]
-        return np.vstack([self.bones.reshape(-1, 3), origin, self.contact[None], self.feet, circles])
+        return np.vstack([self.bones.reshape(-1, 3), origin, self.body, self.contacts, self.feet, circles])
 
 
-def build_skeleton(robot: Robot, q: Vector, contact: Contact, supports: Sequence[Support] = ()) -> Skeleton:
+def build_skeleton(
+    robot: Robot, q: Vector, contacts: Sequence[Contact], supports: Sequence[Support] = ()
+) -> Skeleton:
     """Place the sticks at ``q``, shape (nq,).
 
-    A bone joins a joint's origin to its parent's.  The contact and the feet hang on their links; the last link of a
-    chain without one goes on to its farthest frame, or to its center of mass where it has none.
+    A bone joins a joint's origin to its parent's; a base that carries four joints or more is a box instead.  Contacts
+    and feet hang on their links; the last link of a chain without one goes on to its farthest frame, or to its center
+    of mass where it has none.
     """
     model = robot.model
     data = model.createData()
@@ -57,31 +82,54 @@ def build_skeleton(robot: Robot, q: Vector, contact: Contact, supports: Sequence
     first = 2 if robot.floating else 1
     base = pin.SE3(places[1]) if robot.floating else pin.SE3.Identity()
     origins = [np.zeros(3), *(np.array(places[i].translation) for i in range(1, model.njoints))]
-    bones = [(origins[model.parents[i]], origins[i]) for i in range(first, model.njoints)]
-    held: list[Contact | Support] = [contact, *supports]
+    body = _body(model, base) if robot.floating else np.zeros((0, 3))
+    bones = [
+        (origins[model.parents[i]], origins[i])
+        for i in range(first, model.njoints)
+        if model.parents[i] >= first or not len(body)
+    ]
+    held: list[Contact | Support] = [*contacts, *supports]
     hanging = [point_on(robot, one.frame, one.offset) for one in held]
     frames = [_placed(places, point) for point in hanging]
     ends = [np.array(frame.translation) for frame in frames]
-    turned = np.asarray(frames[0].rotation) if contact.normal_frame == "contact" else np.eye(3)
-    bones += [(origins[point.joint], end) for point, end in zip(hanging, ends, strict=True)]
+    normals = [
+        (np.asarray(frame.rotation) if contact.normal_frame == "contact" else np.eye(3)) @ np.array(contact.normal)
+        for contact, frame in zip(contacts, frames, strict=False)
+    ]
+    bones += [
+        (origins[point.joint], end)
+        for point, end in zip(hanging, ends, strict=True)
+        if point.joint >= first or not len(body)
+    ]
     # A link that already goes on to its foot or contact needs no other tip.
     done = {int(model.parents[i]) for i in range(1, model.njoints)}
     done |= {point.joint for point in hanging if np.linalg.norm(point.position) > 1e-3}
     for leaf in range(first, model.njoints):
         if leaf not in done:
             bones.append((origins[leaf], np.array(places[leaf].act(_tip(model, leaf)))))
-    rotors = _rotors(robot, places)
-    for circle in rotors:
-        bones.append((np.array(base.translation), circle.mean(axis=1)))
     return Skeleton(
         bones=np.array(bones),
         joints=np.array(origins[first:]).reshape(-1, 3),
         base=base,
-        contact=ends[0],
-        normal=turned @ np.array(contact.normal),
-        feet=np.array(ends[1:]).reshape(-1, 3),
-        rotors=rotors,
+        body=body,
+        contacts=np.array(ends[: len(contacts)]),
+        normals=np.array(normals),
+        feet=np.array(ends[len(contacts) :]).reshape(-1, 3),
+        rotors=_rotors(robot, places),
     )
+
+
+def _body(model: pin.Model, base: pin.SE3) -> Vector:
+    """Corners of the box between the joints on the base, in its axes; none for fewer than four joints."""
+    hips = np.array([model.jointPlacements[i].translation for i in range(2, model.njoints) if model.parents[i] == 1])
+    if len(hips) < 4:
+        return np.zeros((0, 3))
+    low, high = hips.min(axis=0), hips.max(axis=0)
+    # Hips at one height span no box: a model knows nothing of the body's height.
+    lacking = max(_LEAST_HEIGHT * float((high - low)[:2].min()) - float((high - low)[2]), 0.0)
+    low[2], high[2] = low[2] - lacking / 2, high[2] + lacking / 2
+    corners = [(x, y, z) for z in (low[2], high[2]) for x, y in _AROUND * (high - low)[:2] + low[:2]]
+    return np.array([base.act(np.array(corner)) for corner in corners])
 
 
 def _placed(places: Sequence[pin.SE3], point: PointOnLink) -> pin.SE3:

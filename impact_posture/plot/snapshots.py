@@ -12,21 +12,33 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from impact_posture.escape import plot_label
-from impact_posture.plot.robot import depth_of, draw_sticks, side_plane
+from impact_posture.plot.robot import BODY, depth_of, draw_sticks, side_plane
 from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.shapes import Plane, Vector
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
-from impact_posture.plot.style import BLUE, FORMATS, GRAY, INK, PALE, VERMILLION, check_formats, framed, save, style
+from impact_posture.plot.style import (
+    BLUE,
+    DEFAULT_FORMATS,
+    GRAY,
+    INK,
+    PALE,
+    VERMILLION,
+    check_formats,
+    framed,
+    save,
+    shared_legend,
+    style,
+)
 
-NOTES = ("Sticks join joint origins; they are not the links' shapes. Gray: where the robot was when the run began.",)
+NOTES = "Sticks join joint origins; they are not the links' shapes. Gray: where the robot was when the run began."
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
 _START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
 # Just before the blow: a tick that it has no part in, s.
 _BEFORE = 0.005
 
 
-def draw_snapshots(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+def draw_snapshots(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
     """Write ``snapshots`` of one run of each controller (nominal first) into ``out_dir``; return the paths.
 
     Raises:
@@ -72,7 +84,9 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
     highest = float(np.clip(8.5 / len(views), 1.2, 3.0))
     height = float(np.clip(2.1 * (high - low)[1] / (high - low)[0], 1.2, highest)) + 0.2
     with style():
-        figure, body = framed(*run_header(views), height * len(views) + 0.85, NOTES)
+        figure, body = framed(
+            *run_header(views), height * len(views) + 0.85, [f"{NOTES} {BODY}" if len(rows[0][0].body) else NOTES]
+        )
         panels = subplots(body, len(views), 3, sharex=True, sharey=True)
         for axes_row, row, view, arrow in zip(panels, rows, views, arrows, strict=True):
             for column, (axes, state, (word, time)) in enumerate(zip(axes_row, row, instants(view), strict=True)):
@@ -88,18 +102,17 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
                 axes.locator_params(nbins=5)
                 first = f"{word}\n" * (view is views[0])
                 axes.set_title(f"{first}t = {max(time, 0.0):.2f} s", fontsize=8)
-            axes_row[0].set_ylabel(f"{plot_label(view.name)}\n{plane.up} [m]")
+            axes_row[0].set_ylabel(f"{plot_label(view.name)}\n{plane.up}  [m]")
         for axes in panels[-1]:
-            axes.set_xlabel(f"{plane.right} [m]")
+            axes.set_xlabel(f"{plane.right}  [m]")
         # The lowest panels say what the eye looks along.
-        panels[-1][1].set_xlabel(f"{plane.right} [m]\nseen along {depth_of(plane)}")
-        look = {"ncols": 7, "handlelength": 2.0, "columnspacing": 1.2}
-        body.legend(handles=_handles(rows[0][0], views[0]), loc="outside lower center", **look)
+        panels[-1][1].set_xlabel(f"{plane.right}  [m]\nseen along {depth_of(plane)}")
+        shared_legend(body, _handles(rows[0][0], views[0]), "lower")
     return figure
 
 
 def _skeleton(view: RunView, tick: int) -> Skeleton:
-    return build_skeleton(view.robot, view.q[tick], view.contact, view.supports)
+    return build_skeleton(view.robot, view.q[tick], [view.contact], view.supports)
 
 
 def _window(low: Vector, high: Vector, view: RunView, plane: Plane) -> tuple[Vector, Vector]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,8 @@ from matplotlib.textpath import text_to_path
 
 from impact_posture.errors import InputError, OutputError
 from impact_posture.escape import printable
+from impact_posture.folder import scratch_folder
+from impact_posture.plot.labels import place_labels
 from impact_posture.plot.view import SEPARATOR
 
 # Okabe and Ito's palette, "Color Universal Design", 2008.
@@ -32,12 +35,12 @@ FREE_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": (0, (6, 1.6, 1, 1.6)),
 # Arrows of the worst normals of a cone.
 WORST_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (3, 1.5)), "linewidth": 1.1}
 WORST_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.1}
-# Behind a letter that stands on lines.
-PLATE: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.6}
 BEFORE_BAR: dict[str, Any] = {"facecolor": "#fbe3d3", "edgecolor": VERMILLION, "hatch": "//////", "linewidth": 0.6}
 AFTER_BAR: dict[str, Any] = {"facecolor": BLUE, "edgecolor": BLUE, "linewidth": 0.6}
 
 FORMATS = ("png", "svg", "pdf")
+# Of a PDF alone, a figure takes as long as of the PNG of three.
+DEFAULT_FORMATS = ("png",)
 # Width of a two-column page, inches.
 WIDTH = 7.2
 _SMALL = 7.0
@@ -100,16 +103,37 @@ def framed(title: str, lines: Sequence[str], height: float, notes: Sequence[str]
 
 def wrap(line: str, separator: str) -> list[str]:
     """Break a line of small print at separators so that it fits the page, by the font's own widths."""
-    font = FontProperties(family="DejaVu Sans", size=_SMALL)
     parts, room = [""], 72 * WIDTH * 0.975
     for piece in line.split(separator):
         longer = f"{parts[-1]}{separator}{piece}" if parts[-1] else piece
-        width, _, _ = text_to_path.get_text_width_height_descent(longer.replace("$", ""), font, ismath=False)
-        if width <= room:
+        if text_width(longer.replace("$", ""), _SMALL) <= room:
             parts[-1] = longer
         else:
             parts.append(piece)
     return [part for part in parts if part]
+
+
+def text_width(text: str, size: float) -> float:
+    """Width of a text, points."""
+    font = FontProperties(family="DejaVu Sans", size=size)
+    return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0])
+
+
+def shared_legend(body: Any, handles: Sequence[Any], place: str, **look: Any) -> None:
+    """Put the one legend of a figure above (``upper``) or below (``lower``) its panels, as wide as the page."""
+    size, handle, gap, room = _RC["legend.fontsize"], 2.2, 1.4, 72 * WIDTH * 0.96
+    widths = [text_width(str(h.get_label()).replace("$", ""), size) + size * (handle + 0.8 + gap) for h in handles]
+
+    def width(columns: int) -> float:
+        # Entries fill column by column.
+        rows = -(-len(widths) // columns)
+        return sum(max(widths[k : k + rows]) for k in range(0, len(widths), rows))
+
+    columns = next((n for n in range(len(handles), 1, -1) if width(n) <= room), 1)
+    # As few rows as that takes, and those alike.
+    columns = -(-len(handles) // -(-len(handles) // columns))
+    look = {"ncols": columns, "handlelength": handle, "columnspacing": gap} | look
+    body.legend(handles=list(handles), loc=f"outside {place} center", **look)
 
 
 def lay_out(figure: Figure) -> None:
@@ -117,6 +141,7 @@ def lay_out(figure: Figure) -> None:
     # Panels with equal axes change their size in the first round and are placed in the second.
     for _ in range(2):
         figure.draw_without_rendering()
+    place_labels(figure)
     figure.set_layout_engine("none")
     # The layout's solver differs in the last digits from run to run; the files must not.
     for part in figure.subfigs:
@@ -139,8 +164,8 @@ def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
     return wanted
 
 
-def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = FORMATS) -> list[Path]:
-    """Write ``figure`` as ``out_dir/name.<format>`` for each format; return the paths.
+def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
+    """Write ``figure`` as ``out_dir/name.<format>`` for each format, each file whole or not at all; return the paths.
 
     Raises:
         InputError: An unknown format.
@@ -156,8 +181,9 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = FORM
         metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(extension, {})
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with style():
-                figure.savefig(path, metadata=metadata)
+            with scratch_folder(path.parent) as beside, style():
+                figure.savefig(beside / path.name, metadata=metadata)
+                os.replace(beside / path.name, path)
         except OSError as error:
             raise OutputError(
                 f"cannot be written ({error.strerror or error})", where=str(path), mend="choose another folder"

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from impact_posture.errors import InputError
 from impact_posture.plot.path import draw_shares, log_axis, share_notes, spreads, undrawn
 from impact_posture.plot.style import BLUE, GRAY, INK, VERMILLION, framed, style
-from impact_posture.plot.view import ResultView, TradeOffData, header_lines
+from impact_posture.plot.view import ResultView, TradeOffData, header_lines, objective_unit
 
 NOTES = (
     "Each point is the best posture found that moves at most so far from the initial one (joint angles, sliding "
@@ -47,9 +48,11 @@ def tradeoff_figure(view: ResultView) -> Figure:
         lower.set_xlabel("distance moved from the initial posture, at most  [rad, mixed with m]")
         if data.knee is not None:
             _upright(lower, data)
-        _legend(upper, upper.get_legend_handles_labels())
+        handles = upper.get_legend_handles_labels()[0]
         if drawn:
-            _legend(lower, lower.get_legend_handles_labels(), title="value / start")
+            # A line without anything parts them from those of the panel below.
+            handles += [Line2D([], [], linestyle="", label="value / start:"), *lower.get_legend_handles_labels()[0]]
+        body.legend(handles=handles, loc="outside right center", handlelength=3.2)
         body.align_ylabels([upper, lower])
     return figure
 
@@ -70,12 +73,12 @@ def _objective(axes: Any, data: TradeOffData, view: ResultView) -> None:
         axes.set_ylim(float(y.min()) - room, float(y.max()) + 1.5 * room)
     axes.grid(True)
     kind = "objective" if not view.objective.normal_cone_deg else "worst objective of the cone"
-    axes.set_ylabel(f"{kind} ({view.objective.kind})" + ("  (log)" if log else ""))
+    axes.set_ylabel(f"{kind} ({view.objective.kind})  [{objective_unit(view)}]" + (", log" if log else ""))
     axes.set_title(_title(data), parse_math=False)
     share = axes.secondary_yaxis("right", functions=(lambda v: 1 - v / y[0], lambda r: (1 - r) * y[0]))
     if not log:
-        share.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:.3g} %".replace("-", "−")))
-        share.set_ylabel("reduction")
+        share.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:.3g}".replace("-", "−")))
+        share.set_ylabel("reduction  [%]")
     else:
         share.set_visible(False)
     if data.knee is None:
@@ -103,8 +106,3 @@ def _title(data: TradeOffData) -> str:
         return f"knee: {100 * share:.0f} % of the gain for {100 * way:.0f} % of the distance"
     half = float(np.interp(x[-1] / 2, x, y))
     return f"half of the distance buys {100 * (y[0] - half) / gain:.0f} % of the gain; no knee"
-
-
-def _legend(axes: Any, entries: tuple[list[Any], list[str]], **more: Any) -> None:
-    """Beside the panel, clear of the axis on its right."""
-    axes.legend(*entries, loc="center left", bbox_to_anchor=(1.14, 0.5), title_fontsize=7.5, handlelength=3.2, **more)

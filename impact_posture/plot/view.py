@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -16,10 +16,9 @@ from impact_posture.errors import MetricError
 from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.one_blow import OneBlow
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
 from impact_posture.impact.scalars import objective_value
-from impact_posture.impact.uncertain import worst_in_world
+from impact_posture.impact.single_impact import SingleImpact
 from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
@@ -133,7 +132,7 @@ class ResultView:
         objective = self.objective
         if not objective.supports:
             return None
-        return ImpactOracle(objective.robot, objective.contact, objective.metric).quantities(q)
+        return ImpactOracle(replace(objective.case, supports=())).quantities(q)
 
     @cached_property
     def worst_before(self) -> WorstNormal | None:
@@ -146,10 +145,11 @@ class ResultView:
         return self._worst(self.q_optimal)
 
     def _worst(self, q: Vector) -> WorstNormal | None:
-        if not self.objective.normal_cone_deg:
+        cone = self.objective.normal_cone
+        if cone is None:
             return None
         try:
-            return worst_in_world(self.objective, q)
+            return cone.worst_in_world(q)
         except MetricError:
             return None
 
@@ -208,10 +208,23 @@ def jump_unit(view: ResultView) -> str:
     return mixed_unit(view.robot)
 
 
+def objective_unit(view: ResultView) -> str:
+    """Unit of the objective's values."""
+    jump = jump_unit(view)
+    square = "J" if jump == "√J" else f"{jump}²"
+    return {"impulse": square, "energy": "kg"}.get(view.objective.kind, f"{square}/(m/s)²")
+
+
 def mixed_unit(robot: Robot) -> str:
     """Unit of the Euclidean ``‖ν‖``: both units where it mixes them."""
     kinds = [u for u in ("m/s", "rad/s") if u in velocity_units(robot)]
     return kinds[0] if len(kinds) == 1 else f"({', '.join(kinds)})"
+
+
+def contact_letters(view: ResultView) -> list[str]:
+    """What tells the contacts of a picture apart: nothing where there is one, else a letter each."""
+    count = len(view.objective.contacts)
+    return [f" {letter}" for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[:count]] if count > 1 else [""]
 
 
 def header_lines(view: ResultView) -> tuple[str, list[str]]:
@@ -220,7 +233,9 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
     H never stands alone: G, V, S and E stand beside it.
     """
     contact, robot = view.objective.contact, view.robot
-    title = view.title or f"{robot.name}, impact at {contact.frame}"
+    named = zip(view.objective.contacts, contact_letters(view), strict=True)
+    frames = ", ".join(f"{one.frame}{letter and f' ({letter.strip()})'}" for one, letter in named)
+    title = view.title or f"{robot.name}, impact at {frames}"
     normal = ", ".join(number(v) for v in contact.normal)
     axes = "world" if contact.normal_frame == "world" else "contact frame"
     facts = [f"robot {robot.name}", f"contact {contact.frame}"] if view.title else []
@@ -234,8 +249,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
         f"armature {_armature(robot)}",
     ]
     if view.objective.others:
-        others = ", ".join(other.frame for other in view.objective.others)
-        facts.insert(0, f"drawn and in numbers: this contact alone; objective also of {others}")
+        facts.insert(0, f"numbers and ellipsoids: {contact.frame} alone; objective: all contacts together")
     if view.objective.scenarios:
         facts.insert(
             0, f"drawn and in numbers: the model as it stands; objective the worst of {len(view.objective.scenarios)}"
@@ -247,7 +261,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
         ("G", "1/kg", lambda f: f.G),
         ("V", "‖Δν‖²/(m/s)²", lambda f: f.V),
         ("S", "‖Δν‖²/(m/s)²", lambda f: f.S),
-        ("E", "J/(m/s)²", lambda f: f.E),
+        ("E", "kg", lambda f: f.E),
     ]
     numbers = [
         f"{name} {number(get(view.before))} → {number(get(view.after))}"
@@ -259,7 +273,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
 
 def _worst_values(view: ResultView) -> str:
     """The objective before and after, where it is none of the five quantities but the worst of several blows."""
-    if isinstance(view.objective.inner, OneBlow):
+    if isinstance(view.objective.worst_case, SingleImpact):
         return ""
     found = [objective_value(view.objective, q) for q in (view.q_initial, view.q_optimal)]
     return " " + " → ".join(number(value) for value in found)

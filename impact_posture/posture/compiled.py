@@ -90,7 +90,6 @@ def _pays(solver: ca.Function, starts: int) -> bool:
 
 def _key(problem: PostureProblem) -> str:
     """Hash of what shapes the program's functions; targets, limits and the leading normal are parameters."""
-    objective = problem.objective
     content = [
         __version__,
         own_source("dynamics", "impact", "posture"),
@@ -99,11 +98,7 @@ def _key(problem: PostureProblem) -> str:
         problem.robot.model_sha256,
         # Where frames sit on their links is no part of the dynamics, but of every expression of a point.
         *[f"{f.name} {f.parentJoint} {f.placement.homogeneous.tolist()}" for f in problem.robot.model.frames],
-        repr((objective.kind, objective.metric, objective.supports, objective.compliance)),
-        repr((objective.normal_cone_deg, objective.others, objective.bilateral)),
-        repr([scenario.robot.model_sha256 for scenario in objective.scenarios]),
-        repr((objective.contact.frame, objective.contact.offset, objective.contact.normal_frame)),
-        repr(objective.scale),
+        problem.objective.structure,
         *[f"{c.structure}:{problem.carried(i)}" for i, c in enumerate(problem.constraints)],
     ]
     return hashlib.sha256("\n".join(content).encode()).hexdigest()[:32]

@@ -59,6 +59,10 @@ class Constraint(ABC):
     def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
         """``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``numeric.q``."""
 
+    def describe(self) -> str:
+        """The constraint in words, one line."""
+        return f"{self.name} {'held' if self.equality else 'kept within its bounds'}"
+
     def row_name(self, row: int) -> str:
         """What one row is called."""
         return self.name if self.rows == 1 else f"{self.name}[{row}]"
@@ -97,6 +101,10 @@ class PositionBox(HeldPosition):
         self.upper = np.array(half, dtype=float)
         self.lower = -self.upper
 
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return f"{super().describe()} (" + " × ".join(f"±{v:g}" for v in self.upper) + " m)"
+
     def row_name(self, row: int) -> str:
         """See :class:`Constraint`."""
         return f"{self.name} along {'xyz'[row]}"
@@ -130,6 +138,10 @@ class HeldOrientation(Constraint):
         left = self.target @ right
         self.parameters = np.concatenate([_coefficients(left.T), _coefficients(right)])
         self.lower = self.upper = np.zeros(width)
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return super().describe() + ("" if self.axis is None else " (tilt zero, yaw free)")
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
         """See :class:`Constraint`."""
@@ -168,6 +180,10 @@ class HeldPose(Constraint):
         )
         self.parameters = np.concatenate([p.parameters for p in self._parts])
         self.lower = self.upper = np.zeros(sum(p.rows for p in self._parts))
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return super().describe() + ("" if self.rows == 6 else " (position and normal; spin free)")
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
         """See :class:`Constraint`."""
@@ -232,6 +248,10 @@ class CenterOfMassOverFeet(Constraint):
         self.parameters = np.concatenate([normals.T.reshape(-1), offsets])
         self.lower = np.full(self._k, -np.inf)
         self.upper = np.full(self._k, -margin)
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return f"{self.name}, {self.margin:g} m inside the support polygon"
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
         """See :class:`Constraint`."""

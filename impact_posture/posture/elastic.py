@@ -63,7 +63,7 @@ def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAn
             best = found
         if not best.conflicts:
             break
-    assert best is not None
+    assert best is not None  # noqa: S101 (narrows a type)
     return best
 
 

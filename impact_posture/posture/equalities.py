@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.posture.problem import PostureProblem
 from impact_posture.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from impact_posture.posture.problem import PostureProblem
 
 Vector = NDArray[np.float64]
 

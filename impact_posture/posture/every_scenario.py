@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.scenarios import FewModels
 from impact_posture.posture.constraint import CenterOfMassOverFeet, Constraint
 from impact_posture.posture.feet import KeptFeet
 
@@ -26,12 +25,10 @@ def in_every_scenario(
         friction: Of the feet that stay.
         constraints: Of the robot as modeled.
     """
-    if not isinstance(objective.inner, FewModels):
-        return []
     found: list[Constraint] = []
     kept = any(isinstance(constraint, KeptFeet) for constraint in constraints)
     centers = [constraint for constraint in constraints if isinstance(constraint, CenterOfMassOverFeet)]
-    for scenario, member in zip(objective.scenarios[1:], objective.inner.members[1:], strict=True):
+    for scenario, member in zip(objective.scenarios[1:], objective.by_scenario[1:], strict=True):
         # The armature moves no center of mass.
         if scenario.payload is not None and scenario.armature_factor == 1:
             loaded = scenario.robot.model, scenario.name

@@ -46,6 +46,10 @@ class KeptFeet(Constraint):
         self.lower = np.full(len(matrix), -np.inf)
         self.upper = np.zeros(len(matrix))
 
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return f"{self.name}: the impact neither lifts nor slides one"
+
     @property
     def structure(self) -> str:
         """See :class:`Constraint`."""

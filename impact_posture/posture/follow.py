@@ -190,7 +190,7 @@ class _Curve:
 
     def _point(self, k: int, q: Vector, certificate: Certificate | None = None) -> TradePoint:
         problem = self._at(self._radii[k])
-        found = problem.objective.oracle.quantities(q)
+        found = problem.impact.oracle.quantities(q)
         return TradePoint(
             within=self._radii[k],
             distance=distance(self._chart, q, self._initial),

@@ -8,7 +8,7 @@ Formulation (the "lifted" one): the impact's linear solve is left to IPOPT::
 
 so that every function is linear or quadratic in the auxiliaries and the exact Hessian stays small
 (``tests/benchmarks/formulations.py`` measures both forms).  An inner maximum adds its own form
-(:mod:`impact_posture.impact.inner`).
+(:mod:`impact_posture.impact.worst_case`).
 """
 
 from __future__ import annotations
@@ -173,10 +173,11 @@ def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts:
 def program(problem: PostureProblem, chart: Chart) -> tuple[dict[str, ca.SX], int]:
     """Its expressions ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``, and how many last rows are ``≤ 0``."""
     x = ca.SX.sym("x", chart.nx)
-    n, scale, weight = ca.SX.sym("n", 3), ca.SX.sym("scale"), ca.SX.sym("weight")
+    own = ca.SX.sym("own", len(problem.objective.parameters))
+    scale, weight = ca.SX.sym("scale"), ca.SX.sym("weight")
     reference = ca.SX.sym("reference", chart.nx)
     tree = Tree(problem.robot.model, chart.configuration(x), x)
-    lifted = problem.objective.lift(tree, n, scale)
+    lifted = problem.objective.lift(tree, own, scale)
     rows, targets = [chart.norms(x)], []
     for index, constraint in enumerate(problem.constraints):
         p = ca.SX.sym(f"p{index}", len(constraint.parameters))
@@ -186,7 +187,7 @@ def program(problem: PostureProblem, chart: Chart) -> tuple[dict[str, ca.SX], in
     value = lifted.value / scale + weight * distance_squared(chart, tree.q, chart.configuration(reference))
     symbols = {
         "x": ca.vertcat(x, lifted.variables),
-        "p": ca.vertcat(n, scale, weight, reference, *targets),
+        "p": ca.vertcat(own, scale, weight, reference, *targets),
         "f": value,
         "g": ca.vertcat(*rows),
     }
@@ -197,7 +198,7 @@ def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Vector:
     """Values of the program's parameters."""
     return np.concatenate(
         [
-            np.array(problem.objective.contact.normal),
+            problem.objective.parameters,
             [scale, problem.requirements.regularization],
             chart.to_x(problem.given),
             *[c.parameters for c in problem.constraints],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.posture.problem import PostureProblem
+from impact_posture.impact.objective import ImpactObjective, Objective
 
 Vector = NDArray[np.float64]
 
@@ -13,9 +13,20 @@ Vector = NDArray[np.float64]
 _LOCKED = 0.05
 
 
-def notes_on_blows(problem: PostureProblem, initial: Vector, q: Vector) -> list[str]:
+def percent(share: float) -> str:
+    """Return a share in percent: digits enough never to read 100 where it is less, and no minus before a zero."""
+    for digits in range(1, 15):
+        text = f"{100 * share:.{digits}f}"
+        if abs(share) >= 1 or abs(float(text)) != 100:
+            break
+    return f"{text.removeprefix('-') if float(text) == 0 else text}%"
+
+
+def notes_on_impacts(objective: Objective, initial: Vector, q: Vector) -> list[str]:
     """Where a smaller jump per impulse is no smaller jump per speed, and contacts that lock; one line each."""
-    objective, notes = problem.objective, []
+    notes: list[str] = []
+    if not isinstance(objective, ImpactObjective):
+        return notes
     for single in objective.singles:
         start, end = single.oracle.quantities(initial), single.oracle.quantities(q)
         before, after = start.G, end.G

@@ -46,7 +46,7 @@ def null_space_path(problem: PostureProblem, start: Vector, end: Vector, points:
         postures.append(projector.project(pin.interpolate(model, start, end, float(t))).q)
     postures.append(end)
     steps = [np.linalg.norm(pin.difference(model, a, b)) for a, b in pairwise(postures)]
-    found = [problem.objective.oracle.quantities(q) for q in postures]
+    found = [problem.impact.oracle.quantities(q) for q in postures]
     return NullSpacePath(
         q=np.array(postures),
         s=np.concatenate([[0.0], np.cumsum(steps)]),

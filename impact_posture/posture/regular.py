@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -13,10 +12,8 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.constraint import HeldTurn
 from impact_posture.posture.equalities import RANK_TOLERANCE, base_point, equality_jacobian, held_rows, rank
+from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import Projector, feasible_start
-
-if TYPE_CHECKING:
-    from impact_posture.posture.problem import PostureProblem
 
 Vector = NDArray[np.float64]
 

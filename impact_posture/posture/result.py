@@ -94,7 +94,7 @@ def result_arrays(
     solution: PostureSolution, path: NullSpacePath, tradeoff: TradeOff | None = None
 ) -> dict[str, NDArray[np.float64]]:
     """The content of ``result.npz``: postures, ellipsoids, jumps, the null-space path, and the trade-off."""
-    oracle = solution.problem.objective.oracle
+    oracle = solution.problem.impact.oracle
     arrays: dict[str, NDArray[np.float64]] = {}
     for name, q in (("initial", solution.initial), ("optimal", solution.q)):
         found = oracle.quantities(q)

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SolverFailed
-from impact_posture.impact.scenarios import FewModels
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.problem import PostureProblem, build_problem
+from impact_posture.posture.notes import percent
+from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.solve import SAME_POSTURE, PostureSolution, Progress, solve, wrapped_difference
 from impact_posture.robot.scenario import between
 
@@ -103,13 +105,13 @@ class Robustness:
             parts.append(f"the optimum of the model as it stands breaks {', '.join(self.broken)}")
         elif self.gain < -_NOISE:
             parts.append(
-                f"the worst case is {-self.gain:.1%} higher than {here}: more --starts will find a better one"
+                f"the worst case is {percent(-self.gain)} higher than {here}: more --starts will find a better one"
             )
         else:
-            parts.append(f"the worst case is {max(self.gain, 0.0):.1%} lower than {here}")
+            parts.append(f"the worst case is {percent(max(self.gain, 0.0))} lower than {here}")
         lower = self.price < -_NOISE
         parts.append(
-            f"the model as it stands is {abs(self.price):.1%} {'below' if lower else 'above'} its own optimum"
+            f"the model as it stands is {percent(abs(self.price))} {'below' if lower else 'above'} its own optimum"
         )
         if self.between > self.worst_robust * (1 + _NOISE):
             parts.append(f"between the scenarios it reaches {self.between:.4g}, above the worst of them")
@@ -152,15 +154,15 @@ def solve_robustly(
     Raises:
         Infeasible, SolverFailed: See :func:`~impact_posture.posture.solve.solve`.
     """
-    objective, given, wanted = problem.objective, problem.given, problem.requirements
-    if not isinstance(objective.inner, FewModels):
+    given, wanted = problem.given, problem.requirements
+    if not (isinstance(problem.objective, ImpactObjective) and problem.objective.scenarios):
         return RobustSolution(
             solve(problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress), None
         )
     # Each built anew: what the feet bear and where the center of mass is hangs on the model.
     alone = [
         build_problem(scenario.robot, member, given, wanted)
-        for scenario, member in zip(objective.scenarios, objective.inner.members, strict=True)
+        for scenario, member in zip(problem.impact.scenarios, problem.impact.by_scenario, strict=True)
     ]
     total = starts * (len(alone) + 1)
 
@@ -185,7 +187,7 @@ def solve_robustly(
 
 def compare_scenarios(solution: PostureSolution, optima: Sequence[Vector | None], seed: int = 0) -> Robustness:
     """The robust optimum beside the optimum of each scenario alone, and among models drawn between the scenarios."""
-    problem, objective = solution.problem, solution.problem.objective
+    problem, objective = solution.problem, solution.problem.impact
     found: list[ScenarioOptimum] = []
     for scenario, q in zip(objective.scenarios, optima, strict=True):
         member = replace(objective, robot=scenario.robot, scenarios=())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,14 +10,16 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from impact_posture.errors import InputError, SpecError
-from impact_posture.escape import toml_string
+from impact_posture.escape import toml
 from impact_posture.impact.metric import Metric, MetricKind, ObjectiveKind
-from impact_posture.impact.request import ImpactRequest, ResolvedImpact
+from impact_posture.impact.request import FLOATS, ImpactRequest, ResolvedImpact
+from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.constraint import CenterOfMassOverFeet
-from impact_posture.posture.problem import BaseMode, PostureProblem, Requirements, build_problem
+from impact_posture.posture.problem import BaseMode, PostureProblem, Requirements
 from impact_posture.robot.loader import LoadOptions, from_folder, names_a_path
 from impact_posture.robot.scenario import Payload
 from impact_posture.robot.spec import ContactPose, Root, Vector3, read_toml, validate, with_tuples
+from impact_posture.robot.urdf import EXAMPLE_PREFIX
 
 SCHEMA = "impact-posture/problem/1"
 
@@ -39,6 +40,7 @@ class ProblemSettings(BaseModel):
     config: str | None = None
     armature: str | dict[str, float] | None = None
     lock: tuple[str, ...] = ()
+    lock_massless: bool = False
     frame: str | None = None
     normal: Vector3 | None = None
     normal_frame: Literal["world", "contact"] = "world"
@@ -137,6 +139,7 @@ def prepare(settings: ProblemSettings) -> Prepared:
             config=settings.config,
             armature=settings.armature,
             lock=settings.lock,
+            lock_massless=settings.lock_massless,
         ),
         frame=settings.frame,
         normal=settings.normal,
@@ -162,6 +165,11 @@ def prepare(settings: ProblemSettings) -> Prepared:
         impact = replace(impact, objective=replace(impact.objective, metric=_listed_metric(settings, impact)))
     if settings.q is not None:
         impact = replace(impact, q=impact.robot.check_posture(np.array(settings.q), where="q"))
+    if impact.missing_support:
+        if settings.base is None:
+            what = f"nothing says what holds {impact.robot.name} up, {FLOATS}"
+            raise InputError(what, where=settings.robot, mend=impact.missing_support)
+        impact = replace(impact, missing_support="")
     problem = build_problem(impact.robot, impact.objective, impact.q, _requirements(settings, impact))
     return Prepared(settings, impact, problem)
 
@@ -232,7 +240,8 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
     }
     for key in _FILES:
         value = getattr(settings, key)
-        changes[key] = None if value is None else str(Path(value).expanduser().resolve())
+        in_package = value is None or value.startswith(EXAMPLE_PREFIX)
+        changes[key] = value if in_package else str(Path(value).expanduser().resolve())
     if settings.armature is not None:
         changes["armature"] = _armature_by_joint(impact)
     return settings.model_copy(update=changes)
@@ -260,27 +269,14 @@ def dump_settings(settings: ProblemSettings) -> str:
     Raises:
         SpecError: The path of a file is not UTF-8.
     """
-    lines = [f"schema = {_toml(SCHEMA)}"]
+    lines = [f"schema = {toml(SCHEMA)}"]
     for key in ProblemSettings.model_fields:
         value = getattr(settings, key)
         if key != "schema_" and value is not None:
             try:
-                lines.append(f"{key} = {_toml(value)}")
+                lines.append(f"{key} = {toml(value)}")
             except UnicodeEncodeError:
                 raise SpecError(
                     f"'{value}' is not UTF-8, as TOML has to be", where=key, mend="rename the file or folder"
                 ) from None
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{toml_string(k)} = {_toml(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(v) for v in value) + "]"
-    if isinstance(value, float):
-        return repr(value)
-    if isinstance(value, str):
-        return toml_string(value)
-    # JSON's integers and booleans are TOML's.
-    return json.dumps(value)

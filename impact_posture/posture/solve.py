@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ContactError, Infeasible, MetricError, SolverFailed
-from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.posture.blas import one_blas_thread
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
@@ -22,7 +21,7 @@ from impact_posture.posture.distance import distance
 from impact_posture.posture.elastic import elastic
 from impact_posture.posture.equalities import equality_jacobian, rank
 from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp
-from impact_posture.posture.notes import notes_on_blows
+from impact_posture.posture.notes import notes_on_impacts
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import Projector, feasible_start
 from impact_posture.processes import shared_out
@@ -137,7 +136,7 @@ def solve(
         raise _failure(runs)
     # The first of equally good ones: the answer does not hang on which process was faster.
     best = min(good, key=lambda r: round(r.minimized, 9))
-    assert best.record is not None and best.certificate is not None
+    assert best.record is not None and best.certificate is not None  # noqa: S101 (narrows types)
     q, certificate, notes = best.record.q, best.certificate, []
     numeric = Numeric(problem.robot.model)
     redundancy = problem.robot.nv - rank(equality_jacobian(problem, numeric.at(q)))
@@ -148,7 +147,7 @@ def solve(
     elif best.objective > scale * (1 - 1e-6):
         notes.append("no better posture found: the initial one is already (locally) optimal for this blow")
     optima = distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None])
-    notes += notes_on_blows(problem, initial, q)
+    notes += notes_on_impacts(problem.objective, initial, q)
     hits = sum(o.hits for o in optima)
     if len(optima) > 1 and optima[0].hits == 1 and hits >= _MANY:
         notes.append(
@@ -207,21 +206,16 @@ def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
         ContactError: The contact point cannot move along the normal there.
     """
     objective = problem.objective
-    # A normal along which nothing can move leaves rounding; in a cone around it there are others.
-    quantities = [single.oracle.quantities(initial) for single in objective.singles]
-    moves = bool(objective.normal_cone_deg) or any(_moves(found) for found in quantities)
-    value = objective.value(initial) if moves else 0.0
+    # A normal along which nothing can move leaves rounding.
+    value = objective.value(initial) if objective.movable(initial) else 0.0
     if not (np.isfinite(value) and value > 0):
+        frames = ", ".join(f"'{contact.frame}'" for contact in objective.contacts)
         raise ContactError(
-            f"the contact point at '{objective.contact.frame}' cannot move along the normal",
+            f"the contact point at {frames} cannot move along the normal",
             where="--normal",
             mend="choose another frame, normal or posture: a blow along it moves nothing",
         )
     return value
-
-
-def _moves(found: ImpactQuantities) -> bool:
-    return bool(found.G > 1e-12 * float(np.linalg.eigvalsh(found.mobility)[-1]))
 
 
 @one_blas_thread()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -12,9 +11,7 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.equalities import held_rows
-
-if TYPE_CHECKING:
-    from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.problem import PostureProblem
 
 Vector = NDArray[np.float64]
 

@@ -51,21 +51,35 @@ def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool)
     return tuple(warnings)
 
 
-def check_moved_mass(model: pin.Model, where: str) -> None:
-    """Refuse a joint that moves nothing: the mass matrix would be singular.
-
-    Raises:
-        InertiaError: A joint without armature whose whole subtree has neither mass nor rotational inertia.
-    """
+def massless_joints(model: pin.Model) -> tuple[str, ...]:
+    """Return the joints without armature whose whole subtree has neither mass nor rotational inertia."""
     moved = np.array([max(i.mass, float(np.abs(i.inertia).max())) for i in model.inertias])
+    found: list[str] = []
     for joint in range(model.njoints - 1, 0, -1):
         first = model.idx_vs[joint]
         armature = np.asarray(model.armature)[first : first + model.nvs[joint]]
         if moved[joint] <= _TINY and not (armature > 0).all():
-            raise InertiaError(
-                f"joint '{model.names[joint]}' moves no mass", where=where, mend="give its links a mass or --lock it"
-            )
+            found.insert(0, str(model.names[joint]))
         moved[model.parents[joint]] += moved[joint]
+    return tuple(found)
+
+
+def check_moved_mass(model: pin.Model, where: str) -> None:
+    """Refuse joints that move nothing: the mass matrix would be singular.
+
+    Raises:
+        InertiaError: Naming all of them.
+    """
+    found = massless_joints(model)
+    if found:
+        named = ", ".join(f"'{name}'" for name in found)
+        one = len(found) == 1
+        raise InertiaError(
+            f"joint {named} moves no mass" if one else f"{len(found)} joints move no mass: {named}",
+            where=where,
+            mend=f"give {'its' if one else 'their'} links a mass, or make {'it' if one else 'them'} rigid by "
+            "--lock-massless (robot.toml [model] lock_massless = true)",
+        )
 
 
 def check_mass_matrix(

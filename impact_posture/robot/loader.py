@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.errors import InputError, PackageNotFound, RobotNotFound, SpecError, UrdfError
+from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
 from impact_posture.robot.armature import ArmatureOption, armature_warning, set_armature
-from impact_posture.robot.inertia import check_mass_matrix, check_moved_mass
+from impact_posture.robot.inertia import check_mass_matrix, check_moved_mass, massless_joints
 from impact_posture.robot.robot import Robot, Vector
 from impact_posture.robot.spec import RobotSpec, Root, Vector3, read_spec
 from impact_posture.robot.urdf import (
     EXAMPLE_PREFIX,
     build_model,
+    example_models,
     example_robot_data,
     joint_index,
     resolve_path,
@@ -31,12 +35,13 @@ class LoadOptions:
     Attributes:
         root: Put the robot on a free-flyer or weld it to the world; ``None``: as robot.toml says.
         package_dirs: Where ``package://`` paths lead; dynamics needs none, pictures may.
-        srdf: Another SRDF.
+        srdf: Another SRDF: a path, or ``example-robot-data:<path below robots/>``.
         config: Another robot.toml (else one beside the URDF).
         armature: ``"none"``, a TOML file's path, or values by joint; ``None``: robot.toml's, else the rotor data of
             the SRDF, else zero.
-        lock: Joints made rigid at the default posture.
+        lock: Joints made rigid at the default posture: names, or patterns such as ``gripper_*``.
         mounting: How far joints sit from where the URDF has them, by joint: meters, in the parent joint's axes.
+        lock_massless: Make those joints rigid, too, that move no mass.
     """
 
     root: Root | None = None
@@ -46,6 +51,7 @@ class LoadOptions:
     armature: ArmatureOption = None
     lock: tuple[str, ...] = field(default=())
     mounting: Mapping[str, Vector3] = field(default_factory=dict)
+    lock_massless: bool = False
 
 
 def known_robots() -> tuple[str, ...]:
@@ -62,7 +68,16 @@ def load_robot(robot: str, options: LoadOptions | None = None) -> Robot:
         SpecError: The robot.toml cannot be used.
     """
     options = options or LoadOptions()
-    spec, urdf, source, base, name = _locate(robot, options)
+    return build_robot(locate(robot, options), options)
+
+
+def build_robot(located: Located, options: LoadOptions) -> Robot:
+    """Build the robot that a URDF and a ``robot.toml`` describe.
+
+    Raises:
+        ImpactPostureError: As :func:`load_robot`.
+    """
+    spec, urdf, source, base, name = located
     root: Root = options.root or spec.model.root
     _check_package_dirs(options.package_dirs, Path(), "--package-dir")
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
@@ -77,11 +92,16 @@ def load_robot(robot: str, options: LoadOptions | None = None) -> Robot:
         raise SpecError(
             f"default_posture '{default}' does not exist", where=name, mend=f"one of: {', '.join(postures)}"
         )
-    locked = tuple(dict.fromkeys((*spec.model.lock, *options.lock)))
     armature_source = set_armature(model, spec, srdf, options.armature, name)
+    locked = _named(model, (*spec.model.lock, *options.lock), f"{name} --lock")
+    if spec.model.lock_massless or options.lock_massless:
+        massless = (joint for joint in massless_joints(model) if joint != "root_joint")
+        locked = tuple(dict.fromkeys((*locked, *massless)))
     if locked:
         model, postures = _lock(model, locked, postures, default, name)
     check_moved_mass(model, source)
+    if root == "fixed":
+        warnings = (*warnings, *_bases_left_out(spec, srdf, default))
     warnings = (*warnings, *armature_warning(model, armature_source, spec.constraints.hold))
     loaded = Robot(
         name=name,
@@ -136,8 +156,18 @@ def from_folder(data: dict[str, object], folder: Path, files: Sequence[str]) -> 
     return data
 
 
-def _locate(robot: str, options: LoadOptions) -> tuple[RobotSpec, Path, str, Path, str]:
-    """Return spec, URDF file, its printable source, the folder that relative paths start from, and the name."""
+class Located(NamedTuple):
+    """What is known of a robot before its URDF is read: the folder is where relative paths start from."""
+
+    spec: RobotSpec
+    urdf: Path
+    source: str
+    folder: Path
+    name: str
+
+
+def locate(robot: str, options: LoadOptions) -> Located:
+    """Find the files of a robot that is given by name, path or URI."""
     own = robots_data() / robot / "robot.toml"
     if "/" not in robot and own.is_file():
         spec, base = read_spec(own), own.parent
@@ -151,7 +181,7 @@ def _locate(robot: str, options: LoadOptions) -> tuple[RobotSpec, Path, str, Pat
             if found != urdf:
                 urdf = found
                 source = text if (text := spec.model.urdf or "").startswith(EXAMPLE_PREFIX) else str(urdf)
-        return spec, urdf, source, base, spec.name or robot
+        return Located(spec, urdf, source, base, spec.name or robot)
     if robot.startswith(EXAMPLE_PREFIX):
         urdf, source = resolve_path(robot, Path()), robot
     elif names_a_path(robot, Path()):
@@ -159,21 +189,23 @@ def _locate(robot: str, options: LoadOptions) -> tuple[RobotSpec, Path, str, Pat
         source = robot
     else:
         listed = list(known_robots())
-        raise RobotNotFound(robot, listed, mend="(or give a path to a .urdf)")
+        shipped = [EXAMPLE_PREFIX + p for p in example_models() if robot.casefold() in Path(p).stem.casefold()]
+        either = "".join(f"{uri}, or " for uri in shipped[:2])
+        raise RobotNotFound(robot, listed, mend=f"(or give {either}a path to a .urdf)")
     config = Path(options.config) if options.config else urdf.parent / "robot.toml"
     if options.config or (config.is_file() and EXAMPLE_PREFIX not in source):
         spec = read_spec(config)
         base = config.parent
     else:
         spec, base = RobotSpec(), urdf.parent
-    return spec, urdf, source, base, spec.name or urdf.stem
+    return Located(spec, urdf, source, base, spec.name or urdf.stem)
 
 
 def _srdf(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
     text = options.srdf or spec.model.srdf
     if text is None:
         return None
-    path = Path(text).expanduser() if options.srdf else resolve_path(text, base)
+    path = resolve_path(text, Path() if options.srdf else base)
     if not path.is_file():
         raise UrdfError("no such file", where=str(path), mend="check --srdf or robot.toml [model] srdf")
     return path
@@ -195,8 +227,12 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
     for key, posture in spec.postures.items():
         q = np.array(pin.neutral(model), dtype=float)
         if posture.base is not None and spec.model.root != "free-flyer" and root != "free-flyer":
-            raise SpecError(f"posture '{key}' gives a base pose, but the root is fixed", where=name, mend="remove it")
-        # A floating robot that --root bolts down keeps its postures, without their base.
+            raise SpecError(
+                f"posture '{key}' gives a base pose, but the root is fixed",
+                where=name,
+                mend='remove it, or write root = "free-flyer" in [model]',
+            )
+        # A floating robot that --root bolts down keeps its postures; what is left of their base is a warning.
         if posture.base is not None and root == "free-flyer":
             _check_base(posture.base, f"{name} posture '{key}'")
             q[:7] = posture.base
@@ -217,6 +253,24 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
                 q[first] = value
         result[key] = np.asarray(pin.normalize(model, q))
     return result
+
+
+def _bases_left_out(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str, ...]:
+    """Say whose base pose a fixed root leaves out: the robot then stands at the world's origin, along its axes."""
+    states = ET.parse(srdf).getroot().iter("group_state") if srdf is not None else ()
+    named = [key for key, posture in spec.postures.items() if posture.base is not None]
+    named += [
+        str(state.get("name"))
+        for state in states
+        if any(len((joint.get("value") or "").split()) == 7 for joint in state.iter("joint"))
+    ]
+    if not named:
+        return ()
+    which = default if default in named else ", ".join(dict.fromkeys(named))
+    return (
+        f"the root is fixed: the base pose of posture {which} is left out, and the root link sits at the world's "
+        "origin along its axes; --root free-flyer keeps it",
+    )
 
 
 def _check_base(base: Sequence[float], where: str) -> None:
@@ -268,6 +322,24 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
             low[k], high[k] = -value, value
         setattr(model, f"lower{kind}Limit", low)
         setattr(model, f"upper{kind}Limit", high)
+
+
+def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, ...]:
+    """Joints by name or pattern, each once.
+
+    Raises:
+        JointNotFound: What names no joint, with the nearest names.
+    """
+    known = [str(n) for n in model.names if n not in ("universe", "root_joint")]
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        fitting = [pattern] if pattern in known else [n for n in known if fnmatchcase(n, pattern)]
+        if not fitting:
+            raise JointNotFound(
+                pattern, known, where=where, mend="(nothing fits this pattern)" if set(pattern) & set("*?[") else ""
+            )
+        found.update(dict.fromkeys(fitting))
+    return tuple(found)
 
 
 def _lock(

@@ -19,6 +19,9 @@ _OUR_KEYS = ("schema", "robot", "convention", "joint_names", "q")
 _BY_NAME_KEYS = ("schema", "robot", "base", "joints")
 _SHAPES = "q with joint_names, joints by name, or a JointState's name and position"
 
+_FIXED = ", but the root is fixed: the root link sits at the world's origin along its axes"
+_NO_BASE = "remove the base and give --normal as it is seen from there, or --root free-flyer"
+
 
 def read_posture(robot: Robot, text: str | None, where: str = "--posture") -> Vector:
     """Return the configuration that ``text`` names, shape (nq,), checked against length, quaternion and limits.
@@ -122,14 +125,17 @@ def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Vector:
             raise PostureError(
                 f"{fault}, so that q cannot be read", where=where, mend='give them by name: "joints": {"name": value}'
             )
-    return np.array(_numbers(data["q"], "q", where))
+    q = _numbers(data["q"], "q", where)
+    if not robot.floating and len(q) == robot.nq + 7:
+        raise PostureError("begins with a base pose" + _FIXED, where=where, mend=_NO_BASE)
+    return np.array(q)
 
 
 def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: str) -> Vector:
     q = robot.posture()
     if base is not None:
         if not robot.floating:
-            raise PostureError("gives a base pose, but the root is fixed", where=where, mend="remove 'base'")
+            raise PostureError("gives a base pose" + _FIXED, where=where, mend=_NO_BASE)
         pose = _numbers(base, "base", where)
         if len(pose) != 7:
             raise PostureError(f"'base' has {len(pose)} numbers", where=where, mend="give [x, y, z, qx, qy, qz, qw]")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from impact_posture.errors import SpecError, nearest
+from impact_posture.errors import SpecError, nearest, not_one_of
 
 SCHEMA = "impact-posture/robot/1"
 
@@ -32,6 +33,7 @@ class ModelSpec(_Strict):
     root: Root = "fixed"
     package_dirs: tuple[str, ...] = ()
     lock: tuple[str, ...] = ()
+    lock_massless: bool = False
     # Some published URDFs carry links that no rigid body can be; their owner may insist.
     accept_inertias: bool = False
 
@@ -150,7 +152,10 @@ def validate(cls: type[_Model], data: object, where: str) -> _Model:
             known = _keys_at(cls, fault["loc"][:-1])
             close = ", ".join(nearest(str(fault["loc"][-1]), known))
             raise SpecError(f"unknown key '{path}'", where=where, mend=f"did you mean {close}?") from None
-        raise SpecError(f"key '{path}': {fault['msg']}", where=where, mend="correct the value") from None
+        what, mend = str(fault["msg"]), "correct the value"
+        if fault["type"] == "literal_error":
+            what, mend = not_one_of(fault["input"], re.findall(r"'([^']*)'", fault["ctx"]["expected"]))
+        raise SpecError(f"key '{path}': {what}", where=where, mend=mend) from None
 
 
 def _keys_at(cls: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:

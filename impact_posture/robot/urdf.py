@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
+from typing import IO
 
 import pinocchio as pin
 
@@ -58,10 +59,15 @@ def resolve_path(text: str, base: Path) -> Path:
     root = example_robot_data()
     path = root / text.removeprefix(EXAMPLE_PREFIX)
     if not path.is_file():
-        known = [p.relative_to(root).as_posix() for p in sorted(root.rglob("*.[us]rdf"))]
-        fitting = [k for k in known if k.endswith(path.suffix)]
+        fitting = example_models(path.suffix)
         raise PackageNotFound(text.removeprefix(EXAMPLE_PREFIX), fitting, where=EXAMPLE_PREFIX.rstrip(":"))
     return path
+
+
+def example_models(suffix: str = ".urdf") -> list[str]:
+    """Paths below the ``robots/`` folder of example-robot-data, sorted."""
+    root = example_robot_data()
+    return [p.relative_to(root).as_posix() for p in sorted(root.rglob("*.[us]rdf")) if str(p).endswith(suffix)]
 
 
 def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) -> tuple[pin.Model, tuple[str, ...]]:
@@ -125,11 +131,16 @@ def _parse(path: Path) -> ET.Element:
     return root
 
 
+def _nameless_file() -> IO[bytes]:
+    """A file in memory where the system has such: to read a robot, no folder need be writable."""
+    return os.fdopen(os.memfd_create("words"), "w+b") if hasattr(os, "memfd_create") else tempfile.TemporaryFile()
+
+
 @contextlib.contextmanager
 def _quiet_stderr() -> Iterator[list[str]]:
     """Keep the URDF parser's own words off the terminal; hand back the first line of them."""
     words = [""]
-    with tempfile.TemporaryFile() as sink:
+    with _nameless_file() as sink:
         saved = os.dup(2)
         os.dup2(sink.fileno(), 2)
         try:

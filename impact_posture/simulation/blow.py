@@ -25,6 +25,7 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
 from impact_posture.libraries import cache_folder, is_cached
 from impact_posture.posture.compiled import own_source
+from impact_posture.progress import tell
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
 from impact_posture.toolchain import find_compiler
 
@@ -88,6 +89,7 @@ def compiled(objective: ImpactObjective) -> Gradient:
     folder = cache_folder("gradients") / _key(objective)
     with _locked(folder.with_suffix(".lock")):
         if not is_cached(library_path(folder, "blow")):
+            tell("compiling the gradient")
             written = write_export([objective], folder, prefix="blow", portable=True, build=True, force=True)
             if written.library is None:
                 raise CompilerError("has gone", where="C compiler", mend="try again")

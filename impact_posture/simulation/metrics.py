@@ -30,9 +30,11 @@ class Metrics:
         q_total_impact_base: The same of the floating base's six entries.
         q_total_impact_joints: The same of the joints'.
         q_total_dwell: The same as the first over the dwell windows; 0 for pushes.
+        q_total_recovery: The same over the recovery windows: a push that is stored and given back is in here.
         peak_jump: Largest ``‖ν(t) − ν⁻‖`` within 15 ms of the first touch, mean over the contacts that came about (0
             without any); for pushes the largest ``‖ν‖`` within the window.
         peak_jump_max: The largest of them.
+        peak_recovery: As ``peak_jump``, but looked for over the whole recovery window.
         peak_force: Largest normal force within the impact windows, N; for pushes the push.
         saturation_inside: Seconds within the impact windows with a rotor or a joint at a control limit.
         saturation_outside: Seconds without.
@@ -41,7 +43,8 @@ class Metrics:
         failed_ticks: Ticks that held the command before.
         slip: Way that the shape that hits (the fastest foot, for pushes) slid within the impact windows, m.
         stops: Joints at a position limit within the impact windows that were not there at the start.
-        contacts: How many contacts came about.
+        contacts: How many contacts (or pushes) came about.
+        contacts_asked: How many the scenario asks for.
         rested: Whether the robot was at rest before it was pushed; true for contacts.
     """
 
@@ -49,8 +52,10 @@ class Metrics:
     q_total_impact_base: float
     q_total_impact_joints: float
     q_total_dwell: float
+    q_total_recovery: float
     peak_jump: float
     peak_jump_max: float
+    peak_recovery: float
     peak_force: float
     saturation_inside: float
     saturation_outside: float
@@ -60,6 +65,7 @@ class Metrics:
     slip: float
     stops: tuple[str, ...]
     contacts: int
+    contacts_asked: int
     rested: bool = True
 
     def to_dict(self) -> dict[str, object]:
@@ -72,7 +78,7 @@ class Metrics:
 
 def measure(setup: Setup, run: Run) -> Metrics:
     """Measure a run."""
-    series, impacts = run.series, run.impacts
+    series, impacts, task = run.series, run.impacts, setup.scenario.task
     inside: Flags = np.zeros(series.t.size, dtype=bool)
     for window in impacts:
         inside[series.slice(window.begin, window.end)] = True
@@ -82,17 +88,23 @@ def measure(setup: Setup, run: Run) -> Metrics:
     rotors, joints = saturated(setup, series)
     relaxed = series.status == STATUSES.index(Status.RELAXED)
     failed = ~relaxed & (series.status != STATUSES.index(Status.SOLVED))
-    dwell = sum(float(speed[series.slice(w.begin, w.end)].sum()) * period for w in run.windows if w.kind == "dwell")
+    dwell, recovery = (
+        sum(float(speed[series.slice(w.begin, w.end)].sum()) * period for w in run.windows if w.kind == kind)
+        for kind in ("dwell", "recovery")
+    )
     # A blow that never came is no small one.
     jumps = [jump(setup, series, w) for w in impacts if w.touched] or [0.0]
+    later = [_peak(setup, series, w, w.end) for w in run.windows if w.kind == "recovery" and w.touched] or [0.0]
     stopped = (series.at_stop[inside] & ~series.at_stop[0]).any(axis=0) if inside.any() else np.zeros(0, bool)
     return Metrics(
         q_total_impact=float(speed[inside].sum() * period),
         q_total_impact_base=float(np.linalg.norm(series.v[inside, :base], axis=1).sum() * period),
         q_total_impact_joints=float(np.linalg.norm(series.v[inside, base:], axis=1).sum() * period),
         q_total_dwell=dwell,
+        q_total_recovery=recovery,
         peak_jump=float(np.mean(jumps)),
         peak_jump_max=float(np.max(jumps)),
+        peak_recovery=float(np.mean(later)),
         peak_force=float(series.peak[inside].max(initial=0.0)),
         saturation_inside=float((rotors | joints)[inside].sum() * period),
         saturation_outside=float((rotors | joints)[~inside].sum() * period),
@@ -102,6 +114,7 @@ def measure(setup: Setup, run: Run) -> Metrics:
         slip=float(series.slip[inside].sum() * period),
         stops=tuple(setup.robot.tangent_names[k] for k in np.flatnonzero(stopped)),
         contacts=sum(w.touched for w in impacts),
+        contacts_asked=task.count if isinstance(task, RepeatedContacts) else 1,
         rested=run.rested,
     )
 
@@ -128,7 +141,13 @@ def before(series: Series, window: Window) -> int:
 
 def jump(setup: Setup, series: Series, window: Window) -> float:
     """Largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP` of a window's begin; for pushes the largest ``‖ν‖`` within it."""
-    if not isinstance(setup.scenario.task, RepeatedContacts):
-        return float(np.linalg.norm(series.v[series.slice(window.begin, window.end)], axis=1).max(initial=0.0))
-    after = series.v[series.slice(window.begin, window.begin + JUMP)]
-    return float(np.linalg.norm(after - series.v[before(series, window)], axis=1).max(initial=0.0))
+    hits = isinstance(setup.scenario.task, RepeatedContacts)
+    return _peak(setup, series, window, window.begin + JUMP if hits else window.end)
+
+
+def _peak(setup: Setup, series: Series, window: Window, end: float) -> float:
+    """Largest ``‖ν(t) − ν⁻‖`` from a window's begin until ``end``; for pushes the largest ``‖ν‖``."""
+    after = series.v[series.slice(window.begin, end)]
+    if isinstance(setup.scenario.task, RepeatedContacts):
+        after = after - series.v[before(series, window)]
+    return float(np.linalg.norm(after, axis=1).max(initial=0.0))

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.distance import distance
 from impact_posture.posture.follow import trade_off
-from impact_posture.posture.problem import Requirements, build_problem
+from impact_posture.posture.problem import Requirements
 from impact_posture.posture.solve import PostureSolution, solve
+from impact_posture.progress import tell
 from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.programs import nominal_posture
 from impact_posture.simulation.scenario import Setup
@@ -74,12 +76,13 @@ def offline_posture(
     Raises:
         Infeasible, SolverFailed: As :func:`impact_posture.posture.solve.solve`.
     """
+    tell("looking for the offline posture")
     solution = _solved(setup, objective, starts, seed)
     initial = objective.value(solution.initial)
     if holds(setup, solution.q, share):
         value, far = objective.value(solution.q), _far(setup, solution.q, solution.initial)
         return OfflinePosture(solution.q, value, initial, value, far, far)
-    curve = trade_off(solution, _POINTS)
+    curve = trade_off(solution, _POINTS, progress=_tell)
     whole, optimum = curve.points[-1].distance, curve.points[-1].objective
     for point in reversed(curve.points):
         if point.certified and holds(setup, point.q, share):
@@ -106,10 +109,15 @@ def _solved(setup: Setup, objective: ImpactObjective, starts: int, seed: int) ->
     for stops, edges in ((_MARGIN, _COM_MARGIN), (0.0, _COM_MARGIN), (0.0, _COM_MARGIN / 2)):
         try:
             wanted = replace(asked, limit_margin=stops, com_margin=edges if stands else 0.0)
-            return solve(build_problem(robot, objective, setup.q, wanted), starts=starts, seed=seed, jobs=1)
+            problem = build_problem(robot, objective, setup.q, wanted)
+            return solve(problem, starts=starts, seed=seed, jobs=1, progress=_tell)
         except (Infeasible, SolverFailed):
             continue
-    return solve(build_problem(robot, objective, setup.q, asked), starts=starts, seed=seed, jobs=1)
+    return solve(build_problem(robot, objective, setup.q, asked), starts=starts, seed=seed, jobs=1, progress=_tell)
+
+
+def _tell(done: int, total: int) -> None:
+    tell("looking for the offline posture", done / total)
 
 
 def holds(setup: Setup, q: Array, share: float) -> bool:

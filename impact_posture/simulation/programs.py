@@ -93,7 +93,7 @@ def _check_gains(setup: Setup) -> None:
 
 def _contacts(setup: Setup, control: Control) -> tuple[Contact, ...]:
     footing = control.footing
-    assert footing is not None
+    assert footing is not None  # noqa: S101 (narrows a type)
     contacts = support_contacts(setup.robot, friction=footing.friction)
     if not contacts:
         raise SpecError(

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import ImpactPostureError
+from impact_posture.robot.robot import Robot
 from impact_posture.simulation.blow import Gradient
 from impact_posture.simulation.exchange import Truth
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
@@ -17,6 +18,20 @@ Array = NDArray[np.float64]
 STATUSES: tuple[Status, ...] = tuple(Status)
 # The metric is drawn, not controlled with: ticks from one evaluation to the next.
 _EVERY = 10
+
+
+def feet_of(setup: Setup) -> tuple[str, ...]:
+    """Frames of the shapes on bodies that are to stay on the ground; none where the robot does not stand."""
+    scenario, robot = setup.scenario, setup.robot
+    if scenario.control.footing is None:
+        return ()
+    held = {_joint(robot, support.frame) for support in robot.spec.supports}
+    led = scenario.task.frame if isinstance(scenario.task, RepeatedContacts) else None
+    return tuple(s.frame for s in scenario.scene.shapes if s.frame != led and _joint(robot, s.frame) in held)
+
+
+def _joint(robot: Robot, frame: str) -> int:
+    return int(robot.model.frames[robot.frame_id(frame)].parentJoint)
 
 
 class Recorder:
@@ -32,6 +47,8 @@ class Recorder:
         robot, task = setup.robot, setup.scenario.task
         shapes = [s.frame for s in setup.scenario.scene.shapes]
         self._shape = shapes.index(task.frame) if isinstance(task, RepeatedContacts) else None
+        feet = feet_of(setup)
+        self._feet = [k for k, frame in enumerate(shapes) if frame in feet]
         self._joints = {robot.tangent_names[k]: k for k in range(robot.nv)}
         self._rows: list[tuple[object, ...]] = []
         self._touches: list[float] = []
@@ -45,6 +62,11 @@ class Recorder:
     def pushed(self, force: Array, begin: float, end: float) -> None:
         """A push acts from ``begin`` to ``end``."""
         self._push = (force, begin, end)
+
+    @property
+    def ticks(self) -> int:
+        """How many were taken down."""
+        return len(self._rows)
 
     def take(self, truth: Truth, command: Command, level: float, distance: float) -> None:
         """Take down a tick."""
@@ -64,7 +86,8 @@ class Recorder:
             slip = max((s.slip for s in truth.shapes), default=0.0)
         self._rows.append((
             truth.t, truth.q, truth.v, truth.torques, np.clip(command.rotor_speed, *self._rotors), truth.rotor_speeds,
-            force, peak, slip, sum(s.touching for s in truth.shapes), self._value(truth.q), level,
+            force, peak, slip, sum(s.touching for s in truth.shapes),
+            [truth.shapes[k].touching for k in self._feet], self._value(truth.q), level,
             STATUSES.index(command.status), self._stopped(truth), distance,
         ))  # fmt: skip
 

@@ -10,8 +10,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.processes import in_a_copy
+from impact_posture.progress import tell
 from impact_posture.simulation.blow import interpreted
 from impact_posture.simulation.controllers import Mode, Workshop
 from impact_posture.simulation.driver import Driver
@@ -19,13 +20,15 @@ from impact_posture.simulation.exchange import Drive
 from impact_posture.simulation.recorder import Recorder
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush
-from impact_posture.simulation.series import Series, Window
+from impact_posture.simulation.series import RECOVERY, Series, Window
 from impact_posture.tsid.controller import Command
 
 Array = NDArray[np.float64]
 
 # When controllers begin to prepare, s: after the first reaction of sensors and motors.
 _BRACE = 0.1
+# Ticks from one word about the progress to the next.
+_TELL = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +42,7 @@ class Run:
         waited: Seconds until the robot was pushed; NaN for contacts.
         rested: Whether it had come to rest by then; one that does not within the scenario's patience is pushed all
             the same, and what is measured holds its own motion.
+        away: When the state ran away, which ended the run, s.
     """
 
     series: Series
@@ -46,6 +50,7 @@ class Run:
     sign: int = 1
     waited: float = float("nan")
     rested: bool = True
+    away: float | None = None
 
     @property
     def impacts(self) -> tuple[Window, ...]:
@@ -66,7 +71,7 @@ def run(workshop: Workshop, controller: str, *, seed: int = 0, mode: Mode = "liv
         only: That sign of the push alone.
 
     Raises:
-        SimulationDiverged: The robot ran away.
+        SimulationDiverged: The robot ran away at once; one that does so later has a run that ends there.
         ControllerNotFound: No such controller.
         InputError: Ticks that are no multiple of the physics' steps, or a sign that is none.
     """
@@ -95,18 +100,31 @@ class _Loop:
             )
         command = driver.reset(setup.q)
         self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
+        tell("building the expressions")
         self.recorder = Recorder(setup, interpreted(workshop.objective()))
+        self.away: float | None = None
 
     @property
     def t(self) -> float:
         return self.world.time
 
-    def tick(self, reference: Reference | None = None) -> None:
+    def tick(self, reference: Reference | None = None) -> bool:
+        """Go on by a tick; whether the state is still one."""
         point = None if reference is None else reference.at(self.t)
         command: Command = self.driver.tick(self.world.read(), point)
-        self.world.step(Drive(command.torque, command.rotor_speed), self.count)
+        try:
+            self.world.step(Drive(command.torque, command.rotor_speed), self.count)
+        except SimulationDiverged as error:
+            # A picture needs two ticks.
+            if self.recorder.ticks < 2:
+                raise
+            self.away = error.time
+            return False
         distance = 0.0 if point is None else point.distance
         self.recorder.take(self.world.truth(), command, self.driver.level, distance)
+        if not self.recorder.ticks % _TELL:
+            tell(f"simulating, t = {self.t:.1f} s", None if reference is None else self.t / reference.total)
+        return True
 
 
 def _contacts(workshop: Workshop, driver: Driver, task: RepeatedContacts, seed: int, mode: Mode) -> Run:
@@ -126,7 +144,8 @@ def _contacts(workshop: Workshop, driver: Driver, task: RepeatedContacts, seed: 
         # The way in begins long before: from there on the next blow is the one that is expected.
         if expected and loop.t >= expected[0] - crossing - 1e-9:
             driver.expect(expected.pop(0))
-        loop.tick(reference)
+        if not loop.tick(reference):
+            break
     series, first = loop.recorder.series(), []
     for k, blow in enumerate(blows):
         begin, end = reference.start(k), reference.start(k) + reference.cycle
@@ -135,7 +154,8 @@ def _contacts(workshop: Workshop, driver: Driver, task: RepeatedContacts, seed: 
         at = blow if touch is None else touch
         first.append(Window("impact", k, at, at + task.window, touch is not None))
         first.append(Window("dwell", k, at, max(leaves, at), touch is not None))
-    return Run(series, tuple(sorted(first, key=lambda w: w.kind != "impact")))
+        first.append(Window("recovery", k, at, min(at + RECOVERY, end), touch is not None))
+    return Run(series, tuple(sorted(first, key=lambda w: w.kind != "impact")), away=loop.away)
 
 
 def _pushes(
@@ -150,6 +170,8 @@ def _pushes(
         # What was reached is held, and comes to rest once more without the term.
         driver.hold()
         rested = _settle(loop, task, loop.t + 2 * ramp, []) and rested
+    if loop.away is not None:
+        return tuple(Run(loop.recorder.series(), (), sign, rested=False, away=loop.away) for sign in signs)
     first, *others = (partial(_push, loop, task, sign, rested) for sign in signs)
     with ExitStack() as copies:
         waiting = [copies.enter_context(in_a_copy(other)) for other in others]
@@ -163,16 +185,18 @@ def _push(loop: _Loop, task: SinglePush, sign: int, rested: bool) -> Run:
     loop.world.push(push)
     loop.recorder.pushed(np.array(push.force), begin, begin + task.duration)
     for _ in range(round((task.duration + task.after) / loop.period)):
-        loop.tick()
-    window = Window("impact", 0, begin, begin + task.duration, True)
-    return Run(loop.recorder.series(), (window,), sign, begin, rested)
+        if not loop.tick():
+            break
+    ends = {"impact": task.duration, "recovery": min(RECOVERY, task.duration + task.after)}
+    windows = tuple(Window(kind, 0, begin, begin + length, True) for kind, length in ends.items())
+    return Run(loop.recorder.series(), windows, sign, begin, rested, loop.away)
 
 
 def _settle(loop: _Loop, task: SinglePush, least: float, brace: list[Callable[[], None]]) -> bool:
     """Go on until ``least`` and until the robot has been quiet for long enough; whether it has."""
     still, end = 0.0, max(least, loop.t) + task.patience
     while loop.t < least - 1e-9 or still < task.still - 1e-9:
-        if loop.t > end:
+        if loop.t > end or loop.away is not None:
             return False
         if brace and loop.t >= _BRACE - 1e-9:
             brace.pop()()

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, SpecError
+from impact_posture.progress import tell
+from impact_posture.robot.actuation import allocation
 from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.postures import read_posture, set_joints
 from impact_posture.robot.robot import Robot
@@ -156,6 +158,29 @@ class Control:
     footing: Footing | None = None
 
 
+@dataclass(frozen=True)
+class Bounds:
+    """What a run must keep to count (:func:`impact_posture.simulation.outcome.judge`).
+
+    The first three are for a floating base.
+
+    Attributes:
+        tilt_deg: Largest angle between vertical and the base's axis that was vertical at the start, degrees.
+        clearance: Least height of the base's origin above every surface, m.
+        sink: How far the base may be below its start, or below where a reference leads it, m.
+        lifted: Longest time without contact of a foot that is to stay, s.
+        relaxed: Largest share of relaxed ticks.
+        held: Longest time that a command is held for, s.
+    """
+
+    tilt_deg: float = 60.0
+    clearance: float = 0.0
+    sink: float = 1.0
+    lifted: float = 0.1
+    relaxed: float = 0.5
+    held: float = 0.05
+
+
 @dataclass(frozen=True, eq=False)
 class ImpactScenario:
     """An experiment as a file describes it; nothing is loaded yet.
@@ -171,6 +196,7 @@ class ImpactScenario:
         scene: The surroundings.
         task: What happens.
         control: The gains.
+        bounds: What a run must keep to count.
     """
 
     name: str
@@ -183,6 +209,7 @@ class ImpactScenario:
     scene: Scene
     task: RepeatedContacts | SinglePush
     control: Control
+    bounds: Bounds = Bounds()
 
     @property
     def normal(self) -> Array:
@@ -252,8 +279,30 @@ def set_up(scenario: ImpactScenario) -> Setup:
     Raises:
         ImpactPostureError: The first thing that does not fit, in one line.
     """
+    tell(f"loading {scenario.robot}")
     robot = load_robot(scenario.robot, scenario.load)
+    _check_base(robot, scenario)
     q = set_joints(robot, read_posture(robot, scenario.posture, where="posture"), scenario.joints, scenario.source)
     q = robot.check_posture(q, where=scenario.source)
     robot.frame_id(scenario.task.frame)
     return Setup(scenario, robot, q, build_world(robot, scenario.scene, q))
+
+
+def _check_base(robot: Robot, scenario: ImpactScenario) -> None:
+    """Refuse a floating base that nothing holds, or that its rotors cannot push in every direction."""
+    if not robot.floating or scenario.control.footing is not None:
+        return
+    propulsion = robot.spec.propulsion
+    if propulsion is None:
+        feet = "add [control.footing] to the scenario" if robot.spec.supports else (
+            "add [propulsion] or [[supports]] to its robot.toml, or set root to fixed"
+        )  # fmt: skip
+        missing = "the scenario has no [control.footing]" if robot.spec.supports else "its data names no feet"
+        raise SpecError(f"{robot.name} would fall: it has no rotors and {missing}", where=scenario.source, mend=feet)
+    rank = allocation(robot.model, propulsion).rank
+    if rank < 6:
+        raise SpecError(
+            f"the rotors of {robot.name} push and turn its base in {rank} of 6 directions",
+            where=scenario.source,
+            mend="the controllers need all 6: tilt the rotors, or take another robot",
+        )

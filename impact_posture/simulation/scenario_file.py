@@ -12,6 +12,7 @@ from impact_posture.errors import ImpactPostureError, ScenarioNotFound, SpecErro
 from impact_posture.robot.loader import LoadOptions, from_folder
 from impact_posture.robot.spec import NonNegative, Positive, Root, Vector3, read_toml, validate, with_tuples
 from impact_posture.simulation.scenario import (
+    Bounds,
     Control,
     Footing,
     Gains,
@@ -154,6 +155,17 @@ class ControlFile(_Strict):
     footing: FootingFile | None = None
 
 
+class BoundsFile(_Strict):
+    """``[bounds]``: see :class:`~impact_posture.simulation.scenario.Bounds`."""
+
+    tilt_deg: Positive = Bounds().tilt_deg
+    clearance: float = Bounds().clearance
+    sink: Positive = Bounds().sink
+    lifted: NonNegative = Bounds().lifted
+    relaxed: Annotated[float, Field(ge=0, le=1)] = Bounds().relaxed
+    held: NonNegative = Bounds().held
+
+
 class ScenarioFile(_Strict):
     """The content of a ``scenario.toml``."""
 
@@ -177,6 +189,7 @@ class ScenarioFile(_Strict):
     contacts: ContactsFile | None = None
     push: PushFile | None = None
     control: ControlFile
+    bounds: BoundsFile = BoundsFile()
 
 
 def known_scenarios() -> tuple[str, ...]:
@@ -239,6 +252,7 @@ def _build(file: ScenarioFile, source: str) -> ImpactScenario:
             footing=None if control.footing is None else Footing(**control.footing.given()),  # type: ignore[arg-type]
             **gains,
         ),
+        bounds=Bounds(**file.bounds.given()),  # type: ignore[arg-type]
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ Array = NDArray[Any]
 
 # S within which two times are one: sums of time steps are not exact.
 _SAME = 1e-9
+# S from the begin of an impact in which what was held back may come out again.
+RECOVERY = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +26,8 @@ class Window:
     """A time that counts.
 
     Attributes:
-        kind: ``impact``, or ``dwell``: from the first touch until the reference leaves.
+        kind: ``impact``; ``dwell``, from the first touch until the reference leaves; or ``recovery``, from the
+            impact's begin until :data:`RECOVERY` later, at most until the next approach begins or the run ends.
         contact: Which contact, or push, it belongs to, from 0.
         begin: s.
         end: s.
@@ -56,6 +60,7 @@ class Series:
         peak: Largest normal force on that shape within the tick, N, shape (n,).
         slip: Tangential speed of the shape, or of the fastest foot, where it touches, m/s, shape (n,).
         touching: Shapes that touch, shape (n,).
+        feet: Whether each foot that is to stay touches, shape (n, feet).
         objective: H of the blow, shape (n,); NaN where it was not evaluated.
         level: Of the preparing term, shape (n,).
         status: Index into :data:`STATUSES`, shape (n,).
@@ -73,6 +78,7 @@ class Series:
     peak: Array
     slip: Array
     touching: Array
+    feet: Array
     objective: Array
     level: Array
     status: Array
@@ -98,6 +104,9 @@ class Series:
         """
         try:
             with np.load(path, allow_pickle=False) as found:
-                return Series(**{f.name: found[f.name] for f in fields(Series)})
-        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+                columns = {f.name: found[f.name] for f in fields(Series)}
+            if len({column.shape[0] for column in columns.values()}) != 1:
+                raise ValueError("columns of different lengths")
+            return Series(**columns)
+        except (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, BadZipFile, zlib.error) as error:
             raise SpecError(f"is no time series ({error})", where=str(path), mend="run simulate again") from None

@@ -13,6 +13,7 @@ from impact_posture.tsid.contacts import ContactStack
 from impact_posture.tsid.limits import AccelerationBounds
 from impact_posture.tsid.program import Program
 from impact_posture.tsid.qp import EQUALITY, QP
+from impact_posture.tsid.rank import LevelRank
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import TaskStack
 
@@ -39,6 +40,7 @@ class Assembly:
     Attributes:
         program: What it is made from.
         qp: The program of the last :meth:`build_qp`.
+        rank: What of its levels is independent, and the program without the rest.
         levels: Names and rows of the strict levels in the order in which they give way last to first; hard contacts
             come first, as ``contacts``.
         limits: The entries of ``[z; A z]`` that come from joint limits.
@@ -65,6 +67,10 @@ class Assembly:
         self._place_cost(robot)
         self.levels = self._name_levels(hard, levels)
         self.limits = np.arange(nv)
+        # What a force of one newton accelerates: else the cheapest way to move would be to lift the robot's weight.
+        units = np.ones(qp.n)
+        units[self._f] = robot.mass
+        self.rank = LevelRank(qp, blind.stop, [rows for _, rows in self.levels], nv, units)
         self.names = (
             *robot.tangent_names,
             *(f"spare {k}" for k in range(spare)),
@@ -86,6 +92,7 @@ class Assembly:
         self.qp.A[self._cones, self._f] = self.contacts.cone
         self.qp.lower[self._at(self._cones)] = self.contacts.least
         self._set_weights()
+        self.rank.reset()
 
     def build_qp(self, state: State) -> QP:
         """Fill the buffers for the tasks, contacts and limits at ``state``; the same object every time."""
@@ -96,6 +103,7 @@ class Assembly:
             self.bounds.update(state)
         self._fill_dynamics(state)
         self._fill_cost(state)
+        self.rank.update()
         return self.qp
 
     # ---- what a solution means ----------------------------------------------------------------------------------

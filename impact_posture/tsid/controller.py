@@ -17,7 +17,7 @@ from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.program import Program
 from impact_posture.tsid.qp import EQUALITY, Solver
-from impact_posture.tsid.relaxation import Outcome, Relaxed, solve
+from impact_posture.tsid.relaxation import Outcome, Relaxed, missed, solve
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Task
 
@@ -39,8 +39,9 @@ class Status(Enum):
     """How a tick ended."""
 
     SOLVED = "solved"
+    """Everything holds that has to; strict levels as far as their rank goes (``Report.deficient``)."""
     RELAXED = "relaxed"
-    """Limits made the strict levels infeasible: some gave way (``Report.relaxed``)."""
+    """Limits took from a strict level what it could have had beside those above it (``Report.relaxed``)."""
     INFEASIBLE = "infeasible"
     """No acceleration satisfies what must hold: the previous command is held."""
     UNSOLVED = "unsolved"
@@ -76,7 +77,9 @@ class Report:
 
     Attributes:
         status: How it ended.
-        relaxed: What gave way, the most important first.
+        relaxed: What gave way to limits, the most important first.
+        deficient: What levels miss for want of rank, not because of limits: they ask for a motion that the levels
+            above them determine, contradict themselves, or are damped near a singularity (:class:`LevelRank`).
         residuals: ``ÿ − ÿ*`` of each task, by name; of ``contacts`` likewise.
         active: Names of the bounds that hold, with ``lower`` or ``upper``.
         dynamics: ``‖Mν̇ + h − Gu − Jᵀf − J_eᵀF̂‖_∞``.
@@ -87,6 +90,7 @@ class Report:
 
     status: Status
     relaxed: tuple[Relaxed, ...]
+    deficient: tuple[Relaxed, ...]
     residuals: dict[str, Array]
     active: tuple[tuple[str, str], ...]
     dynamics: float
@@ -209,7 +213,7 @@ class Controller:
     def report(self) -> Report:
         """What the last tick did; computed when asked."""
         assembly, state, posture = self.assembly, self.state, self.program.posture
-        residuals, active, dynamics = {}, [], float("nan")
+        residuals, active, dynamics, deficient = {}, [], float("nan"), ()
         solved = self._outcome.solved
         if solved is not None:
             z = solved.z
@@ -219,6 +223,7 @@ class Controller:
                 residuals[posture.name] = acceleration - posture.desired(state)
             if assembly.contacts.size:
                 residuals["contacts"] = assembly.contacts.J @ acceleration - assembly.contacts.a
+            deficient = missed(assembly, z, equations=False)
             force = assembly.generalized_force(state, z)
             dynamics = float(np.max(np.abs(force - self.actuators.G @ self._u)))
             for name, multiplier, sense in zip(assembly.names, solved.multipliers, assembly.qp.sense, strict=True):
@@ -228,6 +233,7 @@ class Controller:
         return Report(
             self._status,
             self._outcome.relaxed,
+            deficient,
             residuals,
             tuple(active),
             dynamics,

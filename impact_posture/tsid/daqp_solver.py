@@ -7,8 +7,9 @@ import numpy as np
 
 from impact_posture.tsid.qp import QP, Solved
 
-# Exit flags of DAQP: 1 and 2 are solutions (2: soft constraints are active); -1 and -6 say that there is none.
-_NONE = (-1, -6)
+# Exit flags of DAQP: 1 and 2 are solutions (2: soft constraints are active); -1 says that there is none.  -6 says that
+# equations depend on others, or on bounds that were active before: without those it may find one.
+_NONE = -1
 
 
 class DaqpSolver:
@@ -53,4 +54,4 @@ class DaqpSolver:
     @property
     def infeasible(self) -> bool:
         """Whether the last program had no solution."""
-        return self._flag in _NONE
+        return self._flag == _NONE

@@ -67,12 +67,15 @@ def solve(assembly: Assembly, solver: Solver, aside: Solver) -> Outcome:
         solver: The tick's own; keeps its active set.
         aside: For the relaxed programs, of the same size.
     """
-    solved = solver.solve(assembly.qp)
+    qp = assembly.rank.qp
+    if assembly.rank.changed:
+        solver.reset()
+    solved = solver.solve(qp)
     if solved is None and not solver.infeasible:
         # Gave up from its warm start: once more without.
         solver.reset()
-        solved = solver.solve(assembly.qp)
-    if solved is not None or not assembly.qp.finite:
+        solved = solver.solve(qp)
+    if solved is not None or not qp.finite:
         return Outcome(solved)
     return _relax(assembly, aside)
 
@@ -90,51 +93,59 @@ def _relax(assembly: Assembly, solver: Solver) -> Outcome:
 
 def _opened(assembly: Assembly, nearest: Array, stray: float) -> QP:
     """The tick's program with what ``nearest`` does not reach held where it is, to ``stray``."""
-    asked, limits = assembly.qp, assembly.limits
+    asked, limits = assembly.rank.qp, assembly.limits
     qp, values = asked.copy(), nearest[limits]
     room = np.where(_passed(asked, nearest, limits) > 0, stray * (1.0 + np.abs(values)), 0.0)
     qp.lower[limits] = np.minimum(qp.lower[limits], values) - room
     qp.upper[limits] = np.maximum(qp.upper[limits], values) + room
-    for _, rows in assembly.levels:
-        off, size = _missed(asked, nearest, rows)
-        if float(np.max(np.abs(off))) > _OFF * size:
-            at = slice(qp.n + rows.start, qp.n + rows.stop)
+    for _, level in assembly.levels:
+        rows = assembly.rank.rows(level, equations=True)
+        off, size = _missed(assembly, nearest, rows)
+        if float(np.max(np.abs(off), initial=0.0)) > _OFF * size:
+            at = qp.n + rows
             qp.sense[at] = INEQUALITY
             qp.lower[at] += off - stray * size
             qp.upper[at] += off + stray * size
     return qp
 
 
-def _gave_way(assembly: Assembly, z: Array) -> tuple[Relaxed, ...]:
-    qp, limits = assembly.qp, assembly.limits
-    most = float(np.max(_passed(qp, z, limits), initial=0.0))
-    found = [Relaxed("joint limits", most)] if most > _OFF * (1.0 + float(np.max(np.abs(z[limits])))) else []
-    for name, rows in assembly.levels:
-        off, size = _missed(qp, z, rows)
-        if float(np.max(np.abs(off))) > _OFF * size:
+def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, ...]:
+    """By how much the levels miss, in those rows that are equations or in those that lack rank."""
+    found = []
+    for name, level in assembly.levels:
+        off, size = _missed(assembly, z, assembly.rank.rows(level, equations))
+        if float(np.max(np.abs(off), initial=0.0)) > _OFF * size:
             found.append(Relaxed(name, float(np.linalg.norm(off))))
     return tuple(found)
 
 
-def _missed(qp: QP, z: Array, rows: slice) -> tuple[Array, float]:
-    """``Jν̇ − a`` of a level, and how large the numbers are that it is the difference of."""
-    A, wanted = qp.A[rows], qp.lower[qp.n + rows.start : qp.n + rows.stop]
-    return A @ z - wanted, 1.0 + float(np.max(np.abs(A) @ np.abs(z)))
+def _gave_way(assembly: Assembly, z: Array) -> tuple[Relaxed, ...]:
+    limits = assembly.limits
+    most = float(np.max(_passed(assembly.qp, z, limits), initial=0.0))
+    opened = most > _OFF * (1.0 + float(np.max(np.abs(z[limits]))))
+    return (*([Relaxed("joint limits", most)] if opened else []), *missed(assembly, z, equations=True))
+
+
+def _missed(assembly: Assembly, z: Array, rows: NDArray[np.intp]) -> tuple[Array, float]:
+    """``Jν̇ − a`` of some rows, and how large the numbers are that it is the difference of."""
+    A = assembly.rank.qp.A[rows]
+    return A @ z - assembly.rank.wanted[rows], 1.0 + float(np.max(np.abs(A) @ np.abs(z), initial=0.0))
 
 
 def _hierarchy(assembly: Assembly) -> list[Level]:
     """What always holds; the acceleration bounds; the strict levels."""
-    qp, n = assembly.qp, assembly.qp.n
-    strict = np.zeros(qp.m, dtype=bool)
+    qp, limits, rank = assembly.rank.qp, assembly.limits, assembly.rank
+    n = qp.n
+    always = np.ones(qp.m, dtype=bool)
     for _, rows in assembly.levels:
-        strict[rows] = True
+        always[rows] = False
     lower, upper = qp.lower[n:], qp.upper[n:]
-    limits = assembly.limits
-    found = [
-        Level(qp.A[~strict], lower[~strict], upper[~strict]),
+    levels = [rank.rows(level, equations=True) for _, level in assembly.levels]
+    return [
+        Level(qp.A[always], lower[always], upper[always]),
         Level(np.eye(n)[limits], qp.lower[limits], qp.upper[limits]),
+        *(Level(qp.A[rows], lower[rows], upper[rows]) for rows in levels),
     ]
-    return [*found, *(Level(qp.A[rows], lower[rows], upper[rows]) for _, rows in assembly.levels)]
 
 
 def _passed(qp: QP, z: Array, limits: NDArray[np.intp]) -> Array:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 from impact_posture.codegen.compiler import compiled
 from impact_posture.codegen.export import export
 from impact_posture.dynamics.mjcf_numeric import MujocoNumeric
+from impact_posture.folder import scratch_folder
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.verification.differences import difference_gradient
@@ -74,7 +73,7 @@ def pinocchio_differences(objective: ImpactObjective, sample: Sample) -> Numbers
 def _oracle(objective: ImpactObjective, sample: Sample) -> ImpactOracle:
     x, y, z = (float(v) for v in sample.normal)
     contact = replace(objective.contact, normal=(x, y, z))
-    return ImpactOracle(objective.robot, contact, objective.metric, objective.supports, objective.compliance)
+    return ImpactOracle(replace(objective.case, contact=contact))
 
 
 def casadi_source(objective: ImpactObjective) -> Source:
@@ -103,9 +102,9 @@ def compiled_source(objective: ImpactObjective) -> Iterator[Source]:
     """
     # The export's H and ∇H are the same whatever the objective; this one exists everywhere.
     objective, robot, prefix = replace(objective, kind="impulse"), objective.robot, "verified"
-    with tempfile.TemporaryDirectory(prefix="impact-posture-") as folder:
-        export(objective, Path(folder), prefix=prefix, check=False)
-        with compiled(Path(folder), prefix, robot.nq, robot.nv) as library:
+    with scratch_folder() as folder:
+        export(objective, folder, prefix=prefix, check=False)
+        with compiled(folder, prefix, robot.nq, robot.nv) as library:
 
             def numbers(sample: Sample) -> Numbers:
                 code, H, gradient = library.eval(sample.q, sample.normal)

@@ -41,9 +41,7 @@ class ReducedObjective:
         x, scale = ca.SX.sym("x", chart.nx), ca.SX.sym("scale")
         q = chart.configuration(x)
         n = ca.SX(np.array(objective.contact.normal))
-        kernel = ImpactKernel(
-            problem.robot, objective.contact, objective.metric, objective.supports, objective.compliance, q, n
-        )
+        kernel = ImpactKernel(objective.case, q, n)
         tree = Tree(problem.robot.model, q, x)
         rows = [chart.norms(x)]
         for index, constraint in enumerate(problem.constraints):

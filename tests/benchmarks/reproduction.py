@@ -21,7 +21,7 @@ from impact_posture.experiment.figures import draw_reproduction
 from impact_posture.experiment.many import Store
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction, controllers_of, jobs_of, reproduce
-from impact_posture.experiment.summary import advice, remarks, scenario_table, table_one
+from impact_posture.experiment.summary import LEGEND, advice, remarks, scenario_table, table_one
 
 ROOT = Path(__file__).parents[2]
 PAGE, IMAGES = ROOT / "docs" / "generated" / "reproduction.md", ROOT / "docs" / "images" / "reproduction"
@@ -74,6 +74,7 @@ def _page(found: Reproduction, every: Reproduction) -> list[str]:
         "## Table I of the paper, and ours",
         f"`q_total_impact`, seeds {seeds}; mean ± half of the 95 % confidence interval.",
         table_one(found),
+        LEGEND,
     ]
     for scenario in found.scenarios:
         few = f"means over seeds 0 to {every.seeds - 1}" if every.seeds > 1 else "seed 0"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -57,6 +59,79 @@ def test_simulate_for_people(push: Path, tmp_path: Path) -> None:
     assert "solo8-push, robust:held" in done.stdout and "pushed after" in done.stdout
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
     assert (tmp_path / "solo8-push-robust-held" / "series-minus.npz").is_file()
+
+
+@pytest.fixture(scope="session")
+def falls(push: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A push that no controller stands."""
+    path = tmp_path_factory.mktemp("scenarios") / "falls.toml"
+    text, count = re.subn(r"(?m)^force = \[6.5, 0, 0\]", "force = [60, 0, 0]", push.read_text(encoding="utf-8"))
+    assert count == 1
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_simulate_a_robot_that_falls(falls: Path, tmp_path: Path) -> None:
+    done = start("simulate", str(falls), *"--sign +1 --out fell --format png".split(), cwd=tmp_path)
+    assert done.returncode == 4 and len(done.stderr.splitlines()) == 1
+    assert "solo8-push, nominal: fell: the base" in done.stderr and "at t = " in done.stderr
+    assert "q_total" not in done.stdout and "peak jump" not in done.stdout
+    assert "limits made a task give way" in done.stdout and "the last one was kept" in done.stdout
+    assert max(len(line) for line in done.stdout.splitlines()) <= 80
+    assert list((tmp_path / "fell").glob("*.png")) and (tmp_path / "fell" / "series.npz").is_file()
+    again = start("simulate", str(falls), *"--sign +1 --out fell --format png --force --json".split(), cwd=tmp_path)
+    found = json.loads(again.stdout)
+    assert again.returncode == 4 and found == json.loads((tmp_path / "fell" / "run.json").read_text())
+    assert (found["status"], found["metrics"], found["prediction"]) == ("fell", None, None)
+    assert {"status", "time", "what", "sign"} == set(found["events"][0])
+
+
+def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
+    options = "--controllers nominal,stiff --seeds 1 --out both --format png --quiet".split()
+    done = start("compare", str(falls), *options, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    rows = [line.split() for line in done.stdout.splitlines()]
+    assert ["nominal", "fell", "1/1"] in rows and ["stiff", "fell", "1/1"] in rows
+    assert "no reduction where a run did not complete" in done.stdout and "seed 0: fell: the base" in done.stdout
+    found = json.loads((tmp_path / "both" / "comparison.json").read_text())
+    for row in found["rows"]:
+        assert (row["status"], row["runs"], row["completed"]) == ("fell", 1, 0)
+        assert row["metrics"] == {} and row["reduction"] is None and len(row["failed"]) == 1
+
+
+def test_contacts_are_counted_against_what_was_asked_for(aerial: Path, tmp_path: Path) -> None:
+    path = tmp_path / "far.toml"
+    text = (
+        aerial.read_text(encoding="utf-8").replace("beyond = 0.03", "beyond = 0.0").replace("gap = 0.06", "gap = 0.2")
+    )
+    path.write_text(re.sub(r"(?m)^kp = \[16.0, 16.0, 16.0", "kp = [0.5, 16.0, 16.0", text), encoding="utf-8")
+    done = start("simulate", str(path), *"--out far --format png".split(), cwd=tmp_path)
+    assert done.returncode == 4 and "contacts  0 of 1" in " ".join(done.stdout.split()).replace(
+        "contacts ", "contacts  "
+    )
+    assert "lost contact: 1 of 1 contacts were never made" in done.stderr
+
+
+def test_progress_is_for_terminals(aerial: Path, tmp_path: Path) -> None:
+    def on_a_terminal(*arguments: str) -> str:
+        parent, child = os.openpty()
+        with subprocess.Popen(
+            [str(COMMAND), "simulate", str(aerial), "--out", "run", "--force", "--format", "png", *arguments],
+            stdout=subprocess.DEVNULL, stderr=child, cwd=tmp_path, env={**os.environ, "TERM": "xterm"},
+        ) as process:  # fmt: skip
+            os.close(child)
+            said = b""
+            with contextlib.suppress(OSError):
+                while part := os.read(parent, 65536):
+                    said += part
+            assert process.wait() == 0
+        os.close(parent)
+        return said.decode()
+
+    said = on_a_terminal()
+    for words in ("loading", "building the expressions", "simulating, t = ", "drawing"):
+        assert words in said, words
+    assert on_a_terminal("--quiet") == ""
 
 
 def test_compare(aerial: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ def test_a_run_answers_with_its_document(aerial: Path) -> None:
     assert found["schema"] == SCHEMA and found["controller"] == "nominal" and found["seed"] == 0
     assert found["metrics"]["contacts"] == 1 and found["metrics"]["q_total_impact"] > 0
     assert {"inside", "outside"} <= set(found["metrics"]["saturation_s"])
-    assert [w["kind"] for w in found["windows"]] == ["impact", "dwell"]
+    assert [w["kind"] for w in found["windows"]] == ["impact", "dwell", "recovery"]
     assert found["windows"][0]["end"] - found["windows"][0]["begin"] == pytest.approx(0.3)
     assert found["prediction"]["blows"] == 1 and found["prediction"]["ratio"] > 0
     assert len(runs) == 1
@@ -91,8 +92,53 @@ def test_a_changed_scenario_or_a_broken_file_is_run_anew(aerial: Path, tmp_path:
     workshop.cache_clear()
     assert key_of(job) != before and store.find(job) is None
     assert key_of(Job(str(path), "nominal", gain=3.0)) != key_of(job)
-    next(store.folder.glob("*.json")).write_text("{", encoding="utf-8")
+
+
+@pytest.mark.parametrize("damage", ["empty", "half", "bytes", "other text", "another job's", "deep", "a folder"])
+def test_a_damaged_file_is_run_anew(aerial: Path, tmp_path: Path, damage: str) -> None:
+    job, store = Job(str(aerial), "nominal"), Store(tmp_path / "kept")
+    store.keep(Job(str(aerial), "nominal", 1), {"status": "completed", "runs": []})
+    store.keep(job, {"status": "completed", "runs": []})
+    assert store.find(job) is not None
+    path, other = (store.folder / f"aerial-nominal-{seed}.json".replace("aerial", job.name[:-10]) for seed in (0, 1))
+    whole = path.read_bytes()
+    made = {
+        "empty": b"", "half": whole[: len(whole) // 2], "bytes": b"\xff\xfe\x00", "another job's": other.read_bytes(),
+        "other text": whole.replace(b"completed", b"fell"), "deep": b"[" * 100_000,
+    }  # fmt: skip
+    path.unlink()
+    if damage in made:
+        path.write_bytes(made[damage])
+    else:
+        path.mkdir()
     assert store.find(job) is None
+
+
+@pytest.mark.parametrize("damage", ["missing", "half", "garbage", "flipped"])
+def test_a_damaged_series_is_run_anew(
+    push: Path, tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(many, "execute", lambda job: _kept_run(str(push)))
+    store, job = Store(tmp_path / "kept"), Job(str(push), "nominal")
+    run_many([job], store=store, keep_series=lambda job: True)
+    path = store.series(job, -1)
+    whole = path.read_bytes()
+    # Nothing is run where all is well.
+    monkeypatch.setattr(many, "execute", None)
+    run_many([job], store=store, keep_series=lambda job: True)
+    monkeypatch.setattr(many, "execute", lambda job: _kept_run(str(push)))
+    path.unlink()
+    if damage != "missing":
+        middle = len(whole) // 3
+        flipped = whole[:middle] + bytes(255 - b for b in whole[middle : middle + 400]) + whole[middle + 400 :]
+        path.write_bytes({"half": whole[: len(whole) // 2], "garbage": b"\x00" * 500, "flipped": flipped}[damage])
+    run_many([job], store=store, keep_series=lambda job: True)
+    assert path.read_bytes() == whole
+
+
+@functools.cache
+def _kept_run(path: str) -> Any:
+    return execute(Job(path, "nominal"))
 
 
 def test_a_robot_that_ran_away_is_a_result(aerial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +147,8 @@ def test_a_robot_that_ran_away_is_a_result(aerial: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(many, "execute", away)
     (found,) = run_many([Job(str(aerial), "nominal")])
-    assert found["error"].startswith("SimulationDiverged") and found["seed"] == 0
+    assert (found["status"], found["seed"], found["runs"]) == ("control lost", 0, [])
+    assert "the state ran away at t = 1 s" in found["events"][0]["what"] and found["events"][0]["time"] == 1.0
 
 
 def test_what_is_misspelt_is_said_before_anything_runs(aerial: Path) -> None:

@@ -20,20 +20,22 @@ from impact_posture.experiment.reproduction import (
     jobs_of,
     targets_of,
 )
-from impact_posture.experiment.statistics import QUANTITIES, Interval, row_of
+from impact_posture.experiment.statistics import QUANTITIES, Interval, fate, row_of
 from impact_posture.experiment.summary import advice, remarks, scenario_table, summary, table_one
 from impact_posture.simulation.controllers import CONTROLLERS, MEANING
 from impact_posture.simulation.metrics import Metrics
+from impact_posture.simulation.outcome import gravest
 from impact_posture.simulation.scenario_file import known_scenarios
 
-METRICS = Metrics(1.0, 0.5, 0.8, 2.0, 3.0, 3.5, 100.0, 0.1, 0.2, 0.05, 7, 0, 0.01, (), 5)
+METRICS = Metrics(1.0, 0.5, 0.8, 2.0, 2.5, 3.0, 3.5, 3.0, 100.0, 0.1, 0.2, 0.05, 7, 0, 0.01, (), 5, 5)
 
 
 def document(controller: str, seed: int, q: float, **changed: Any) -> dict[str, Any]:
-    values = {**METRICS.__dict__, "q_total_impact": q, **changed}
+    values = {**METRICS.__dict__, "q_total_impact": q, "q_total_recovery": 2 * q, **changed}
     prediction = {"H": 10.0 * q, "ratio": 1.2}
-    return {"scenario": "aerial-vertical", "controller": controller, "seed": seed,
-            "metrics": Metrics(**values).to_dict(), "prediction": prediction}  # fmt: skip
+    return {"scenario": "aerial-vertical", "controller": controller, "seed": seed, "status": "completed",
+            "events": [], "runs": [{"sign": 1}], "metrics": Metrics(**values).to_dict(),
+            "prediction": prediction}  # fmt: skip
 
 
 NOMINAL = [document("nominal", k, 2.0 + 0.1 * k) for k in range(4)]
@@ -59,22 +61,46 @@ def test_reductions_are_paired_by_seed() -> None:
     assert set(row.metrics) == set(QUANTITIES)
 
 
+def failed(controller: str, seed: int, *statuses: str) -> dict[str, Any]:
+    events = [{"status": s, "time": 1.5 + k, "what": f"broke bound {k}", "sign": 1} for k, s in enumerate(statuses)]
+    return {"scenario": "aerial-vertical", "controller": controller, "seed": seed, "status": statuses[-1],
+            "events": events, "runs": [{"sign": 1}], "metrics": None, "prediction": None}  # fmt: skip
+
+
 def test_runs_that_failed_are_told_and_left_out() -> None:
-    own = [document("robust", 0, 1.0), {"seed": 1, "error": "SimulationDiverged: ran away"}]
+    own = [document("robust", 0, 1.0), failed("robust", 1, "lost contact", "fell")]
     row = row_of("aerial-vertical", "robust", own, NOMINAL)
-    assert row.failed == ("SimulationDiverged: ran away",) and row.metrics["peak_jump"].samples == 1
-    targets = targets_of(row)
-    assert targets is not None and targets.missed[-1] == "failed" and not targets.met
+    assert (row.status, row.completed, row.runs) == ("fell", 1, 2)
+    assert row.failed == ("seed 1: fell: broke bound 1 at t = 2.50 s",) and row.metrics["peak_jump"].samples == 1
+    # Nothing is compared with a robot that fell, whichever of the two it was.
+    assert row.reduction is None and row.recovery is None and not row.change and targets_of(row) is None
+    against = row_of("aerial-vertical", "robust", [document("robust", 0, 1.0)], [failed("nominal", 0, "fell")])
+    assert against.status == "completed" and against.reduction is None
+    assert row.to_dict()["reduction"] is None and row.to_dict()["completed"] == 1
     nothing = row_of("aerial-vertical", "robust", own[1:], NOMINAL)
     assert nothing.reduction is None and targets_of(nothing) is None and not nothing.metrics
-    assert "failed: SimulationDiverged: ran away" in scenario_table([nothing])
+    assert "| robust | fell, 0 of 1 completed |" in scenario_table([nothing])
+    found = Reproduction(2, (row_of("aerial-vertical", "nominal", NOMINAL[:2], NOMINAL[:2]), row))
+    assert best_of(found.rows) is None and "nothing was better" in advice(found)[0]
+    assert "robust`: seed 1: fell" in summary(found)
+
+
+def test_the_gravest_of_two_pushes_is_told() -> None:
+    both = {**failed("robust", 0, "control lost", "fell"), "runs": [{"sign": 1}, {"sign": -1}]}
+    assert fate(both) == "fell: broke bound 1 at t = 2.50 s (push +1)"
+    assert [gravest(s) for s in ((), ("completed", "lost contact"), ("fell", "control lost"))] == [
+        "completed", "lost contact", "fell"
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("changed", "missed"),
     [
         ({}, ()),
-        ({"q_total_impact": 1.1}, ("reduction",)),
+        ({"q_total_impact": 1.1}, ("reduction", "recovery")),
+        # Stored in the window and given back after it.
+        ({"q_total_recovery": 4.4}, ("recovery",)),
+        ({"peak_recovery": 3.1}, ("peak_recovery",)),
         ({"peak_jump": 3.1}, ("peak_jump",)),
         ({"saturation_inside": 0.11}, ("saturation",)),
         ({"stops": ("elbow",)}, ("stops",)),

@@ -13,6 +13,7 @@ import pytest
 from impact_posture.simulation.blow import interpreted
 from impact_posture.simulation.controllers import Mode, Workshop
 from impact_posture.simulation.offline import offline_posture
+from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.runs import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup, set_up
 from impact_posture.simulation.scenario_file import read_scenario
@@ -73,7 +74,8 @@ def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **co
         "t": begin + period * np.arange(1, n + 1), "q": np.tile(setup.q, (n, 1)), "v": np.zeros((n, robot.nv)),
         "torque": np.zeros((n, joints)), "rotor_command": np.full((n, rotors), middle),
         "rotor_speed": np.full((n, rotors), middle), "force": np.zeros((n, 3)), "peak": np.zeros(n),
-        "slip": np.zeros(n), "touching": np.zeros(n, int), "objective": np.full(n, np.nan), "level": np.zeros(n),
+        "slip": np.zeros(n), "touching": np.zeros(n, int),
+        "feet": np.ones((n, len(feet_of(setup))), bool), "objective": np.full(n, np.nan), "level": np.zeros(n),
         "status": np.zeros(n, int), "at_stop": np.zeros((n, robot.nv), bool), "reference": np.zeros(n),
     }  # fmt: skip
     return Series(**{**nothing, **columns})

@@ -76,6 +76,20 @@ def test_a_window_has_as_many_ticks_wherever_it_begins(begin: float) -> None:
         assert t[part.start] > begin and t[part.start - 1] <= begin + 1e-9
 
 
+def test_what_is_given_back_later_is_in_the_recovery() -> None:
+    setup = shop("aerial-vertical").setup
+    v = np.zeros((1000, 9))
+    v[:201, 0] = 0.5
+    # Quiet in the window, and all of it afterwards.
+    v[600:800, 3] = 2.0
+    windows = (touch(0.2), touch(0.2, 0.5, kind="recovery"), touch(0.9, 0.1, 1, touched=False))
+    found = measure(setup, Run(by_hand(setup, 1000, v=v), windows))
+    assert found.q_total_impact == pytest.approx(0.5e-3) and found.peak_jump == pytest.approx(0.5)
+    assert found.q_total_recovery == pytest.approx(0.5e-3 + 2 * 0.1)
+    assert found.peak_recovery == pytest.approx(np.hypot(0.5, 2.0))
+    assert (found.contacts, found.contacts_asked) == (1, setup.scenario.task.count)  # type: ignore[union-attr]
+
+
 def test_windows_that_overlap_count_once() -> None:
     v = np.zeros((1000, 9))
     v[:, 1] = 1.0

@@ -11,6 +11,7 @@ import pytest
 from impact_posture.errors import ControllerNotFound, InputError
 from impact_posture.simulation.controllers import CONTROLLERS, Mode, Workshop
 from impact_posture.simulation.metrics import measure
+from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.runs import Run, run
@@ -51,7 +52,8 @@ def check(made: Workshop, found: Run, controller: str, mode: str) -> None:
     period = setup.scenario.control.period
     np.testing.assert_allclose(np.diff(series.t), period, atol=1e-9)
     metrics = measure(setup, found)
-    assert metrics.failed_ticks == 0 and metrics.contacts == 1
+    assert judge(setup, found) == ()
+    assert metrics.failed_ticks == 0 and metrics.contacts == metrics.contacts_asked == 1
     assert metrics.relaxed_ticks < series.t.size / 4
     assert 0 < metrics.q_total_impact < 3 and 0 < metrics.peak_jump < 30
     # It neither falls nor flies away.
@@ -82,7 +84,7 @@ def test_both_signs_are_run_and_mirror_each_other_roughly() -> None:
     ]
     assert moved[0] > 0.002 and moved[1] < -0.002
     for found, sign in ((forward, 1), (backward, -1)):
-        (window,) = found.windows
+        (window,) = found.impacts
         part = found.series.slice(window.begin, window.end)
         np.testing.assert_array_equal(found.series.force[part], np.tile([sign * 6.5, 0, 0], (200, 1)))
         assert not found.series.force[: part.start].any() and not found.series.force[part.stop :].any()
@@ -134,9 +136,12 @@ def test_windows_begin_at_the_first_touch_and_are_as_long_for_every_controller(n
     leaves = task.settle + reference.inward + task.dwell
     for controller in ("nominal", "robust", "invariant", "walker"):
         found = lived(name, controller, "live", None)
-        impact, dwell = found.windows
+        impact, dwell, recovery = found.windows
         series = found.series
-        assert (impact.kind, dwell.kind, impact.touched) == ("impact", "dwell", True)
+        assert (impact.kind, dwell.kind, recovery.kind, impact.touched) == ("impact", "dwell", "recovery", True)
+        # The next approach would begin before a second is over.
+        assert recovery.begin == impact.begin
+        assert recovery.end == pytest.approx(min(impact.begin + 1, reference.total))
         first = int(np.argmax(series.touching > 0))
         assert series.t[first] - 1e-3 - 1e-9 <= impact.begin <= series.t[first]
         assert impact.end - impact.begin == pytest.approx(task.window)
@@ -154,7 +159,10 @@ def test_pushes_have_windows_as_long_as_they_last_and_wait_for_rest(name: str) -
     task = made.setup.scenario.task
     assert isinstance(task, SinglePush)
     found = lived(name, "nominal", "live", None)
-    (window,) = found.windows
+    window, recovery = found.windows
+    assert recovery.begin == window.begin and recovery.end - recovery.begin == pytest.approx(
+        task.duration + task.after
+    )
     assert window.end - window.begin == pytest.approx(task.duration) and window.begin == found.waited
     before = found.series.slice(window.begin - task.still, window.begin)
     quiet = np.linalg.norm(found.series.v[before], axis=1).max() < task.quiet
@@ -170,10 +178,14 @@ def test_a_contact_that_never_comes_has_a_window_where_it_was_expected(monkeypat
     for key in made.setup.world.built.gaps:
         monkeypatch.setitem(made.setup.world.built.gaps, key, 0.14)  # type: ignore[arg-type]
     found = driven(made, "nominal")
-    impact, _ = found.windows
+    impact, *_ = found.windows
     assert not impact.touched and not found.series.touching.any()
     metrics = measure(made.setup, found)
     assert (metrics.contacts, metrics.peak_jump, metrics.peak_force) == (0, 0.0, 0.0)
+    assert metrics.contacts_asked == 1
+    (event,) = judge(made.setup, found)
+    assert event.status == "lost contact" and "1 of 1 contacts were never made" in event.what
+    assert event.time == impact.begin
     assert predict(made.setup, made.objective(), found) == ()
 
 

@@ -172,7 +172,7 @@ class Dropped:
             if q is None:
                 left_out["not on the constraints"] += 1
                 continue
-            found = problem.objective.oracle.quantities(q)
+            found = problem.impact.oracle.quantities(q)
             if found.S is None:
                 left_out["S undefined"] += 1
                 continue
@@ -222,7 +222,7 @@ def choices(
         for name, q in (("start", solution.initial), (objective, solution.q))[bool(found) :]:
             scene = Scene(problem.objective, q)
             measured = {mu: _try(scene, Surface(mu)) for mu in frictions}
-            found.append(Choice(name, problem.objective.oracle.quantities(q), measured))
+            found.append(Choice(name, problem.impact.oracle.quantities(q), measured))
     return found
 
 

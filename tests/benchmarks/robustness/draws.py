@@ -12,7 +12,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.errors import Infeasible, InputError
-from impact_posture.posture.problem import Requirements, build_problem
+from impact_posture.posture.build_problem import build_problem
+from impact_posture.posture.problem import Requirements
 from impact_posture.posture.starts import Projector
 from impact_posture.robot.loader import load_robot
 from impact_posture.simulation.blow import blow_of

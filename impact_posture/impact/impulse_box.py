@@ -7,11 +7,10 @@ its maximum over ``0 ≤ λ_i ≤ λ̄_i`` (``|λ_i| ≤ λ̄_i`` where contacts
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -19,21 +18,21 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.errors import ContactError, MetricError
-from impact_posture.impact.inner import Subgradients, finite_maximum, first_of_largest
+from impact_posture.impact.contact import Contact
+from impact_posture.impact.impact_kind import ImpactKind
+from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import (
     ABOVE,
     Guess,
     Lifted,
-    blow_at,
+    impact_at,
     unknown_jump,
     weighed,
     worst_of,
     worst_of_guesses,
 )
-
-if TYPE_CHECKING:
-    from impact_posture.impact.kernel import ImpactKernel
-    from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.impact.worst_case import Subgradients, finite_maximum, first_of_largest
 
 Vector = NDArray[np.float64]
 
@@ -67,16 +66,15 @@ class WorstImpulses:
         }
 
 
-def check_contacts(objective: ImpactObjective) -> None:
-    """Refuse what has no box of impulses to take the worst of.
+def check_contacts(contacts: Sequence[Contact], kind: ImpactKind, *, bilateral: bool, cone: bool) -> None:
+    """Refuse contacts that have no box of impulses to take the worst of.
 
     Raises:
         ContactError: Too many contacts, or one point along one normal twice.
-        MetricError: An objective per approach speed, or a cone of normals.
+        MetricError: A kind per approach speed, or a cone of normals.
     """
-    contacts = objective.contacts
     if len(contacts) == 1:
-        if objective.bilateral:
+        if bilateral:
             raise ContactError(
                 "there is one contact: pulling is as bad as pushing", where="--bilateral", mend="leave it out"
             )
@@ -87,14 +85,14 @@ def check_contacts(objective: ImpactObjective) -> None:
         for other in contacts[:i]:
             if (one.frame, one.offset, one.normal) == (other.frame, other.offset, other.normal):
                 raise ContactError(f"'{one.frame}' is given twice", where="--contact", mend="remove one")
-    if objective.kind != "impulse":
+    if not kind.adds_up:
         raise MetricError(
-            f"{objective.kind} is per approach speed of one contact: of several at once the impulses are not known "
+            f"{kind.name} is per approach speed of one contact: of several at once the impulses are not known "
             "from it",
             where="--objective",
             mend="choose impulse, whose bounds are given, or one --contact",
         )
-    if objective.normal_cone_deg:
+    if cone:
         raise MetricError(
             "the worst case over a cone of normals is exact for one contact only",
             where="--normal-cone",
@@ -112,17 +110,29 @@ def corners(count: int, bilateral: bool) -> Vector:
 
 
 @dataclass(frozen=True)
-class BoxOfImpulses:
-    """The worst corner of ``0 ≤ λ_i ≤ λ̄_i``, or of ``|λ_i| ≤ λ̄_i``."""
+class ImpulseBox:
+    """The worst corner of ``0 ≤ λ_i ≤ λ̄_i``, or of ``|λ_i| ≤ λ̄_i``.
 
-    objective: ImpactObjective
+    Attributes:
+        oracles: Pinocchio's numbers for each contact, the leading one first.
+        bilateral: Whether the contacts can pull as well as push.
+        attempts: Guesses of the lifted form.
+    """
+
+    oracles: tuple[ImpactOracle, ...]
+    bilateral: bool = False
     attempts: int = len(ABOVE)
+
+    @property
+    def oracle(self) -> ImpactOracle:
+        """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
+        return self.oracles[0]
 
     @cached_property
     def corners(self) -> Vector:
         """Impulses at the corners, N·s, shape (k, m)."""
-        bounds = np.array([contact.impulse for contact in self.objective.contacts])
-        return np.asarray(corners(len(bounds), self.objective.bilateral) * bounds)
+        bounds = np.array([oracle.contact.impulse for oracle in self.oracles])
+        return np.asarray(corners(len(bounds), self.bilateral) * bounds)
 
     def worst(self, q: Vector) -> WorstImpulses:
         """The worst corner at ``q``, from Pinocchio's numbers."""
@@ -132,69 +142,68 @@ class BoxOfImpulses:
         return WorstImpulses(float(values[leading]), impulses, self.corners[tied], jumps @ impulses)
 
     def value(self, q: Vector) -> float:
-        """See :class:`~impact_posture.impact.inner.InnerMaximum`."""
+        """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
         return float(self._jumps_and_values(q)[1].max())
 
     def gradient(self, q: Vector) -> Vector:
-        """See :class:`~impact_posture.impact.inner.InnerMaximum`."""
+        """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
         return self._gradient(q, self.worst(q).impulses)
 
     def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
-        """See :class:`~impact_posture.impact.inner.InnerMaximum`; of all corners that tie."""
+        """See :class:`~impact_posture.impact.worst_case.WorstCase`; of all corners that tie."""
         _, tied, gaps = finite_maximum(self._jumps_and_values(q)[1], within)
         return Subgradients(np.array([self._gradient(q, self.corners[k]) for k in tied]), gaps)
 
     def _jumps_and_values(self, q: Vector) -> tuple[Vector, Vector]:
         """``a_i`` as columns, shape (nv, m), and ``λᵀKλ`` at every corner, shape (k,)."""
-        singles = self.objective.singles
-        jumps = np.stack([single.oracle.quantities(q).jump for single in singles], axis=1)
-        K = jumps.T @ singles[0].oracle.at(q).weigh(jumps)
+        jumps = np.stack([oracle.quantities(q).jump for oracle in self.oracles], axis=1)
+        K = jumps.T @ self.oracle.at(q).weigh(jumps)
         return jumps, np.asarray(np.einsum("ki,ij,kj->k", self.corners, K, self.corners))
 
     def _gradient(self, q: Vector, impulses: Vector) -> Vector:
         """``∂_q‖Σ λ_i a_i‖²_W = 2 ∂_q[Σ λ_i n_iᵀJ_i b − bᵀMa]``, shape (nv,)."""
-        oracles = [single.oracle.at(q) for single in self.objective.singles]
+        oracles = [oracle.at(q) for oracle in self.oracles]
         first = oracles[0]
-        blows = np.stack([oracle.J.T @ oracle.n for oracle in oracles], axis=1)
-        x = first.answer(blows @ impulses)
+        forces = np.stack([oracle.J.T @ oracle.n for oracle in oracles], axis=1)
+        x = first.answer(forces @ impulses)
         y = first.answer(first.weigh(x.a))
         gradient = -first.inertial(y, x)
         for weight, oracle in zip(impulses, oracles, strict=True):
-            own, in_frame = np.array(oracle.contact.normal), oracle.contact.normal_frame == "contact"
-            gradient = gradient + weight * oracle.coupling(own, y.a, in_frame)
+            own = np.array(oracle.contact.normal)
+            gradient = gradient + weight * oracle.coupling(own, y.a, oracle.case.in_contact_frame)
         return np.asarray(2 * gradient + first.metric_gradient(x.a))
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """See :class:`~impact_posture.impact.inner.InnerMaximum`: ``K``, its worst corner, one gradient there."""
-        blows = self._blows(k.n)
-        jumps = [k.answer([blow]) for blow in blows]
+        """See :class:`~impact_posture.impact.worst_case.WorstCase`: ``K``, its worst corner, one gradient there."""
+        impacts = self._impacts(k.n)
+        jumps = [k.answer([impact]) for impact in impacts]
         K = _gram(len(jumps), lambda i, j: k.product(jumps[i], jumps[j]))
         rows = [ca.DM(corner) for corner in self.corners]
         _, impulses = first_of_largest([_form(K, row) for row in rows], [ca.SX(row) for row in rows])
         worst = k.answer([
-            Wrench(blow.point, blow.force * impulses[i], blow.moment, blow.in_frame) for i, blow in enumerate(blows)
+            Wrench(one.point, one.force * impulses[i], one.moment, one.in_frame) for i, one in enumerate(impacts)
         ])  # fmt: skip
         return k.product(worst, worst), k.size_gradient(worst)
 
     def lift(self, tree: Tree, n: ca.SX, scale: ca.SX) -> Lifted:
-        """See :class:`~impact_posture.impact.inner.InnerMaximum`: a jump a contact, ``t`` above each corner."""
-        jumps = [unknown_jump(self.objective, tree, blow, f"{i}_") for i, blow in enumerate(self._blows(n))]
-        K = _gram(len(jumps), lambda i, j: weighed(self.objective, jumps[i], jumps[j]))
+        """See :class:`~impact_posture.impact.worst_case.WorstCase`: a jump a contact, ``t`` above each corner."""
+        case = self.oracle.case
+        jumps = [unknown_jump(case, tree, impact, f"{i}_") for i, impact in enumerate(self._impacts(n))]
+        K = _gram(len(jumps), lambda i, j: weighed(case.metric, jumps[i], jumps[j]))
         parts = [Lifted(jump.variables, jump.residual, ca.SX(0)) for jump in jumps]
         return worst_of(parts, [_form(K, ca.DM(corner)) for corner in self.corners], scale)
 
     def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
-        """See :class:`~impact_posture.impact.inner.InnerMaximum`."""
-        found = [single.oracle.quantities(q) for single in self.objective.singles]
+        """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
+        found = [oracle.quantities(q) for oracle in self.oracles]
         parts = [np.concatenate([one.jump, one.support_impulse]) for one in found]
         guesses = [Guess(p, np.full(p.size, -np.inf)) for p in parts]
         return worst_of_guesses(guesses, self.value(q) / scale, attempt)
 
-    def _blows(self, n: ca.SX) -> list[Wrench]:
-        """Unit blows of all contacts; the leading one's normal is an input, the others' are constants."""
-        leading = blow_at(self.objective, self.objective.contact, n)
-        others = self.objective.others
-        return [leading, *[blow_at(self.objective, other, ca.SX(np.array(other.normal))) for other in others]]
+    def _impacts(self, n: ca.SX) -> list[Wrench]:
+        """Unit impulses of all contacts; the leading one's normal is an input, the others' are constants."""
+        leading, *others = [oracle.case for oracle in self.oracles]
+        return [impact_at(leading, n), *[impact_at(c, ca.SX(np.array(c.contact.normal))) for c in others]]
 
 
 def _gram(count: int, entry: Callable[[int, int], ca.SX]) -> ca.SX:

@@ -1,23 +1,22 @@
-"""What an objective asks of its inner maximum: over normals, impulses, models, or over nothing at all.
+"""The inner maximum of ``min_q max ‖Δν‖²``: over normals, impulses, models, or over nothing at all.
 
-``min_q max_{blow, model} ‖Δν‖²``: the inner maximum is one of few shapes, each with its own exact form; they stand
-behind one protocol, so that the program, the C export and the certificate do not tell them apart.
+Each shape of the maximum has its own exact form.  All stand behind one protocol, so that the program, the C export
+and the certificate do not tell them apart.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import Tree
+from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import Guess, Lifted
-
-if TYPE_CHECKING:
-    from impact_posture.impact.kernel import ImpactKernel
+from impact_posture.impact.oracle import ImpactOracle
 
 Vector = NDArray[np.float64]
 
@@ -43,8 +42,13 @@ class Subgradients:
         return np.asarray(self.gradients[0])
 
 
-class InnerMaximum(Protocol):
-    """The largest of what may happen at one posture."""
+class WorstCase(Protocol):
+    """The largest value that the impact may have at one posture."""
+
+    @property
+    def oracle(self) -> ImpactOracle:
+        """Pinocchio's numbers for the leading contact, on the robot as modeled."""
+        ...
 
     @property
     def attempts(self) -> int:

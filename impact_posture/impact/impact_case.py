@@ -1,0 +1,44 @@
+"""One impact on one robot: which contact, how the jump is weighed, which feet stay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.impact.contact import Contact, Support, default_compliance, point_on
+from impact_posture.impact.metric import Metric
+from impact_posture.robot.robot import Robot
+
+
+@dataclass(frozen=True)
+class ImpactCase:
+    """What the velocity jump of a single impact depends on, apart from the posture.
+
+    Attributes:
+        robot: The robot.
+        contact: Where the impact acts, and along which normal.
+        metric: Weight ``W`` of the jump's squared norm.
+        supports: Feet that stay on the ground; empty for a robot that flies or is bolted down.
+        compliance: ε of the supports, 1/kg; zero for :func:`~impact_posture.impact.contact.default_compliance`.
+    """
+
+    robot: Robot
+    contact: Contact
+    metric: Metric = field(default_factory=Metric)
+    supports: tuple[Support, ...] = ()
+    compliance: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.compliance <= 0:
+            object.__setattr__(self, "compliance", default_compliance(self.robot))
+
+    @cached_property
+    def point(self) -> PointOnLink:
+        """The contact point on its link."""
+        return point_on(self.robot, self.contact.frame, self.contact.offset)
+
+    @property
+    def in_contact_frame(self) -> bool:
+        """Whether the normal is given in the contact frame and so turns with the robot."""
+        return self.contact.normal_frame == "contact"

@@ -1,0 +1,124 @@
+"""Letters beside points: each goes to the nearest place around its point where nothing else is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation
+from mpl_toolkits.mplot3d import proj3d
+
+from impact_posture.plot.shapes import Plane, Vector
+
+# Distances from the point to try, points; directions to try; how far a letter stays from what is drawn, pixels.
+_GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0)
+_ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+_CLEAR = 2.0
+
+
+class Label(Annotation):  # type: ignore[misc]
+    """A letter at a point of an axes, in data coordinates, shape (2,) or (3,); :func:`place_labels` finds its place.
+
+    ``toward`` is the direction in the picture in which it stands best.
+    """
+
+    def __init__(
+        self, text: str, point: Vector, toward: tuple[float, float] = (0.0, 1.0), color: str = "black"
+    ) -> None:
+        super().__init__(
+            text, (0.0, 0.0), (0.0, 0.0), textcoords="offset points", fontstyle="italic", ha="center", va="center",
+            color=color, zorder=7, annotation_clip=False,
+        )  # fmt: skip
+        self.point = np.asarray(point, dtype=float)
+        self.toward = toward
+        # Where it will stand is not known yet: the layout must not make room for it.
+        self.set_in_layout(False)
+
+
+def draw_end_on(axes: Any, name: str, plane: Plane, n: Vector, at: Vector, color: str = "black") -> None:
+    """Draw a normal across the picture plane as a dot (towards the reader) or a cross (away) in a ring."""
+    toward = float(np.cross(plane.axes[0], plane.axes[1]) @ n)
+    look = {"linestyle": "", "markeredgecolor": color, "zorder": 6.5}
+    axes.plot(*at[:, None], marker="o", markersize=8, markerfacecolor="white", markeredgewidth=1, **look)
+    axes.plot(*at[:, None], marker="." if toward > 0 else "x", markersize=4, color=color, **look)
+    axes.add_artist(Label(name, at, (1.0, 1.0), color))
+
+
+def place_labels(figure: Figure) -> None:
+    """Move the letters of a figure, which has its layout and has been drawn, to where nothing else is."""
+    for axes in figure.axes:
+        labels = [text for text in axes.texts if isinstance(text, Label)]
+        if not labels:
+            continue
+        ink = np.vstack([np.zeros((0, 2)), *_ink(axes)])
+        for label in labels:
+            ink = np.vstack([ink, _place(axes, label, ink)])
+
+
+def _place(axes: Any, label: Label, ink: Vector) -> Vector:
+    """Move one letter; return points of the place that it takes."""
+    point = label.point
+    if len(point) == 3:
+        point = np.array(proj3d.proj_transform(*point, axes.get_proj())[:2])
+    label.xy = tuple(point)
+    anchor = np.asarray(axes.transData.transform(point))
+    box = label.get_window_extent()
+    half = np.array([box.width, box.height]) / 2 + _CLEAR
+    scale = axes.figure.dpi / 72
+    near = ink[np.abs(ink - anchor).max(axis=1) < 2 * half.max() + _GAPS[-1] * scale]
+    best, place = np.inf, anchor
+    for gap in _GAPS:
+        for angle in _ANGLES:
+            direction = np.array([np.cos(angle), np.sin(angle)])
+            center = anchor + direction * (gap * scale + float(np.abs(direction) @ half))
+            hits = int((np.abs(near - center) < half).all(axis=1).sum())
+            outside = (center - half < axes.bbox.min).any() or (center + half > axes.bbox.max).any()
+            cost = 100.0 * hits + 1e6 * outside + gap - 6.0 * float(direction @ np.array(label.toward))
+            if cost < best:
+                best, place = cost, center
+    label.xyann = tuple((place - anchor) / scale)
+    return _filled(place - half, place + half)
+
+
+def _ink(axes: Any) -> Iterator[Vector]:
+    """Points in pixels, at most a few apart, of all that is drawn in an axes but its grid and its letters."""
+    scale = axes.figure.dpi / 72
+    for line in axes.lines:
+        drawn = line.get_transform().transform(line.get_path().vertices)
+        if line.get_linestyle() not in ("None", " ", ""):
+            yield _along(drawn)
+        if line.get_marker() not in ("None", " ", "", None):
+            reach = line.get_markersize() * scale / 2
+            for center in drawn[np.isfinite(drawn).all(axis=1)]:
+                yield _filled(center - reach, center + reach)
+    arrows = [text.arrow_patch for text in axes.texts if getattr(text, "arrow_patch", None) is not None]
+    for patch in (*axes.patches, *arrows):
+        yield _along(patch.get_transform().transform_path(patch.get_path()).interpolated(8).vertices)
+    for collection in axes.collections:
+        transform = collection.get_transform()
+        for path in collection.get_paths():
+            yield _along(transform.transform(path.vertices))
+    for text in axes.texts:
+        if text.get_text() and not isinstance(text, Label):
+            box = text.get_window_extent()
+            yield _filled(box.min, box.max)
+
+
+def _along(points: Vector) -> Vector:
+    """Points at most two pixels apart along a line through ``points``, shape (n, 2)."""
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < 2:
+        return points
+    # Far outside of every panel is far enough.
+    points = np.clip(points, -1e4, 1e4)
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    s = np.linspace(0.0, way[-1], 2 + int(way[-1] / 2))
+    return np.stack([np.interp(s, way, points[:, k]) for k in (0, 1)], axis=1)
+
+
+def _filled(low: Vector, high: Vector) -> Vector:
+    """Points two pixels apart in a rectangle."""
+    x, y = (np.linspace(a, b, 2 + int((b - a) / 2)) for a, b in zip(low, high, strict=True))
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -1,0 +1,53 @@
+"""Axes in space: equal scales, and ticks and names that do not stand on each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D
+
+from impact_posture.plot.shapes import Vector
+from impact_posture.plot.style import text_width
+
+_TICKS = 6.5
+# Of an axis' length, at its ends: two axes meet there.
+_CORNER = 0.07
+
+
+class Space(Axes3D):  # type: ignore[misc]
+    """3-D axes that the layout leaves room for, names of the axes included."""
+
+    def get_tightbbox(self, renderer: Any = None, **more: Any) -> Any:
+        """All that is drawn; matplotlib leaves the names out for the layout, and others end upon them."""
+        return super().get_tightbbox(renderer, **(more | {"for_layout_only": False}))
+
+
+def frame_space(axes: Any, low: Vector, high: Vector, unit: str, bins: int, *, azimuth: float) -> None:
+    """Give 3-D axes the limits ``low`` to ``high``, one scale, few ticks, and names with the unit."""
+    size = high - low
+    axes.set_box_aspect(tuple(size))
+    axes.view_init(elev=21, azim=azimuth)
+    for k, name in enumerate("xyz"):
+        getattr(axes, f"set_{name}lim")(low[k], high[k])
+        axis = getattr(axes, f"{name}axis")
+        share = float(size[k] / size.max())
+        longest = _set_ticks(axis, low[k], high[k], round(bins * share), room=np.inf if name == "z" else 95 * share)
+        # Matplotlib puts numbers 8 and names 21 off their axis, centered there: points in a cube, less in a flat box.
+        scale = max(float(np.delete(size, k).mean() / size.max()), 0.25)
+        axes.tick_params(axis=name, pad=(8 if name == "z" else 6) / scale - 8, labelsize=_TICKS)
+        getattr(axes, f"set_{name}label")(f"{name}  [{unit}]", labelpad=(longest / 2 + 4) / scale - 13, fontsize=7.0)
+
+
+def _set_ticks(axis: Any, low: float, high: float, bins: int, room: float) -> float:
+    """Few ticks, none at the ends, whose numbers fit a length in points; return the longest number's."""
+    air = _CORNER * (high - low)
+    for count in range(max(bins, 3), 0, -1):
+        ticks = MaxNLocator(count, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+        ticks = ticks[(low + air <= ticks) & (ticks <= high - air)]
+        axis.set_ticks(ticks)
+        longest = max((text_width(t, _TICKS) for t in axis.get_major_formatter().format_ticks(ticks)), default=0.0)
+        if len(ticks) * longest <= room or len(ticks) < 2:
+            break
+    return longest

@@ -1,0 +1,226 @@
+"""From requirements to constraints: the posture problem in the field's own terms, before any solver sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+import scipy
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import InputError
+from impact_posture.impact.contact import Contact, Support, point_on
+from impact_posture.impact.objective import ImpactObjective, Objective
+from impact_posture.posture.constraint import (
+    CenterOfMassOverFeet,
+    Constraint,
+    HeldOrientation,
+    HeldPose,
+    HeldPosition,
+    PositionBox,
+)
+from impact_posture.posture.equalities import base_point
+from impact_posture.posture.every_scenario import in_every_scenario
+from impact_posture.posture.feet import KeptFeet
+from impact_posture.posture.gauge import pin_undetermined
+from impact_posture.posture.problem import PostureProblem, Requirements
+from impact_posture.posture.regular import regularize
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.spec import ContactPose
+
+Vector = NDArray[np.float64]
+
+
+def build_problem(robot: Robot, objective: Objective, given: Vector, requirements: Requirements) -> PostureProblem:
+    """Turn requirements into constraints; nothing is solved yet.
+
+    Raises:
+        InputError: Requirements that contradict each other or the robot.
+    """
+    _check(robot, requirements)
+    numeric = Numeric(robot.model).at(given)
+    chart = Chart(robot.model)
+    constraints: list[Constraint] = []
+    for support in objective.supports:
+        constraints.append(_held_support(robot, numeric, support))
+    held = {s.frame for s in objective.supports}
+    poses = (requirements.contact_pose, *requirements.other_poses)
+    # Two impacts at one frame, along two normals, hold it once.
+    struck: dict[str, tuple[Contact, ContactPose]] = {}
+    # An objective without contacts leaves the contact pose unused.
+    for contact, mode in zip(objective.contacts, poses, strict=bool(objective.contacts)):
+        struck.setdefault(contact.frame, (contact, mode))
+    for contact, mode in struck.values():
+        constraints += _contact_constraints(robot, contact, numeric, requirements, mode)
+    for frame in dict.fromkeys(requirements.keep):
+        if frame not in held:
+            point = point_on(robot, frame)
+            constraints.append(HeldPose(f"pose of {frame}", point, numeric.placement(point)))
+    constraints += _base_constraints(robot, numeric, requirements)
+    decided: list[str] = []
+    if requirements.com_over_feet:
+        try:
+            constraints.append(_com_constraint(robot, objective.supports, numeric, requirements.com_margin))
+        except InputError:
+            if requirements.com_asked:
+                raise
+            decided.append("center of mass left free: the feet span no area to keep it above")
+    if isinstance(objective, ImpactObjective):
+        if requirements.keep_contacts:
+            constraints += _kept_feet(objective, numeric, requirements.friction)
+        constraints += in_every_scenario(objective, numeric, requirements.friction, constraints)
+    lower, upper = _bounds(robot, chart, given, requirements)
+    more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
+    problem = PostureProblem(
+        robot, objective, requirements, given, (*constraints, *more), lower, upper, notes=(*decided, *notes)
+    )
+    return regularize(problem)
+
+
+def _check(robot: Robot, requirements: Requirements) -> None:
+    if not robot.floating and requirements.base != "free":
+        raise InputError(
+            f"base '{requirements.base}' asked of a robot whose root is fixed",
+            where="--base",
+            mend="leave it out or use --root free-flyer",
+        )
+    for name, values in (("--box", requirements.box), ("--base-box", requirements.base_box)):
+        if not all(np.isfinite(v) and v > 0 for v in values):
+            raise InputError(f"half extents {values}", where=name, mend="give three lengths above zero")
+    for name, value in (
+        ("com_margin", requirements.com_margin),
+        ("limit_margin", requirements.limit_margin),
+        ("regularization", requirements.regularization),
+    ):
+        if not (np.isfinite(value) and value >= 0):
+            raise InputError(f"is {value:g}", where=name, mend="give a number ≥ 0")
+    if not (np.isfinite(requirements.friction) and requirements.friction > 0):
+        raise InputError(f"is {requirements.friction:g}", where="friction", mend="give a coefficient above zero")
+    quaternion = requirements.target_quaternion
+    if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):
+        raise InputError(
+            "is one target for several contacts",
+            where="--target-quaternion" if quaternion is not None else "--target-position",
+            mend="leave it out and start from a --posture that has the contacts in place",
+        )
+    if quaternion is not None and not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
+        raise InputError(
+            f"has norm {np.linalg.norm(quaternion):.4g}", where="--target-quaternion", mend="give a unit x y z w"
+        )
+    if requirements.target_position is not None and not np.isfinite(requirements.target_position).all():
+        raise InputError("is not finite", where="--target-position", mend="give three numbers")
+    for joint in requirements.hold:
+        robot.joint_id(joint)
+
+
+def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constraint:
+    point = point_on(robot, support.frame, support.offset)
+    placement = numeric.placement(point)
+    if support.kind == "point":
+        return HeldPosition(f"foot {support.frame}", point, placement.translation)
+    return HeldPose(f"foot {support.frame}", point, placement)
+
+
+def contact_target(robot: Robot, contact: Contact, numeric: Numeric, requirements: Requirements) -> pin.SE3:
+    """Where a contact frame is to be: the target given, else where it is at ``numeric.q``."""
+    placement = numeric.placement(point_on(robot, contact.frame)).copy()
+    if requirements.target_position is not None:
+        placement.translation = np.array(requirements.target_position)
+    if requirements.target_quaternion is not None:
+        quaternion = pin.Quaternion(np.array(requirements.target_quaternion))
+        placement.rotation = quaternion.normalized().matrix()
+    return placement
+
+
+def _contact_constraints(
+    robot: Robot, contact: Contact, numeric: Numeric, requirements: Requirements, mode: ContactPose
+) -> list[Constraint]:
+    point = point_on(robot, contact.frame)
+    target = contact_target(robot, contact, numeric, requirements)
+    name = f"pose of {contact.frame}"
+    if mode == "free":
+        if requirements.target_position is not None or requirements.target_quaternion is not None:
+            raise InputError(
+                "a target is given but the contact pose is free",
+                where="--contact-pose",
+                mend="use full, position, aligned or box",
+            )
+        return []
+    if mode == "full":
+        return [HeldPose(name, point, target)]
+    if mode == "aligned":
+        n = np.array(contact.normal)
+        axis = n if contact.normal_frame == "contact" else target.rotation.T @ n
+        return [HeldPose(name, point, target, axis)]
+    if mode == "box":
+        return [PositionBox(f"position of {contact.frame}", point, target.translation, requirements.box)]
+    return [HeldPosition(f"position of {contact.frame}", point, target.translation)]
+
+
+def _kept_feet(objective: ImpactObjective, numeric: Numeric, friction: float) -> list[Constraint]:
+    """One constraint a contact: cones are convex, so what each impact leaves standing all together do."""
+    if objective.bilateral:
+        raise InputError(
+            "contacts that pull as well as push would have to leave the feet without any impulse",
+            where="--keep-contacts",
+            mend="leave out --bilateral or --keep-contacts",
+        )
+    return [KeptFeet(single, numeric, friction) for single in objective.singles]
+
+
+def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements) -> list[Constraint]:
+    if not robot.floating:
+        return []
+    base = base_point()
+    placement = numeric.placement(base)
+    if requirements.base == "level":
+        upright = np.array([0.0, 0.0, 1.0])
+        return [HeldOrientation("level base", base, np.eye(3), upright)]
+    if requirements.base == "fixed":
+        return [HeldPose("base", base, placement)]
+    if requirements.base == "box":
+        return [PositionBox("base position", base, placement.translation, requirements.base_box)]
+    return []
+
+
+def _com_constraint(
+    robot: Robot, supports: Sequence[Support], numeric: Numeric, margin: float
+) -> CenterOfMassOverFeet:
+    corners = []
+    for support in supports:
+        placement = numeric.placement(point_on(robot, support.frame, support.offset))
+        for sx in (-1, 1):
+            for sy in (-1, 1):
+                corner = placement.act(np.array([sx * support.size[0], sy * support.size[1], 0.0]))
+                corners.append(corner[:2])
+    try:
+        equations = scipy.spatial.ConvexHull(np.array(corners)).equations
+    except (scipy.spatial.QhullError, ValueError):
+        raise InputError(
+            "the feet span no area to keep the center of mass above",
+            where="com_over_feet",
+            mend="give three feet or soles with a size, or set com_over_feet = false (--no-com)",
+        ) from None
+    # One row an edge: qhull repeats the equation of an edge that it met in pieces.
+    unique = np.unique(np.round(equations, 12), axis=0)
+    return CenterOfMassOverFeet(unique[:, :2], -unique[:, 2], margin)
+
+
+def _bounds(robot: Robot, chart: Chart, given: Vector, requirements: Requirements) -> tuple[Vector, Vector]:
+    lower, upper = chart.bounds()
+    x = chart.to_x(given)
+    margin = requirements.limit_margin
+    lower, upper = lower + margin, upper - margin
+    for slot in chart.slots:
+        if slot.name in requirements.hold:
+            lower[slot.x] = upper[slot.x] = x[slot.x]
+        elif (lower[slot.x] > upper[slot.x]).any():
+            raise InputError(
+                f"a margin of {margin:g} leaves joint '{slot.name}' no room",
+                where="limit_margin",
+                mend="give a smaller one",
+            )
+    return lower, upper

@@ -1,0 +1,120 @@
+"""Signals at random times: the process ends as it should, says so in one line, and leaves nothing behind.
+
+``--hostile-full`` sends more of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+COMMAND = Path(sys.executable).parent / "impact-posture"
+PUSH = ("tilthex_arm", "--normal", "0", "0", "1")
+# Each with the processor time, s, that it takes at least.
+COMMANDS = {
+    "evaluate": (("evaluate", *PUSH), 0.7),
+    "codegen": (("codegen", *PUSH, "--compile", "--out", "deep/er/out"), 2.0),
+    "optimize": (("optimize", *PUSH, "--starts", "6", "--jobs", "2", "--quiet", "--out", "out"), 3.0),
+    "simulate": (("simulate", "solo8-push", "--quiet", "--out", "out"), 3.0),
+}
+SIGNALS = (signal.SIGINT, signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+TICKS = os.sysconf("SC_CLK_TCK")
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks at processes in /proc")
+
+
+def caught(pid: int) -> int:
+    """The signals that a process handles, as bits."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("SigCgt"):
+            return int(line.split()[1], 16)
+    return 0
+
+
+def busy(pid: int) -> float:
+    """Processor time of a process so far, s."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def session(leader: int) -> list[str]:
+    """The command lines of the living processes of a session."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError, ValueError):
+            fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            if int(entry.name) and int(fields[3]) == leader and fields[0] not in "ZX":
+                found.append((entry / "cmdline").read_text().replace("\0", " "))
+    return found
+
+
+def times(count: int) -> list[tuple[str, int, signal.Signals]]:
+    """Command, number of the case, and the signal: each command as often."""
+    return [(name, k, SIGNALS[(k + n) % len(SIGNALS)]) for k in range(count) for n, name in enumerate(COMMANDS)]
+
+
+def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
+    arguments, whole = COMMANDS[name]
+    # The same case at the same point of the work, however fast the machine is now.
+    moment = random.Random(f"{name} {k}").uniform(0.0, whole)
+    work, temporary = folder / "work", folder / "temporary"
+    for place in (work, temporary):
+        place.mkdir()
+    cache = {"XDG_CACHE_HOME": str(folder / "cache"), "MPLCONFIGDIR": os.environ.get("MPLCONFIGDIR", "")}
+    process = subprocess.Popen(
+        [str(COMMAND), *arguments], cwd=work, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True, env=os.environ | cache | {"TMPDIR": str(temporary)},
+        # A shell that runs the tests in the background has it ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    try:
+        with contextlib.suppress(OSError):
+            # Before that, the interpreter itself starts.
+            while process.poll() is None and not caught(process.pid) >> (signal.SIGTERM - 1) & 1:
+                time.sleep(0.002)
+            begin = busy(process.pid)
+            while process.poll() is None and busy(process.pid) < begin + moment:
+                time.sleep(0.005)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, number)
+        _, errors = process.communicate(timeout=60)
+        left = session(process.pid)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    about = f"{name} at {moment:.2f} s, {number.name}: {process.returncode}, {errors!r}"
+    lines = [line for line in errors.splitlines() if not line.startswith("warning: ")]
+    if process.returncode != 0:
+        assert process.returncode == 128 + number, about
+        assert len(lines) == 1 and lines[0].startswith("error: "), about
+    assert "Traceback" not in errors and "ignored" not in errors, about
+    # Ended before the signal, or between its last step and its end: then the folder is there, whole.
+    names = {path.name for path in work.iterdir()}
+    assert names <= {"out", "deep"}, about
+    if "deep" in names:
+        assert [path.name for path in (work / "deep" / "er").iterdir()] == ["out"], about
+    assert not list(temporary.iterdir()), about
+    assert not list((folder / "cache").rglob(".impact-posture-*")), about
+    assert not left, about
+
+
+@pytest.mark.parametrize(("name", "k", "number"), times(3), ids=lambda value: str(getattr(value, "name", value)))
+def test_a_signal_ends_everything(name: str, k: int, number: signal.Signals, tmp_path: Path) -> None:
+    send(name, k, number, tmp_path)
+
+
+def test_many_signals(tmp_path: Path, hostile_full: bool) -> None:
+    if not hostile_full:
+        pytest.skip("many signals: give --hostile-full")
+    for name, k, number in times(25):
+        folder = tmp_path / f"{name}-{k}"
+        folder.mkdir()
+        send(name, k, number, folder)

@@ -1,0 +1,189 @@
+"""What becomes of a run: bounds on records made by hand, robots that fall for real, robots that nothing holds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.errors import SpecError
+from impact_posture.simulation.metrics import measure
+from impact_posture.simulation.outcome import Event, judge
+from impact_posture.simulation.recorder import STATUSES
+from impact_posture.simulation.runs import Run
+from impact_posture.simulation.scenario import Bounds, Setup, set_up
+from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.series import Window
+from impact_posture.tsid.controller import Status
+from tests.simulation.shops import SHIPPED, by_hand, driven, needs_mujoco, shop, shortened, workshop
+
+RELAXED, HELD = STATUSES.index(Status.RELAXED), STATUSES.index(Status.INFEASIBLE)
+HEXTILT = Path(__file__).parent / "hextilt.toml"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _mujoco() -> None:
+    needs_mujoco()
+
+
+def judged(setup: Setup, columns: dict[str, Any], **run: Any) -> tuple[Event, ...]:
+    windows = run.pop("windows", (Window("impact", 0, 0.2, 0.5, True),))
+    return judge(setup, Run(by_hand(setup, 1000, **columns), windows, **run))
+
+
+def turned(setup: Setup, axis: tuple[float, float, float], degrees: float) -> np.ndarray[Any, Any]:
+    """The start posture, from tick 400 on with its base turned about an axis of the world."""
+    q = np.tile(setup.q, (1000, 1))
+    turn = pin.AngleAxis(np.radians(degrees), np.array(axis)).matrix() @ pin.Quaternion(setup.q[3:7]).matrix()
+    q[400:, 3:7] = pin.Quaternion(turn).coeffs()
+    return q
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_robot_that_stays_where_it_is_completes(name: str) -> None:
+    assert judged(shop(name).setup, {}) == ()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_tilt_is_measured_from_the_start_and_yaw_is_none(name: str) -> None:
+    setup = shop(name).setup
+    assert judged(setup, {"q": turned(setup, (0, 0, 1), 170)}) == ()
+    assert judged(setup, {"q": turned(setup, (1, 0, 0), 59)}) == ()
+    (event,) = judged(setup, {"q": turned(setup, (0, 1, 0), -61)})
+    assert event.status == "fell" and "tilted beyond 60°" in event.what and event.time == pytest.approx(0.401)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_below_the_surface_and_far_below_the_start(name: str) -> None:
+    setup = shop(name).setup
+    surface = setup.scenario.scene.surfaces[0].name
+    n, point = setup.world.built.normals[surface], setup.world.built.points[surface]
+    q = np.tile(setup.q, (1000, 1))
+    q[600:, :3] -= ((setup.q[:3] - point) @ n + 1e-3) * n
+    events = judged(setup, {"q": q})
+    assert f"went into the surface '{surface}'" in "; ".join(e.what for e in events)
+    assert {e.status for e in events} == {"fell"} and events[0].time == pytest.approx(0.601)
+    q = np.tile(setup.q, (1000, 1))
+    q[700:, 2] -= 1.001
+    events = judged(setup, {"q": q})
+    assert "sank by more than 1 m" in "; ".join(e.what for e in events)
+    # Where a reference leads the arm down, the base follows.
+    if n[2] == 1 and "aerial" in name:
+        reference = np.where(np.arange(1000) < 700, 0.0, 0.5)
+        assert "sank" not in "; ".join(e.what for e in judged(setup, {"q": q, "reference": reference}))
+
+
+@pytest.mark.parametrize(
+    ("status", "begin", "length", "words"),
+    [
+        (RELAXED, 100, 500, None),
+        (RELAXED, 100, 501, "50 % of all ticks"),
+        (HELD, 300, 50, None),
+        (HELD, 300, 51, "no command was found for 0.051 s"),
+    ],
+)
+def test_relaxed_and_held_ticks(status: int, begin: int, length: int, words: str | None) -> None:
+    column = np.zeros(1000, int)
+    column[begin : begin + length] = status
+    for name in ("aerial-lateral", "solo8-push"):
+        found = judged(shop(name).setup, {"status": column})
+        if words is None:
+            assert found == ()
+        else:
+            assert [e.status for e in found] == ["control lost"] and words in found[0].what
+            assert found[0].time == pytest.approx(1e-3 * (begin + 1))
+
+
+def test_feet_that_leave_the_ground_and_contacts_that_never_come() -> None:
+    setup = shop("solo8-push").setup
+    feet = np.ones((1000, 4), bool)
+    feet[200:300, 1] = False
+    assert judged(setup, {"feet": feet}) == ()
+    feet[200:301, 1], feet[400:900, 2] = False, False
+    (event,) = judged(setup, {"feet": feet})
+    assert event.status == "lost contact" and event.what == "FR_FOOT left the ground for 0.101 s"
+    windows = [Window("impact", k, 0.1 + 0.2 * k, 0.2 + 0.2 * k, k != 2) for k in range(4)]
+    (event,) = judged(shop("aerial-vertical").setup, {}, windows=tuple(windows))
+    assert event.status == "lost contact" and event.what.startswith("1 of 4 contacts") and event.time == 0.5
+
+
+def test_the_scenario_sets_the_bounds() -> None:
+    setup = shop("solo8-push").setup
+    feet, status = np.ones((1000, 4), bool), np.zeros(1000, int)
+    feet[200:400, 1], status[500:600] = False, HELD
+    columns = {"feet": feet, "status": status, "q": turned(setup, (0, 1, 0), 70)}
+    assert {e.status for e in judged(setup, columns)} == {"lost contact", "control lost", "fell"}
+    wide = replace(setup.scenario, bounds=Bounds(tilt_deg=80, lifted=0.3, held=0.2))
+    assert judged(replace(setup, scenario=wide), columns) == ()
+
+
+# ---- for real -----------------------------------------------------------------------------------------------------
+
+
+def test_a_robot_that_is_pushed_over_fell() -> None:
+    made = workshop(shortened("solo8-push", force=(60.0, 0.0, 0.0), after=0.5))
+    found = driven(made, "nominal")
+    events = judge(made.setup, found)
+    assert "fell" in {e.status for e in events}
+    assert all(found.waited < e.time <= found.series.t[-1] for e in events)
+
+
+def test_a_run_whose_state_runs_away_ends_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("aerial-lateral", "solo8-push"):
+        made = workshop(shortened(name))
+        world, step = made.setup.world, made.setup.world.step
+
+        def away(command: Any, count: int = 1, world: Any = world, step: Any = step) -> None:
+            if world.time > 0.05:
+                world._data.qvel[0] = 1e9
+            step(command, count)
+
+        monkeypatch.setattr(world, "step", away)
+        found = driven(made, "nominal")
+        assert found.away is not None and 0.05 < found.away < 0.06 and found.series.t[-1] < found.away
+        assert ("control lost", found.away) in [(e.status, e.time) for e in judge(made.setup, found)]
+        assert measure(made.setup, found).contacts == 0
+
+
+@pytest.mark.parametrize("controller", ["nominal", "robust"])
+def test_a_hextilt_flies_on_its_own_rotors_and_touches_the_floor(controller: str) -> None:
+    made = workshop(set_up(read_scenario(HEXTILT)))
+    found = driven(made, controller)
+    assert judge(made.setup, found) == ()
+    metrics = measure(made.setup, found)
+    assert metrics.contacts == 1 and metrics.failed_ticks == 0 and 0 < metrics.q_total_impact < 2
+    assert np.abs(found.series.q[:, :3] - made.setup.q[:3]).max() < 0.2
+
+
+# ---- nothing holds it ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("robot", "frame", "config", "words"),
+    [
+        ("borinot", "flying_arm_2__ee", None, "push and turn its base in 4 of 6 directions"),
+        ("hextilt", "flying_arm_5__gripper", "", r"no rotors and its data names no feet; add \[propulsion\]"),
+        ("solo8", "FL_FOOT", None, r"no \[control.footing\]; add \[control.footing\]"),
+    ],
+)
+def test_a_robot_that_would_fall_is_refused(
+    tmp_path: Path, robot: str, frame: str, config: str | None, words: str
+) -> None:
+    text = HEXTILT.read_text(encoding="utf-8").replace('"hextilt"', f'"{robot}"')
+    text = text.replace("flying_arm_5__gripper", frame)
+    if config is not None:
+        text = text.replace('armature = "none"', 'armature = "none"\nconfig = "bare.toml"')
+        (tmp_path / "bare.toml").write_text(
+            'name = "bare"\n[model]\nroot = "free-flyer"\n'
+            'urdf = "example-robot-data:hextilt_description/urdf/hextilt_flying_arm_5.urdf"\n',
+            encoding="utf-8",
+        )
+    path = tmp_path / "falls.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(SpecError, match=words) as caught:
+        set_up(read_scenario(path))
+    assert "\n" not in caught.value.line and str(path) in caught.value.line
