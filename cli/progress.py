@@ -60,10 +60,11 @@ def progress_line(*, shown: bool) -> Iterator[Callable[[int, int], None] | None]
         return
     from rich.progress import BarColumn, Progress, TextColumn
 
+    from impact_posture.escape import printable
     from impact_posture.progress import listening
 
     # Drawn when something is told, by no thread of its own: runs fork.
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[runs]}"))
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[runs]}"))
     line = Progress(*columns, console=console, transient=True, auto_refresh=False)
     task = line.add_task("", total=None, runs="")
     drawn, words = 0.0, ""
@@ -74,7 +75,7 @@ def progress_line(*, shown: bool) -> Iterator[Callable[[int, int], None] | None]
         if doing == words and now - drawn < _REFRESH:
             return
         drawn, words = now, doing
-        line.update(task, description=doing, completed=share or 0.0, total=None if share is None else 1.0)
+        line.update(task, description=printable(doing), completed=share or 0.0, total=None if share is None else 1.0)
         line.refresh()
 
     def advance(done: int, total: int) -> None:

@@ -78,7 +78,7 @@ def simulate(
     from impact_posture.folder import check_output
     from impact_posture.posture.blas import one_blas_thread
     from impact_posture.simulation.scenario_file import read_scenario
-    from impact_posture_cli.output import Page, print_json
+    from impact_posture_cli.output import Page, complain, print_json
     from impact_posture_cli.progress import progress_line
 
     name = read_scenario(scenario).name
@@ -96,7 +96,7 @@ def simulate(
         _show(Page(quiet=quiet), document, job.label, folder)
     if document["status"] != "completed":
         sys.stdout.flush()
-        sys.stderr.write(f"error: {name}, {job.label}: {fate(document)}; its numbers are no result\n")
+        complain(f"error: {name}, {job.label}: {fate(document)}; its numbers are no result")
         raise typer.Exit(_FAILED)
 
 
