@@ -28,6 +28,9 @@ from impact_posture.codegen.emitter import DOUBLE
 from impact_posture.codegen.export import default_prefix, export
 from impact_posture.codegen.variants import variants
 from impact_posture.dynamics.mjcf import write_mjcf
+from impact_posture.experiment.reproduction import Reproduction
+from impact_posture.experiment.statistics import Row
+from impact_posture.experiment.summary import summary
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.plot import ResultView, jump_figure, save
@@ -179,6 +182,21 @@ def test_readme_shows_names_as_text(exports: dict[str, Path]) -> None:
         shape = [t.type for t in tokens if t.type.endswith("_open") or t.type == "fence"]
         shapes = shapes or shape
         assert shape == shapes, ascii(name)[:60]
+
+
+def test_summary_shows_names_as_text() -> None:
+    rows = [
+        Row(name, controller, "fell", 1, 0, (name,), {}, None, None, {}, (name,), True, None, None)
+        for name in ("plain", *NASTY)
+        for controller in ("nominal", "robust")
+    ]
+    text = summary(Reproduction(1, tuple(rows)))
+    assert_plain(text)
+    tokens = list(flat(MarkdownIt("commonmark", {"html": True}).enable("table").parse(text)))
+    assert not [t for t in tokens if t.type.startswith(("html", "link", "image", "fence"))]
+    assert sum(t.type == "table_open" for t in tokens) == len(NASTY) + 2
+    shown = "".join(t.content for t in tokens if t.type == "text")
+    assert all(escape.printable(name).strip() in shown for name in NASTY)
 
 
 def test_identifiers_and_file_names() -> None:
