@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -14,6 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from impact_posture.job import load_view
+from impact_posture.plot.view import header_lines
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
@@ -106,6 +110,13 @@ def test_verify_takes_the_problem_of_a_result(result: Path, tmp_path: Path) -> N
     assert document["contacts"] == known["contacts"] and document["supports"] == known["supports"]
     refused = run("verify", result, "--frame", "ee", cwd=tmp_path)
     assert refused.returncode == 2 and "--frame contradicts RESULT_DIR" in " ".join(refused.stderr.split())
+
+
+def test_energy_has_one_unit_in_pictures_and_tables(result: Path, tmp_path: Path) -> None:
+    (line,) = [line for line in header_lines(load_view(result))[1] if " E " in line]
+    assert re.search(r"\bE [\d.]+ → [\d.]+ kg", line), line
+    done = run("evaluate", "tilthex_arm", "--normal", 0, 0, 1, cwd=tmp_path)
+    assert re.search(r"^ *E +[\d.]+ +kg ", done.stdout, re.MULTILINE), done.stdout
 
 
 def test_posture_file_starts_the_next_optimization(result: Path, tmp_path: Path) -> None:

@@ -92,7 +92,9 @@ def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, 
         page.table((), [("  -", line) for line in dict.fromkeys(draft.guesses)])
         page.line("Then leave the options out that it answers, as in")
         beside = path.name == "robot.toml" and path.parent == Path(robot).parent
-        page.line(f"  impact-posture optimize {robot}{'' if beside else f' --config {path}'} --normal X Y Z")
+        config = "" if beside else f" --config {path}"
+        # Not broken at the terminal's edge: it is there to be copied.
+        page.console.print(f"  impact-posture optimize {robot}{config} --normal X Y Z", soft_wrap=True, markup=False)
 
 
 def _head(page: Page, summary: dict[str, Any]) -> None:

@@ -190,8 +190,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
     else:
         listed = list(known_robots())
         shipped = [EXAMPLE_PREFIX + p for p in example_models() if robot.casefold() in Path(p).stem.casefold()]
-        either = "".join(f"{uri}, or " for uri in shipped[:2])
-        raise RobotNotFound(robot, listed, mend=f"(or give {either}a path to a .urdf)")
+        raise RobotNotFound(robot, [*listed, *shipped], mend="(or give a path to a .urdf)")
     config = Path(options.config) if options.config else urdf.parent / "robot.toml"
     if options.config or (config.is_file() and EXAMPLE_PREFIX not in source):
         spec = read_spec(config)
