@@ -1,11 +1,8 @@
-"""``simulate``, ``compare``, ``reproduce`` through the installed entry point."""
+"""``simulate``, ``compare``, ``reproduce`` as a user runs them."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +10,7 @@ import numpy as np
 import pytest
 
 from impact_posture.simulation.series import Series
-
-COMMAND = Path(sys.executable).parent / "impact-posture"
-
-
-def start(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1"}
-    return subprocess.run(
-        [str(COMMAND), *arguments], capture_output=True, text=True, timeout=180, env=environment, cwd=cwd
-    )
+from tests.command import run as start
 
 
 def document(*arguments: str, cwd: Path) -> dict[str, Any]:
