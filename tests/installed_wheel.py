@@ -213,8 +213,10 @@ def main() -> None:
             commands(work, programs)
         with step("install, with all extras"):
             install(work, wheel, "sim,test,docs", options.lowest)
-        with step("types"):
-            types(work, programs)
+        # What mypy finds hangs on the types that other packages came with: those of today are the ones to satisfy.
+        if not options.lowest:
+            with step("types"):
+                types(work, programs)
         if options.tests is not None:
             with step("tests"):
                 suite(work, programs, options.tests)
