@@ -4,14 +4,17 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test lint types docs bench study-impacts study-robustness reproduction calibration regression
+.PHONY: help demo test wheel test-wheel lowest lint types docs bench study-impacts study-robustness reproduction calibration regression
 .PHONY: pictures clean
 
 help:
 	@echo "make demo        install into .venv, optimize a real robot, leave pictures and C code in demo/"
 	@echo "make test        install with the test extras and run the whole suite"
-	@echo "make lint types  ruff; mypy"
+	@echo "make lint types  ruff, import-linter; mypy"
 	@echo "make docs        the documentation site in docs/_build/html"
+	@echo "make wheel       build sdist and wheel, compare them with git, install, run every command, types"
+	@echo "make test-wheel  the same, then the whole suite against what was installed"
+	@echo "make lowest      the same with the lowest versions that pyproject.toml allows; PYTHON= tries another Python"
 	@echo "make bench       solve times, and the exported kernel beside its peers, on this machine"
 	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
@@ -45,17 +48,28 @@ demo: $(VENV)/.installed
 	@cat demo/LOOK.txt
 
 test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -q
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -q
+
+wheel: $(VENV)/.installed-test
+	$(BIN)/python -m tests.installed_wheel
+
+test-wheel: $(VENV)/.installed-test
+	$(BIN)/python -m tests.installed_wheel --tests -n $(JOBS) --dist worksteal
+
+lowest: $(VENV)/.installed-test
+	$(BIN)/python -m tests.installed_wheel --lowest --tests -n $(JOBS) --dist worksteal
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-logo
 
-# mypy does not see mapped packages in an editable install, so it checks what a wheel would install.
+# mypy does not see mapped packages in an editable install, so it checks what a wheel would install; from there, since it
+# would read the sources that lie in the folder where it starts.
 types: $(VENV)/.installed-test
 	rm -rf build/types build/lib
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target build/types .
-	MYPYPATH=build/types $(BIN)/mypy -p impact_posture -p impact_posture_cli -p impact_posture_robots
+	cd build/types && $(CURDIR)/$(BIN)/mypy --config-file $(CURDIR)/pyproject.toml -p impact_posture -p impact_posture_cli -p impact_posture_robots
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
@@ -86,4 +100,4 @@ pictures: $(VENV)/.installed
 	$(BIN)/python docs/pictures.py
 
 clean:
-	rm -rf $(VENV) demo docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import impact_posture_robots
 from impact_posture.errors import FrameNotFound, PostureError, SpecError
 from impact_posture.robot.actuation import (
     actuation_matrix,
@@ -19,7 +20,7 @@ from impact_posture.robot.actuation import (
 )
 from impact_posture.robot.spec import PropulsionSpec, RotorSpec, read_spec
 
-FOLDER = Path(__file__).resolve().parent.parent / "robots" / "tilthex_arm"
+FOLDER = Path(impact_posture_robots.__path__[0]) / "tilthex_arm"
 POSTURES = ["home", "tucked", "brace_down", "brace_forward", "brace_up"]
 
 

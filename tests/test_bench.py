@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -21,10 +20,10 @@ from impact_posture.benchmark.workbench import Absent, Workbench
 from impact_posture.errors import CompilerError, InputError
 from impact_posture.robot.loader import known_robots, load_robot
 from impact_posture_cli.commands.bench import PeerName
+from tests.command import run
 from tests.helpers import robot
 from tests.tools import need_compiler
 
-COMMAND = Path(sys.executable).parent / "impact-posture"
 ROOT = Path(__file__).parents[1]
 LINK = (
     '<link name="{0}"><inertial><origin xyz="0.1 0.02 0.05"/><mass value="1.5"/>'
@@ -70,11 +69,7 @@ def own_cache(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def bench(folder: Path, *arguments: str, **more: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1", **more}
-    return subprocess.run(
-        [str(COMMAND), "bench", *arguments],
-        cwd=folder, env=environment, capture_output=True, text=True, timeout=100, check=False,
-    )  # fmt: skip
+    return run("bench", *arguments, cwd=folder, env=more)
 
 
 def measured(path: Path, *peers: str, said: list[str] | None = None) -> BenchReport:

@@ -156,27 +156,6 @@ def test_held_tasks_have_the_jacobian_of_their_error(example: ModuleType) -> Non
         assert_close(task.compute_jacobian(configuration), central_gradient(error, model, q, 1e-3), 1e-9, repr(task))
 
 
-# ---- TSID ---------------------------------------------------------------------------------------------------------
-
-
-def test_tsid_lowers_H_where_it_is_installed() -> None:
-    if importlib.util.find_spec("tsid") is None:
-        pytest.skip("needs stack-of-tasks' TSID: pip install --no-binary tsid tsid")
-    need_compiler()
-    # A program of its own: a TSID that does not fit the pin beside it takes the process with it.
-    done = subprocess.run(
-        [sys.executable, str(EXAMPLES / "tsid_impact.py")], capture_output=True, text=True, timeout=120, check=False
-    )
-    if done.returncode < 0 or "MemoryError" in done.stderr:
-        pytest.skip("the TSID that is installed does not fit the pin beside it: pip install --no-binary tsid tsid")
-    assert done.returncode == 0, done.stderr
-    numbers = re.search(r"H (\S+) → (\S+) .*\ntip off by (\S+) mm", done.stdout)
-    assert numbers is not None, done.stdout
-    before, after, tip = map(float, numbers.groups())
-    assert after < 0.57 * before
-    assert tip < 1e-2
-
-
 # ---- C++ ----------------------------------------------------------------------------------------------------------
 
 

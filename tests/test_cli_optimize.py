@@ -1,4 +1,4 @@
-"""``optimize`` and ``plot`` through the installed entry point: what they write, and what they refuse."""
+"""``optimize`` and ``plot`` as a user runs them: what they write, and what they refuse."""
 
 from __future__ import annotations
 
@@ -18,15 +18,10 @@ import pytest
 
 from impact_posture.job import load_view
 from impact_posture.plot.view import header_lines
+from tests.command import run
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
-
-
-def run(*arguments: object, cwd: Path, **more: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(COMMAND), *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=120, **more
-    )
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +135,7 @@ def test_posture_file_starts_the_next_optimization(result: Path, tmp_path: Path)
 
 
 def test_human_output_fits_80_columns(tmp_path: Path) -> None:
-    done = run("optimize", "solo8", "--normal", 1, 0, 0, *FAST, cwd=tmp_path, env=os.environ | {"COLUMNS": "80"})
+    done = run("optimize", "solo8", "--normal", 1, 0, 0, *FAST, cwd=tmp_path)
     assert done.returncode == 0
     assert max(len(line.rstrip()) for line in done.stdout.splitlines()) <= 80
     for word in ("constraints", "reduction", "certificate", "base roll", "before", "after"):
@@ -311,7 +306,7 @@ def test_file_size_limit_leaves_nothing(tmp_path: Path) -> None:
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 
-    refused(run(*BASE, "--out", "out", cwd=tmp_path, preexec_fn=limit), 1, "out")
+    refused(run(*BASE, "--out", "out", cwd=tmp_path, prepare=limit), 1, "out")
     untouched(tmp_path)
 
 
@@ -407,7 +402,7 @@ def test_normal_of_any_length(scale: str, tmp_path: Path) -> None:
 
 def test_failing_compiler_does_not_cost_the_posture(tmp_path: Path) -> None:
     arguments = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--starts", 2, "--format", "png")
-    done = run(*arguments, cwd=tmp_path, env=os.environ | {"CC": "false"})
+    done = run(*arguments, cwd=tmp_path, env={"CC": "false"})
     assert done.returncode == 0
     assert "could not be built" in done.stderr
     assert (tmp_path / "tilthex_arm-ee" / "posture.json").is_file()

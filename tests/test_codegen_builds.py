@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import subprocess
-import sys
 from importlib import util
 from pathlib import Path
 from typing import Any
@@ -27,9 +26,9 @@ from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.toolchain import run_compiler
+from tests import command
 from tests.tools import need, need_compiler
 
-COMMAND = Path(sys.executable).parent / "impact-posture"
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
 
 JOINTS = [
@@ -276,9 +275,7 @@ def test_a_build_that_fails_leaves_what_was_there(
 
 
 def call(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(COMMAND), "codegen", *arguments], cwd=folder, capture_output=True, text=True, timeout=120, check=False
-    )
+    return command.run("codegen", *arguments, cwd=folder)
 
 
 def test_command_for_a_robot(tmp_path: Path) -> None:
@@ -299,7 +296,7 @@ def test_command_for_a_robot(tmp_path: Path) -> None:
 def test_command_for_a_result(tmp_path: Path) -> None:
     solve = ("tilthex_arm", "--normal", "0", "0", "1", "--objective", "speed", "--starts", "1", "--out", "r")
     quick = ("--no-codegen", "--format", "png", "--compile", "never", "--jobs", "1")
-    run([str(COMMAND), "optimize", *solve, *quick], tmp_path)
+    assert command.run("optimize", *solve, *quick, cwd=tmp_path).returncode == 0
     done = call(tmp_path, "r", "--out", "c", "--quiet")
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "r" / "result.json").read_text())

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import casadi as ca
@@ -30,6 +28,7 @@ from impact_posture.posture.problem import Requirements
 from impact_posture.posture.settings import make_settings, prepare
 from impact_posture.posture.solve import run_start, solve
 from impact_posture.robot.loader import load_robot
+from tests.command import run
 from tests.helpers import (
     assert_close,
     central_gradient,
@@ -43,7 +42,6 @@ from tests.helpers import (
 )
 from tests.tools import need_compiler
 
-COMMAND = Path(sys.executable).parent / "impact-posture"
 ANGLES = (1.0, 5.0, 20.0, 45.0, 80.0)
 ROBOTS = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "solo8": "base_link", "talos": "gripper_right_base_link"}
 CONE_KINDS: tuple[ObjectiveKind, ...] = ("impulse", "sticking", "energy")
@@ -329,10 +327,6 @@ def test_export_has_the_worst_case(tmp_path: Path) -> None:
         assert made.manifest["normal_cone_deg"] == 15.0
         header = next((tmp_path / kind).glob("*.h")).read_text()
         assert "worst normal within 15 degrees" in header and "subgradient" in header
-
-
-def run(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([str(COMMAND), *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=120)
 
 
 def test_command_line(tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import casadi as ca
@@ -23,6 +21,7 @@ from impact_posture.posture.feet import KeptFeet
 from impact_posture.posture.settings import make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.robot import Robot
+from tests.command import run
 from tests.helpers import assert_close, central_gradient, frame_jacobian, mass_matrix, robot
 
 FEET = {"solo8": 4, "solo12": 4, "talos": 2}
@@ -175,17 +174,12 @@ def test_kept_feet_change_the_optimum() -> None:
     ],
 )
 def test_refusals(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
-    command = Path(sys.executable).parent / "impact-posture"
-    done = subprocess.run(
-        [command, "optimize", *arguments], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = run("optimize", *arguments, cwd=tmp_path)
     assert done.returncode in (1, 2)
     assert said in done.stderr and "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
 
 
 def test_the_line_stands_in_evaluate(tmp_path: Path) -> None:
-    command = Path(sys.executable).parent / "impact-posture"
-    arguments = ["evaluate", "solo12", "--frame", "base_link", "--normal", "0", "0", "1"]
-    done = subprocess.run([command, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = run("evaluate", "solo12", "--frame", "base_link", "--normal", "0", "0", "1", cwd=tmp_path)
     assert done.returncode == 0 and "the blow lifts" in done.stdout

@@ -9,9 +9,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import impact_posture_robots
 from impact_posture.robot.spec import RobotSpec, SupportSpec, read_spec
 
-ROBOTS = Path(__file__).resolve().parent.parent / "robots"
+ROBOTS = Path(impact_posture_robots.__path__[0])
 NAMES = sorted(p.parent.name for p in ROBOTS.glob("*/robot.toml"))
 NAMED_IN_THE_ISSUE = {
     "solo8", "solo12", "talos", "hextilt", "borinot", "panda", "ur5", "g1", "go2", "anymal_kinova", "tiago",

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +31,7 @@ from impact_posture.posture.settings import dump_settings, make_settings, prepar
 from impact_posture.posture.solve import solve
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.scenario import MOST_SCENARIOS, Payload, between, build_scenarios
+from tests.command import run
 from tests.helpers import (
     assert_close,
     central_gradient,
@@ -47,7 +45,6 @@ from tests.helpers import (
 )
 from tests.tools import need_compiler
 
-COMMAND = Path(sys.executable).parent / "impact-posture"
 FRAMES = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "bolt": "base_link", "talos": "gripper_right_base_link"}
 
 
@@ -400,13 +397,6 @@ def test_export_has_the_worst_scenario(tmp_path: Path, kind: str, real: Real) ->
 
 
 # ---- the command line ---------------------------------------------------------------------------------------------
-
-
-def run(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"COLUMNS": "80", "NO_COLOR": "1"}
-    return subprocess.run(
-        [str(COMMAND), *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=120, env=environment
-    )
 
 
 def test_optimize(tmp_path: Path) -> None:

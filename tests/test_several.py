@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,6 +39,7 @@ from impact_posture.posture.starts import feasible_start
 from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RobotSpec
+from tests.command import run
 from tests.helpers import (
     assert_close,
     central_gradient,
@@ -56,7 +55,6 @@ from tests.helpers import (
 from tests.test_dynamics import random_tree
 from tests.tools import need, need_compiler
 
-COMMAND = Path(sys.executable).parent / "impact-posture"
 HANDS = ("gripper_right_base_link", "gripper_left_base_link")
 
 
@@ -440,13 +438,6 @@ def test_exported_frame_struck_along_two_normals(tmp_path: Path) -> None:
 # ---- the command line ---------------------------------------------------------------------------------------------
 
 BOTH = ("--contact", "panda_hand_tcp:0,0,1", "--contact", "panda_link4:1,0,0:2")
-
-
-def run(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"COLUMNS": "80", "NO_COLOR": "1"}
-    return subprocess.run(
-        [str(COMMAND), *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=120, env=environment
-    )
 
 
 def test_json(tmp_path: Path) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -30,10 +28,10 @@ from impact_posture.posture.starts import Projector
 from impact_posture.posture.tradeoff import TradeOff, find_knee
 from impact_posture_cli.options import TRADEOFF_POINTS
 from impact_posture_cli.words import fill_optional
+from tests.command import run
 from tests.helpers import central_gradient, relative, rng
 from tests.test_posture import walk
 
-COMMAND = Path(sys.executable).parent / "impact-posture"
 CASES: dict[str, dict[str, object]] = {
     "fixed": {"robot": "kinova", "normal": (0, 0, 1), "contact_pose": "position", "objective": "sticking"},
     "floating": {"robot": "tilthex_arm", "normal": (0, 0, 1)},
@@ -289,10 +287,6 @@ def test_no_points_are_refused(points: int) -> None:
 
 
 # ---- the command line -------------------------------------------------------------------------------------------
-
-
-def run(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([str(COMMAND), *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=120)
 
 
 BASE = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--starts", 2, "--jobs", 1, "--no-codegen")

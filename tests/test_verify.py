@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import importlib.util
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -28,10 +27,10 @@ from impact_posture.verification.report import Row, VerificationReport, deviatio
 from impact_posture.verification.samples import Sample, random_samples
 from impact_posture.verification.sources import Numbers, casadi_source, pinocchio_numbers
 from impact_posture.verification.verify import CASADI, COMPILED, DIFFERENCES, MUJOCO, verify
+from tests.command import run
 from tests.helpers import NAMES, Vector, robot
 from tests.test_dynamics import write_urdf
 
-COMMAND = Path(sys.executable).parent / "impact-posture"
 QUANTITIES = ["H", "G", "Λ_c", "∇H"]
 HAS_MUJOCO = importlib.util.find_spec("mujoco") is not None
 
@@ -292,10 +291,7 @@ def test_progress_reaches_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def start(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1", **env}
-    return subprocess.run(
-        [str(COMMAND), "verify", *arguments], capture_output=True, text=True, timeout=120, env=environment
-    )
+    return run("verify", *arguments, env=env)
 
 
 def test_the_table(tmp_path: Path) -> None:

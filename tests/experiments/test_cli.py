@@ -1,4 +1,4 @@
-"""``simulate``, ``compare``, ``reproduce`` through the installed entry point."""
+"""``simulate``, ``compare``, ``reproduce`` as a user runs them."""
 
 from __future__ import annotations
 
@@ -15,15 +15,9 @@ import numpy as np
 import pytest
 
 from impact_posture.simulation.series import Series
+from tests.command import run as start
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
-
-
-def start(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "80", "NO_COLOR": "1"}
-    return subprocess.run(
-        [str(COMMAND), *arguments], capture_output=True, text=True, timeout=180, env=environment, cwd=cwd
-    )
 
 
 def document(*arguments: str, cwd: Path) -> dict[str, Any]:
