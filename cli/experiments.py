@@ -42,7 +42,7 @@ def rows_table(page: Page, rows: tuple[Row, ...] | list[Row]) -> None:
         lines.append((f"  {row.controller}{'' if row.rested else ' *'}", *numbers, status))
     head = ("  controller", "q_total", "less %", "in 1 s %", "peak jump", "status")
     page.table(head, lines, right=(1, 2, 3, 4))
-    page.line("  less %: reduction within the windows; in 1 s %: until 1 s after each impact began", style="dim")
+    page.line("  less %: within the windows; in 1 s %: until 1 s after each impact began", style="dim")
     if any(row.failed for row in rows):
         page.line("  no reduction where a run did not complete, of either controller; means are of those that did",
                   style="dim")  # fmt: skip

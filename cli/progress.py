@@ -64,17 +64,18 @@ def progress_line(*, shown: bool) -> Iterator[Callable[[int, int], None] | None]
     from impact_posture.progress import listening
 
     # Drawn when something is told, by no thread of its own: runs fork.
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[runs]}"))
+    words = TextColumn("{task.description}", markup=False)
+    columns = (words, BarColumn(), TextColumn("{task.fields[runs]}"))
     line = Progress(*columns, console=console, transient=True, auto_refresh=False)
     task = line.add_task("", total=None, runs="")
-    drawn, words = 0.0, ""
+    drawn, last = 0.0, ""
 
     def show(doing: str, share: float | None = None) -> None:
-        nonlocal drawn, words
+        nonlocal drawn, last
         now = time.monotonic()
-        if doing == words and now - drawn < _REFRESH:
+        if doing == last and now - drawn < _REFRESH:
             return
-        drawn, words = now, doing
+        drawn, last = now, doing
         line.update(task, description=printable(doing), completed=share or 0.0, total=None if share is None else 1.0)
         line.refresh()
 

@@ -18,12 +18,12 @@ from impact_posture.simulation.scenario import RepeatedContacts
 from impact_posture.simulation.series import Series, Window
 
 
-def draw_runs(job: Job, runs: Sequence[Run], folder: Path, formats: Sequence[str]) -> None:
+def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:
     """Figures of one job; those of a push the other way in ``minus/``."""
-    for one in runs:
+    for one, part in zip(runs, document["runs"], strict=True):
         into = folder if one is runs[0] else folder / "minus"
         tell("drawing")
-        view = run_view(job, one.series, one.windows, one.sign)
+        view = run_view(job, one.series, one.windows, one.sign, part["status"])
         draw_run(view, into, formats)
         draw_snapshots([view], into, formats)
 
@@ -56,8 +56,8 @@ def draw_reproduction(
         draw_side_by_side([labels[label] for label in shown if label in labels], store, folder / scenario, formats)
 
 
-def run_view(job: Job, series: Series, windows: Sequence[Window], sign: int) -> RunView:
-    """What is drawn of a run."""
+def run_view(job: Job, series: Series, windows: Sequence[Window], sign: int, status: str) -> RunView:
+    """What is drawn of a run; one that did not complete says so wherever its name stands."""
     shop = workshop(job.scenario, job.free)
     setup, scenario = shop.setup, shop.setup.scenario
     objective = shop.objective()
@@ -81,7 +81,7 @@ def run_view(job: Job, series: Series, windows: Sequence[Window], sign: int) -> 
         windows=tuple(Span(w.kind, w.begin, w.end, w.contact, w.touched) for w in windows if w.kind != "recovery"),
         surface=np.array(setup.world.built.points[scenario.surface.name]) if hits else None,
         supports=objective.supports,
-        label=job.label,
+        label=job.label if status == "completed" else f"{job.label} ({status})",
         facts=(f"seed {job.seed}", *(() if hits else (f"push {sign:+d}",))),
     )
 
@@ -92,6 +92,5 @@ def _kept(job: Job, store: Store) -> RunView | None:
     if document is None or not document["runs"]:
         return None
     part = document["runs"][0]
-    return run_view(
-        job, Series.load(store.series(job, part["sign"])), [Window(**w) for w in part["windows"]], part["sign"]
-    )
+    series = Series.load(store.series(job, part["sign"]))
+    return run_view(job, series, [Window(**w) for w in part["windows"]], part["sign"], part["status"])

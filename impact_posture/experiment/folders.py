@@ -37,7 +37,7 @@ def write_simulation(
         _write_json(folder / SIMULATION, document)
         for one in runs:
             one.series.save(folder / f"series{'' if one.sign > 0 else '-minus'}.npz")
-        draw_runs(job, runs, folder, formats)
+        draw_runs(job, runs, document, folder, formats)
 
 
 def write_comparison(

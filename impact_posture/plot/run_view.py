@@ -192,7 +192,7 @@ def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
     else:
         touched = [sum(w.touched for w in view.impacts) for view in views]
         counts = ", ".join(str(count) for count in (touched if len(set(touched)) > 1 else touched[:1]))
-        facts += [f"contact {one.contact.frame}", f"n = ({n})", f"contacts {counts}"]
+        facts += [f"contact {one.contact.frame}", f"n = ({n})", f"contacts {counts} of {len(one.impacts)}"]
     facts.append(f"on {', '.join(s.frame for s in one.supports)}" if one.supports else "no supports")
     shared = [fact for fact in one.facts if all(fact in view.facts for view in views)]
     return title, ["  ·  ".join([*facts, *shared])]

@@ -68,11 +68,14 @@ def _take_shown(folder: Path) -> None:
 
 def _page(found: Reproduction, every: Reproduction) -> list[str]:
     seeds = ", ".join(str(k) for k in range(found.seeds))
+    shown = f"seeds {seeds}; mean ± half of the 95 % confidence interval" if found.seeds > 2 else (
+        f"seeds {seeds}; too few for intervals" if found.seeds > 1 else "seed 0 alone: no means, no intervals"
+    )  # fmt: skip
     parts = [
         "## What to choose",
         "\n".join(f"- {line}" for line in advice(found, every)),
         "## Table I of the paper, and ours",
-        f"`q_total_impact`, seeds {seeds}; mean ± half of the 95 % confidence interval.",
+        f"`q_total_impact`, {shown}.",
         table_one(found),
         LEGEND,
     ]
