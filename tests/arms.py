@@ -57,9 +57,7 @@ def arm(
         contact=ContactSpec(frame=TIP),
         propulsion=hexarotor.spec.propulsion if floating else None,
     )
-    return Robot(
-        "made up", "tests", model, "free-flyer" if floating else "fixed", {"home": posture}, "home", spec
-    )
+    return Robot("made up", "tests", model, "free-flyer" if floating else "fixed", {"home": posture}, "home", spec)
 
 
 def yaw_and_pitches() -> Robot:
