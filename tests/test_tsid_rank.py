@@ -51,7 +51,8 @@ def test_gentle_flight_is_solved_at_every_tick(name: str, noise: float) -> None:
     """The arm cannot roll the end effector, hence the base's tilt and the pose share a row."""
     r = MADE[name]()
     controller, generator = Controller(r, aerial_program(r, JointPosture(r))), rng(name, noise)
-    q, v = r.posture(), np.zeros(r.nv)
+    # A nudge: the shared row is asked for two different things, if only in the seventh digit.
+    q, v = r.posture(), 1e-7 * generator.normal(size=r.nv)
     assert controller.reset(q, v).status is Status.SOLVED
     for k in range(300):
         seen = pin.integrate(r.model, q, noise * generator.normal(size=r.nv)), v + noise * generator.normal(size=r.nv)
@@ -60,7 +61,7 @@ def test_gentle_flight_is_solved_at_every_tick(name: str, noise: float) -> None:
         assert np.abs(controller.report().residuals["tilt"]).max() <= 1e-8
         q, v = integrate(r, q, v, command)
     assert_dynamics(controller, command)
-    assert np.linalg.norm(v) < (0.05 if noise else 1e-9)
+    assert np.linalg.norm(v) < (0.05 if noise else 1e-6)
 
 
 @pytest.mark.parametrize("name", MADE)
