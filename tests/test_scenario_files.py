@@ -16,6 +16,7 @@ from impact_posture.simulation import scenario_file
 from impact_posture.simulation.exchange import Drive
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import (
+    EndEffectorGains,
     Footing,
     Gains,
     ImpactScenario,
@@ -224,6 +225,7 @@ def test_surface_and_shape_of_a_push_are_refused() -> None:
     [
         ("PhysicsFile", Physics), ("SurfaceFile", Surface), ("ShapeFile", Shape), ("SensorsFile", Sensors),
         ("ContactsFile", RepeatedContacts), ("PushFile", SinglePush), ("GainsFile", Gains),
+        ("EndEffectorFile", EndEffectorGains),
         ("RobustFile", RobustTerm), ("FootingFile", Footing),
     ],
 )  # fmt: skip

@@ -12,6 +12,7 @@ import pytest
 from impact_posture.errors import InputError, PostureError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RotorSpec
+from impact_posture.tsid import relaxation
 from impact_posture.tsid.body_tasks import Tilt
 from impact_posture.tsid.controller import Command, Controller, Status
 from impact_posture.tsid.frame_tasks import FramePose, FramePosition, Impedance
@@ -240,7 +241,7 @@ class Refusing:
         return None
 
 
-def test_a_solver_that_gives_up_holds_the_last_command() -> None:
+def test_a_solver_that_gives_up_holds_the_last_command(monkeypatch: pytest.MonkeyPatch) -> None:
     r = robot(ARM)
     controller = Controller(r, aerial_program(r, JointPosture(r)))
     controller.reset(r.posture(), np.zeros(r.nv))
@@ -250,11 +251,19 @@ def test_a_solver_that_gives_up_holds_the_last_command() -> None:
     controller._solver = Refusing()
     command = controller.tick(0.001, r.posture(), np.zeros(r.nv))
     assert command.status is Status.SOLVED and np.allclose(command.u, before.u, rtol=0, atol=1e-6)
-    # ... and where it does not, the command is held, from what was sent last.
+    # ... where it does not, the levels without the cost do ...
     controller._aside = Refusing()
+    bare = controller.tick(0.001, r.posture(), 0.05 * rng("bare").normal(size=r.nv))
+    assert bare.status is Status.SOLVED
+    assert np.abs(controller.report().residuals["tilt"]).max() <= 1e-5
+    assert np.abs(controller.report().residuals["ee pose"]).max() <= 1e-4
+    assert_limits(controller, bare)
+    # ... and where not even those have an answer, the command is held, from what was sent last.
+    monkeypatch.setattr(relaxation, "lexicographic", lambda levels: None)
     held = controller.tick(0.001, r.posture(), np.zeros(r.nv))
     assert held.status is Status.UNSOLVED
-    assert np.allclose(held.u, command.u, rtol=0, atol=1e-8)
+    assert np.allclose(held.u, bare.u, rtol=0, atol=1e-8)
+    monkeypatch.undo()
     controller._solver, controller._aside = working, aside
     assert solve(controller.assembly, working, aside).solved is not None
 

@@ -15,7 +15,7 @@ import pytest
 
 from impact_posture.errors import InputError, PostureError
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
-from impact_posture.tsid.frame_tasks import FramePose, FramePosition, Impedance
+from impact_posture.tsid.frame_tasks import FrameAligned, FramePose, FramePosition, Impedance
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.state import State
@@ -41,7 +41,7 @@ def tasks(name: str) -> list[Task]:
     found: list[Task] = [FramePose(point), FramePosition(bare), JointPosture(robot(name))]
     if robot(name).floating:
         found += [Tilt(), BaseOrientation(), CenterOfMass()]
-    return found
+    return [*found, FrameAligned(point, (0.3, -0.5, 0.8))]
 
 
 def state_of(name: str, task: Task, q: np.ndarray, v: np.ndarray) -> State:

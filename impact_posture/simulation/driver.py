@@ -36,15 +36,15 @@ class Driver:
         self._hand = end_effector_task(setup)
         program = build_program(setup, posture, self._hand)
         self.controller = Controller(setup.robot, program, period=setup.scenario.control.period)
-        n = setup.scenario.normal
-        self._inward = np.concatenate([-n, np.zeros(3)])
-        self._home: pin.SE3 | None = None
+        self._inward = np.zeros(3 if self._hand is None else self._hand.size)
+        self._inward[:3] = -setup.scenario.normal
+        self._home: pin.SE3 | Array | None = None
 
     def reset(self, q: Array) -> Command:
         """Begin at rest: what the tasks hold is what is there, whatever a run before has moved."""
         if self._hand is not None:
             self._hand.target = None
-            self._hand.target_velocity, self._hand.target_acceleration = np.zeros(6), np.zeros(6)
+            self._hand.target_velocity = self._hand.target_acceleration = np.zeros(self._hand.size)
         for task in self.controller.program.weighted:
             if isinstance(task, CenterOfMass | BaseOrientation):
                 task.target = None
@@ -84,8 +84,10 @@ class Driver:
     def _follow(self, reference: ReferencePoint) -> None:
         if self._hand is None or self._home is None:
             return
-        way = reference.distance * self._inward[:3]
-        self._hand.target = pin.SE3(self._home.rotation, self._home.translation + way)
+        home, way = self._home, reference.distance * self._inward[:3]
+        self._hand.target = (
+            home + way if isinstance(home, np.ndarray) else pin.SE3(home.rotation, home.translation + way)
+        )
         self._hand.target_velocity = reference.speed * self._inward
         self._hand.target_acceleration = reference.acceleration * self._inward
 

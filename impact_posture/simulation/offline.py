@@ -62,9 +62,10 @@ def offline_posture(
 ) -> OfflinePosture:
     """Optimize the posture for the scenario's blow; stop where the motors can hold it.
 
-    End effector where it starts, base level (a robot that flies); feet where they are, center of mass above them (one
-    that stands).  Of the trade-off between objective and distance from the start, the farthest posture that a nominal
-    controller holds at rest with at most ``share`` of every torque limit, and of the rotors' range, is taken.
+    End effector where it starts, as far as its task holds it; base level (a robot that flies); feet where they are,
+    center of mass above them (one that stands).  Of the trade-off between objective and distance from the start, the
+    farthest posture that a nominal controller holds at rest with at most ``share`` of every torque limit, and of the
+    rotors' range, is taken.
 
     Args:
         setup: The experiment.
@@ -100,7 +101,7 @@ def _solved(setup: Setup, objective: ImpactObjective, starts: int, seed: int) ->
     robot, control = setup.robot, setup.scenario.control
     stands = control.footing is not None
     asked = Requirements(
-        contact_pose="full" if control.end_effector is not None else "free",
+        contact_pose="free" if control.end_effector is None else control.end_effector.pose,
         base="level" if control.tilt is not None and robot.floating else "free",
         hold=tuple(j for j in robot.spec.constraints.hold if j not in robot.locked),
         com_over_feet=stands,

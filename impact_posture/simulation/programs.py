@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import SpecError
+from impact_posture.impact.contact import point_on
 from impact_posture.simulation.scenario import Control, RepeatedContacts, Setup
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
 from impact_posture.tsid.contacts import Contact, support_contacts
-from impact_posture.tsid.frame_tasks import FramePose, Impedance
+from impact_posture.tsid.frame_tasks import EndEffector, FrameAligned, FramePose, FramePosition, Impedance
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.program import Program
 from impact_posture.tsid.task import Task
 
 
-def end_effector_task(setup: Setup) -> FramePose | None:
+def end_effector_task(setup: Setup) -> EndEffector | None:
     """The end effector's task, where the scenario has gains for one.
 
     Raises:
@@ -36,10 +38,15 @@ def end_effector_task(setup: Setup) -> FramePose | None:
         )
     soften = None if control.apparent_mass is None else Impedance(control.apparent_mass)
     point = Point(task.frame, setup.scenario.shape.offset)
-    return FramePose(point, name="end effector", impedance=soften, kp=gains.kp, kd=gains.kd, weight=gains.weight)
+    common = {"name": "end effector", "impedance": soften, "kp": gains.kp, "kd": gains.kd, "weight": gains.weight}
+    if gains.pose == "aligned":
+        placed = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, task.frame))
+        return FrameAligned(point, placed.rotation.T @ setup.scenario.normal, **common)  # type: ignore[arg-type]
+    kind = FramePose if gains.pose == "full" else FramePosition
+    return kind(point, **common)  # type: ignore[arg-type]
 
 
-def build_program(setup: Setup, posture: JointPosture, end_effector: FramePose | None) -> Program:
+def build_program(setup: Setup, posture: JointPosture, end_effector: EndEffector | None) -> Program:
     """The program of a scenario with a posture task of its own.
 
     A robot with ``[control.footing]`` stands: contacts and friction constrain, center of mass, base orientation, end

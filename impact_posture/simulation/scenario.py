@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from impact_posture.simulation.scene import Scene, Shape, Surface
 from impact_posture.simulation.world import World, build_world
 
 Array = NDArray[np.float64]
+EndEffectorPose = Literal["full", "position", "aligned"]
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,18 @@ class Gains:
 
 
 @dataclass(frozen=True)
+class EndEffectorGains(Gains):
+    """Of the end effector's task.
+
+    Attributes:
+        pose: What is led: the frame's pose (``full``), its ``position``, or with ``aligned`` position and the frame's
+            direction that is the surface's normal at the start, spin about it free.
+    """
+
+    pose: EndEffectorPose = "full"
+
+
+@dataclass(frozen=True)
 class RobustTerm:
     """The impact-robust term.
 
@@ -140,7 +154,7 @@ class Control:
         robust: Of the impact-robust term.
         period: Seconds from tick to tick.
         tilt: Of the level base, first priority.
-        end_effector: Of the end effector's pose, second priority: linear entries first.
+        end_effector: Of the end effector, second priority: linear entries first.
         apparent_mass: M_d of ``F̂/M_d`` in the end effector's law, kg; ``None``: the force is left out.
         center_of_mass: Of the center of mass.
         base: Of the base's orientation.
@@ -151,7 +165,7 @@ class Control:
     robust: RobustTerm
     period: float = 1e-3
     tilt: Gains | None = None
-    end_effector: Gains | None = None
+    end_effector: EndEffectorGains | None = None
     apparent_mass: float | None = None
     center_of_mass: Gains | None = None
     base: Gains | None = None

@@ -14,6 +14,8 @@ from impact_posture.robot.spec import NonNegative, Positive, Root, Vector3, read
 from impact_posture.simulation.scenario import (
     Bounds,
     Control,
+    EndEffectorGains,
+    EndEffectorPose,
     Footing,
     Gains,
     ImpactScenario,
@@ -125,6 +127,12 @@ class GainsFile(_Strict):
     weight: Positive = 1.0
 
 
+class EndEffectorFile(GainsFile):
+    """``[control.end_effector]``: see :class:`~impact_posture.simulation.scenario.EndEffectorGains`."""
+
+    pose: EndEffectorPose = "full"
+
+
 class RobustFile(_Strict):
     """``[control.robust]``: see :class:`~impact_posture.simulation.scenario.RobustTerm`."""
 
@@ -148,7 +156,7 @@ class ControlFile(_Strict):
     posture: GainsFile
     robust: RobustFile
     tilt: GainsFile | None = None
-    end_effector: GainsFile | None = None
+    end_effector: EndEffectorFile | None = None
     apparent_mass: Positive | None = None
     center_of_mass: GainsFile | None = None
     base: GainsFile | None = None
@@ -231,7 +239,7 @@ def scenario_path(scenario: str | Path) -> Path:
 
 def _build(file: ScenarioFile, source: str) -> ImpactScenario:
     control = file.control
-    tasks = ("posture", "tilt", "end_effector", "center_of_mass", "base")
+    tasks = ("posture", "tilt", "center_of_mass", "base")
     gains = {key: Gains(**part.given()) for key in tasks if (part := getattr(control, key)) is not None}
     return ImpactScenario(
         name=file.name,
@@ -249,6 +257,7 @@ def _build(file: ScenarioFile, source: str) -> ImpactScenario:
             robust=RobustTerm(**control.robust.given()),  # type: ignore[arg-type]
             period=control.period,
             apparent_mass=control.apparent_mass,
+            end_effector=None if control.end_effector is None else EndEffectorGains(**control.end_effector.given()),  # type: ignore[arg-type]
             footing=None if control.footing is None else Footing(**control.footing.given()),  # type: ignore[arg-type]
             **gains,
         ),

@@ -213,7 +213,8 @@ class Controller:
     def report(self) -> Report:
         """What the last tick did; computed when asked."""
         assembly, state, posture = self.assembly, self.state, self.program.posture
-        residuals, active, dynamics, deficient = {}, [], float("nan"), ()
+        residuals, active, dynamics = {}, [], float("nan")
+        deficient: tuple[Relaxed, ...] = ()
         solved = self._outcome.solved
         if solved is not None:
             z = solved.z

@@ -7,8 +7,8 @@ import numpy as np
 
 from impact_posture.tsid.qp import QP, Solved
 
-# Exit flags of DAQP: 1 and 2 are solutions (2: soft constraints are active); -1 says that there is none.  -6 says that
-# equations depend on others, or on bounds that were active before: without those it may find one.
+# Exit flags of DAQP: 1 and 2 are solutions (2: soft constraints are active); -1 says that there is none.  So would -6
+# (equations depend on others), were it not also about bounds that were active before.
 _NONE = -1
 
 

@@ -1,7 +1,8 @@
-"""Tasks of a frame: its pose on SE(3), its position."""
+"""Tasks of a frame: its pose on SE(3), its position, its position with the direction of an axis."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -142,6 +143,87 @@ class FramePose(Task):
     def feedforward(self, state: State) -> Array | None:
         """``M_d⁻¹ F̂`` where an impedance is set."""
         return None if self._soften is None or not state.pushed else self._soften * state.force
+
+
+class FrameAligned(Task):
+    """World position of a point, and where an axis of its frame points; spin about the axis is free (5 × nv).
+
+    Position as in :class:`FramePosition`.  Then the shortest rotation that takes the axis to where the target has it,
+    in the two directions of the frame across the axis; ``J`` picks those of the frame's angular velocity.
+
+    Attributes:
+        target: ``T_des``, world from frame, origin at the point; where it is at ``reset`` unless set.
+    """
+
+    def __init__(
+        self,
+        point: Point,
+        axis: ArrayLike = (0.0, 0.0, 1.0),
+        *,
+        name: str | None = None,
+        kp: ArrayLike = 100.0,
+        kd: ArrayLike | None = None,
+        weight: ArrayLike = 1.0,
+        impedance: Impedance | None = None,
+    ) -> None:
+        """Set gains and the axis, in the frame; its length does not matter.
+
+        Raises:
+            InputError: The axis has no direction, or gains that are none.
+        """
+        super().__init__(name or f"{point.frame} axis", 5, kp=kp, kd=kd, weight=weight)
+        self.point, self.points = point, (point,)
+        self.target: pin.SE3 | None = None
+        self._axis = np.array(axis, dtype=float)
+        length = float(np.linalg.norm(self._axis))
+        if not (length > 0 and math.isfinite(length)):
+            raise InputError("the axis has no direction", where=self.name, mend="give a vector that is not zero")
+        self._axis /= length
+        # Across the axis: the other right singular vectors of a row.
+        self._across = np.linalg.svd(self._axis[None])[2][1:]
+        self._soften = None if impedance is None else impedance.inverse()
+
+    def reset(self, state: State) -> None:
+        """Take the present pose as target unless one is set."""
+        if self.target is None:
+            self.target = placement(state.at(self.point))
+
+    def error(self, state: State) -> Array:
+        """``p_des − p``, then angle (rad) times axis of the shortest rotation."""
+        here = state.at(self.point)
+        if self.target is None:
+            raise without_target(self.name)
+        wanted = here.rotation.T @ (self.target.rotation @ self._axis)
+        turn = self._across @ np.cross(self._axis, wanted)
+        sine, cosine = math.hypot(*turn), float(self._axis @ wanted)
+        if sine >= 1e-12:
+            turn *= math.atan2(sine, cosine) / sine
+        elif cosine < 0:
+            # The other way round: there every axis is as short as any other.
+            turn[0] = math.pi
+        return np.concatenate([self.target.translation - here.position, turn])
+
+    def jacobian(self, state: State) -> Array:
+        """Linear rows, world-aligned, then angular velocity across the axis."""
+        here = state.at(self.point)
+        return self._picked(here, here.jacobian)
+
+    def drift(self, state: State) -> Array:
+        """Acceleration at ``ν̇ = 0``; ``d(Rᵀω)/dt = Rᵀω̇``."""
+        here = state.at(self.point)
+        return self._picked(here, here.drift)
+
+    def feedforward(self, state: State) -> Array | None:
+        """``M_d⁻¹ F̂`` where an impedance is set."""
+        if self._soften is None or not state.pushed:
+            return None
+        return self._picked(state.at(self.point), self._soften * state.force)
+
+    def _picked(self, here: PointState, six: Array) -> Array:
+        return np.concatenate([six[:3], self._across @ (here.rotation.T @ six[3:])])
+
+
+EndEffector = FramePose | FramePosition | FrameAligned
 
 
 def placement(point: PointState) -> pin.SE3:

@@ -9,7 +9,7 @@ from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
 from impact_posture.tsid.contacts import Contact, support_contacts
-from impact_posture.tsid.frame_tasks import FramePose, FramePosition
+from impact_posture.tsid.frame_tasks import EndEffector, FramePose
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
@@ -70,7 +70,7 @@ def aerial_program(
     robot: Robot,
     posture: JointPosture,
     *,
-    end_effector: FramePose | None = None,
+    end_effector: EndEffector | None = None,
     tilt: Tilt | None = None,
     order: Literal["strict", "weighted"] = "strict",
     law: LimitLaw | None = LimitLaw(),
@@ -80,7 +80,7 @@ def aerial_program(
     Args:
         robot: The robot; the end effector is its default contact frame.
         posture: Nominal (:class:`JointPosture`), or impact-robust.
-        end_effector: Instead of one with ``kp = 60``; the measured force acts at its point.
+        end_effector: Instead of a pose with ``kp = 60``; the measured force acts at its point.
         tilt: Instead of one with ``kp = 100``.
         order: ``strict``: tilt and end effector as equalities (Problems 2 and 3).  ``weighted``: all in the cost,
             with the tasks' own weights (Problem 1).
@@ -105,7 +105,7 @@ def arm_program(
     robot: Robot,
     posture: JointPosture,
     *,
-    end_effector: FramePose | FramePosition | None = None,
+    end_effector: EndEffector | None = None,
     order: Literal["strict", "weighted"] = "strict",
     law: LimitLaw | None = LimitLaw(),
 ) -> Program:
@@ -114,7 +114,7 @@ def arm_program(
     Args:
         robot: The robot; the end effector is its default contact frame.
         posture: Nominal or impact-robust.
-        end_effector: Instead of one with ``kp = 60``; the measured force acts at its point.
+        end_effector: Instead of a pose with ``kp = 60``; the measured force acts at its point.
         order: ``strict``: the end effector as an equality.  ``weighted``: in the cost, with its own weight.
         law: Of the joint limits.
 

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 # Singular values of a level's rows, over the length of its longest row, below which a direction is damped.  In their
 # postures the shipped robots stay above 0.03.
-SINGULAR = 1e-2
+SINGULAR = 2e-2
 # Share of that below which a direction is dropped: far above rounding, far below what could be seen.
 _NOTHING = 1e-9
 # Least 1 − α: a damped row's weight stays within the solver's digits.
@@ -92,7 +92,7 @@ class LevelRank:
         """Those rows of a level that are equations, or those that are not."""
         n = self._given.n
         held = self.qp.sense[n + rows.start : n + rows.stop] == EQUALITY
-        return np.arange(rows.start, rows.stop)[held == equations]
+        return np.asarray(np.arange(rows.start, rows.stop)[held == equations])
 
     def _begin(self) -> None:
         lengths = np.linalg.norm(self._rows * self._units, axis=1)

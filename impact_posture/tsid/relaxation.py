@@ -15,9 +15,9 @@ Array = NDArray[np.float64]
 
 # What counts as not reached, relative to the numbers that a row adds up: the hierarchy is solved to about six digits.
 _OFF = 1e-6
-# How far what gave way may stray from what was reached, likewise, tried one after the other: held to the last digit
-# it would leave no room to satisfy to the last digit what always holds.
-_STRAY = (1e-6, 1e-4, 1e-2)
+# Tried one after the other, both likewise: what misses by more than the first may stray from what was reached by the
+# second.  Held to the last digit it would leave no room to satisfy to the last digit what always holds.
+_STRAY = ((_OFF, 1e-6), (0.0, 1e-6), (0.0, 1e-4), (0.0, 1e-2))
 # Proximal weights that are tried one after the other, relative to the largest in the cost: the first that makes the
 # program well enough conditioned for the solver changes its solution the least.  Steps with each bring it back.
 _PROXIMAL, _STEPS = (0.0, 1e-6, 1e-3, 1e3), 3
@@ -84,15 +84,18 @@ def _relax(assembly: Assembly, solver: Solver) -> Outcome:
     nearest = lexicographic(_hierarchy(assembly))
     if nearest is None:
         return Outcome(None)
-    for stray in _STRAY:
-        solved = _minimize(_opened(assembly, nearest, stray), nearest, solver)
+    for least, stray in _STRAY:
+        solved = _minimize(_opened(assembly, nearest, least, stray), nearest, solver)
         if solved is not None:
-            return Outcome(solved, _gave_way(assembly, solved.z))
-    return Outcome(None)
+            break
+    else:
+        # What leads nowhere is the cost: without it there is an answer.
+        solved = Solved(nearest, np.zeros(assembly.qp.n + assembly.qp.m), 0)
+    return Outcome(solved, _gave_way(assembly, solved.z))
 
 
-def _opened(assembly: Assembly, nearest: Array, stray: float) -> QP:
-    """The tick's program with what ``nearest`` does not reach held where it is, to ``stray``."""
+def _opened(assembly: Assembly, nearest: Array, least: float, stray: float) -> QP:
+    """The tick's program with what ``nearest`` misses by more than ``least`` held where it is, to ``stray``."""
     asked, limits = assembly.rank.qp, assembly.limits
     qp, values = asked.copy(), nearest[limits]
     room = np.where(_passed(asked, nearest, limits) > 0, stray * (1.0 + np.abs(values)), 0.0)
@@ -101,7 +104,7 @@ def _opened(assembly: Assembly, nearest: Array, stray: float) -> QP:
     for _, level in assembly.levels:
         rows = assembly.rank.rows(level, equations=True)
         off, size = _missed(assembly, nearest, rows)
-        if float(np.max(np.abs(off), initial=0.0)) > _OFF * size:
+        if float(np.max(np.abs(off), initial=0.0)) > least * size:
             at = qp.n + rows
             qp.sense[at] = INEQUALITY
             qp.lower[at] += off - stray * size

@@ -7,9 +7,12 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError
+from impact_posture.impact.contact import point_on
 from impact_posture.simulation.controllers import CONTROLLERS, Workshop
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.prediction import predict
@@ -154,6 +157,29 @@ def test_an_arm_on_a_fixed_base_meets_a_table(folder: Path, which: str, controll
     assert blow.approach == pytest.approx(0.2, rel=0.1)
 
 
+@pytest.mark.parametrize(("pose", "size"), [("position", 3), ("aligned", 5)])
+def test_the_end_effector_can_be_led_by_less_than_its_pose(folder: Path, pose: str, size: int) -> None:
+    """Whoever leads it; the offline optimum is free in the same."""
+    text = HIT.format(robot="panda", frame=robot("panda").spec.contact.frame, more="")
+    path = folder / f"{pose}.toml"
+    path.write_text(text.replace("kp = 100", f'pose = "{pose}"\nkp = 100'), encoding="utf-8")
+    made = workshop(set_up(read_scenario(path)))
+    found = driven(made, "posture")
+    metrics = measure(made.setup, found)
+    assert metrics.contacts == 1 and metrics.failed_ticks == 0 and metrics.relaxed_ticks < 30
+    for controller in CONTROLLERS:
+        program = made.driver(controller).controller.program
+        assert [[task.size for task in level] for level in program.levels] == [[size]], controller
+    (blow,) = predict(made.setup, made.objective(), found)
+    assert blow.approach == pytest.approx(0.2, rel=0.1)
+    point = point_on(made.setup.robot, made.setup.scenario.task.frame)
+    begin, end = (Numeric(made.setup.robot.model).at(q).placement(point) for q in found.series.q[[0, -1]])
+    axis = begin.rotation.T @ made.setup.scenario.normal
+    tilted = np.arccos(np.clip(made.setup.scenario.normal @ (end.rotation @ axis), -1.0, 1.0))
+    spun = np.linalg.norm(pin.log3(begin.rotation.T @ end.rotation))
+    assert spun > 0.05 and (tilted < 0.03 if pose == "aligned" else tilted > 0.05)
+
+
 @pytest.mark.parametrize(("name", "force"), [("solo12", 6.5), ("go2", 30.0)])
 def test_another_robot_stands_and_is_pushed(folder: Path, name: str, force: float) -> None:
     made = standing(folder, name, force)
@@ -214,6 +240,8 @@ def test_a_pushed_arm_without_a_hand_task_still_runs(folder: Path) -> None:
         ("[control.posture]", "[control.footing]\n\n[control.posture]", r"\[control.footing\], but a base that is"),
         ("speed = 0.2", "speed = 0.9", r"the gap is 0.04 m"),
         ("[control.posture]\nkp = 10", "[control.posture]\nkp = [1, 2]", r"kp: has shape"),
+        ("kp = 100", 'pose = "aligned"\nkp = [1, 2, 3, 4, 5, 6]', r"end effector: kp: has shape \(6,\).*or 5"),
+        ("kp = 100", 'pose = "align"\nkp = 100', r"control.end_effector.pose"),
     ],
 )
 def test_what_does_not_fit_the_arm_is_one_line(folder: Path, old: str, new: str, words: str) -> None:
