@@ -38,6 +38,7 @@ $(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
 	@touch $@ $(VENV)/.installed
 
 demo: $(VENV)/.installed
+	@rm -f demo/LOOK.txt
 	$(BIN)/impact-posture optimize tilthex_arm --frame ee --normal 0 0 1 --out demo --force
 	@cp docs/demo.txt demo/LOOK.txt
 	@echo
