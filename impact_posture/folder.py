@@ -99,9 +99,14 @@ def scratch_folder(parent: Path | None = None) -> Iterator[Path]:
         parent: Where; the system's folder for such things by default.
 
     Raises:
+        OutputError: The system has no such folder.
         OSError: It cannot be made.
     """
-    with _scratch(Path(tempfile.gettempdir()) if parent is None else parent, 0o700) as folder:
+    try:
+        parent = Path(tempfile.gettempdir()) if parent is None else parent
+    except FileNotFoundError:
+        raise OutputError("no temporary folder can be written", where="TMPDIR", mend="set it to one") from None
+    with _scratch(parent, 0o700) as folder:
         yield folder
 
 

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from impact_posture.plot import ResultView, TradeOffData
 
 FORMATS = ("png",)
+# What reading a result raises that somebody has changed, or that was not copied whole.
+_BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, EOFError, BadZipFile, RecursionError)
 
 
 @dataclass(frozen=True)
@@ -181,7 +183,7 @@ def load_view(folder: Path) -> ResultView:
         initial, optimal = (np.array(document[key]["q"], dtype=float) for key in ("initial", "optimal"))
         recorded = document["robot"]["model_sha256"]
         view = _view(prepared, initial, optimal, path, document)
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError, EOFError, BadZipFile) as error:
+    except _BROKEN as error:
         raise SpecError(
             f"is no whole result ({type(error).__name__}: {error})", where=str(folder), mend="run optimize again"
         ) from None

@@ -1,0 +1,148 @@
+"""Runs a command line in a forked copy of this process, where everything is imported, and judges how it ended."""
+
+from __future__ import annotations
+
+import io
+import os
+import resource
+import shlex
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+
+from impact_posture_cli.app import app
+from impact_posture_cli.boundary import run
+from impact_posture_cli.words import put_right
+
+CODES = {0, 1, 2, 3, 4, 130, 143}
+# Of a usage error: how to call it, and what was wrong.
+USAGE = ("Usage: ", "Try ", "Error: ")
+# Raw words of libraries and interpreters.
+NOISE = ("Traceback", "internal error", "Warning:", "Exception ignored", "terminate called", "Segmentation", "DEBUG")
+# Processor seconds that one attack may take, and seconds until it counts as hanging.
+BUSY, PATIENCE = 60, 120
+
+SMALL = """<robot name="small">
+  <link name="world_link"/>
+  <link name="upper"><inertial><origin xyz="0 0 0.2"/><mass value="1.5"/>
+    <inertia ixx="0.02" iyy="0.02" izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="lower"><inertial><origin xyz="0.01 0 0.15"/><mass value="0.8"/>
+    <inertia ixx="0.01" iyy="0.012" izz="0.003" ixy="0" ixz="0.001" iyz="0"/></inertial></link>
+  <link name="tip"/>
+  <joint name="shoulder" type="revolute"><parent link="world_link"/><child link="upper"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="20" velocity="3"/></joint>
+  <joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.4"/>
+    <axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="10" velocity="4"/></joint>
+  <joint name="wrist" type="fixed"><parent link="lower"/><child link="tip"/><origin xyz="0 0 0.3"/></joint>
+</robot>
+"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command line ended: its code, below zero for a signal, and what it wrote."""
+
+    argv: tuple[str, ...]
+    code: int
+    out: str
+    err: str
+    changed: tuple[str, ...]
+
+    @property
+    def complaints(self) -> list[str]:
+        """What is wrong with that; nothing where all is well."""
+        lines = [line for line in self.err.splitlines() if line.strip() and not line.startswith("warning: ")]
+        errors = [line for line in lines if line.startswith(("error: ", "Error: "))]
+        found = [f"says {word!r}" for word in NOISE if word in self.err or word in self.out]
+        if self.code not in CODES:
+            found.append(f"exit code {self.code}")
+        elif self.code == 0 and lines:
+            found.append("words on standard error after success")
+        elif self.code and len(errors) != 1:
+            found.append(f"{len(errors)} error lines")
+        elif any(line not in errors and not (self.code == 2 and line.startswith(USAGE)) for line in lines):
+            found.append("more than one line")
+        if self.code and self.changed:
+            found.append(f"fails and leaves {', '.join(self.changed)}")
+        return found
+
+
+def strike(folder: Path, *argv: str) -> Outcome:
+    """Run a command line in a folder."""
+    before = _content(folder)
+    streams = [os.memfd_create(name) for name in ("out", "err")]
+    child = os.fork()
+    if child == 0:
+        _become(folder, argv, streams)
+    status = _wait(child)
+    texts = []
+    for stream in streams:
+        os.lseek(stream, 0, os.SEEK_SET)
+        with os.fdopen(stream, "rb") as file:
+            texts.append(file.read().decode(errors="replace"))
+    after = _content(folder)
+    changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
+    return Outcome(argv, os.waitstatus_to_exitcode(status), texts[0], texts[1], tuple(changed))
+
+
+def attack(
+    cases: Iterable[tuple[str, ...]], folder: Path, arrange: Callable[[int], object] = lambda k: None
+) -> list[Outcome]:
+    """Run them all, each after ``arrange(k)``; fail with every complaint, each with its command line.
+
+    Returns:
+        What came of them, so that a test can see that its attack was one.
+    """
+    outcomes, failures = [], []
+    for k, argv in enumerate(cases):
+        arrange(k)
+        outcome = strike(folder, *argv)
+        outcomes.append(outcome)
+        if outcome.complaints:
+            words = outcome.err.strip()[-300:]
+            failures.append(f"case {k}: {shlex.join(argv)[:300]!a}\n    {'; '.join(outcome.complaints)}: {words!a}")
+    assert not failures, f"{len(failures)} of {len(outcomes)}:\n" + "\n".join(failures)
+    return outcomes
+
+
+def _become(folder: Path, argv: tuple[str, ...], streams: list[int]) -> None:
+    code = 70
+    try:
+        signal.alarm(PATIENCE)
+        resource.setrlimit(resource.RLIMIT_CPU, (BUSY, BUSY))
+        os.chdir(folder)
+        for number, stream in zip((1, 2), streams, strict=True):
+            os.dup2(stream, number)
+        sys.stdout, sys.stderr = (io.TextIOWrapper(os.fdopen(n, "wb", closefd=False)) for n in (1, 2))
+        sys.argv = ["impact-posture", *argv]
+        code = run(typer.main.get_command(app), put_right(argv))
+        for file in (sys.stdout, sys.stderr):
+            file.flush()
+    finally:
+        os._exit(code)
+
+
+def _wait(child: int) -> int:
+    end = time.monotonic() + 2 * PATIENCE
+    while time.monotonic() < end:
+        pid, status = os.waitpid(child, os.WNOHANG)
+        if pid:
+            return status
+        time.sleep(0.002)
+    with suppress(ProcessLookupError):
+        os.kill(child, signal.SIGKILL)
+    return os.waitpid(child, 0)[1]
+
+
+def _content(folder: Path) -> dict[str, bytes]:
+    found = {}
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder).as_posix()
+        found[name] = path.read_bytes() if path.is_file() else b""
+    return found

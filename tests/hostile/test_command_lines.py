@@ -1,0 +1,72 @@
+"""Every option of every command with values that make no sense: one line, the right code, nothing lost.
+
+``--hostile-full`` tries twenty times as many.
+"""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from impact_posture_cli.app import app
+from tests.hostile.arena import attack
+from tests.hostile.values import value
+
+PUSH = ("small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
+# Where a command would begin to work for long, a folder that must not be replaced stops it.
+STOP = ("--out", "precious", "--force")
+SOUND: dict[str, tuple[str, ...]] = {
+    "inspect": ("small.urdf",),
+    "evaluate": PUSH,
+    "optimize": (*PUSH, *STOP),
+    "codegen": (*PUSH, *STOP),
+    "simulate": ("aerial-vertical", *STOP),
+    "compare": ("aerial-vertical", *STOP),
+    "reproduce": STOP,
+    "plot": ("precious",),
+    "robots": (),
+}
+COUNT = 12
+
+
+def parameters(command: str) -> list[Any]:
+    return list(typer.main.get_command(app).commands[command].params)  # type: ignore[attr-defined]
+
+
+def spoil(command: str, rng: random.Random) -> tuple[str, ...]:
+    """A sound command line with one or two options more, or with another argument."""
+    words = [command, *SOUND[command]]
+    for _ in range(rng.choice((1, 1, 2))):
+        parameter = rng.choice(parameters(command))
+        if parameter.param_type_name == "argument":
+            words[1:2] = [value(rng)]
+            continue
+        name = rng.choice([*parameter.opts, *parameter.secondary_opts])
+        count = 0 if parameter.is_flag else parameter.nargs
+        words += [name, *(value(rng) if rng.random() < 0.8 else "1" for _ in range(count))]
+    if rng.random() < 0.15:
+        words.insert(rng.randrange(1, len(words) + 1), value(rng))
+    if rng.random() < 0.1:
+        del words[rng.randrange(len(words))]
+    return tuple(words)
+
+
+@pytest.mark.parametrize("command", SOUND)
+def test_values_that_make_no_sense(command: str, arena: Path, hostile_full: bool) -> None:
+    rng = random.Random(command)
+    stops = SOUND[command][-3:] == STOP
+    cases = [spoil(command, rng) for _ in range(COUNT * (20 if hostile_full else 1))]
+    # With two folders to write to, the last one counts: that of ours.
+    outcomes = attack([(*case, *STOP) if stops else case for case in cases], arena)
+    assert len({outcome.code for outcome in outcomes}) > 1
+    assert (arena / "precious" / "thesis.txt").read_text() == "ten years"
+
+
+def test_no_command_and_wrong_commands(arena: Path) -> None:
+    rng = random.Random(0)
+    outcomes = attack([*[(value(rng), value(rng)) for _ in range(8)], ("--json",), ("evaluate", "--json")], arena)
+    assert {outcome.code for outcome in outcomes} == {2}

@@ -1,0 +1,174 @@
+"""Spoiled URDFs: a robot or one line that names the file, in bounded time and memory.
+
+``--hostile-full`` tries twenty times as many.
+"""
+
+from __future__ import annotations
+
+import random
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.hostile.arena import SMALL, attack, strike
+from tests.hostile.values import NUMBERS, TEXTS
+
+PUSH = ("--frame", "tip", "--normal", "0", "0", "1")
+COUNT = 24
+
+
+def spoiled(rng: random.Random) -> bytes:
+    """The small robot with one to three things wrong."""
+    root = ET.fromstring(SMALL)
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        rng.choice((remove, duplicate, set_attribute, set_number, rename, reconnect, move, add))(root, rng)
+    text = ET.tostring(root).decode()
+    if rng.random() < 0.15:
+        at = rng.randrange(len(text))
+        text = rng.choice(
+            (text[:at], text[:at] + text[at + 5 :], text[:at] + "<" + text[at:], text[:at] + "\x00&#0;" + text[at:])
+        )
+    return text.encode(errors="replace")
+
+
+def parents(root: ET.Element) -> list[tuple[ET.Element, ET.Element]]:
+    return [(parent, child) for parent in root.iter() for child in parent]
+
+
+def remove(root: ET.Element, rng: random.Random) -> None:
+    if pairs := parents(root):
+        parent, child = rng.choice(pairs)
+        parent.remove(child)
+
+
+def duplicate(root: ET.Element, rng: random.Random) -> None:
+    if pairs := parents(root):
+        parent, child = rng.choice(pairs)
+        parent.append(child)
+
+
+def with_attributes(root: ET.Element, rng: random.Random) -> ET.Element:
+    return rng.choice([element for element in root.iter() if element.attrib] or [root])
+
+
+def printable(texts: tuple[str, ...]) -> list[str]:
+    """What XML can hold."""
+    return [
+        text for text in texts if len(text) < 1000 and all(c >= " " and not "\ud800" <= c <= "\udfff" for c in text)
+    ]
+
+
+def set_attribute(root: ET.Element, rng: random.Random) -> None:
+    element = with_attributes(root, rng)
+    key = rng.choice([*element.attrib, "stranger"])
+    element.set(key, rng.choice(printable(TEXTS)))
+
+
+def set_number(root: ET.Element, rng: random.Random) -> None:
+    element = with_attributes(root, rng)
+    if not element.attrib:
+        return
+    key = rng.choice(sorted(element.attrib))
+    words = element.get(key, "").split()
+    k = rng.randrange(max(1, len(words)))
+    words[k : k + 1] = [rng.choice(printable(NUMBERS))] * rng.choice((1, 1, 1, 3))
+    element.set(key, " ".join(words))
+
+
+def rename(root: ET.Element, rng: random.Random) -> None:
+    rng.choice(list(root.iter())).tag = rng.choice(
+        ("link", "joint", "inertial", "mass", "stranger", "mimic", "robot")
+    )
+
+
+def reconnect(root: ET.Element, rng: random.Random) -> None:
+    """Cycles, two roots, a link with two parents, a link of itself."""
+    ends = [end for end in root.iter() if end.tag in ("parent", "child")]
+    if ends:
+        rng.choice(ends).set("link", rng.choice(("world_link", "upper", "lower", "tip", "nowhere", "universe")))
+
+
+def move(root: ET.Element, rng: random.Random) -> None:
+    (parent, child), (other, _) = (
+        rng.choice(parents(root) or [(root, root)]),
+        rng.choice(parents(root) or [(root, root)]),
+    )
+    if child is not root and other not in child.iter():
+        parent.remove(child)
+        other.append(child)
+
+
+def add(root: ET.Element, rng: random.Random) -> None:
+    text = rng.choice((
+        '<link name="island"/>', '<link name="upper"/>', '<joint name="shoulder" type="revolute"/>',
+        "<transmission/>",
+        '<joint name="loose" type="floating"><parent link="tip"/><child link="extra"/></joint>', '<link name=""/>',
+        '<joint name="wheel" type="continuous"><parent link="tip"/><child link="extra"/><axis xyz="0 0 0"/></joint>',
+        '<joint name="m" type="revolute"><parent link="tip"/><child link="extra"/><mimic joint="m"/></joint>',
+        '<link name="extra"/>', '<xacro/>', '<gazebo reference="tip"><plugin filename="/dev/null"/></gazebo>',
+        '<joint name="p" type="planar"><parent link="tip"/><child link="extra"/><axis xyz="1 0 0"/></joint>',
+    ))  # fmt: skip
+    root.append(ET.fromstring(text))
+
+
+@pytest.mark.parametrize(
+    "argv", [("inspect", "bad.urdf", "--json"), ("evaluate", "bad.urdf", *PUSH)], ids=lambda a: a[0]
+)
+def test_spoiled_urdfs(argv: tuple[str, ...], arena: Path, hostile_full: bool) -> None:
+    rng = random.Random(argv[0])
+    outcomes = attack(
+        [argv] * (COUNT * (20 if hostile_full else 1)),
+        arena,
+        lambda k: (arena / "bad.urdf").write_bytes(spoiled(rng) if k else SMALL.encode()),
+    )
+    assert outcomes[0].code == 0
+    refused = [outcome for outcome in outcomes if outcome.code]
+    assert len(refused) > COUNT / 4
+    # Or the frame, or the joint, that is no longer there.
+    assert sum("bad.urdf" in outcome.err for outcome in refused) > len(refused) / 2
+
+
+def bomb() -> str:
+    """Entities that grow to 10⁹ of them."""
+    entities = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10}">' for k in range(1, 10))
+    return f'<!DOCTYPE robot [<!ENTITY e0 "a">{entities}]>{SMALL.replace("small", "&e9;", 1)}'
+
+
+def outside() -> str:
+    """A file from elsewhere."""
+    return f'<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]>{SMALL.replace("small", "&x;", 1)}'
+
+
+def nested() -> str:
+    """Elements within elements."""
+    return SMALL.replace('<link name="tip"/>', "<a>" * 20_000 + "</a>" * 20_000 + '<link name="tip"/>')
+
+
+def wide() -> str:
+    """Ten thousand links that nothing joins."""
+    return SMALL.replace("</robot>", "".join(f'<link name="l{k}"/>' for k in range(10_000)) + "</robot>")
+
+
+def long() -> str:
+    """A name of a million letters."""
+    return SMALL.replace("small", "a" * 1_000_000, 1)
+
+
+def wide_text() -> str:
+    """Another encoding than it says."""
+    return '<?xml version="1.0" encoding="utf-16"?>' + SMALL
+
+
+def comment() -> str:
+    """Nothing but a comment."""
+    return "<!-- " + "a" * 100_000 + " -->"
+
+
+@pytest.mark.parametrize("make", [bomb, outside, nested, wide, long, wide_text, comment], ids=lambda f: f.__name__)
+def test_files_made_to_break_parsers(make: Callable[[], str], arena: Path) -> None:
+    (arena / "bad.urdf").write_text(make())
+    outcome = strike(arena, "inspect", "bad.urdf", "--json")
+    assert not outcome.complaints, (outcome.complaints, outcome.err[-300:])
+    assert len(outcome.err) < 5_000 and "root:" not in outcome.out
