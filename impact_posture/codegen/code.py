@@ -16,8 +16,8 @@ from impact_posture.codegen.variants import Variant
 from impact_posture.codegen.vectors import LARGEST_VECTOR, vector_text
 from impact_posture.impact.objective import ImpactObjective
 
-# The stack's bound: blocks have frames of their own (APART), so one of them is there at a time, and what a compiler puts
-# by in it are the block's variables.  Where it joins functions, the variables of all of them may get places.
+# The bound: blocks have frames of their own (APART), so one of them is there at a time, and a compiler puts by
+# in it no more than the block's variables.  Where it joins functions, the variables of all of them may get places.
 # Return addresses, saved registers, alignment and the small functions' own variables, for the calls in each other.
 _FRAMES = 2048
 # A compiler that makes vectors of neighboring numbers (-march=native) puts some by in several of them.

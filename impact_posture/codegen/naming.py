@@ -10,8 +10,8 @@ from impact_posture.errors import InputError
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 # <prefix>.h would be included instead of the C library's.
 _C_HEADERS = frozenset(
-    "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef stdint"
-    " stdio stdlib string tgmath time wchar wctype".split()
+    "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef"
+    " stdint stdio stdlib string tgmath time wchar wctype".split()
 )
 
 FUNCTIONS = ("eval", "objective", "value", "jump", "ellipsoid", "eval_batch")

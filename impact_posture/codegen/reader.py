@@ -33,7 +33,7 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
         raise SpecError(what, where=str(path), mend=mend)
     try:
         manifest = json.loads(files[0].read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         words = getattr(error, "strerror", None) or str(error)
         raise SpecError(f"cannot be read ({words})", where=str(files[0]), mend="run codegen again") from None
     schema = manifest.get("schema") if isinstance(manifest, dict) else None
@@ -50,7 +50,7 @@ def is_manifest(path: Path) -> bool:
     """Whether a file is the manifest of an export."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
     return isinstance(document, dict) and document.get("schema") == SCHEMA
 

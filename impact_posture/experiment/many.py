@@ -41,7 +41,7 @@ class Store:
         """The document of a job that is done."""
         try:
             kept = json.loads(self._path(job).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return None
         if not isinstance(kept, dict) or kept.get("key") != key_of(job):
             return None
