@@ -11,6 +11,7 @@ import os
 import re
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -38,7 +39,11 @@ def run(command: Any, arguments: Sequence[str]) -> int:
             stream.reconfigure(errors="replace")
     wants_json = "--json" in arguments
     try:
-        code = command.main(args=list(arguments), prog_name="impact-posture", standalone_mode=False)
+        with warnings.catch_warnings():
+            if not os.environ.get(DEBUG_VARIABLE):
+                # Libraries' own, such as NumPy's of an overflow: the results are checked, and say what is wrong.
+                warnings.simplefilter("ignore")
+            code = command.main(args=list(arguments), prog_name="impact-posture", standalone_mode=False)
         sys.stdout.flush()
         if code == _INTERRUPTED:  # newer Typers hand Ctrl-C back as a code
             return _interrupted(wants_json)
@@ -72,6 +77,16 @@ def _explain(error: Exception, wants_json: bool) -> int:
         mend = "free some space" if error.errno == errno.ENOSPC else "check the path and its permissions"
         where = str(error.filename) if error.filename is not None else ""
         return _report(1, kind, error.strerror or str(error), where, mend, wants_json=wants_json)
+    if isinstance(error, MemoryError) or "bad_alloc" in str(error):
+        return _report(
+            1,
+            "MemoryError",
+            "out of memory",
+            mend="free some, raise its limit (ulimit -v), or give fewer --jobs",
+            wants_json=wants_json,
+        )
+    if isinstance(error, RecursionError):
+        return _report(1, kind, "an input is nested too deeply", mend="correct the file", wants_json=wants_json)
     what = f"{kind}: {error}" if str(error) else kind
     mend = f"please report it with the output of {DEBUG_VARIABLE}=1"
     return _report(1, "InternalError", what, "internal error", mend, wants_json=wants_json)

@@ -180,17 +180,19 @@ def load_view(folder: Path) -> ResultView:
             path = NullSpacePath(
                 **{key: arrays[f"path_{key}"] for key in ("q", "s", "H", "G", "V", "S", "objective")}
             )
-        initial, optimal = (np.array(document[key]["q"], dtype=float) for key in ("initial", "optimal"))
-        recorded = document["robot"]["model_sha256"]
-        view = _view(prepared, initial, optimal, path, document)
+        robot, recorded = prepared.impact.robot, str(document["robot"]["model_sha256"])
+        if recorded != robot.model_sha256:
+            raise SpecError(
+                f"was made with another model of {robot.name} (sha256 {recorded[:12]}…)",
+                where=str(folder),
+                mend="run optimize again, or use the URDF and armature of then",
+            )
+        initial, optimal = (
+            robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
+            for key in ("initial", "optimal")
+        )
+        return _view(prepared, initial, optimal, path, document)
     except _BROKEN as error:
         raise SpecError(
             f"is no whole result ({type(error).__name__}: {error})", where=str(folder), mend="run optimize again"
         ) from None
-    if recorded != prepared.impact.robot.model_sha256:
-        raise SpecError(
-            f"was made with another model of {prepared.impact.robot.name} (sha256 {recorded[:12]}…)",
-            where=str(folder),
-            mend="run optimize again, or use the URDF and armature of then",
-        )
-    return view

@@ -23,12 +23,30 @@ _GUARD = (
 
 
 def find_compiler() -> list[str] | None:
-    """The C compiler as the head of a command: ``$CC`` (which may carry options), cc, gcc or clang; else ``None``."""
-    for text in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
-        words = shlex.split(text)
+    """The C compiler as the head of a command: ``$CC`` (which may carry options), cc, gcc or clang; else ``None``.
+
+    Raises:
+        CompilerError: ``$CC`` is no command: a quote is open.
+    """
+    for words in (words_of("CC"), ["cc"], ["gcc"], ["clang"]):
         if words and shutil.which(words[0]):
             return words
     return None
+
+
+def words_of(variable: str) -> list[str]:
+    """An environment variable's words, split as a shell does.
+
+    Raises:
+        CompilerError: A quote is open.
+    """
+    text = os.environ.get(variable, "")
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise CompilerError(
+            f"{text!r} cannot be split into words ({str(error).lower()})", where=variable, mend="close the quote"
+        ) from None
 
 
 def run_compiler(command: list[str], folder: Path) -> None:

@@ -105,7 +105,7 @@ class Bounded(ExactImpact):
 
     @cached_property
     def sticking_by_elimination(self) -> tuple[float, float]:
-        """Largest errors of S and of ∇S's entries: ``γ_3n`` is 3n roundings, each of the effect of the worst of five."""
+        """Largest errors of S and of ∇S's entries: ``γ_3n`` is 3n roundings, each as bad as the worst of five."""
         others = [RoundedOnce(self.oracle, self.compliance, seed) for seed in range(5)]
         roundings = 3 * len(self.K_held)
         moved_S = max(abs(float(o.S - self.S)) for o in others)

@@ -106,6 +106,24 @@ def test_one_joint_and_a_contact_that_moves_one_way(tmp_path: Path) -> None:
     assert_all_there(verify(objective(str(path), frame="l1", offset=(0.3, 0.0, 0.0)), samples=3))
 
 
+@pytest.mark.parametrize("joints", [1, 2, 3])
+def test_a_planar_robot_that_is_hit_across_its_plane(tmp_path: Path, joints: int) -> None:
+    """G and H are exactly zero: V does not exist, what is compared does."""
+    link = '<link name="{}"><inertial><mass value="1"/><inertia {}/></inertial></link>'
+    inertia = " ".join(f'{key}="{0.01 * (key[1] == key[2])}"' for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+    joint = (
+        '<joint name="j{0}" type="continuous"><parent link="l{0}"/><child link="l{1}"/><axis xyz="0 0 1"/>{2}</joint>'
+    )
+    text = "".join(link.format(f"l{k}", inertia) for k in range(joints + 1))
+    text += "".join(joint.format(k, k + 1, '<origin xyz="0.5 0 0"/>') for k in range(joints))
+    (tmp_path / "planar.urdf").write_text(f'<robot name="planar">{text}</robot>')
+    request = ImpactRequest(str(tmp_path / "planar.urdf"), frame=f"l{joints}", normal=(0, 0, 1), offset=(0.5, 0, 0))
+    found = request.resolve().objective
+    report = verify(found, samples=1)
+    assert found.oracle.quantities(report.samples[0].q).G == 0.0
+    assert_all_there(report)
+
+
 # ---- what differs fails, and is named ----------------------------------------------------------------------------
 
 

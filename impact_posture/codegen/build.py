@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import shlex
 from contextlib import suppress
 from pathlib import Path
 
 from impact_posture.errors import CompilerError, OutputError
 from impact_posture.libraries import put_library, seal_path
-from impact_posture.toolchain import find_compiler, run_compiler
+from impact_posture.toolchain import find_compiler, run_compiler, words_of
 
 # Strict C forbids fused multiply-adds by default.
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=fast", "-fPIC", "-shared")
@@ -46,8 +45,16 @@ def build_library(folder: Path, prefix: str, target: Path | None = None, extra_f
     target = library_path(folder, prefix) if target is None else target
     # In the same folder, so that the rename is one step; by process, so that two builds do not meet.
     beside = target.with_name(f".{target.name}.{os.getpid()}.part")
-    own = shlex.split(os.environ.get("CFLAGS", ""))
-    command = [*compiler, *FLAGS, *own, *extra_flags, f"{prefix}.c", "-o", str(beside.absolute()), "-lm"]
+    command = [
+        *compiler,
+        *FLAGS,
+        *words_of("CFLAGS"),
+        *extra_flags,
+        f"{prefix}.c",
+        "-o",
+        str(beside.absolute()),
+        "-lm",
+    ]
     try:
         run_compiler(command, folder)
         put_library(beside, target)

@@ -16,7 +16,9 @@ from impact_posture.codegen.variants import Variant
 from impact_posture.codegen.vectors import LARGEST_VECTOR, vector_text
 from impact_posture.impact.objective import ImpactObjective
 
-# Return addresses, saved registers and the small functions' own variables, for the calls in each other.
+# The bound: blocks have frames of their own (APART), so one of them is there at a time, and a compiler puts by
+# in it no more than the block's variables.  Where it joins functions, the variables of all of them may get places.
+# Return addresses, saved registers, alignment and the small functions' own variables, for the calls in each other.
 _FRAMES = 2048
 # A compiler that makes vectors of neighboring numbers (-march=native) puts some by in several of them.
 _SPILL = 2
@@ -127,7 +129,8 @@ class _Writer:
     def _stack_bytes(self) -> int:
         size = self._real.size
         numbers = sum(width * count for width, count in self._layout.sizes.items()) + 3 * self._angles(self._layout)
-        single = size * numbers + _SPILL * max((b.local_bytes for b in self._emitter.blocks), default=0)
+        frames = [max(_SPILL * b.local_bytes, b.local_bytes + b.wide_bytes) for b in self._emitter.blocks]
+        single = size * numbers + max(frames, default=0)
         return -(-(max(single, self._largest) + _FRAMES) // 64) * 64
 
     # ---- one configuration ------------------------------------------------------------------------------------

@@ -21,11 +21,13 @@ from impact_posture.codegen.program import COSINE, Node
 
 # Characters of a constant's place, about.
 _PLACE = 7
-SHORT_NAMES = ("K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
+SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
 """Macros of the emitted text, for its end to take back."""
 
 # What a block may be handed, beside the inputs.
 _SHARED = ("s", "c", "w", "w2", "w4")
+# A vector wider than the processor's is made of parts: without optimization they and the whole each have a place.
+_HALVES = 2
 _MATH = re.compile(r"\b(exp|log|pow|sqrt|a?sin|a?cos|a?tan|atan2|tanh|hypot|fabs|fmin|fmax)\(")
 
 
@@ -115,11 +117,13 @@ class BlockText:
         text: The function.
         call: Its call, with names of the caller's own: inputs, ``m.s``, ``m.w`` and so on.
         local_bytes: What its variables take at most.
+        wide_bytes: What the parts of vectors that the processor does not have may take beside.
     """
 
     text: str
     call: str
     local_bytes: int
+    wide_bytes: int
 
 
 class Constants:
@@ -236,10 +240,20 @@ class Emitter:
         title = f"{self.dialect.prefix}_block{number}"
         local = sum(self._graph.nodes[k].width for k in names) * self._size
         return BlockText(
-            f"static void {title}({', '.join(parameters)})\n{{\n{body}\n}}\n",
+            f"APART static void {title}({', '.join(parameters)})\n{{\n{body}\n}}\n",
             f"{title}({', '.join(arguments)});",
             local,
+            _HALVES * self._vector_bytes(block),
         )
+
+    def _vector_bytes(self, block: Block) -> int:
+        """Bytes of all results of a block that are vectors, those within statements too."""
+        total, waiting = 0, list(block.nodes)
+        while waiting:
+            node = self._graph.nodes[waiting.pop()]
+            total += node.width * self._size if node.width > 1 else 0
+            waiting += [a for a in node.operands if a in self.layout.inlined]
+        return total
 
     def _expression(self, k: int, number: int, names: dict[int, str], lines: list[str], *, top: bool = False) -> str:
         """C of a node: a name, a place in an array, or the operation itself, in parentheses unless on ``top``."""

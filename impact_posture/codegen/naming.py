@@ -9,6 +9,11 @@ from impact_posture.errors import InputError
 from impact_posture.escape import identifier
 
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+# <prefix>.h would be included instead of the C library's.
+_C_HEADERS = frozenset(
+    "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef"
+    " stdint stdio stdlib string tgmath time wchar wctype".split()
+)
 
 FUNCTIONS = ("eval", "objective", "value", "jump", "ellipsoid", "eval_batch")
 """What each frame of an export has, as ``<stem>_<function>``."""
@@ -24,7 +29,7 @@ def check_prefix(prefix: str) -> str:
     """Return a prefix that C takes.
 
     Raises:
-        InputError: It is no C identifier, or the example's file name.
+        InputError: It is no C identifier, or the name of the example or of a header of C's.
     """
     if not _IDENTIFIER.fullmatch(prefix):
         raise InputError(
@@ -34,6 +39,8 @@ def check_prefix(prefix: str) -> str:
         )
     if prefix.lower() == "example":
         raise InputError("the prefix 'example' is taken by example.c", where="--prefix", mend="choose another")
+    if prefix.lower() in _C_HEADERS:
+        raise InputError(f"the prefix '{prefix}' is taken by C's {prefix}.h", where="--prefix", mend="choose another")
     return prefix
 
 

@@ -203,25 +203,28 @@ if(NOT CMAKE_BUILD_TYPE AND NOT CMAKE_CONFIGURATION_TYPES)
   set(CMAKE_BUILD_TYPE Release)
 endif()
 
-add_library($prefix $prefix.c $prefix.h)
-add_library($prefix::$prefix ALIAS $prefix)
-target_include_directories($prefix PUBLIC
+# CMake keeps names such as test, all and install for itself: the target has another one than what it makes.
+add_library(${prefix}_library $prefix.c $prefix.h)
+add_library($prefix::$prefix ALIAS ${prefix}_library)
+target_include_directories(${prefix}_library PUBLIC
   "$$<BUILD_INTERFACE:$${CMAKE_CURRENT_SOURCE_DIR}>" "$$<INSTALL_INTERFACE:$${CMAKE_INSTALL_INCLUDEDIR}>")
-set_target_properties($prefix PROPERTIES C_STANDARD 99 C_STANDARD_REQUIRED ON POSITION_INDEPENDENT_CODE ON)
+set_target_properties(${prefix}_library PROPERTIES OUTPUT_NAME $prefix EXPORT_NAME $prefix
+  C_STANDARD 99 C_STANDARD_REQUIRED ON POSITION_INDEPENDENT_CODE ON)
 if(UNIX)
-  target_link_libraries($prefix PUBLIC m)
+  target_link_libraries(${prefix}_library PUBLIC m)
 endif()
 
-install(TARGETS $prefix EXPORT $prefix-targets)
+install(TARGETS ${prefix}_library EXPORT $prefix-targets)
 install(FILES $prefix.h DESTINATION "$${CMAKE_INSTALL_INCLUDEDIR}")
 install(EXPORT $prefix-targets NAMESPACE $prefix:: FILE ${prefix}Config.cmake
   DESTINATION "$${CMAKE_INSTALL_LIBDIR}/cmake/$prefix")
 
 if(CMAKE_SOURCE_DIR STREQUAL CMAKE_CURRENT_SOURCE_DIR)
   enable_testing()
-  add_executable(example example.c)
-  target_link_libraries(example PRIVATE $prefix)
-  add_test(NAME $prefix COMMAND example)
+  add_executable(${prefix}_example example.c)
+  set_target_properties(${prefix}_example PROPERTIES OUTPUT_NAME example)
+  target_link_libraries(${prefix}_example PRIVATE ${prefix}_library)
+  add_test(NAME ${prefix}_example COMMAND ${prefix}_example)
 endif()
 """)
 

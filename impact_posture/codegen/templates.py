@@ -103,6 +103,14 @@ SOURCE = Template("""\
 
 const char ${prefix}_manifest[] = "$identity";
 
+/* A function with a frame of its own: compilers do not always let parts that they join share theirs. */
+#if defined(__GNUC__)
+#define APART __attribute__((noinline))
+#elif defined(_MSC_VER)
+#define APART __declspec(noinline)
+#else
+#define APART
+#endif
 $vectors$posture
 static int ${prefix}_finite(const $real *x, int count)
 {
@@ -238,7 +246,7 @@ typedef struct {
 } ${stem}_lanes_work;
 
 /* ${upper}_LANES configurations a group, each at the place that at[] says. */
-static void ${stem}_lanes(
+APART static void ${stem}_lanes(
   const $real *q, const $real *n, const int *at, int groups, $real *H, $real *grad)
 {
 $gather  ${stem}_lanes_work work[${upper}_GROUPS];

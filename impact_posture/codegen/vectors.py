@@ -54,7 +54,7 @@ LARGEST_VECTOR = 64
 
 _PORTABLE = Template("""\
 /* Sines and cosines of count angles. */
-static void ${prefix}_sincos(const $real *angle, $real *sine, $real *cosine, int count)
+APART static void ${prefix}_sincos(const $real *angle, $real *sine, $real *cosine, int count)
 {
   int k;
   for (k = 0; k < count; ++k) {
@@ -107,7 +107,7 @@ typedef $integer ${prefix}_it __attribute__((vector_size(${upper}_TURNS)));
 
 _SINCOS = Template("""\
 /* Sines and cosines of count angles, a multiple of the vectors' lanes; all arrays apart from each other. */
-__attribute__((unused)) static void ${prefix}_${name}(const $real *angle, $real *sine, $real *cosine, int count)
+__attribute__((unused)) APART static void ${prefix}_${name}(const $real *angle, $real *sine, $real *cosine, int count)
 {
   int k, i, far = 0;
   for (k = 0; k < count; ++k) {

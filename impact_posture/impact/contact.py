@@ -19,6 +19,8 @@ NormalFrame = Literal["world", "contact"]
 
 # A normal shorter than this is what rounding left of zero.
 _DUST = 1e-9
+# Of impulses and speeds: their squares, times whatever a robot has, must stay within the range of doubles.
+LARGEST = 1e100
 # Compliance times the robot's mass: what is taken unless told, and the least that leaves digits enough.
 _DEFAULT_COMPLIANCE, _LEAST_COMPLIANCE = 1e-4, 1e-6
 
@@ -65,6 +67,12 @@ class Contact:
             raise ContactError("the offset is not finite", where="--offset", mend="give three numbers")
         if not (np.isfinite(impulse) and impulse > 0):
             raise ContactError(f"the impulse bound is {impulse:g}", where="--impulse", mend="give N·s above zero")
+        if not 1 / LARGEST <= impulse <= LARGEST:
+            raise ContactError(
+                f"with an impulse bound of {impulse:g} the objective λ̄²H is beyond double precision",
+                where="--impulse",
+                mend=f"give {1 / LARGEST:g} to {LARGEST:g} N·s",
+            )
         n = n / np.abs(n).max()  # first: any length must do, and squares overflow
         n = n / np.linalg.norm(n)
         x, y, z = (float(v) for v in n)

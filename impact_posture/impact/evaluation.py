@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.classical import Ellipsoid, ellipsoid_of
 from impact_posture.impact.cone import WorstNormal
-from impact_posture.impact.contact import point_on
+from impact_posture.impact.contact import LARGEST, point_on
 from impact_posture.impact.footing import Footing, footing
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses
 from impact_posture.impact.jump import Dominance, Jump, find_dominance, weighed_jump
@@ -149,8 +149,8 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
     Raises:
         InputError: A negative or non-finite speed, or a restitution outside [0, 1].
     """
-    if not (np.isfinite(speed) and speed >= 0):
-        raise InputError(f"the approach speed is {speed:g}", where="--speed", mend="give m/s, zero or more")
+    if not 0 <= speed <= LARGEST:
+        raise InputError(f"the approach speed is {speed:g}", where="--speed", mend=f"give m/s, 0 to {LARGEST:g}")
     if not 0 <= restitution <= 1:
         raise InputError(f"the restitution is {restitution:g}", where="--restitution", mend="give 0 to 1")
     robot, oracle = objective.robot, objective.oracle

@@ -178,6 +178,8 @@ def read_toml(path: Path) -> dict[str, object]:
         raise SpecError("no such file", where=str(path), mend="check the path") from None
     except (OSError, UnicodeDecodeError) as error:
         raise SpecError(f"cannot be read ({error})", where=str(path), mend="check the file") from None
+    except RecursionError:
+        raise SpecError("is nested too deeply", where=str(path), mend="correct the syntax") from None
     except tomllib.TOMLDecodeError as error:
         raise SpecError(f"is not valid TOML ({error})", where=str(path), mend="correct the syntax") from None
 

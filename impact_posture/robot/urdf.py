@@ -16,6 +16,9 @@ import pinocchio as pin
 from impact_posture.errors import JointNotFound, PackageNotFound, UrdfError
 from impact_posture.robot.inertia import check_inertias
 
+# Pinocchio's data hold 6 nv³ numbers, 0.4 GB at 200 degrees of freedom and 48 GB at 1,000, whatever is asked of it.
+MOST_DEGREES_OF_FREEDOM = 200
+
 EXAMPLE_PREFIX = "example-robot-data:"
 
 
@@ -79,7 +82,7 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
         accept_inertias: Turn refusals of impossible inertias into warnings.
 
     Raises:
-        UrdfError: Missing file, not XML, not a URDF, or a tree that Pinocchio rejects.
+        UrdfError: Missing file, not XML, not a URDF, a tree that Pinocchio rejects, or too many joints.
         InertiaError: A mass or inertia that no rigid body has.
     """
     root = _parse(path)
@@ -94,6 +97,12 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
         raise UrdfError(f"makes no robot ({said})", where=str(path), mend="correct the URDF") from None
     if model.nv == 0:
         raise UrdfError("has no movable joint", where=str(path), mend="use --root free-flyer or another URDF")
+    if model.nv > MOST_DEGREES_OF_FREEDOM:
+        raise UrdfError(
+            f"has {model.nv} degrees of freedom, more than the {MOST_DEGREES_OF_FREEDOM} that are computed with",
+            where=str(path),
+            mend="make joints that hardly matter fixed in the URDF",
+        )
     return model, check_inertias(root, model, path, accept_inertias)
 
 

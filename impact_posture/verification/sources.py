@@ -112,7 +112,8 @@ def compiled_source(objective: ImpactObjective) -> Iterator[Source]:
                 ellipsoid_code, ellipsoid = library.ellipsoid(sample.q)
                 return Numbers({
                     "H": _accepted(code, np.array([H])),
-                    "G": _accepted(jump_code, np.array([G])),
+                    # Code 3: V does not exist where G is zero; G does, and the comparison refuses what is not finite.
+                    "G": _accepted(0 if jump_code == 3 else jump_code, np.array([G])),
                     "Λ_c": _accepted(ellipsoid_code, ellipsoid),
                     "∇H": _accepted(code, gradient),
                 })  # fmt: skip
