@@ -177,7 +177,14 @@ def torque_panel(views: Sequence[RunView]) -> Panel | None:
         named = f"The torque limits (±{number(limit)} {unit}) lie outside of the panels."
         notes.append(named if unit else f"All stay within {number(100 * peak)} % of it.")
         lines = ()
-    return Panel(label, [one.joint_names[k] for k in shown], values, lines, note=" ".join(notes), noisy=one.rotor_limits is not None)
+    return Panel(
+        label,
+        [one.joint_names[k] for k in shown],
+        values,
+        lines,
+        note=" ".join(notes),
+        noisy=one.rotor_limits is not None,
+    )
 
 
 def joint_panels(views: Sequence[RunView]) -> list[Panel]:

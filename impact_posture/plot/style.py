@@ -130,11 +130,12 @@ def shared_legend(body: Any, handles: Sequence[Any], place: str, **look: Any) ->
 
 def lay_out(figure: Figure) -> None:
     """Give everything its place and keep it: every format then shows the same picture, in half the time."""
-    # Panels with equal axes change their size in the first round and are placed in the second.
-    for _ in range(2):
-        figure.draw_without_rendering()
-    place_labels(figure)
+    # Panels with equal axes change their size in the first round and are placed in the others.
+    for _ in range(3):
+        figure.get_layout_engine().execute(figure)
     figure.set_layout_engine("none")
+    figure.draw_without_rendering()
+    place_labels(figure)
     # The layout's solver differs in the last digits from run to run; the files must not.
     for part in figure.subfigs:
         box = part.bbox_relative
