@@ -18,7 +18,7 @@ _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
 _CLEAR = 2.0
 
 
-class Label(Annotation):  # type: ignore[misc]
+class Label(Annotation):
     """A letter at a point of an axes, in data coordinates, shape (2,) or (3,); :func:`place_labels` finds its place.
 
     ``toward`` is the direction in the picture in which it stands best.
