@@ -140,6 +140,8 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
                 axes.set_title(plot_label(views[which].name), fontweight="bold")
             if row % len(rows) == len(rows) - 1:
                 axes.set_xlabel(blows(views[which]).label)
+            else:
+                axes.tick_params(labelbottom=False)
             if column == 0:
                 axes.set_ylabel(panel.label)
             else:

@@ -13,12 +13,12 @@ from mpl_toolkits.mplot3d import proj3d
 from impact_posture.plot.shapes import Plane, Vector
 
 # Distances from the point to try, points; directions to try; how far a letter stays from what is drawn, pixels.
-_GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0)
+_GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0, 36.0)
 _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
 _CLEAR = 2.0
 
 
-class Label(Annotation):  # type: ignore[misc]
+class Label(Annotation):
     """A letter at a point of an axes, in data coordinates, shape (2,) or (3,); :func:`place_labels` finds its place.
 
     ``toward`` is the direction in the picture in which it stands best.

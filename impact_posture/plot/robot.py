@@ -232,8 +232,6 @@ def _plane_3d(axes: Any, surface: Surface) -> None:
 def _plane_2d(axes: Any, surface: Surface, plane: Plane) -> None:
     color = INK if surface.color == GRAY else surface.color
     if np.linalg.norm(plane.axes @ surface.normal) < 0.05:
-        # Seen face on: n comes towards the reader or goes away.
-        axes.plot(*(plane.axes @ square(surface.point, surface.normal, surface.side)), color=color, linewidth=0.8)
         draw_end_on(axes, surface.name, plane, surface.normal, plane.axes @ surface.contact, color)
         return
     outline = surface.outline(plane)

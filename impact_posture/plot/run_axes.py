@@ -148,8 +148,8 @@ def grid(body: Any, view: RunView, rows: int) -> tuple[Any, list[Clip]]:
 
 
 def name_time(panels: Any, clips: Sequence[Clip]) -> None:
-    """Label the lowest panels' axes of time."""
-    for axes, clip in zip(panels[-1], clips, strict=True):
+    """Label a row of panels' axes of time."""
+    for axes, clip in zip(panels, clips, strict=False):
         axes.set_xlabel(clip.label)
 
 

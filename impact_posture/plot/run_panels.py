@@ -96,7 +96,7 @@ class Panel:
         ranges: Of each run, a lower and an upper bound to shade between, shape (n, 2).
         stopped: When a curve's joint was at its stop, of each run, shape (n, curves).
         note: To be said below the picture.
-        noisy: Whether the curves carry noise.
+        noisy: Whether the curves carry noise, as those of robots that fly.
     """
 
     label: str
@@ -177,7 +177,14 @@ def torque_panel(views: Sequence[RunView]) -> Panel | None:
         named = f"The torque limits (±{number(limit)} {unit}) lie outside of the panels."
         notes.append(named if unit else f"All stay within {number(100 * peak)} % of it.")
         lines = ()
-    return Panel(label, [one.joint_names[k] for k in shown], values, lines, note=" ".join(notes), noisy=True)
+    return Panel(
+        label,
+        [one.joint_names[k] for k in shown],
+        values,
+        lines,
+        note=" ".join(notes),
+        noisy=one.rotor_limits is not None,
+    )
 
 
 def joint_panels(views: Sequence[RunView]) -> list[Panel]:

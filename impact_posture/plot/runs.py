@@ -80,7 +80,7 @@ def metric_figure(view: RunView) -> Figure:
             axes_row[0].set_ylabel(label)
         for axes in panels[0]:
             scale_metric(axes, [view.objective])
-        name_time(panels, clips)
+        name_time(panels[-1], clips)
         finish(body, list(panels[:, 0]), common_handles([view]), [("", panels[2, 0])])
     return figure
 
@@ -96,7 +96,7 @@ def controls_figure(view: RunView) -> Figure:
             for axes, clip in zip(axes_row, clips, strict=True):
                 draw_panel(axes, panel, 0, view, clip)
             axes_row[0].set_ylabel(panel.label)
-        name_time(panels, clips)
+        name_time(panels[-1], clips)
         finish(body, list(panels[:, 0]), common_handles([view], rows), headed(rows, panels[:, 0]))
     return figure
 
@@ -125,7 +125,11 @@ def joints_figure(views: Sequence[RunView]) -> Figure:
             axes_row[0].set_ylabel(panel.label)
             if len(views) > 1:
                 axes_row[0].set_title(plot_label(views[which].name), loc="left", fontweight="bold")
-        name_time(panels, clips[-1][:columns])
+            if panel is rows[-1]:
+                name_time(axes_row, clips[which])
+            else:
+                for axes in axes_row:
+                    axes.tick_params(labelbottom=False)
         finish(body, list(panels[:, 0]), common_handles(views, rows), headed(rows, panels[:, 0]))
         for k in range(len(rows)):
             share_height(list(panels[k :: len(rows)].flat))

@@ -44,7 +44,7 @@ def _set_ticks(axis: Any, low: float, high: float, bins: int, room: float) -> fl
     """Few ticks, none at the ends, whose numbers fit a length in points; return the longest number's."""
     air = _CORNER * (high - low)
     for count in range(max(bins, 3), 0, -1):
-        ticks = MaxNLocator(count, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+        ticks = np.asarray(MaxNLocator(count, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
         ticks = ticks[(low + air <= ticks) & (ticks <= high - air)]
         axis.set_ticks(ticks)
         longest = max((text_width(t, _TICKS) for t in axis.get_major_formatter().format_ticks(ticks)), default=0.0)

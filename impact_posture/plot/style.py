@@ -121,7 +121,7 @@ def text_width(text: str, size: float) -> float:
 
 def shared_legend(body: Any, handles: Sequence[Any], place: str, **look: Any) -> None:
     """Put the one legend of a figure above (``upper``) or below (``lower``) its panels, as wide as the page."""
-    size, handle, gap, room = _RC["legend.fontsize"], 2.2, 1.4, 72 * WIDTH * 0.96
+    size, handle, gap, room = float(_RC["legend.fontsize"]), 2.2, 1.4, 72 * WIDTH * 0.96
     widths = [text_width(str(h.get_label()).replace("$", ""), size) + size * (handle + 0.8 + gap) for h in handles]
 
     def width(columns: int) -> float:
@@ -138,11 +138,13 @@ def shared_legend(body: Any, handles: Sequence[Any], place: str, **look: Any) ->
 
 def lay_out(figure: Figure) -> None:
     """Give everything its place and keep it: every format then shows the same picture, in half the time."""
-    # Panels with equal axes change their size in the first round and are placed in the second.
-    for _ in range(2):
-        figure.draw_without_rendering()
-    place_labels(figure)
+    # Panels with equal axes change their size in the first round and are placed in the others.
+    engine: Any = figure.get_layout_engine()
+    for _ in range(3):
+        engine.execute(figure)
     figure.set_layout_engine("none")
+    figure.draw_without_rendering()
+    place_labels(figure)
     # The layout's solver differs in the last digits from run to run; the files must not.
     for part in figure.subfigs:
         box = part.bbox_relative

@@ -13,6 +13,7 @@ import pytest
 from impact_posture.errors import InputError, OutputError
 from impact_posture.plot import (
     FIGURES,
+    FORMATS,
     FigureNotFound,
     ResultView,
     classical_figure,
@@ -23,13 +24,14 @@ from impact_posture.plot import (
     postures_figure,
     tradeoff_figure,
 )
-from impact_posture.plot.style import WIDTH, lay_out
+from impact_posture.plot.style import WIDTH
+from tests.plot.page import defects
 from tests.plot.views import PENDULUM, make_view, text_of
 
 
 def test_figures_are_written_in_all_formats(tilthex: ResultView, tmp_path: Path) -> None:
     # Surfaces and hatches in every format, the rest in one each: the writers are matplotlib's.
-    first = draw_all(tilthex, tmp_path / "figures", only=["ellipsoid", "jump"])
+    first = draw_all(tilthex, tmp_path / "figures", FORMATS, only=["ellipsoid", "jump"])
     assert [p.name for p in first] == [f"{n}.{f}" for n in ("ellipsoid", "jump") for f in ("png", "svg", "pdf")]
     paths = first + draw_all(tilthex, tmp_path / "figures", (".PNG",), only=["postures"])
     paths += draw_all(tilthex, tmp_path / "figures", ("svg", "svg"), only=["nullspace", "classical", "tradeoff"])
@@ -61,24 +63,33 @@ def test_the_same_view_gives_the_same_files(pendulum: ResultView, tmp_path: Path
     ("name", "figure"),
     [
         ("talos", postures_figure),
-        ("talos", jump_figure),
-        ("solo8", ellipsoid_figure),
+        ("tilthex", postures_figure),
+        ("solo8", postures_figure),
+        ("pendulum", postures_figure),
+        ("turned", postures_figure),
+        ("two_hands", postures_figure),
         ("panda", postures_figure),
+        ("talos", jump_figure),
+        ("panda", jump_figure),
+        ("solo8", ellipsoid_figure),
         ("solo8_cone", ellipsoid_figure),
         ("torso", ellipsoid_figure),
         ("turned", ellipsoid_figure),
+        ("pendulum", ellipsoid_figure),
         ("talos", classical_figure),
+        ("turned", classical_figure),
+        ("pendulum", classical_figure),
         ("tilthex", tradeoff_figure),
+        ("pendulum", path_figure),
     ],
 )
-def test_nothing_hangs_over_its_part_of_the_page(name: str, figure: object, request: pytest.FixtureRequest) -> None:
+def test_pages_have_no_defects(name: str, figure: object, request: pytest.FixtureRequest) -> None:
     page = figure(request.getfixturevalue(name))  # type: ignore[operator]
-    lay_out(page)
+    assert defects(page) == []
     head, body, foot = page.subfigs
     for part in (head, foot):
         for words in part.texts:
             box = words.get_window_extent()
-            assert box.x0 >= 0 and box.x1 <= part.bbox.x1
             assert box.y0 >= part.bbox.y0 and box.y1 <= part.bbox.y1
     # A pixel less all round: what they touch is blank.
     boxes = [axes.get_tightbbox().padded(-1) for axes in body.axes]
@@ -87,6 +98,21 @@ def test_nothing_hangs_over_its_part_of_the_page(name: str, figure: object, requ
         assert box.y0 >= body.bbox.y0 and box.y1 <= body.bbox.y1
     for legend in body.legends:
         assert not any(legend.get_window_extent().overlaps(box) for box in boxes)
+
+
+def test_defects_are_found(monkeypatch: pytest.MonkeyPatch, turned: ResultView) -> None:
+    monkeypatch.setattr("impact_posture.plot.style.place_labels", lambda figure: None)
+    page = postures_figure(turned)
+    _, flat = page.axes
+    flat.set_xlabel("x")
+    flat.text(0.5, 0.5, "one", transform=flat.transAxes)
+    flat.text(0.5, 0.51, "other", transform=flat.transAxes)
+    flat.plot([], [], label="line")
+    flat.legend()
+    found = defects(page)
+    assert "'one' stands on 'other'" in found and "2 legends" in found and "no unit on an axis 'x'" in found
+    flat.plot(np.mean(flat.get_xlim()), np.mean(flat.get_ylim()), "ks", markersize=30)
+    assert "'one' stands on a line" in defects(page)
 
 
 def test_degenerate_robot_draws(pendulum: ResultView) -> None:

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.plot import (
+    FORMATS,
     Bar,
     RunView,
     Span,
@@ -36,8 +37,8 @@ from impact_posture.plot.run_axes import AT_LIMIT, LIMIT, SHADES, STOP, thin
 from impact_posture.plot.run_panels import SHOWN
 from impact_posture.plot.skeleton import build_skeleton
 from impact_posture.plot.snapshots import instants
-from impact_posture.plot.style import lay_out
 from impact_posture.robot.loader import load_robot
+from tests.plot.page import defects
 from tests.plot.views import PENDULUM, text_of
 
 TICKS = 400
@@ -83,7 +84,7 @@ def make_run(
 
 @pytest.fixture(scope="module")
 def flying() -> RunView:
-    return make_run("tilthex_arm", rotor_unit="Hz")
+    return make_run("tilthex_arm")
 
 
 @pytest.fixture(scope="module")
@@ -139,8 +140,8 @@ def test_metric_shows_H_speed_and_force(flying: RunView) -> None:
     np.testing.assert_array_equal(H.lines[0].get_xdata(), flying.t[known])
     np.testing.assert_array_equal(H.lines[0].get_ydata(), flying.objective[known])
     np.testing.assert_allclose(speed.lines[0].get_ydata(), np.linalg.norm(flying.v, axis=1))
-    np.testing.assert_allclose(curves(force)["normal, peak"][1], flying.peak)
-    np.testing.assert_allclose(curves(force)["friction"][1], 0.0, atol=1e-12)
+    np.testing.assert_allclose(curves(force)["force: normal, peak"][1], flying.peak)
+    np.testing.assert_allclose(curves(force)["force: friction"][1], 0.0, atol=1e-12)
     assert H.get_yscale() == "linear" and H.get_ylim()[0] == 0.0
     assert [axes.get_ylabel() for axes in (H, speed, force)] == [
         "H  [‖Δν‖²/(N·s)²]",
@@ -165,10 +166,17 @@ def test_controls_show_rotors_torques_limits_and_saturation(flying: RunView) -> 
     torque = np.outer(np.sin(flying.t), flying.torque_limits)
     figure = controls_figure(dataclasses.replace(flying, rotor_command=command, torque=torque))
     rotors, _, joints, _ = panels(figure)
-    assert limits(rotors) == [propulsion.speed_min, propulsion.speed_max]
-    assert limits(joints) == [-1.0, 1.0] and joints.get_ylabel() == "torque / limit"
+    # As shares of the highest speed: a robot.toml does not name the unit.
+    assert limits(rotors) == [propulsion.speed_min / propulsion.speed_max, 1.0]
+    share = flying.rotor_speed[:, 0] / propulsion.speed_max
+    np.testing.assert_allclose(curves(rotors)["rotor 1"][1], share)
+    # Thin and without dashes: they carry noise.
+    assert {
+        (line.get_linestyle(), line.get_linewidth()) for line in rotors.lines if line.get_label()[:5] == "rotor"
+    } == {("-", 0.7)}
+    assert limits(joints) == [-1.0, 1.0] and joints.get_ylabel() == "torque / limit  [1]"
     assert set(curves(rotors)) == {f"rotor {k}" for k in range(1, 7)}
-    assert rotors.get_ylabel() == "rotor speed  [Hz]"
+    assert rotors.get_ylabel() == "rotor speed / highest  [1]"
     for k, name in enumerate(flying.joint_names):
         np.testing.assert_allclose(curves(joints)[name][1], torque[:, k] / flying.torque_limits[k])
     marks = [line for line in rotors.lines if line.get_marker() == AT_LIMIT["marker"]]
@@ -280,7 +288,7 @@ def test_snapshots_show_the_robot_where_it_was(flying: RunView, pushed: RunView)
     figure = snapshots_figure([flying])
     assert [time for _, time in instants(flying)] == pytest.approx([flying.t[0], 0.995, 1.3])
     for axes, (_, time) in zip(panels(figure), instants(flying), strict=True):
-        state = build_skeleton(flying.robot, flying.q[flying.index(time)], flying.contact)
+        state = build_skeleton(flying.robot, flying.q[flying.index(time)], [flying.contact])
         spots = [line.get_xydata()[0] for line in axes.lines if len(line.get_xdata()) == 1]  # type: ignore[index, arg-type]
         assert any(np.allclose(spot, state.contact[[0, 2]]) for spot in spots)
         # The surface x = −0.5 stands upright.
@@ -290,7 +298,7 @@ def test_snapshots_show_the_robot_where_it_was(flying: RunView, pushed: RunView)
     arrows = [[t for t in axes.texts if t.arrow_patch is not None] for axes in panels(snapshots_figure([pushed]))]  # type: ignore[attr-defined]
     assert [len(own) for own in arrows] == [0, 1, 1]
     tip, tail = np.array(arrows[2][0].xy), np.array(arrows[2][0].xyann)
-    state = build_skeleton(pushed.robot, pushed.q[pushed.index(1.3)], pushed.contact)
+    state = build_skeleton(pushed.robot, pushed.q[pushed.index(1.3)], [pushed.contact])
     np.testing.assert_allclose(tip, state.contact[[0, 2]])
     assert (tip - tail)[0] > 0 and (tip - tail)[1] == pytest.approx(0)
 
@@ -334,7 +342,7 @@ def test_bars_carry_means_intervals_and_the_papers_numbers() -> None:
 )
 def test_nothing_overlaps(name: str, figure: Any, request: pytest.FixtureRequest) -> None:
     page = figure(request.getfixturevalue(name))
-    lay_out(page)
+    assert defects(page) == []
     _, body, foot = page.subfigs
     boxes = [axes.get_tightbbox().padded(-1) for axes in panels(page)]
     for k, box in enumerate(boxes):
@@ -351,7 +359,7 @@ def test_nothing_overlaps(name: str, figure: Any, request: pytest.FixtureRequest
 def test_files_in_all_formats_and_the_same_each_time(flying: RunView, fixed: RunView, tmp_path: Path) -> None:
     short = dataclasses.replace(fixed, windows=())
     paths = draw_run(short, tmp_path, ("svg",)) + draw_comparison([short, short], tmp_path, ("pdf",))
-    paths += draw_snapshots([flying], tmp_path, ("png",)) + draw_bars(ROWS, tmp_path)
+    paths += draw_snapshots([flying], tmp_path, ("png",)) + draw_bars(ROWS, tmp_path, FORMATS)
     assert [path.name for path in paths] == [
         "metric.svg", "controls.svg", "joints.svg",
         "comparison-metric.pdf", "comparison-controls.pdf", "comparison-joints.pdf",
