@@ -67,13 +67,13 @@ class LevelRank:
 
     def reset(self) -> None:
         """Take the lengths of the rows anew at the next :meth:`update`."""
-        self._lengths: Array | None = None
+        self._begun = False
 
     def update(self) -> None:
         """Look at the rows that are in the program now."""
         if not self._count:
             return
-        if self._lengths is None:
+        if not self._begun:
             self._begin()
         way = self._way
         np.subtract(self._rows, self._reference, out=way)
@@ -99,7 +99,7 @@ class LevelRank:
         for level in self._levels:
             lengths[level] = lengths[level].max()
         lengths[lengths == 0.0] = 1.0
-        self._lengths, self._scale = lengths, self._units / lengths[:, None]
+        self._lengths, self._scale, self._begun = lengths, self._units / lengths[:, None], True
         self._measure()
 
     def _measure(self) -> None:
@@ -113,7 +113,6 @@ class LevelRank:
 
     def _reduced(self) -> QP:
         given, lengths = self._given, self._lengths
-        assert lengths is not None
         n = given.n
         qp = QP(given.H, given.g, given.A.copy(), given.lower.copy(), given.upper.copy(), given.sense.copy())
         self.wanted = self._asked.copy()
