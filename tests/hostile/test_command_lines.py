@@ -30,7 +30,7 @@ SOUND: dict[str, tuple[str, ...]] = {
     "plot": ("precious",),
     "robots": (),
 }
-COUNT = 12
+COUNT = 8
 
 
 def parameters(command: str) -> list[Any]:

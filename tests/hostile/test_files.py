@@ -23,7 +23,7 @@ from tests.hostile.values import TOML, spoiled
 
 PUSH = ("small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
 STOP = ("--out", "precious", "--force")
-COUNT = 12
+COUNT = 8
 
 PROBLEM = """robot = "small.urdf"
 frame = "tip"

@@ -77,15 +77,21 @@ def test_what_needs_a_temporary_folder_says_so(tmp_path: Path) -> None:
     assert done.returncode == 0 or "TMPDIR: no temporary folder can be written" in done.stderr
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"MPLBACKEND": "module://matplotlib_inline.backend_inline"},
-        {"MPLBACKEND": "nonsense", "MPLCONFIGDIR": "/proc/nothing", "HOME": "/proc/nothing", "XDG_CACHE_HOME": ""},
-    ],
-    ids=["notebook", "nonsense, and nothing of the user's can be written"],
-)
-def test_pictures_whatever_the_backend_and_without_noise(settings: dict[str, str], tmp_path: Path) -> None:
+def test_the_backend_of_a_notebook_is_not_ours() -> None:
+    program = (
+        "from impact_posture_cli.process import prepare as p\np()\nimport matplotlib as m\nprint(m.get_backend())"
+    )
+    notebook = {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False,
+        env=os.environ | notebook,
+    )  # fmt: skip
+    assert (done.stdout, done.stderr) == ("agg\n", "")
+
+
+def test_pictures_whatever_the_backend_and_without_noise(tmp_path: Path) -> None:
+    nothing = "/proc/nothing"
+    settings = {"MPLBACKEND": "nonsense", "MPLCONFIGDIR": nothing, "HOME": nothing, "XDG_CACHE_HOME": ""}
     (tmp_path / "temporary").mkdir()
     done = subprocess.run(
         [COMMAND, "optimize", *PUSH, "--starts", "1", "--no-codegen", "--format", "svg", "--out", "out"],

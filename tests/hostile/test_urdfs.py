@@ -16,7 +16,7 @@ from tests.hostile.arena import SMALL, attack, strike
 from tests.hostile.values import NUMBERS, TEXTS
 
 PUSH = ("--frame", "tip", "--normal", "0", "0", "1")
-COUNT = 24
+COUNT = 16
 
 
 def spoiled(rng: random.Random) -> bytes:
