@@ -15,8 +15,8 @@ from impact_posture.posture.notes import percent
 from impact_posture.posture.settings import make_settings, prepare, resolved_settings
 from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.postures import read_posture, write_posture
+from impact_posture_cli.app import app
 from impact_posture_cli.boundary import run
-from impact_posture_cli.main import app
 from impact_posture_cli.words import put_right
 from tests.helpers import robot
 
