@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 
-from impact_posture_cli.process import prepare
+from impact_posture_cli.process import memory_fault, prepare, refuse
 
 
 def main() -> None:
     """Run the command line and exit with its code."""
     prepare()
+    if fault := memory_fault():
+        sys.exit(refuse(fault))
     # Not before: a signal that comes while these are imported ends the process quietly, too.
     import typer
 

@@ -10,6 +10,8 @@ from functools import partial
 
 _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "the terminal was closed"}
 _SEEN: list[int] = []
+# Below this limit on the address space OpenBLAS may wait forever for memory while SciPy is imported.
+_LEAST_MEMORY = 1 << 30
 
 
 def prepare() -> None:
@@ -17,10 +19,26 @@ def prepare() -> None:
     _open_streams()
     # A notebook's backend, or one that does not exist, must not end what only writes files.
     os.environ["MPLBACKEND"] = "agg"
+    # Matrices are small here: threads of the linear algebra only take memory, and fail to start where it is scarce.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     for number in _WORDS:
         # What is ignored stays so: nohup, and a shell's jobs in the background.
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
+
+
+def memory_fault() -> str:
+    """What is wrong with the limit on the process's memory; empty for nothing."""
+    if sys.platform == "win32":
+        return ""
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY or limit >= _LEAST_MEMORY:
+        return ""
+    return (
+        f"ulimit -v: the process may use {limit >> 20} MB of address space; allow at least {_LEAST_MEMORY >> 20} MB"
+    )
 
 
 def _open_streams() -> None:
@@ -46,12 +64,16 @@ def _end(number: int, frame: object) -> None:
 
 
 def _leave(number: int) -> None:
-    code, words = 128 + number, _WORDS[signal.Signals(number)]
+    kind = "Interrupted" if number == signal.SIGINT else "Terminated"
+    os._exit(refuse(_WORDS[signal.Signals(number)], 128 + number, kind))
+
+
+def refuse(what: str, code: int = 1, kind: str = "MemoryError") -> int:
+    """Write an error before, or instead of, everything else, and return its code."""
     with suppress(OSError):
-        os.write(2, f"error: {words}\n".encode())
+        os.write(2, f"error: {what}\n".encode())
         if "--json" in sys.argv:
-            # Not through sys.stdout: the signal may have come while it was written to.
-            kind = "Interrupted" if number == signal.SIGINT else "Terminated"
-            content = f'{{"code": {code}, "kind": "{kind}", "what": "{words}", "where": "", "mend": ""}}'
+            # Not through sys.stdout: a signal may have come while it was written to.
+            content = f'{{"code": {code}, "kind": "{kind}", "what": "{what}", "where": "", "mend": ""}}'
             os.write(1, f'{{"error": {content}}}\n'.encode())
-    os._exit(code)
+    return code

@@ -219,6 +219,17 @@ class SolverFailed(ImpactPostureError):
     exit_code = 4
 
 
+class WorkerDied(ImpactPostureError):
+    """A worker process ended without an answer."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "a worker process was killed",
+            where="--jobs",
+            mend="give it more memory, or work in one process: --jobs 1",
+        )
+
+
 class SimulationDiverged(ImpactPostureError):
     """A simulation's state ran away; carries the time."""
 

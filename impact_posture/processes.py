@@ -8,9 +8,11 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
-from multiprocessing.pool import Pool
 from typing import Any, NoReturn, TypeVar
+
+from impact_posture.errors import WorkerDied
 
 _Result = TypeVar("_Result")
 
@@ -94,20 +96,34 @@ def shared_out(function: Callable[[int], _Result], count: int, jobs: int) -> Ite
 
     In forked processes where ``jobs`` is more than one and the system can fork; else one after the other, here.  When
     the block is left, in peace or by Ctrl-C, no process is left running; nor, on Linux, when this process is killed.
+
+    Raises:
+        WorkerDied: A worker was killed, for example for want of memory.
     """
     if min(jobs, count) < 2 or "fork" not in multiprocessing.get_all_start_methods():
         yield ((index, function(index)) for index in range(count))
         return
     _WORK["function"] = function
-    # Signals reach every process of the terminal's group: workers must not act on them, not even at birth.
-    with signals_held():
-        pool: Pool = multiprocessing.get_context("fork").Pool(min(jobs, count), _depend, (os.getpid(),))
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(min(jobs, count), multiprocessing.get_context("fork"), _depend, (os.getpid(),))
     try:
-        yield pool.imap_unordered(_worker, range(count))
+        # The workers are forked here.  Signals reach every process of the terminal's group: workers must not act on
+        # them, not even at birth.
+        with signals_held():
+            futures = [pool.submit(_worker, index) for index in range(count)]
+        yield _finished(futures)
     finally:
-        pool.terminate()
-        pool.join()
+        for child in set(multiprocessing.active_children()) - others:
+            child.kill()
+        pool.shutdown(cancel_futures=True)
         _WORK.clear()
+
+
+def _finished(futures: list[Future[tuple[int, _Result]]]) -> Iterator[tuple[int, _Result]]:
+    try:
+        yield from (future.result() for future in as_completed(futures))
+    except BrokenExecutor:
+        raise WorkerDied() from None
 
 
 @contextmanager

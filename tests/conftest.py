@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 
 # Before numpy is imported: workers that share the cores must not each start a thread on every core.
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 import pytest  # noqa: E402

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import resource
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -122,3 +125,23 @@ def test_a_result_with_a_posture_of_another_length(tmp_path: Path, size: int) ->
     np.savez(tmp_path / "result.npz", **path)
     with pytest.raises(PostureError, match=rf"optimal\.q: a posture of tilthex_arm has .* numbers, this one {size}"):
         load_view(tmp_path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit on the address space (Linux)")
+@pytest.mark.parametrize("command", ["inspect", "codegen"])
+def test_too_little_memory_is_one_line_and_no_hang(command: str, tmp_path: Path) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (300 << 20, 300 << 20))
+
+    entry = str(Path(sys.executable).parent / "impact-posture")
+    done = subprocess.run(
+        [entry, command, "talos", "--json"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        preexec_fn=limit,
+    )
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1 and "ulimit -v" in done.stderr
+    assert json.loads(done.stdout)["error"]["code"] == 1

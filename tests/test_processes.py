@@ -14,7 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError, SimulationDiverged
+from impact_posture.errors import (
+    ControllerNotFound,
+    ImpactPostureError,
+    InputError,
+    SimulationDiverged,
+    WorkerDied,
+)
 from impact_posture.processes import end_early, in_a_copy, shared_out, signals_held, undone
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs /proc to look at processes")
@@ -50,6 +56,18 @@ def test_every_index_comes_once_with_its_result_in_whatever_order(jobs: int) -> 
     pids = {pid for _, pid in found.values()}
     assert (os.getpid() in pids) == (jobs == 1) and len(pids) <= jobs
     assert jobs == 1 or gone(list(pids))
+
+
+def test_a_worker_that_is_killed_is_noticed() -> None:
+    def work(index: int) -> int:
+        if index == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return index
+
+    with pytest.raises(WorkerDied, match="--jobs 1"), shared_out(work, 6, 2) as results:
+        list(results)
+    with shared_out(lambda index: index, 3, 2) as results:
+        assert sorted(results) == [(k, k) for k in range(3)]
 
 
 def test_what_cannot_be_sent_to_a_process_is_found_there() -> None:
