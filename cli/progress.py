@@ -22,10 +22,12 @@ def progress_bar(
         shown: Whether to show anything.
         first: What is being done until the first is done; ``doing`` if empty.
     """
-    if not shown:
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if not (shown and console.is_terminal):
         yield None
         return
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from impact_posture.processes import undone
@@ -33,7 +35,7 @@ def progress_bar(
     counted = (MofNCompleteColumn(), TextColumn(what)) if what else ()
     text = TextColumn("{task.description}")
     # No thread redraws it: worker processes are forked meanwhile, and what takes long in C holds Python's lock.
-    bar = Progress(text, console=Console(stderr=True), transient=True, auto_refresh=False)
+    bar = Progress(text, console=console, transient=True, auto_refresh=False)
     task = bar.add_task(f"{first or doing} …", total=None)
 
     def advance(done: int, total: int) -> None:

@@ -80,7 +80,13 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
     out = out.absolute()
     try:
         with _parents_of(out), _scratch(out.parent, 0o777) as beside:
-            yield beside
+            try:
+                yield beside
+            except OutputError as error:
+                # The user knows the folder by its own name.
+                raise OutputError(
+                    error.what, where=error.where.replace(str(beside), str(out)), mend=error.mend
+                ) from None
             write_record(beside, kind, products)
             with signals_held():
                 _replace(beside, out, force, kind)

@@ -74,8 +74,11 @@ def end_early(leave: Callable[[], None]) -> None:
     if _HELD[0]:
         _LATER.append(leave)
         return
-    for child in multiprocessing.active_children():
+    children = multiprocessing.active_children()
+    for child in children:
         child.kill()
+    for child in children:
+        child.join(1)
     for pid, undo in reversed(_UNFINISHED):
         if pid == os.getpid():
             with suppress(Exception):

@@ -228,7 +228,8 @@ def test_no_allocation_and_no_state(built: Built) -> None:
     static = [line for line in source.splitlines() if re.search(r"\bstatic\b", line)]
     assert len(static) >= 4
     assert all(
-        re.match(r"\s*(__attribute__\(\(unused\)\) )?static (const |(int|void) \w+\()", line) for line in static
+        re.match(r"\s*(__attribute__\(\(unused\)\) )?(APART )?static (const |(int|void) \w+\()", line)
+        for line in static
     )
 
 
@@ -359,7 +360,7 @@ def test_cmake_target_from_outside(pendulum: str, tmp_path: Path) -> None:
     export(objective, inside, prefix="pend", posture=robot.posture(), check=False)
     (tmp_path / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(controller C)\nadd_subdirectory(c)\n"
-        "add_executable(controller main.c)\ntarget_link_libraries(controller PRIVATE pend)\n"
+        "add_executable(controller main.c)\ntarget_link_libraries(controller PRIVATE pend::pend)\n"
     )
     (tmp_path / "main.c").write_text(
         '#include "pend.h"\nint main(void) { double v, g[PEND_NV]; return pend_objective(pend_posture, &v, g); }\n'

@@ -140,6 +140,8 @@ def lay_out(figure: Figure) -> None:
     """Give everything its place and keep it: every format then shows the same picture, in half the time."""
     # Panels with equal axes change their size in the first round and are placed in the others.
     engine: Any = figure.get_layout_engine()
+    if engine is None:
+        return
     for _ in range(3):
         engine.execute(figure)
     figure.set_layout_engine("none")

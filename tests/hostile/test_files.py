@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture import job
+from impact_posture import job, plot
+from impact_posture.posture.result import result_document
 from impact_posture.posture.settings import make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.simulation.scenario_file import scenario_path
@@ -146,8 +147,10 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }))  # fmt: skip
     solution = solve(prepared.problem, starts=1, compile="never")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(job, "draw_all", lambda *_: [])
-        job.write_result(prepared, solution, place / "out", codegen=False)
+        patch.setattr(plot, "draw_all", lambda *_: [])
+        job.write_result(
+            prepared, solution, result_document(prepared, solution), place / "out", codegen=False, jobs=1
+        )
     return place / "out"
 
 
