@@ -29,7 +29,7 @@ def run(command: Any, arguments: Sequence[str]) -> int:
     """Run a Typer command and return its exit code.
 
     0 done; 1 an error to act on; 2 a wrong command line; other codes as the error says; 130 interrupted.  One line on
-    standard error, and with ``--json`` the same as ``{"error": {code, kind, what, where, mend}}`` on standard output.
+    standard error, and with ``--json`` the same as ``{"error": {code, kind, what, where, hint}}`` on standard output.
     """
     # Where no folder for its caches can be written, matplotlib logs what it does about that.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
@@ -68,28 +68,28 @@ def _interrupted(wants_json: bool) -> int:
 def _explain(error: Exception, wants_json: bool) -> int:
     kind = type(error).__name__
     if isinstance(error, ImpactPostureError):
-        return _report(error.exit_code, kind, error.what, error.where, error.mend, wants_json=wants_json)
+        return _report(error.exit_code, kind, error.what, error.where, error.hint, wants_json=wants_json)
     if isinstance(error, UsageError):
         return _usage(error, wants_json)
     if isinstance(error, OSError):
         if error.errno == errno.EPIPE:
             return _closed_pipe()
-        mend = "free some space" if error.errno == errno.ENOSPC else "check the path and its permissions"
+        hint = "free some space" if error.errno == errno.ENOSPC else "check the path and its permissions"
         where = str(error.filename) if error.filename is not None else ""
-        return _report(1, kind, error.strerror or str(error), where, mend, wants_json=wants_json)
+        return _report(1, kind, error.strerror or str(error), where, hint, wants_json=wants_json)
     if isinstance(error, MemoryError) or "bad_alloc" in str(error):
         return _report(
             1,
             "MemoryError",
             "out of memory",
-            mend="free some, raise its limit (ulimit -v), or give fewer --jobs",
+            hint="free some, raise its limit (ulimit -v), or give fewer --jobs",
             wants_json=wants_json,
         )
     if isinstance(error, RecursionError):
-        return _report(1, kind, "an input is nested too deeply", mend="correct the file", wants_json=wants_json)
+        return _report(1, kind, "an input is nested too deeply", hint="correct the file", wants_json=wants_json)
     what = f"{kind}: {error}" if str(error) else kind
-    mend = f"please report it with the output of {DEBUG_VARIABLE}=1"
-    return _report(1, "InternalError", what, "internal error", mend, wants_json=wants_json)
+    hint = f"please report it with the output of {DEBUG_VARIABLE}=1"
+    return _report(1, "InternalError", what, "internal error", hint, wants_json=wants_json)
 
 
 def _usage(error: Any, wants_json: bool) -> int:
@@ -117,20 +117,20 @@ def _in_our_words(error: Any) -> None:
         error.message = "; ".join(not_one_of(given[1], re.findall(r"'(.*?)'", given[2])))
 
 
-def _report(code: int, kind: str, what: str, where: str = "", mend: str = "", *, wants_json: bool) -> int:
-    what, where, mend = (one_line(part) for part in (what, where, mend))
+def _report(code: int, kind: str, what: str, where: str = "", hint: str = "", *, wants_json: bool) -> int:
+    what, where, hint = (one_line(part) for part in (what, where, hint))
     line = f"{where}: {what}" if where else what
     with contextlib.suppress(OSError):
-        sys.stderr.write(f"error: {line}; {mend}\n" if mend else f"error: {line}\n")
+        sys.stderr.write(f"error: {line}; {hint}\n" if hint else f"error: {line}\n")
         sys.stderr.flush()
     if wants_json:
-        _document(code, kind, what, where, mend)
+        _document(code, kind, what, where, hint)
     _discard_output()
     return code
 
 
-def _document(code: int, kind: str, what: str, where: str, mend: str) -> None:
-    content = {"code": code, "kind": kind, "what": what, "where": where, "mend": mend}
+def _document(code: int, kind: str, what: str, where: str, hint: str) -> None:
+    content = {"code": code, "kind": kind, "what": what, "where": where, "hint": hint}
     with contextlib.suppress(OSError):
         sys.stdout.write(json.dumps({"error": content}, allow_nan=False) + "\n")
         sys.stdout.flush()

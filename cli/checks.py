@@ -78,7 +78,7 @@ def contact(value: str | None) -> str | None:
         frame, normal, impulse = parse_contact(value)
         Contact.create(frame, normal, impulse=1.0 if impulse is None else impulse)
     except ImpactPostureError as error:
-        raise typer.BadParameter(f"{error.what}; {error.mend}") from None
+        raise typer.BadParameter(f"{error.what}; {error.hint}") from None
     return value
 
 
@@ -98,7 +98,7 @@ def payloads(values: list[str] | None) -> list[str] | None:
         try:
             parse_payload(value)
         except ImpactPostureError as error:
-            raise typer.BadParameter(f"{error.what}; {error.mend}") from None
+            raise typer.BadParameter(f"{error.what}; {error.hint}") from None
     return values
 
 

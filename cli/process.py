@@ -74,6 +74,6 @@ def refuse(what: str, code: int = 1, kind: str = "MemoryError") -> int:
         os.write(2, f"error: {what}\n".encode())
         if "--json" in sys.argv:
             # Not through sys.stdout: a signal may have come while it was written to.
-            content = f'{{"code": {code}, "kind": "{kind}", "what": "{what}", "where": "", "mend": ""}}'
+            content = f'{{"code": {code}, "kind": "{kind}", "what": "{what}", "where": "", "hint": ""}}'
             os.write(1, f'{{"error": {content}}}\n'.encode())
     return code

@@ -1,6 +1,6 @@
 """Every error that a user can act on: one root, exceptions that carry data and say what to do.
 
-The command line prints ``what``, ``where`` and ``mend`` as one line and exits with ``exit_code``.
+The command line prints ``what``, ``where`` and ``hint`` as one line and exits with ``exit_code``.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ class ImpactPostureError(Exception):
     Args:
         what: What is wrong, without a full stop.
         where: Which file, option, joint or frame is meant.
-        mend: What the user can do about it.
+        hint: What the user can do about it.
     """
 
     exit_code: ClassVar[int] = 1
 
-    def __init__(self, what: str, *, where: str = "", mend: str = "") -> None:
-        self.what, self.where, self.mend = (one_line(text) for text in (what, where, mend))
+    def __init__(self, what: str, *, where: str = "", hint: str = "") -> None:
+        self.what, self.where, self.hint = (one_line(text) for text in (what, where, hint))
         super().__init__(self.line)
 
     @property
     def line(self) -> str:
         """The whole message on one line."""
         text = f"{self.where}: {self.what}" if self.where else self.what
-        return f"{text}; {self.mend}" if self.mend else text
+        return f"{text}; {self.hint}" if self.hint else text
 
     def __reduce__(self) -> tuple[object, ...]:
         # Subclasses take other arguments, yet worker processes must be able to send them home.
@@ -82,13 +82,13 @@ class NameNotFound(InputError):
 
     kind: ClassVar[str] = "name"
 
-    def __init__(self, name: str, known: Iterable[str], *, where: str = "", mend: str = "") -> None:
+    def __init__(self, name: str, known: Iterable[str], *, where: str = "", hint: str = "") -> None:
         self.name = name
         self.nearest = nearest(name, known)
         close = ", ".join(printable(other, longest=_LONGEST_NAME) for other in self.nearest)
-        hint = f"did you mean {close}?" if self.nearest else "there are none"
+        guess = f"did you mean {close}?" if self.nearest else "there are none"
         named = printable(name, longest=_LONGEST_NAME)
-        super().__init__(f"no {self.kind} '{named}'", where=where, mend=f"{hint} {mend}".strip())
+        super().__init__(f"no {self.kind} '{named}'", where=where, hint=f"{guess} {hint}".strip())
 
 
 class RobotNotFound(NameNotFound):
@@ -157,7 +157,7 @@ class NotWithinLimits(PostureError):
         super().__init__(
             f"joint '{joint}' is at {value:.6g}, outside its limits [{lower:.6g}, {upper:.6g}]",
             where=where,
-            mend="choose a posture within the limits or correct them in robot.toml [limits.position]",
+            hint="choose a posture within the limits or correct them in robot.toml [limits.position]",
         )
 
 
@@ -184,12 +184,12 @@ class CompilerError(InputError):
 class ManifestMismatch(InputError):
     """A C export was made for another robot than the one in hand; carries what differs, and both values."""
 
-    def __init__(self, key: str, exported: object, found: object, *, where: str = "manifest", mend: str = "") -> None:
+    def __init__(self, key: str, exported: object, found: object, *, where: str = "manifest", hint: str = "") -> None:
         self.key, self.exported, self.found = key, exported, found
         super().__init__(
             f"{key} is {_short(exported)} in the export, {_short(found)} here",
             where=where,
-            mend=mend or "export again for this robot (impact-posture codegen)",
+            hint=hint or "export again for this robot (impact-posture codegen)",
         )
 
 
@@ -203,13 +203,13 @@ class Infeasible(ImpactPostureError):
 
     exit_code = 3
 
-    def __init__(self, conflicts: dict[str, float], *, where: str = "problem", mend: str = "") -> None:
+    def __init__(self, conflicts: dict[str, float], *, where: str = "problem", hint: str = "") -> None:
         self.conflicts = dict(conflicts)
         named = ", ".join(f"{name} (off by {value:.3g})" for name, value in self.conflicts.items())
         super().__init__(
             f"the constraints conflict: {named}",
             where=where,
-            mend=mend or "relax one of them, move the target, or start from another --posture",
+            hint=hint or "relax one of them, move the target, or start from another --posture",
         )
 
 
@@ -226,7 +226,7 @@ class WorkerDied(ImpactPostureError):
         super().__init__(
             "a worker process was killed",
             where="--jobs",
-            mend="give it more memory, or work in one process: --jobs 1",
+            hint="give it more memory, or work in one process: --jobs 1",
         )
 
 
@@ -240,5 +240,5 @@ class SimulationDiverged(ImpactPostureError):
         super().__init__(
             f"the state ran away at t = {time:.4g} s",
             where=where,
-            mend="lower the time step or the controller's gains, or soften the contact",
+            hint="lower the time step or the controller's gains, or soften the contact",
         )

@@ -45,22 +45,22 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
             written.
     """
     if out.is_symlink():
-        raise OutputError("is a symbolic link", where=str(out), mend="name the folder that it leads to, or another")
+        raise OutputError("is a symbolic link", where=str(out), hint="name the folder that it leads to, or another")
     if os.path.lexists(out) and not out.is_dir():
-        raise OutputError("exists and is no folder", where=str(out), mend="choose another --out")
+        raise OutputError("exists and is no folder", where=str(out), hint="choose another --out")
     if Path(os.path.realpath(out)) in (Path.cwd(), *Path.cwd().parents):
         raise OutputError(
-            "is the current folder or one around it", where=str(out), mend="choose a new folder, such as ./result"
+            "is the current folder or one around it", where=str(out), hint="choose a new folder, such as ./result"
         )
     if os.path.ismount(out):
-        raise OutputError("is a mount point", where=str(out), mend="choose a folder in it")
+        raise OutputError("is a mount point", where=str(out), hint="choose a folder in it")
     if out.is_dir() and any(out.iterdir()):
         if not force:
-            raise OutputError("exists", where=str(out), mend="choose another --out, or --force to replace it")
+            raise OutputError("exists", where=str(out), hint="choose another --out, or --force to replace it")
         _check_ours(out, kind)
     parent = _first_existing(out.absolute().parent)
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise OutputError("cannot be written", where=str(parent), mend="choose another --out")
+        raise OutputError("cannot be written", where=str(parent), hint="choose another --out")
 
 
 @contextmanager
@@ -85,7 +85,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
             except OutputError as error:
                 # The user knows the folder by its own name.
                 raise OutputError(
-                    error.what, where=error.where.replace(str(beside), str(out)), mend=error.mend
+                    error.what, where=error.where.replace(str(beside), str(out)), hint=error.hint
                 ) from None
             write_record(beside, kind, products)
             with signals_held():
@@ -93,7 +93,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
     except OSError as error:
         words = error.strerror or str(error)
         raise OutputError(
-            f"cannot be written ({words})", where=str(out), mend="free space or choose another --out"
+            f"cannot be written ({words})", where=str(out), hint="free space or choose another --out"
         ) from error
 
 
@@ -111,7 +111,7 @@ def scratch_folder(parent: Path | None = None) -> Iterator[Path]:
     try:
         parent = Path(tempfile.gettempdir()) if parent is None else parent
     except FileNotFoundError:
-        raise OutputError("no temporary folder can be written", where="TMPDIR", mend="set it to one") from None
+        raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to one") from None
     with _scratch(parent, 0o700) as folder:
         yield folder
 
@@ -157,7 +157,7 @@ def _check_ours(out: Path, kind: Kind) -> None:
     content = _read_record(out)
     if content is not None and content["kind"] != kind:
         raise OutputError(
-            f"holds another command's results ({content['kind']})", where=str(out), mend="choose another --out"
+            f"holds another command's results ({content['kind']})", where=str(out), hint="choose another --out"
         )
     foreign = _foreign(out, set())
     if foreign:
@@ -165,7 +165,7 @@ def _check_ours(out: Path, kind: Kind) -> None:
         raise OutputError(
             f"holds {', '.join(foreign[:_SHOWN])}{more}, which this command did not write",
             where=str(out),
-            mend="choose another --out, or move that away: --force replaces earlier results only",
+            hint="choose another --out, or move that away: --force replaces earlier results only",
         )
 
 
@@ -209,7 +209,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                 raise OutputError(
-                    "exists", where=str(out), mend="choose another --out, or --force to replace it"
+                    "exists", where=str(out), hint="choose another --out, or --force to replace it"
                 ) from None
             raise
         return
@@ -245,7 +245,7 @@ def _parents_of(out: Path) -> Iterator[None]:
                 folder.mkdir(exist_ok=True)
         except OSError as error:
             raise OutputError(
-                f"cannot be made ({error.strerror})", where=str(missing[-1]), mend="choose another --out"
+                f"cannot be made ({error.strerror})", where=str(missing[-1]), hint="choose another --out"
             ) from None
         yield
 

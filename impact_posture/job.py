@@ -172,7 +172,7 @@ def load_view(folder: Path) -> ResultView:
         SpecError: It is no result folder, or the robot is not the one it was made with.
     """
     if not (folder / "result.json").is_file():
-        raise SpecError("holds no result.json", where=str(folder), mend="name a folder that optimize wrote")
+        raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
     try:
         document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
         prepared = prepare(read_settings(folder / "problem.toml"))
@@ -185,7 +185,7 @@ def load_view(folder: Path) -> ResultView:
             raise SpecError(
                 f"was made with another model of {robot.name} (sha256 {recorded[:12]}…)",
                 where=str(folder),
-                mend="run optimize again, or use the URDF and armature of then",
+                hint="run optimize again, or use the URDF and armature of then",
             )
         initial, optimal = (
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
@@ -194,5 +194,5 @@ def load_view(folder: Path) -> ResultView:
         return _view(prepared, initial, optimal, path, document)
     except _BROKEN as error:
         raise SpecError(
-            f"is no whole result ({type(error).__name__}: {error})", where=str(folder), mend="run optimize again"
+            f"is no whole result ({type(error).__name__}: {error})", where=str(folder), hint="run optimize again"
         ) from None

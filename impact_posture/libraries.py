@@ -74,8 +74,8 @@ def load_library(library: Path) -> ctypes.CDLL:
             return ctypes.CDLL(str(library.absolute()))
     except OSError as error:
         fault = f"cannot be loaded ({error.strerror or error})"
-    mend = f"{_REBUILD}; if you built it yourself, delete {seal_path(library).name}" if sealed is False else _REBUILD
-    raise SpecError(fault, where=str(library), mend=mend)
+    hint = f"{_REBUILD}; if you built it yourself, delete {seal_path(library).name}" if sealed is False else _REBUILD
+    raise SpecError(fault, where=str(library), hint=hint)
 
 
 def _fault(library: Path) -> str:
@@ -127,7 +127,7 @@ def cache_path() -> Path:
     try:
         return (base if base.is_absolute() else Path.home() / ".cache") / "impact-posture"
     except RuntimeError:
-        raise OutputError("there is no home folder", where="cache", mend="set IMPACT_POSTURE_CACHE") from None
+        raise OutputError("there is no home folder", where="cache", hint="set IMPACT_POSTURE_CACHE") from None
 
 
 def cache_folder(*parts: str) -> Path:
@@ -144,7 +144,7 @@ def cache_folder(*parts: str) -> Path:
             check_private(folder)
     except OSError as error:
         raise OutputError(
-            f"cannot be written ({error.strerror})", where=str(folder), mend="set IMPACT_POSTURE_CACHE to a folder"
+            f"cannot be written ({error.strerror})", where=str(folder), hint="set IMPACT_POSTURE_CACHE to a folder"
         ) from None
     return folder
 
@@ -165,7 +165,7 @@ def building(library: Path) -> Iterator[Path]:
         raise OutputError(
             f"cannot be written ({error.strerror or error})",
             where=str(library.parent),
-            mend="free some space, or set IMPACT_POSTURE_CACHE to another folder",
+            hint="free some space, or set IMPACT_POSTURE_CACHE to another folder",
         ) from None
 
 
@@ -177,9 +177,9 @@ def check_private(path: Path) -> None:
     """
     found = path.stat()
     if found.st_uid not in (os.geteuid(), 0):
-        raise OutputError("belongs to another user", where=str(path), mend="set IMPACT_POSTURE_CACHE to a folder")
+        raise OutputError("belongs to another user", where=str(path), hint="set IMPACT_POSTURE_CACHE to a folder")
     if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise OutputError("can be written by others", where=str(path), mend=f"chmod go-w {path}, if you trust it")
+        raise OutputError("can be written by others", where=str(path), hint=f"chmod go-w {path}, if you trust it")
 
 
 def is_cached(library: Path) -> bool:

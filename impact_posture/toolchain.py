@@ -45,7 +45,7 @@ def words_of(variable: str) -> list[str]:
         return shlex.split(text)
     except ValueError as error:
         raise CompilerError(
-            f"{text!r} cannot be split into words ({str(error).lower()})", where=variable, mend="close the quote"
+            f"{text!r} cannot be split into words ({str(error).lower()})", where=variable, hint="close the quote"
         ) from None
 
 
@@ -100,7 +100,7 @@ def _start(command: list[str], folder: Path, tied_to: int) -> subprocess.Popen[s
             errors="replace", start_new_session=True, env=os.environ | {"TMPDIR": str(beside)},
         )  # fmt: skip
     except OSError as error:
-        raise CompilerError(f"{error.strerror} ({shlex.join(command)})", where="C compiler", mend="set CC") from None
+        raise CompilerError(f"{error.strerror} ({shlex.join(command)})", where="C compiler", hint="set CC") from None
 
 
 def _check(command: list[str], folder: Path, code: int, output: str) -> None:
@@ -112,5 +112,5 @@ def _check(command: list[str], folder: Path, code: int, output: str) -> None:
     raise CompilerError(
         f"{first or f'it said nothing, exit code {code}'} (command: {shlex.join(command)}, in {folder})",
         where="the C compiler failed",
-        mend="check the compiler or set CC to another",
+        hint="check the compiler or set CC to another",
     )

@@ -1,4 +1,4 @@
-"""Bad models, specs and postures: each one line that says what, where and how to mend it."""
+"""Bad models, specs and postures: each one line that says what, where and what to do."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def one_line(error: ImpactPostureError, *words: str) -> None:
     assert str(error) == error.line
     assert error.what
     assert error.where
-    assert error.mend
+    assert error.hint
     assert error.exit_code == 1
     for word in words:
         assert word in error.line, error.line

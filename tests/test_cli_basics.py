@@ -217,7 +217,7 @@ def test_a_wrong_command_line_is_exit_2(arguments: tuple[str, ...], words: str) 
     assert done.returncode == 2
     assert done.stderr.startswith("Usage: impact-posture") and words in done.stderr
     error = json.loads(done.stdout)["error"]
-    assert set(error) == {"code", "kind", "what", "where", "mend"}
+    assert set(error) == {"code", "kind", "what", "where", "hint"}
     assert error["code"] == 2 and words in error["what"]
 
 
@@ -248,7 +248,7 @@ def test_an_error_is_one_line_and_exit_1(arguments: tuple[str, ...], kind: str, 
     error = json.loads(done.stdout)["error"]
     assert (error["code"], error["kind"]) == (1, kind)
     line = f"{error['where']}: {error['what']}" if error["where"] else error["what"]
-    assert done.stderr == f"error: {line}; {error['mend']}\n"
+    assert done.stderr == f"error: {line}; {error['hint']}\n"
 
 
 def test_a_package_folder_is_looked_for_where_the_user_is(tmp_path: Path) -> None:
@@ -291,7 +291,7 @@ class Raises:
 
 BOUNDARY = [
     (Infeasible({"elbow": 0.25}), 3, "error: problem: the constraints conflict: elbow (off by 0.25); relax"),
-    (SolverFailed("no start converged", mend="more --starts"), 4, "error: no start converged; more --starts"),
+    (SolverFailed("no start converged", hint="more --starts"), 4, "error: no start converged; more --starts"),
     (KeyboardInterrupt(), 130, "error: interrupted\n"),
     (OSError(errno.ENOSPC, "No space left on device", "out"), 1, "error: out: No space left on device; free some"),
     (PermissionError(errno.EACCES, "Permission denied", "out"), 1, "error: out: Permission denied; check the path"),

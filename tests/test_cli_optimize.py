@@ -330,7 +330,7 @@ def test_infeasible_exits_3_and_names_the_conflict(tmp_path: Path) -> None:
     done = run("optimize", "panda", "--normal", 0, 0, 1, "--target-position", 3, 0, 0, "--json", *FAST, cwd=tmp_path)
     refused(done, 3, "pose of panda_hand_tcp")
     error = json.loads(done.stdout)["error"]
-    assert error["code"] == 3 and {"what", "where", "mend"} <= set(error)
+    assert error["code"] == 3 and {"what", "where", "hint"} <= set(error)
     untouched(tmp_path)
 
 

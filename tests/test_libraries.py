@@ -39,7 +39,7 @@ for folder in sys.argv[1:]:
         ImpactGradient.load(folder).objective
         print("loaded", flush=True)
     except ImpactPostureError as error:
-        assert "\\n" not in error.line and error.mend, error
+        assert "\\n" not in error.line and error.hint, error
         print(type(error).__name__, error.what, flush=True)
 """
 

@@ -110,7 +110,7 @@ def test_every_other_robot_of_example_robot_data_loads_or_says_why_not() -> None
         except UrdfError as error:
             refused[path.name] = error
             assert "\n" not in error.line
-            assert error.mend
+            assert error.hint
         else:
             assert np.isfinite(mass_matrix(found.model, found.posture())).all()
     # Its neck turns about an axis through a point mass, and nobody's solver can tell neck_roll from neck_yaw there.

@@ -351,7 +351,7 @@ def test_errors_quote_names_safely(words: tuple[str, ...]) -> None:
 
 def test_every_error_is_one_safe_line() -> None:
     for name in NASTY:
-        error = errors.FrameNotFound(name, NASTY, where=name, mend=name)
+        error = errors.FrameNotFound(name, NASTY, where=name, hint=name)
         assert_plain(error.line)
         assert "\n" not in error.line and len(error.what) < 1000
         assert_plain(errors.ManifestMismatch(name, name, name, where=name).line)

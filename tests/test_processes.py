@@ -86,7 +86,7 @@ def test_nothing_to_do() -> None:
     "error",
     [
         SimulationDiverged(1.25, where="solo8"),
-        ControllerNotFound("robsut", ("robust", "nominal"), mend="look"),
+        ControllerNotFound("robsut", ("robust", "nominal"), hint="look"),
         ZeroDivisionError("by zero"),
     ],
     ids=lambda e: type(e).__name__,
@@ -274,9 +274,9 @@ def test_a_copy_goes_on_from_the_very_state() -> None:
 
 def test_what_a_copy_raises_is_raised_here() -> None:
     def fail() -> None:
-        raise InputError("is wrong", where="the copy", mend="mend it")
+        raise InputError("is wrong", where="the copy", hint="correct it")
 
-    with in_a_copy(fail) as collect, pytest.raises(InputError, match="the copy: is wrong; mend it"):
+    with in_a_copy(fail) as collect, pytest.raises(InputError, match="the copy: is wrong; correct it"):
         collect()
 
 

@@ -380,7 +380,7 @@ def test_a_resolved_problem_gives_the_same_again(tmp_path: Path) -> None:
 def test_refusals(settings_: dict[str, object], kind: type[ImpactPostureError], words: str) -> None:
     with pytest.raises(kind, match=words) as caught:
         problem_of(ELBOW, **settings_)
-    assert "\n" not in caught.value.line and caught.value.mend
+    assert "\n" not in caught.value.line and caught.value.hint
 
 
 # ---- the C export -------------------------------------------------------------------------------------------------

@@ -107,7 +107,7 @@ def test_a_urdf_of_ones_own(root: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "build", "mend"),
+    ("name", "build", "hint"),
     [
         ("panda", aerial_program, "arm_program"),
         ("talos", aerial_program, "propulsion"),
@@ -115,8 +115,8 @@ def test_a_urdf_of_ones_own(root: str, tmp_path: Path) -> None:
         ("panda", legged_program, "supports"),
     ],
 )
-def test_programs_that_do_not_suit_a_robot_say_which_does(name: str, build: type, mend: str) -> None:
-    with pytest.raises(InputError, match=mend):
+def test_programs_that_do_not_suit_a_robot_say_which_does(name: str, build: type, hint: str) -> None:
+    with pytest.raises(InputError, match=hint):
         build(robot(name), JointPosture(robot(name)))
 
 

@@ -203,7 +203,7 @@ def test_mujoco_sees_another_inertia(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.skipif(not HAS_MUJOCO, reason="mujoco is not installed (the extra 'sim')")
 def test_a_model_that_mujoco_refuses_fails_without_stopping_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_: object) -> Any:
-        raise InputError("MuJoCo refuses the model", where="MJCF", mend="correct it")
+        raise InputError("MuJoCo refuses the model", where="MJCF", hint="correct it")
 
     monkeypatch.setattr(module, "MujocoSource", refuse)
     monkeypatch.setattr(module, "find_compiler", lambda: None)

@@ -201,7 +201,7 @@ def test_laws_faster_than_the_time_step_are_refused(solref: tuple[float, float])
 
 
 def one_line(error: ImpactPostureError) -> str:
-    assert "\n" not in error.line and error.mend
+    assert "\n" not in error.line and error.hint
     return error.line
 
 

@@ -172,14 +172,14 @@ def _settings(robot: str, given: dict[str, Any]) -> ProblemSettings:
 
 def _refuse_idle(given: dict[str, Any], settings: ProblemSettings) -> None:
     """Refuse options that would do nothing beside the others."""
-    for name, used, mend in (
+    for name, used, hint in (
         ("box", settings.contact_pose == "box", "--contact-pose box"),
         ("base_box", settings.base == "box", "--base box"),
         ("com_margin", settings.com is not False, "--com"),
         ("friction", settings.keep_contacts, "--keep-contacts"),
     ):
         if name in given and not used:
-            raise typer.BadParameter(f"does nothing without {mend}", param_hint=f"'--{name.replace('_', '-')}'")
+            raise typer.BadParameter(f"does nothing without {hint}", param_hint=f"'--{name.replace('_', '-')}'")
 
 
 def _announce(page: Page, prepared: Prepared) -> None:

@@ -51,7 +51,7 @@ def reproduce(
     scenarios = list(dict.fromkeys(scenario)) if scenario else list(PAPER)
     for name in scenarios:
         if name not in PAPER:
-            raise ScenarioNotFound(name, PAPER, mend="(others: simulate and compare)")
+            raise ScenarioNotFound(name, PAPER, hint="(others: simulate and compare)")
     folder = Path(out)
     check_output(folder, force=force, kind="reproduction")
     store = store_beside(folder)

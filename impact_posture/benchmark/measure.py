@@ -68,7 +68,7 @@ def measure(
     try:
         harness = Harness(case, bench)
     except Absent as absent:
-        raise CompilerError(str(absent), where="bench", mend="check the compiler or set CC to another") from None
+        raise CompilerError(str(absent), where="bench", hint="check the compiler or set CC to another") from None
     kept, differences = _agreeing(made, harness, bench)
     say(f"timing, {rounds} rounds")
     with one_core() as core:
@@ -84,12 +84,12 @@ def measure(
 
 def _check(peers: Sequence[str], rounds: int, patience_s: float) -> None:
     if rounds < 1:
-        raise InputError(f"asked for {rounds}", where="--rounds", mend="give one or more")
+        raise InputError(f"asked for {rounds}", where="--rounds", hint="give one or more")
     if not patience_s >= 1:
-        raise InputError(f"is {patience_s:g} s", where="--patience", mend="give a second or more")
+        raise InputError(f"is {patience_s:g} s", where="--patience", hint="give a second or more")
     for name in peers:
         if name not in PEERS:
-            raise InputError(f"no peer '{name}'", where="--peers", mend=f"one of: {', '.join(PEERS)}")
+            raise InputError(f"no peer '{name}'", where="--peers", hint=f"one of: {', '.join(PEERS)}")
 
 
 def _fastest(rows: list[BenchRow]) -> list[BenchRow]:
@@ -118,7 +118,7 @@ def _agreeing(made: Sequence[Peer], harness: Harness, bench: Workbench) -> tuple
         raise CompilerError(
             f"no build of the export is right ({reasons})",
             where="bench",
-            mend="run impact-posture verify on this robot and frame",
+            hint="run impact-posture verify on this robot and frame",
         )
     return kept, differences
 

@@ -127,7 +127,7 @@ def c_compiler() -> list[str]:
     """
     found = find_compiler()
     if found is None:
-        raise CompilerError("no C compiler found", where="bench", mend="install gcc or clang, or set CC")
+        raise CompilerError("no C compiler found", where="bench", hint="install gcc or clang, or set CC")
     return found
 
 

@@ -41,7 +41,7 @@ def build_library(folder: Path, prefix: str, target: Path | None = None, extra_f
     """
     compiler = find_compiler()
     if compiler is None:
-        raise CompilerError("no C compiler found", where="codegen", mend=GET_ONE)
+        raise CompilerError("no C compiler found", where="codegen", hint=GET_ONE)
     target = library_path(folder, prefix) if target is None else target
     # In the same folder, so that the rename is one step; by process, so that two builds do not meet.
     beside = target.with_name(f".{target.name}.{os.getpid()}.part")
@@ -59,8 +59,8 @@ def build_library(folder: Path, prefix: str, target: Path | None = None, extra_f
         run_compiler(command, folder)
         put_library(beside, target)
     except OSError as error:
-        mend = "check the disk and permissions"
-        raise OutputError(f"cannot be written ({error.strerror})", where=str(target), mend=mend) from None
+        hint = "check the disk and permissions"
+        raise OutputError(f"cannot be written ({error.strerror})", where=str(target), hint=hint) from None
     finally:
         for left in (beside, seal_path(beside)):
             with suppress(OSError):

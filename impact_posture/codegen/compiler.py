@@ -180,7 +180,7 @@ def _checked(difference: float, tolerance: float, other: str, prefix: str) -> fl
         raise CompilerError(
             f"the compiled code differs from {other} numbers by {difference:.3g}, relative",
             where=f"{prefix}.c",
-            mend="try another compiler (set CC) without -ffast-math, or double instead of float",
+            hint="try another compiler (set CC) without -ffast-math, or double instead of float",
         )
     return difference
 

@@ -81,7 +81,7 @@ def export(
     robot = objectives[0].robot
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     if not out.is_dir():
-        raise OutputError("no such folder", where=str(out), mend="create it first")
+        raise OutputError("no such folder", where=str(out), hint="create it first")
     if posture is not None:
         given = np.array(posture, dtype=float)
         posture = robot.check_posture(given, limits=False)
@@ -110,7 +110,7 @@ def default_prefix(objectives: Sequence[ImpactObjective]) -> str:
 def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple[ImpactObjective, ...]:
     objectives = (objective,) if isinstance(objective, ImpactObjective) else tuple(objective)
     if not objectives:
-        raise InputError("no objective is given", where="codegen", mend="give one for each frame")
+        raise InputError("no objective is given", where="codegen", hint="give one for each frame")
     first = objectives[0]
     shared = _what(first)
     for other in objectives[1:]:
@@ -118,7 +118,7 @@ def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple
             raise InputError(
                 f"'{other.contact.frame}' and '{first.contact.frame}' differ in more than the contact",
                 where="codegen",
-                mend="export them one by one",
+                hint="export them one by one",
             )
     return objectives
 
@@ -132,7 +132,7 @@ def _what(o: ImpactObjective) -> tuple[object, ...]:
 def _write(texts: dict[str, str], out: Path, force: bool) -> None:
     there = [name for name in texts if (out / name).exists()]
     if there and not force:
-        raise OutputError(f"holds {there[0]} already", where=str(out), mend="give --force to replace it")
+        raise OutputError(f"holds {there[0]} already", where=str(out), hint="give --force to replace it")
     for name, text in texts.items():
         beside = out / f".{name}.part"
         try:
@@ -142,5 +142,5 @@ def _write(texts: dict[str, str], out: Path, force: bool) -> None:
             with suppress(OSError):
                 beside.unlink()
             raise OutputError(
-                f"cannot be written ({error.strerror})", where=str(out / name), mend="check the disk and permissions"
+                f"cannot be written ({error.strerror})", where=str(out / name), hint="check the disk and permissions"
             ) from None

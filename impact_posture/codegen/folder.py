@@ -113,8 +113,8 @@ def write_export(
             try:
                 agreement = compile_and_check(folder, prefix, objectives, real=real, keep=True)
             except CompilerError as error:
-                mend = f"{error.mend}; without --compile the C code is written all the same"
-                raise CompilerError(error.what, where=error.where, mend=mend) from None
+                hint = f"{error.hint}; without --compile the C code is written all the same"
+                raise CompilerError(error.what, where=error.where, hint=hint) from None
             made = replace(made, compiled=True, agreement=agreement)
     made = replace(made, files=tuple(out / path.name for path in made.files))
     return WrittenExport(out, made, library_path(out, prefix) if made.compiled else None, build)

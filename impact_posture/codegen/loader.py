@@ -113,7 +113,7 @@ class ImpactGradient:
         try:
             found = cls(library, manifest, frame, free=free)
         except AttributeError as error:
-            raise SpecError(f"lacks a function ({error})", where=str(target), mend="run codegen again") from None
+            raise SpecError(f"lacks a function ({error})", where=str(target), hint="run codegen again") from None
         found._self_test(str(target))
         return found
 
@@ -212,11 +212,11 @@ class ImpactGradient:
         """
         q = np.ascontiguousarray(q, dtype=self.dtype)
         if q.ndim != 2 or q.shape[1] != self.nq:
-            raise InputError(f"has shape {q.shape}", where="q", mend=f"give shape (N, {self.nq})")
+            raise InputError(f"has shape {q.shape}", where="q", hint=f"give shape (N, {self.nq})")
         count = q.shape[0]
         n = np.asarray(n, dtype=self.dtype)
         if n.shape not in ((3,), (count, 3)):
-            raise InputError(f"has shape {n.shape}", where="n", mend=f"give shape (3,) or ({count}, 3)")
+            raise InputError(f"has shape {n.shape}", where="n", hint=f"give shape (3,) or ({count}, 3)")
         n = np.ascontiguousarray(np.broadcast_to(n, (count, 3)))
         H, grad = (np.empty(count, self.dtype), np.empty((count, self.nv), self.dtype)) if out is None else out
         for array, shape in ((H, (count,)), (grad, (count, self.nv))):
@@ -224,7 +224,7 @@ class ImpactGradient:
                 raise InputError(
                     f"has shape {array.shape} of {array.dtype}",
                     where="out",
-                    mend=f"give contiguous arrays of {self.dtype}, shapes ({count},) and ({count}, {self.nv})",
+                    hint=f"give contiguous arrays of {self.dtype}, shapes ({count},) and ({count}, {self.nv})",
                 )
         pointers = [ctypes.c_void_p(array.ctypes.data) for array in (q, n, H, grad)]
         self._batch(pointers[0], pointers[1], ctypes.c_int(count), pointers[2], pointers[3])
@@ -244,14 +244,14 @@ class ImpactGradient:
         # Not ">": that is false for a NaN.
         if not difference <= _SELF_TEST[self.manifest["real"]]:
             raise ManifestMismatch(
-                "reference value of H", test["H"], H, where=where, mend="delete the library: it is built again"
+                "reference value of H", test["H"], H, where=where, hint="delete the library: it is built again"
             )
 
 
 def _failure(code: int) -> Exception:
     if code == 1:
-        return InputError("is not finite", where="q or n", mend="correct the measurement")
+        return InputError("is not finite", where="q or n", hint="correct the measurement")
     if code == 2:
         what = "a quaternion or cosine-sine pair is not of unit norm"
-        return PostureError(what, where="q", mend="normalize it")
-    return MetricError("is not finite", where="the result", mend="the quantity does not exist at this posture")
+        return PostureError(what, where="q", hint="normalize it")
+    return MetricError("is not finite", where="the result", hint="the quantity does not exist at this posture")

@@ -182,7 +182,7 @@ def _refuse_infinite(objective: ImpactObjective, values: Iterable[Vector]) -> No
         raise MetricError(
             f"objective '{objective.name}' is not finite at a random posture of {objective.robot.name}",
             where="codegen",
-            mend="choose another objective or frame",
+            hint="choose another objective or frame",
         )
 
 

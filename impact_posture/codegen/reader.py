@@ -75,19 +75,19 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
     files = [path] if not path.is_dir() else sorted(p for p in path.glob("*.json") if is_manifest(p))
     if len(files) != 1:
         what = "holds no export" if not files else f"holds {len(files)} exports"
-        mend = "name the folder that codegen wrote" if not files else f"name one, such as {files[0].name}"
-        raise SpecError(what, where=str(path), mend=mend)
+        hint = "name the folder that codegen wrote" if not files else f"name one, such as {files[0].name}"
+        raise SpecError(what, where=str(path), hint=hint)
     try:
         manifest = json.loads(files[0].read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         words = getattr(error, "strerror", None) or str(error)
-        raise SpecError(f"cannot be read ({words})", where=str(files[0]), mend="run codegen again") from None
+        raise SpecError(f"cannot be read ({words})", where=str(files[0]), hint="run codegen again") from None
     fault = "is no manifest of an export"
     if isinstance(manifest, dict) and manifest.get("schema") == SCHEMA:
         fault = _fault(manifest)
     if fault:
-        mend = "name the folder that codegen wrote, or run codegen again"
-        raise SpecError(fault, where=str(files[0]), mend=mend)
+        hint = "name the folder that codegen wrote, or run codegen again"
+        raise SpecError(fault, where=str(files[0]), hint=hint)
     return manifest, files[0].parent
 
 
@@ -129,7 +129,7 @@ def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: s
         address = ctypes.addressof(ctypes.c_char.in_dll(library, symbol))
     except ValueError:
         raise SpecError(
-            f"has no symbol {symbol}", where=where, mend="delete it: it is built again; or run codegen again"
+            f"has no symbol {symbol}", where=where, hint="delete it: it is built again; or run codegen again"
         ) from None
     inside = ctypes.string_at(address).decode("ascii", "replace")
     pairs = [dict(part.partition("=")[::2] for part in text.split()) for text in (identity(manifest), inside)]
@@ -141,7 +141,7 @@ def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: s
                 given,
                 pairs[1].get(key),
                 where=where,
-                mend="delete the library: it is built again; or run codegen",
+                hint="delete the library: it is built again; or run codegen",
             )
 
 

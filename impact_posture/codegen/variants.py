@@ -38,7 +38,7 @@ def variants(objectives: Sequence[ImpactObjective], prefix: str) -> tuple[Varian
     several = [objective for objective in objectives if objective.others]
     if several and len(objectives) > 1:
         raise InputError(
-            "is one problem of several contacts beside others", where="codegen", mend="export them one by one"
+            "is one problem of several contacts beside others", where="codegen", hint="export them one by one"
         )
     # One frame that is struck along two normals has one H of any normal.
     singles: dict[str, ImpactObjective] = {}

@@ -72,7 +72,7 @@ class Mjcf:
         try:
             model = mujoco.MjModel.from_xml_string(self.xml)
         except ValueError as error:
-            raise InputError(f"MuJoCo refuses the model ({error})", where="MJCF", mend="correct the URDF") from None
+            raise InputError(f"MuJoCo refuses the model ({error})", where="MJCF", hint="correct the URDF") from None
         for name, moments in self.moments.items():
             model.body_inertia[model.body(name).id] = moments
         if self.moments:
@@ -90,7 +90,7 @@ def import_mujoco() -> Any:
         import mujoco
     except ImportError:
         raise InputError(
-            "MuJoCo is not installed", where="the extra 'sim'", mend="pip install 'impact-posture[sim]'"
+            "MuJoCo is not installed", where="the extra 'sim'", hint="pip install 'impact-posture[sim]'"
         ) from None
     return mujoco
 
@@ -218,7 +218,7 @@ def _add_joint(body: ET.Element, model: pin.Model, slot: JointSlot, free: bool, 
         add("ball", ".turn", _alike(armature[3:], slot))
     else:
         raise UnsupportedJoint(
-            f"joint '{slot.name}' of family {family} has no form in MJCF", where="MJCF", mend="lock it (--lock)"
+            f"joint '{slot.name}' of family {family} has no form in MJCF", where="MJCF", hint="lock it (--lock)"
         )
 
 
@@ -226,7 +226,7 @@ def _alike(armature: Vector, slot: JointSlot) -> float:
     """The one armature of axes that turn against each other, or of a ball."""
     if np.ptp(armature) > 0:
         raise InputError(
-            f"the armature of joint '{slot.name}' differs between its axes", where="MJCF", mend="give it one value"
+            f"the armature of joint '{slot.name}' differs between its axes", where="MJCF", hint="give it one value"
         )
     return float(armature[0])
 

@@ -64,7 +64,7 @@ def parse_controller(text: str) -> tuple[str, Mode, bool]:
     name, *words = text.strip().split(":")
     for word in words:
         if word not in ("held", "live", "free"):
-            raise InputError(f"no variant '{word}'", where=f"controller '{text}'", mend="use held, live or free")
+            raise InputError(f"no variant '{word}'", where=f"controller '{text}'", hint="use held, live or free")
     return name, "held" if "held" in words else "live", "free" in words
 
 
@@ -87,7 +87,7 @@ def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
     shop = workshop(job.scenario, job.free)
     scenario = shop.setup.scenario
     if job.sign is not None and job.sign not in getattr(scenario.task, "signs", ()):
-        raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, mend="leave --sign out")
+        raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, hint="leave --sign out")
     runs = run(shop, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
     metrics, found = [measure(shop.setup, one) for one in runs], []
     for one, measured in zip(runs, metrics, strict=True):

@@ -83,7 +83,7 @@ class Store:
         except OSError as error:
             words = error.strerror or str(error)
             raise OutputError(
-                f"cannot be written ({words})", where=str(path), mend="free space or choose another --out"
+                f"cannot be written ({words})", where=str(path), hint="free space or choose another --out"
             ) from error
 
     def _path(self, job: Job) -> Path:

@@ -61,17 +61,17 @@ class Contact:
             raise ContactError(
                 f"the normal {tuple(normal)} has no direction",
                 where="--normal",
-                mend="give three numbers, not all zero",
+                hint="give three numbers, not all zero",
             )
         if not np.isfinite(np.array(offset, dtype=float)).all():
-            raise ContactError("the offset is not finite", where="--offset", mend="give three numbers")
+            raise ContactError("the offset is not finite", where="--offset", hint="give three numbers")
         if not (np.isfinite(impulse) and impulse > 0):
-            raise ContactError(f"the impulse bound is {impulse:g}", where="--impulse", mend="give N·s above zero")
+            raise ContactError(f"the impulse bound is {impulse:g}", where="--impulse", hint="give N·s above zero")
         if not 1 / LARGEST <= impulse <= LARGEST:
             raise ContactError(
                 f"with an impulse bound of {impulse:g} the objective λ̄²H is beyond double precision",
                 where="--impulse",
-                mend=f"give {1 / LARGEST:g} to {LARGEST:g} N·s",
+                hint=f"give {1 / LARGEST:g} to {LARGEST:g} N·s",
             )
         n = n / np.abs(n).max()  # first: any length must do, and squares overflow
         n = n / np.linalg.norm(n)
@@ -118,7 +118,7 @@ def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> Poi
         raise ContactError(
             f"frame '{frame}' is welded to the world and cannot move",
             where=robot.name,
-            mend="choose a frame on a moving link, or --root free-flyer",
+            hint="choose a frame on a moving link, or --root free-flyer",
         )
     position = found.placement.act(np.array(offset, dtype=float))
     return PointOnLink(int(found.parentJoint), np.array(position), np.array(found.placement.rotation))

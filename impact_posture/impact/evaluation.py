@@ -150,9 +150,9 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
         InputError: A negative or non-finite speed, or a restitution outside [0, 1].
     """
     if not 0 <= speed <= LARGEST:
-        raise InputError(f"the approach speed is {speed:g}", where="--speed", mend=f"give m/s, 0 to {LARGEST:g}")
+        raise InputError(f"the approach speed is {speed:g}", where="--speed", hint=f"give m/s, 0 to {LARGEST:g}")
     if not 0 <= restitution <= 1:
-        raise InputError(f"the restitution is {restitution:g}", where="--restitution", mend="give 0 to 1")
+        raise InputError(f"the restitution is {restitution:g}", where="--restitution", hint="give 0 to 1")
     robot, oracle = objective.robot, objective.oracle
     found = oracle.quantities(q)
     scalars = Scalars.of(found)

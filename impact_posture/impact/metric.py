@@ -44,18 +44,18 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | None = None) -> 
     if kind != "weighted":
         if weights is not None:
             raise MetricError(
-                f"--weights goes with --metric weighted, not {kind}", where="--weights", mend="add --metric weighted"
+                f"--weights goes with --metric weighted, not {kind}", where="--weights", hint="add --metric weighted"
             )
         return Metric(kind)
     if weights is None:
         raise MetricError(
-            "the weighted metric needs weights", where="--metric", mend="add --weights FILE or velocity-limits"
+            "the weighted metric needs weights", where="--metric", hint="add --weights FILE or velocity-limits"
         )
     values = _from_limits(robot) if weights == "velocity-limits" else _from_file(robot, Path(weights))
     for name, value in zip(robot.tangent_names, values, strict=True):
         if not (np.isfinite(value) and value > 0):
             raise MetricError(
-                f"the weight of '{name}' is {value:g}", where=weights, mend="every weight must be above zero"
+                f"the weight of '{name}' is {value:g}", where=weights, hint="every weight must be above zero"
             )
     return Metric("weighted", tuple(float(v) for v in values), weights)
 
@@ -70,7 +70,7 @@ def _from_limits(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
             raise MetricError(
                 f"joint '{name}' has no velocity limit",
                 where="--weights velocity-limits",
-                mend="add it to robot.toml [limits.velocity] or give a file",
+                hint="add it to robot.toml [limits.velocity] or give a file",
             )
     return np.asarray(1.0 / limits**2)
 
@@ -89,6 +89,6 @@ def _from_file(robot: Robot, path: Path) -> np.ndarray[tuple[int], np.dtype[np.f
                 values[first : first + robot.model.nvs[joint]] = float(value)  # type: ignore[arg-type]
         except (TypeError, ValueError):
             raise MetricError(
-                f"key '{key}' holds no number", where=str(path), mend="joint = weight; base = [6 numbers]"
+                f"key '{key}' holds no number", where=str(path), hint="joint = weight; base = [6 numbers]"
             ) from None
     return values

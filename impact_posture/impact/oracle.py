@@ -277,5 +277,5 @@ def no_sticking() -> MetricError:
     return MetricError(
         "S does not exist here: the contact point cannot move in every direction and the normal leaves those it can",
         where="--objective sticking",
-        mend="choose --objective speed, or another frame, normal or posture",
+        hint="choose --objective speed, or another frame, normal or posture",
     )

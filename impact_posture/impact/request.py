@@ -93,7 +93,7 @@ class ImpactRequest:
             raise InputError(
                 f"the compliance is {self.compliance:g} 1/kg",
                 where="support_compliance",
-                mend=f"give at least {least:.3g}, 1e-6 over the mass: below it rounding eats what stiffer feet gain",
+                hint=f"give at least {least:.3g}, 1e-6 over the mass: below it rounding eats what stiffer feet gain",
             )
         objective = ImpactObjective(
             robot,
@@ -114,15 +114,15 @@ class ImpactRequest:
     def _contacts(self, robot: Robot) -> list[Contact]:
         if not self.contacts:
             if self.normal is None:
-                raise ContactError("there is none", where="--normal", mend="give the direction out of the surface")
+                raise ContactError("there is none", where="--normal", hint="give the direction out of the surface")
             return [self._contact(robot, self.frame or _default_frame(robot), self.normal, None)]
         if self.frame is not None or self.normal is not None:
             raise ContactError(
-                "--contact stands instead of --frame and --normal", where="--contact", mend="give one of the two"
+                "--contact stands instead of --frame and --normal", where="--contact", hint="give one of the two"
             )
         if len(self.contacts) > 1 and self.offset is not None:
             raise ContactError(
-                "one offset for several contacts", where="--offset", mend="leave it out, or add frames to the URDF"
+                "one offset for several contacts", where="--offset", hint="leave it out, or add frames to the URDF"
             )
         return [self._contact(robot, *parse_contact(text)) for text in self.contacts]
 
@@ -260,5 +260,5 @@ def _default_frame(robot: Robot) -> str:
     raise ContactError(
         f"{robot.name} has no default contact frame",
         where="--frame",
-        mend=f"give one, for example {', '.join(tips(robot, feet(robot))[:3])}",
+        hint=f"give one, for example {', '.join(tips(robot, feet(robot))[:3])}",
     )

@@ -30,7 +30,7 @@ def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support
         found = [_support(robot, text, known) for text in texts]
     for support in found:
         if sum(s.frame == support.frame for s in found) > 1:
-            raise InputError(f"frame '{support.frame}' is given twice", where="--support", mend="remove one")
+            raise InputError(f"frame '{support.frame}' is given twice", where="--support", hint="remove one")
         point_on(robot, support.frame, support.offset)
     return tuple(found)
 
@@ -42,7 +42,7 @@ def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
             frame, kind = text.removesuffix(f":{candidate}"), candidate
     if frame not in robot.frame_names:
         names = dict.fromkeys((*feet(robot), *robot.frame_names))
-        raise FrameNotFound(frame, names, where="--support", mend="(or FRAME:point, FRAME:surface)")
+        raise FrameNotFound(frame, names, where="--support", hint="(or FRAME:point, FRAME:surface)")
     base = known.get(frame, Support(frame))
     return Support(frame, kind or base.kind, base.offset, base.size)
 
@@ -59,5 +59,5 @@ def refuse_held(robot: Robot, contact: Contact, supports: Sequence[Support]) -> 
             raise ContactError(
                 f"the contact point is held by the support at '{support.frame}'",
                 where=f"--frame {contact.frame}",
-                mend="choose another frame, name the other --support frames, or --no-support",
+                hint="choose another frame, name the other --support frames, or --no-support",
             )

@@ -16,7 +16,7 @@ def parse_contact(text: str) -> tuple[str, Vector3, float | None]:
     Raises:
         ContactError: It does not have this form.
     """
-    mend = "write FRAME:NX,NY,NZ or FRAME:NX,NY,NZ:IMPULSE"
+    hint = "write FRAME:NX,NY,NZ or FRAME:NX,NY,NZ:IMPULSE"
     parts = text.split(":")
     impulse: float | None = None
     try:
@@ -24,10 +24,10 @@ def parse_contact(text: str) -> tuple[str, Vector3, float | None]:
             impulse = float(parts.pop())
         x, y, z = (float(v) for v in parts[-1].split(","))
     except ValueError:
-        raise ContactError(f"'{text}' is no contact", where="--contact", mend=mend) from None
+        raise ContactError(f"'{text}' is no contact", where="--contact", hint=hint) from None
     frame = ":".join(parts[:-1])
     if not frame:
-        raise ContactError(f"'{text}' names no frame", where="--contact", mend=mend)
+        raise ContactError(f"'{text}' names no frame", where="--contact", hint=hint)
     return frame, (x, y, z), impulse
 
 
@@ -50,7 +50,7 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
             values[joint] = float(value)
         except ValueError:
             raise InputError(
-                f"'{text}' is no JOINT=VALUE", where="--armature", mend="give none, one file, or JOINT=VALUE each"
+                f"'{text}' is no JOINT=VALUE", where="--armature", hint="give none, one file, or JOINT=VALUE each"
             ) from None
     return values
 
@@ -68,6 +68,6 @@ def parse_payload(text: str) -> Payload:
         value = float("nan")
     if not frame or not value > 0:
         raise InputError(
-            f"'{text}' is no payload", where="--payload", mend="give a frame and kg above zero: FRAME MASS"
+            f"'{text}' is no payload", where="--payload", hint="give a frame and kg above zero: FRAME MASS"
         )
     return Payload(frame, value)

@@ -73,7 +73,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
         InputError: No rows.
     """
     if not rows:
-        raise InputError("there is nothing to draw", where="figure bars", mend="give at least one row")
+        raise InputError("there is nothing to draw", where="figure bars", hint="give at least one row")
     scenarios = list(dict.fromkeys(row.scenario for row in rows))
     groups = [[row for row in rows if row.scenario == name] for name in scenarios]
     columns = min(2, len(groups))

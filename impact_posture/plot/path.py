@@ -100,14 +100,14 @@ def _first(path: PathData | TradeOffData, name: str) -> int | None:
 
 def _checked(path: PathData | None) -> PathData:
     if path is None:
-        raise InputError("there is no path to draw", where="figure nullspace", mend="give ResultView.path")
+        raise InputError("there is no path to draw", where="figure nullspace", hint="give ResultView.path")
     sizes = {name: np.shape(getattr(path, name)) for name in ("s", *QUANTITIES)}
     count = len(path.s)
     if count < 2 or set(sizes.values()) != {(count,)}:
         raise InputError(
             f"the path's arrays have shapes {', '.join(f'{k} {v}' for k, v in sizes.items())}",
             where="figure nullspace",
-            mend="give at least two postures and one number of each quantity for each",
+            hint="give at least two postures and one number of each quantity for each",
         )
     return path
 

@@ -109,8 +109,8 @@ class RunView:
         if len(rotors) != 1 or n < 2 or not (np.diff(self.t) > 0).all():
             raise self._wrong("there is no course of time", "give at least two ticks, later ones later")
 
-    def _wrong(self, what: str, mend: str) -> InputError:
-        return InputError(what, where=f"run view {self.scenario}, {self.controller}", mend=mend)
+    def _wrong(self, what: str, hint: str) -> InputError:
+        return InputError(what, where=f"run view {self.scenario}, {self.controller}", hint=hint)
 
     @property
     def name(self) -> str:
@@ -205,7 +205,7 @@ def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
         InputError: No view, or views that have nothing to do with each other.
     """
     if not views:
-        raise InputError("there is no run to draw", where=where, mend="give at least one view")
+        raise InputError("there is no run to draw", where=where, hint="give at least one view")
     first = views[0]
     for view in views:
         other: dict[str, Any] = {
@@ -219,6 +219,6 @@ def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
                 raise InputError(
                     f"the {what} of {view.name} is {own}, of {first.name} {theirs}",
                     where=where,
-                    mend="compare runs of one scenario",
+                    hint="compare runs of one scenario",
                 )
     return tuple(sorted(views, key=lambda view: view.controller != "nominal"))

@@ -164,7 +164,7 @@ def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
     wanted = tuple(dict.fromkeys(f.lower().lstrip(".") for f in formats))
     for one in wanted:
         if one not in FORMATS:
-            raise InputError(f"no format '{one}'", where="plot", mend=f"choose from {', '.join(FORMATS)}")
+            raise InputError(f"no format '{one}'", where="plot", hint=f"choose from {', '.join(FORMATS)}")
     return wanted
 
 
@@ -190,7 +190,7 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
                 os.replace(beside / path.name, path)
         except OSError as error:
             raise OutputError(
-                f"cannot be written ({error.strerror or error})", where=str(path), mend="choose another folder"
+                f"cannot be written ({error.strerror or error})", where=str(path), hint="choose another folder"
             ) from None
         paths.append(path)
     return paths

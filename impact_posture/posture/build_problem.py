@@ -85,33 +85,33 @@ def _check(robot: Robot, requirements: Requirements) -> None:
         raise InputError(
             f"base '{requirements.base}' asked of a robot whose root is fixed",
             where="--base",
-            mend="leave it out or use --root free-flyer",
+            hint="leave it out or use --root free-flyer",
         )
     for name, values in (("--box", requirements.box), ("--base-box", requirements.base_box)):
         if not all(np.isfinite(v) and v > 0 for v in values):
-            raise InputError(f"half extents {values}", where=name, mend="give three lengths above zero")
+            raise InputError(f"half extents {values}", where=name, hint="give three lengths above zero")
     for name, value in (
         ("com_margin", requirements.com_margin),
         ("limit_margin", requirements.limit_margin),
         ("regularization", requirements.regularization),
     ):
         if not (np.isfinite(value) and value >= 0):
-            raise InputError(f"is {value:g}", where=name, mend="give a number ≥ 0")
+            raise InputError(f"is {value:g}", where=name, hint="give a number ≥ 0")
     if not (np.isfinite(requirements.friction) and requirements.friction > 0):
-        raise InputError(f"is {requirements.friction:g}", where="friction", mend="give a coefficient above zero")
+        raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
     quaternion = requirements.target_quaternion
     if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):
         raise InputError(
             "is one target for several contacts",
             where="--target-quaternion" if quaternion is not None else "--target-position",
-            mend="leave it out and start from a --posture that has the contacts in place",
+            hint="leave it out and start from a --posture that has the contacts in place",
         )
     if quaternion is not None and not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
         raise InputError(
-            f"has norm {np.linalg.norm(quaternion):.4g}", where="--target-quaternion", mend="give a unit x y z w"
+            f"has norm {np.linalg.norm(quaternion):.4g}", where="--target-quaternion", hint="give a unit x y z w"
         )
     if requirements.target_position is not None and not np.isfinite(requirements.target_position).all():
-        raise InputError("is not finite", where="--target-position", mend="give three numbers")
+        raise InputError("is not finite", where="--target-position", hint="give three numbers")
     for joint in requirements.hold:
         robot.joint_id(joint)
 
@@ -146,7 +146,7 @@ def _contact_constraints(
             raise InputError(
                 "a target is given but the contact pose is free",
                 where="--contact-pose",
-                mend="use full, position, aligned or box",
+                hint="use full, position, aligned or box",
             )
         return []
     if mode == "full":
@@ -166,7 +166,7 @@ def _kept_feet(objective: ImpactObjective, numeric: Numeric, friction: float) ->
         raise InputError(
             "contacts that pull as well as push would have to leave the feet without any impulse",
             where="--keep-contacts",
-            mend="leave out --bilateral or --keep-contacts",
+            hint="leave out --bilateral or --keep-contacts",
         )
     return [KeptFeet(single, numeric, friction) for single in objective.singles]
 
@@ -202,7 +202,7 @@ def _com_constraint(
         raise InputError(
             "the feet span no area to keep the center of mass above",
             where="com_over_feet",
-            mend="give three feet or soles with a size, or set com_over_feet = false (--no-com)",
+            hint="give three feet or soles with a size, or set com_over_feet = false (--no-com)",
         ) from None
     # One row an edge: qhull repeats the equation of an edge that it met in pieces.
     unique = np.unique(np.round(equations, 12), axis=0)
@@ -221,6 +221,6 @@ def _bounds(robot: Robot, chart: Chart, given: Vector, requirements: Requirement
             raise InputError(
                 f"a margin of {margin:g} leaves joint '{slot.name}' no room",
                 where="limit_margin",
-                mend="give a smaller one",
+                hint="give a smaller one",
             )
     return lower, upper

@@ -56,12 +56,12 @@ def compiled_solver(
         interpreted = ca.nlpsol("posture", "ipopt", symbols, options)
         compiler = find_compiler()
         if mode == "always" and compiler is None:
-            raise CompilerError("no C compiler found", where="compile", mend="install gcc or clang, or set CC")
+            raise CompilerError("no C compiler found", where="compile", hint="install gcc or clang, or set CC")
         if mode == "never" or compiler is None or (mode == "auto" and not _pays(interpreted, starts)):
             return BuiltSolver(interpreted, False)
         _compile(interpreted, compiler, f"{_key(problem)}.so")
         if (found := _cached(problem, options)) is None:
-            raise CompilerError("what was built cannot be loaded", where="compile", mend="set CC to another compiler")
+            raise CompilerError("what was built cannot be loaded", where="compile", hint="set CC to another compiler")
         return BuiltSolver(found, True)
     except (CompilerError, OutputError) as error:
         if mode == "always":

@@ -61,7 +61,7 @@ def trade_off(
         InputError: No points asked for.
     """
     if points < 1:
-        raise InputError(f"{points} points are asked for", where="--tradeoff", mend="give 1 or more")
+        raise InputError(f"{points} points are asked for", where="--tradeoff", hint="give 1 or more")
     problem = solution.problem
     chart = Chart(problem.robot.model)
     whole = distance(chart, solution.q, solution.initial)

@@ -96,7 +96,7 @@ class PostureProblem:
             raise InputError(
                 f"is '{self.objective.name}', which is not that of an impact",
                 where="objective",
-                mend="use an ImpactObjective for what needs H, G, V and S",
+                hint="use an ImpactObjective for what needs H, G, V and S",
             )
         return self.objective
 

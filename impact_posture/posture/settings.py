@@ -127,7 +127,7 @@ def prepare(settings: ProblemSettings) -> Prepared:
         raise InputError(
             f"weights are listed, but the metric is {settings.metric}",
             where="weights",
-            mend='remove them or say "weighted"',
+            hint='remove them or say "weighted"',
         )
     weights = settings.weights if isinstance(settings.weights, str) else None
     request = ImpactRequest(
@@ -168,7 +168,7 @@ def prepare(settings: ProblemSettings) -> Prepared:
     if impact.missing_support:
         if settings.base is None:
             what = f"nothing says what holds {impact.robot.name} up, {FLOATS}"
-            raise InputError(what, where=settings.robot, mend=impact.missing_support)
+            raise InputError(what, where=settings.robot, hint=impact.missing_support)
         impact = replace(impact, missing_support="")
     problem = build_problem(impact.robot, impact.objective, impact.q, _requirements(settings, impact))
     return Prepared(settings, impact, problem)
@@ -178,7 +178,7 @@ def _listed_metric(settings: ProblemSettings, impact: ResolvedImpact) -> Metric:
     weights = np.array(settings.weights, dtype=float)
     if weights.size != impact.robot.nv or not (np.isfinite(weights).all() and (weights > 0).all()):
         raise SpecError(
-            f"has {weights.size} entries", where="weights", mend=f"give {impact.robot.nv} numbers above zero"
+            f"has {weights.size} entries", where="weights", hint=f"give {impact.robot.nv} numbers above zero"
         )
     return Metric("weighted", tuple(float(w) for w in weights), "problem.toml")
 
@@ -190,10 +190,10 @@ def _requirements(settings: ProblemSettings, impact: ResolvedImpact) -> Requirem
     com = spec.com_over_feet and bool(impact.supports) if settings.com is None else settings.com
     if com and not impact.supports:
         raise InputError(
-            "there are no feet to keep the center of mass over", where="--com", mend="add --support or --no-com"
+            "there are no feet to keep the center of mass over", where="--com", hint="add --support or --no-com"
         )
     if settings.keep_contacts and not impact.supports:
-        raise InputError("there are no feet to keep", where="--keep-contacts", mend="add --support or leave it out")
+        raise InputError("there are no feet to keep", where="--keep-contacts", hint="add --support or leave it out")
     return Requirements(
         contact_pose=settings.contact_pose or robot.contact_pose(impact.contact.frame),
         other_poses=tuple(settings.contact_pose or robot.contact_pose(c.frame) for c in impact.objective.others),
@@ -277,6 +277,6 @@ def dump_settings(settings: ProblemSettings) -> str:
                 lines.append(f"{key} = {toml(value)}")
             except UnicodeEncodeError:
                 raise SpecError(
-                    f"'{value}' is not UTF-8, as TOML has to be", where=key, mend="rename the file or folder"
+                    f"'{value}' is not UTF-8, as TOML has to be", where=key, hint="rename the file or folder"
                 ) from None
     return "\n".join(lines) + "\n"

@@ -187,14 +187,14 @@ def _initial(problem: PostureProblem, seed: int) -> Vector:
     if answer.conflicts:
         limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
         raise Infeasible(
-            answer.conflicts, mend=f"relax one of them, move the target, or start from another --posture{limits}"
+            answer.conflicts, hint=f"relax one of them, move the target, or start from another --posture{limits}"
         )
     found = Projector(problem).project(answer.q)
     if found.violation > 1e-8:
         raise SolverFailed(
             f"a posture within {found.violation:.1e} of the constraints was found, but none on them",
             where="problem",
-            mend="start from a --posture nearer to the target",
+            hint="start from a --posture nearer to the target",
         )
     return found.q
 
@@ -213,7 +213,7 @@ def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
         raise ContactError(
             f"the contact point at {frames} cannot move along the normal",
             where="--normal",
-            mend="choose another frame, normal or posture: a blow along it moves nothing",
+            hint="choose another frame, normal or posture: a blow along it moves nothing",
         )
     return value
 
@@ -304,12 +304,12 @@ def _failure(runs: list[_Run]) -> SolverFailed:
     words = sorted({r.record.status for r in solved if r.record is not None})
     if not solved:
         return SolverFailed(
-            "the objective does not exist where the starts ended", where="solver", mend="choose another --objective"
+            "the objective does not exist where the starts ended", where="solver", hint="choose another --objective"
         )
     nearest = min((r.certificate for r in solved if r.certificate), key=lambda c: c.stationarity)
     return SolverFailed(
         f"none of {len(solved)} feasible starts ended at a certified posture (solver: {', '.join(words)}; best "
         f"stationarity {nearest.stationarity:.1e}, violation {nearest.primal:.1e})",
         where="solver",
-        mend="try more --starts, another --seed or --posture, or a small --regularization",
+        hint="try more --starts, another --seed or --posture, or a small --regularization",
     )

@@ -91,7 +91,7 @@ def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
         raise SpecError(
             f"speed_min {propulsion.speed_min:g} is not below speed_max {propulsion.speed_max:g}",
             where="propulsion",
-            mend="correct the rotor speed limits",
+            hint="correct the rotor speed limits",
         )
     c = propulsion.thrust_coefficient
     return c * propulsion.speed_min**2, c * propulsion.speed_max**2
@@ -112,10 +112,10 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
         raise SpecError(
             f"frame '{propulsion.frame}' is not on the base body",
             where="propulsion.frame",
-            mend="name a frame that is fixed to the floating base",
+            hint="name a frame that is fixed to the floating base",
         )
     if not propulsion.rotors:
-        raise SpecError("there are no rotors", where="propulsion.rotors", mend="list them, or leave propulsion out")
+        raise SpecError("there are no rotors", where="propulsion.rotors", hint="list them, or leave propulsion out")
     columns = []
     for rotor in propulsion.rotors:
         direction = np.asarray(rotor.direction, dtype=float)
@@ -124,7 +124,7 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
             raise SpecError(
                 f"direction of length {length:.4g}",
                 where=f"propulsion.rotors '{rotor.name}'",
-                mend="give a unit vector",
+                hint="give a unit vector",
             )
         force = direction / length
         moment = np.cross(rotor.position, force) - rotor.spin * propulsion.drag_ratio * force
@@ -215,7 +215,7 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
     mass = float(pin.computeTotalMass(model))
     forward = rotation[:, 0] * np.array([1.0, 1.0, 0.0])
     if np.linalg.norm(forward) < 1e-6:
-        raise PostureError("the base's x axis is vertical", where="lateral force", mend="give a level posture")
+        raise PostureError("the base's x axis is vertical", where="lateral force", hint="give a level posture")
     forward /= np.linalg.norm(forward)
     left = np.array([-forward[1], forward[0], 0.0])
     limits = np.asarray(model.effortLimit)[6:]
@@ -267,7 +267,7 @@ def _configuration(model: pin.Model, q: ArrayLike) -> Array:
     if values.shape != (model.nq,):
         raise PostureError(f"{values.size} numbers where the model has nq = {model.nq}", where="posture")
     if not np.all(np.isfinite(values)):
-        raise PostureError("a value is not finite", where="posture", mend="correct it")
+        raise PostureError("a value is not finite", where="posture", hint="correct it")
     return values
 
 
@@ -277,7 +277,7 @@ def _is_free_flyer(model: pin.Model) -> bool:
 
 def _require_free_flyer(model: pin.Model) -> None:
     if not _is_free_flyer(model):
-        raise SpecError("rotors on a robot that cannot fly", where="propulsion", mend='set root = "free-flyer"')
+        raise SpecError("rotors on a robot that cannot fly", where="propulsion", hint='set root = "free-flyer"')
 
 
 def _velocity_names(model: pin.Model) -> list[str]:

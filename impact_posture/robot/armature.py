@@ -47,7 +47,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
     elif option:
         for joint, value in option.items():
             if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"armature {joint}={value:g}", where="--armature", mend="give a number ≥ 0")
+                raise InputError(f"armature {joint}={value:g}", where="--armature", hint="give a number ≥ 0")
             index = joint_index(model, joint, "--armature")
             armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]] = value
         source = f"--armature over {source}"
@@ -62,7 +62,7 @@ def _armature_file(path: Path) -> dict[str, float]:
     try:
         return {str(k): float(v) for k, v in values.items()}
     except (TypeError, ValueError):
-        raise SpecError("holds no table joint = value", where=str(path), mend="write: joint_name = 0.01") from None
+        raise SpecError("holds no table joint = value", where=str(path), hint="write: joint_name = 0.01") from None
 
 
 def _armature_vector(model: pin.Model, default: float, joints: Mapping[str, float], where: str) -> Vector:
@@ -71,7 +71,7 @@ def _armature_vector(model: pin.Model, default: float, joints: Mapping[str, floa
     for joint, value in joints.items():
         index = joint_index(model, joint, f"{where} [armature]")
         if not (np.isfinite(value) and value >= 0):
-            raise SpecError(f"armature of '{joint}' is {value:g}", where=where, mend="give a number ≥ 0")
+            raise SpecError(f"armature of '{joint}' is {value:g}", where=where, hint="give a number ≥ 0")
         armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]] = value
     return armature
 

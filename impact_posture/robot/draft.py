@@ -77,14 +77,14 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
         raise InputError(
             "has its robot.toml already",
             where=robot,
-            mend="name a .urdf, or write what differs and give --config",
+            hint="name a .urdf, or write what differs and give --config",
         )
     # An empty file stands for a robot.toml that may lie beside the URDF.
     located = locate(robot, LoadOptions(config=os.devnull))
     in_package = located.source.startswith(EXAMPLE_PREFIX)
     out = out or (Path(f"{located.urdf.stem}.toml") if in_package else located.urdf.parent / "robot.toml")
     if out.exists() and not force:
-        raise OutputError("exists", where=str(out), mend="name another file, or --force to replace it")
+        raise OutputError("exists", where=str(out), hint="name another file, or --force to replace it")
     draft = draft_spec(located, options, out.absolute().parent)
     # In the same folder, so that relative paths in it lead to the same place.
     beside = out.with_name(f".{out.name}-{os.getpid()}")
@@ -97,7 +97,7 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
             os.link(beside, out)  # fails on a name that somebody took meanwhile
     except OSError as error:
         words = error.strerror or str(error)
-        raise OutputError(f"cannot be written ({words})", where=str(out), mend="name another file") from None
+        raise OutputError(f"cannot be written ({words})", where=str(out), hint="name another file") from None
     finally:
         beside.unlink(missing_ok=True)
     return out, draft

@@ -46,7 +46,7 @@ def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool)
             warnings.append(f"{words}; accepted as robot.toml asks")
         else:
             raise InertiaError(
-                words, where=where, mend="correct its <inertial>, or set accept_inertias = true in robot.toml [model]"
+                words, where=where, hint="correct its <inertial>, or set accept_inertias = true in robot.toml [model]"
             )
     return tuple(warnings)
 
@@ -77,7 +77,7 @@ def check_moved_mass(model: pin.Model, where: str) -> None:
         raise InertiaError(
             f"joint {named} moves no mass" if one else f"{len(found)} joints move no mass: {named}",
             where=where,
-            mend=f"give {'its' if one else 'their'} links a mass, or make {'it' if one else 'them'} rigid by "
+            hint=f"give {'its' if one else 'their'} links a mass, or make {'it' if one else 'them'} rigid by "
             "--lock-massless (robot.toml [model] lock_massless = true)",
         )
 
@@ -116,7 +116,7 @@ def check_mass_matrix(
     raise InertiaError(
         f"the mass matrix is singular at posture '{posture}': {', '.join(named)} {verb}",
         where=where,
-        mend="give the links mass and rotational inertia, or the joints --armature, or --lock one",
+        hint="give the links mass and rotational inertia, or the joints --armature, or --lock one",
     )
 
 
@@ -127,10 +127,10 @@ def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:
         return None
     mass_tag, inertia_tag = inertial.find("mass"), inertial.find("inertia")
     if mass_tag is None:
-        raise InertiaError(f"link '{name}' has an <inertial> without <mass>", where=where, mend="add its mass")
+        raise InertiaError(f"link '{name}' has an <inertial> without <mass>", where=where, hint="add its mass")
     mass = _number(mass_tag, "value", name, where)
     if mass < 0:
-        raise InertiaError(f"link '{name}' has the mass {mass:g} kg", where=where, mend="give a positive mass")
+        raise InertiaError(f"link '{name}' has the mass {mass:g} kg", where=where, hint="give a positive mass")
     if inertia_tag is None:
         return None
     xx, xy, xz, yy, yz, zz = (
@@ -158,5 +158,5 @@ def _number(tag: ET.Element, key: str, link: str, where: str) -> float:
     except ValueError:
         value = float("nan")
     if not np.isfinite(value):
-        raise InertiaError(f"link '{link}': {tag.tag} {key}='{text}' is no number", where=where, mend="correct it")
+        raise InertiaError(f"link '{link}': {tag.tag} {key}='{text}' is no number", where=where, hint="correct it")
     return value

@@ -90,7 +90,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     postures.setdefault("neutral", _neutral(model))
     if default not in postures:
         raise SpecError(
-            f"default_posture '{default}' does not exist", where=name, mend=f"one of: {', '.join(postures)}"
+            f"default_posture '{default}' does not exist", where=name, hint=f"one of: {', '.join(postures)}"
         )
     armature_source = set_armature(model, spec, srdf, options.armature, name)
     locked = _named(model, (*spec.model.lock, *options.lock), f"{name} --lock")
@@ -124,7 +124,7 @@ def _check_package_dirs(folders: Sequence[str], base: Path, where: str) -> None:
         path = base / Path(folder).expanduser()
         if not path.is_dir():
             siblings = sorted(str(Path(folder).with_name(p.name)) for p in path.parent.glob("*") if p.is_dir())
-            raise PackageNotFound(folder, siblings, where=where, mend="name an existing folder")
+            raise PackageNotFound(folder, siblings, where=where, hint="name an existing folder")
 
 
 def names_a_path(robot: str, folder: Path) -> bool:
@@ -190,7 +190,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
     else:
         listed = list(known_robots())
         shipped = [EXAMPLE_PREFIX + p for p in example_models() if robot.casefold() in Path(p).stem.casefold()]
-        raise RobotNotFound(robot, [*listed, *shipped], mend="(or give a path to a .urdf)")
+        raise RobotNotFound(robot, [*listed, *shipped], hint="(or give a path to a .urdf)")
     config = Path(options.config) if options.config else urdf.parent / "robot.toml"
     if options.config or (config.is_file() and EXAMPLE_PREFIX not in source):
         spec = read_spec(config)
@@ -206,7 +206,7 @@ def _srdf(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
         return None
     path = resolve_path(text, Path() if options.srdf else base)
     if not path.is_file():
-        raise UrdfError("no such file", where=str(path), mend="check --srdf or robot.toml [model] srdf")
+        raise UrdfError("no such file", where=str(path), hint="check --srdf or robot.toml [model] srdf")
     return path
 
 
@@ -216,7 +216,7 @@ def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict
     try:
         pin.loadReferenceConfigurations(model, str(srdf), False)
     except Exception as error:  # Pinocchio's own parser raises what its XML library raises.
-        raise UrdfError(f"is no SRDF ({error})", where=str(srdf), mend="correct the SRDF") from None
+        raise UrdfError(f"is no SRDF ({error})", where=str(srdf), hint="correct the SRDF") from None
     states = {item.key(): np.array(item.data(), dtype=float) for item in model.referenceConfigurations}
     return {name: pin.normalize(model, q) for name, q in states.items() if name not in spec.postures}
 
@@ -229,7 +229,7 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
             raise SpecError(
                 f"posture '{key}' gives a base pose, but the root is fixed",
                 where=name,
-                mend='remove it, or write root = "free-flyer" in [model]',
+                hint='remove it, or write root = "free-flyer" in [model]',
             )
         # A floating robot that --root bolts down keeps its postures; what is left of their base is a warning.
         if posture.base is not None and root == "free-flyer":
@@ -242,10 +242,10 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
                 raise SpecError(
                     f"posture '{key}': joint '{joint}' has {model.nvs[index]} degrees of freedom, not one number",
                     where=name,
-                    mend="give it in an SRDF",
+                    hint="give it in an SRDF",
                 )
             if not np.isfinite(value):
-                raise SpecError(f"posture '{key}': joint '{joint}' is {value}", where=name, mend="give a number")
+                raise SpecError(f"posture '{key}': joint '{joint}' is {value}", where=name, hint="give a number")
             if model.nqs[index] == 2:
                 q[first : first + 2] = np.cos(value), np.sin(value)
             else:
@@ -275,7 +275,7 @@ def _bases_left_out(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[s
 def _check_base(base: Sequence[float], where: str) -> None:
     norm = float(np.linalg.norm(base[3:]))
     if not (np.isfinite(base).all() and abs(norm - 1) < 1e-3):
-        raise SpecError(f"base quaternion of norm {norm:.4g}", where=where, mend="give a unit quaternion x y z w")
+        raise SpecError(f"base quaternion of norm {norm:.4g}", where=where, hint="give a unit quaternion x y z w")
 
 
 def _neutral(model: pin.Model) -> Vector:
@@ -296,7 +296,7 @@ def _remount(model: pin.Model, mounting: Mapping[str, Vector3], name: str) -> No
         if moved.shape != (3,) or not np.isfinite(moved).all():
             what = "is not finite" if moved.shape == (3,) else "has not three numbers"
             raise InputError(
-                f"the offset of '{joint}' {what}", where=f"{name} mounting", mend="give three, in meters"
+                f"the offset of '{joint}' {what}", where=f"{name} mounting", hint="give three, in meters"
             )
         placement = model.jointPlacements[index].copy()
         placement.translation = placement.translation + moved
@@ -308,10 +308,10 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
     lower, upper = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
     for joint, (low, high) in spec.limits.position.items():
         if not low < high:
-            raise SpecError(f"position limits of '{joint}' are [{low}, {high}]", where=where, mend="lower < upper")
+            raise SpecError(f"position limits of '{joint}' are [{low}, {high}]", where=where, hint="lower < upper")
         index = joint_index(model, joint, where)
         if model.nqs[index] != 1:
-            raise SpecError(f"joint '{joint}' has no position limits", where=where, mend="remove it: it turns freely")
+            raise SpecError(f"joint '{joint}' has no position limits", where=where, hint="remove it: it turns freely")
         lower[model.idx_qs[index]], upper[model.idx_qs[index]] = low, high
     model.lowerPositionLimit, model.upperPositionLimit = lower, upper
     for values, kind in ((spec.limits.velocity, "Velocity"), (spec.limits.effort, "Effort")):
@@ -335,7 +335,7 @@ def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, 
         fitting = [pattern] if pattern in known else [n for n in known if fnmatchcase(n, pattern)]
         if not fitting:
             raise JointNotFound(
-                pattern, known, where=where, mend="(nothing fits this pattern)" if set(pattern) & set("*?[") else ""
+                pattern, known, where=where, hint="(nothing fits this pattern)" if set(pattern) & set("*?[") else ""
             )
         found.update(dict.fromkeys(fitting))
     return tuple(found)
@@ -354,7 +354,7 @@ def _lock(
             kept_q += range(model.idx_qs[i], model.idx_qs[i] + model.nqs[i])
             kept_v += range(model.idx_vs[i], model.idx_vs[i] + model.nvs[i])
     if not kept_v:
-        raise InputError("every joint is locked", where=f"{name} --lock", mend="leave some free")
+        raise InputError("every joint is locked", where=f"{name} --lock", hint="leave some free")
     reduced.armature = armature[kept_v]
     return reduced, {key: q[kept_q] for key, q in postures.items()}
 

@@ -43,7 +43,7 @@ def read_posture(robot: Robot, text: str | None, where: str = "--posture") -> Ve
         return robot.check_posture(robot.posture(text), where=f"{where} {text or robot.default_posture}")
     path = posture_path(text)
     if path is None:
-        raise PostureNotFound(text, robot.postures, where=where, mend="(or give a .json or .yaml file)")
+        raise PostureNotFound(text, robot.postures, where=where, hint="(or give a .json or .yaml file)")
     data = _load(path)
     return robot.check_posture(_configuration(robot, data, str(path)), where=str(path))
 
@@ -77,13 +77,13 @@ def _load(path: Path) -> Mapping[str, object]:
         # `ros2 topic echo` ends every message with `---`: the first document counts.
         data = json.loads(text) if kind == "JSON" else next(iter(yaml.safe_load_all(text)), None)
     except FileNotFoundError:
-        raise PostureError("no such file", where=str(path), mend="check the path") from None
+        raise PostureError("no such file", where=str(path), hint="check the path") from None
     except OSError as error:
-        raise PostureError(f"cannot be read ({error.strerror})", where=str(path), mend="check the file") from None
+        raise PostureError(f"cannot be read ({error.strerror})", where=str(path), hint="check the file") from None
     except (ValueError, yaml.YAMLError, RecursionError) as error:
-        raise PostureError(f"is not valid {kind} ({error})", where=str(path), mend="correct the syntax") from None
+        raise PostureError(f"is not valid {kind} ({error})", where=str(path), hint="correct the syntax") from None
     if not isinstance(data, dict):
-        raise PostureError("holds no posture", where=str(path), mend=f"give {_SHAPES}")
+        raise PostureError("holds no posture", where=str(path), hint=f"give {_SHAPES}")
     return {str(key): value for key, value in data.items()}
 
 
@@ -91,7 +91,7 @@ def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Vect
     """Tell the three shapes apart by their keys."""
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
-        raise PostureError(f"schema '{schema}' is no posture", where=where, mend=f'give a file of "{SCHEMA}"')
+        raise PostureError(f"schema '{schema}' is no posture", where=where, hint=f'give a file of "{SCHEMA}"')
     if "q" in data:
         _only(data, _OUR_KEYS, where)
         return _in_order(robot, data, where)
@@ -99,18 +99,18 @@ def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Vect
         _only(data, _BY_NAME_KEYS, where)
         joints = data.get("joints", {})
         if not isinstance(joints, dict):
-            raise PostureError("'joints' is no table", where=where, mend='write "joints": {"name": value}')
+            raise PostureError("'joints' is no table", where=where, hint='write "joints": {"name": value}')
         return _by_name(robot, {str(k): v for k, v in joints.items()}, data.get("base"), where)
     if "name" in data and "position" in data:
         return _by_name(robot, _joint_state(data["name"], data["position"], where), None, where)
-    raise PostureError("holds no posture", where=where, mend=f"give {_SHAPES}")
+    raise PostureError("holds no posture", where=where, hint=f"give {_SHAPES}")
 
 
 def _only(data: Mapping[str, object], known: Sequence[str], where: str) -> None:
     for key in data:
         if key not in known:
-            hint = ", ".join(nearest(key, known))
-            raise PostureError(f"unknown key '{key}'", where=where, mend=f"did you mean {hint}?")
+            close = ", ".join(nearest(key, known))
+            raise PostureError(f"unknown key '{key}'", where=where, hint=f"did you mean {close}?")
 
 
 def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Vector:
@@ -123,11 +123,11 @@ def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Vector:
             missing = [name for name in robot.joint_names if name not in names]
             fault = f"leaves out joint '{missing[0]}'" if missing else "has the joints in another order"
             raise PostureError(
-                f"{fault}, so that q cannot be read", where=where, mend='give them by name: "joints": {"name": value}'
+                f"{fault}, so that q cannot be read", where=where, hint='give them by name: "joints": {"name": value}'
             )
     q = _numbers(data["q"], "q", where)
     if not robot.floating and len(q) == robot.nq + 7:
-        raise PostureError("begins with a base pose" + _FIXED, where=where, mend=_NO_BASE)
+        raise PostureError("begins with a base pose" + _FIXED, where=where, hint=_NO_BASE)
     return np.array(q)
 
 
@@ -135,10 +135,10 @@ def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: st
     q = robot.posture()
     if base is not None:
         if not robot.floating:
-            raise PostureError("gives a base pose" + _FIXED, where=where, mend=_NO_BASE)
+            raise PostureError("gives a base pose" + _FIXED, where=where, hint=_NO_BASE)
         pose = _numbers(base, "base", where)
         if len(pose) != 7:
-            raise PostureError(f"'base' has {len(pose)} numbers", where=where, mend="give [x, y, z, qx, qy, qz, qw]")
+            raise PostureError(f"'base' has {len(pose)} numbers", where=where, hint="give [x, y, z, qx, qy, qz, qw]")
         q[:7] = pose
     return set_joints(robot, q, joints, where)
 
@@ -168,13 +168,13 @@ def set_joints(robot: Robot, q: Vector, joints: Mapping[str, object], where: str
             angle = _number(value, f"joint '{name}'", where)
             # nq = 2: a continuous joint is kept as cosine and sine, which hide what is not finite.
             if not math.isfinite(angle):
-                raise PostureError(f"joint '{name}' is not finite", where=where, mend="correct it")
+                raise PostureError(f"joint '{name}' is not finite", where=where, hint="correct it")
             q[first : first + nq] = (angle,) if nq == 1 else (math.cos(angle), math.sin(angle))
         else:
             numbers = _numbers(value, f"joint '{name}'", where)
             if len(numbers) != nq:
                 raise PostureError(
-                    f"joint '{name}' takes {nq} numbers, not {len(numbers)}", where=where, mend="correct it"
+                    f"joint '{name}' takes {nq} numbers, not {len(numbers)}", where=where, hint="correct it"
                 )
             q[first : first + nq] = numbers
     return q
@@ -184,23 +184,23 @@ def _joint_state(name: object, position: object, where: str) -> dict[str, object
     names, positions = _names(name, "name", where), _numbers(position, "position", where)
     if len(names) != len(positions):
         raise PostureError(
-            f"{len(names)} names but {len(positions)} positions", where=where, mend="give one position a name"
+            f"{len(names)} names but {len(positions)} positions", where=where, hint="give one position a name"
         )
     return dict(zip(names, positions, strict=True))
 
 
 def _names(value: object, key: str, where: str) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise PostureError(f"'{key}' is no list of names", where=where, mend="correct it")
+        raise PostureError(f"'{key}' is no list of names", where=where, hint="correct it")
     for name in value:
         if value.count(name) > 1:
-            raise PostureError(f"'{key}' names '{name}' twice", where=where, mend="remove one")
+            raise PostureError(f"'{key}' names '{name}' twice", where=where, hint="remove one")
     return value
 
 
 def _numbers(value: object, key: str, where: str) -> list[float]:
     if not isinstance(value, list):
-        raise PostureError(f"'{key}' is no list of numbers", where=where, mend="correct it")
+        raise PostureError(f"'{key}' is no list of numbers", where=where, hint="correct it")
     return [_number(item, f"'{key}' entry {k}", where) for k, item in enumerate(value)]
 
 
@@ -211,4 +211,4 @@ def _number(value: object, key: str, where: str) -> float:
             return float(value)
         except (ValueError, OverflowError):
             pass
-    raise PostureError(f"{key} is '{value}', no number", where=where, mend="correct it")
+    raise PostureError(f"{key} is '{value}', no number", where=where, hint="correct it")

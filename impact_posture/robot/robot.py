@@ -169,18 +169,18 @@ class Robot:
         """Check length, finiteness, quaternion and limits of ``q``; return it with unit quaternions.
 
         Raises:
-            PostureError: What is wrong and how to mend it.
+            PostureError: What is wrong and what to do.
         """
         q = np.array(q, dtype=float).reshape(-1)
         if q.size != self.nq:
             raise PostureError(
                 f"a posture of {self.name} has {self.nq} numbers, this one {q.size}",
                 where=where,
-                mend=f"give {self.convention.split(';')[0]}",
+                hint=f"give {self.convention.split(';')[0]}",
             )
         if not np.isfinite(q).all():
             raise PostureError(
-                f"entry {int(np.argmin(np.isfinite(q)))} is not finite", where=where, mend="correct it"
+                f"entry {int(np.argmin(np.isfinite(q)))} is not finite", where=where, hint="correct it"
             )
         self._check_norms(q, where)
         if self.floating:
@@ -199,7 +199,7 @@ class Robot:
                 what = "quaternion" if four else "pair of cosine and sine"
                 whose = f"the base {what}" if self.floating and i == 1 else f"the {what} of joint '{name}'"
                 order = " x y z w" if four else ""
-                raise PostureError(f"{whose} has norm {norm:.4g}", where=where, mend=f"give a unit {what}{order}")
+                raise PostureError(f"{whose} has norm {norm:.4g}", where=where, hint=f"give a unit {what}{order}")
 
     def _check_swapped(self, quaternion: Vector, where: str) -> None:
         """Refuse a base quaternion that is plainly w x y z: read as x y z w it would put the robot on its head."""
@@ -210,13 +210,13 @@ class Robot:
             raise PostureError(
                 "the base quaternion puts the robot on its head and looks like w x y z",
                 where=where,
-                mend="give it as x y z w (scalar last)",
+                hint="give it as x y z w (scalar last)",
             )
         if abs(quaternion[0]) > 0.999 and abs(quaternion[3]) < 0.04:
             raise PostureError(
                 "the base quaternion turns the robot by 180° about x and looks like w x y z",
                 where=where,
-                mend="give it as x y z w (scalar last)",
+                hint="give it as x y z w (scalar last)",
             )
 
     def check_limits(self, q: Vector, *, where: str = "posture", tolerance: float = 1e-6) -> None:

@@ -78,23 +78,23 @@ def build_scenarios(
         robot.frame_id(payload.frame)
         if not (np.isfinite(payload.mass) and payload.mass > 0):
             raise InputError(
-                f"the mass at '{payload.frame}' is {payload.mass:g}", where="--payload", mend="give kg above zero"
+                f"the mass at '{payload.frame}' is {payload.mass:g}", where="--payload", hint="give kg above zero"
             )
         if robot.model.frames[robot.frame_id(payload.frame)].parentJoint == 0:
             raise InputError(
                 f"frame '{payload.frame}' is welded to the world: a mass there changes nothing",
                 where="--payload",
-                mend="choose a frame on a moving link",
+                hint="choose a frame on a moving link",
             )
         if payloads.count(payload) > 1:
             raise InputError(f"{payload.mass:g} kg at '{payload.frame}' is given twice", where="--payload",
-                             mend="remove one")  # fmt: skip
+                             hint="remove one")  # fmt: skip
     found = [_scenario(robot, factor, payload) for payload in (None, *payloads) for factor in factors]
     if len(found) > MOST_SCENARIOS:
         raise InputError(
             f"{len(found)} scenarios, each a model of its own",
             where="--payload",
-            mend=f"have at most {MOST_SCENARIOS}",
+            hint=f"have at most {MOST_SCENARIOS}",
         )
     return tuple(found) if len(found) > 1 else ()
 
@@ -107,13 +107,13 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
         raise InputError(
             f"the armature's range is {low:g} to {high:g}",
             where="--armature-range",
-            mend="give two factors above zero on the stated armature, the lower first, such as 0.5 2",
+            hint="give two factors above zero on the stated armature, the lower first, such as 0.5 2",
         )
     if not robot.armature.any():
         raise InputError(
             f"{robot.name} has no armature: a factor on zero changes nothing",
             where="--armature-range",
-            mend="state one with --armature or in robot.toml",
+            hint="state one with --armature or in robot.toml",
         )
     return [1.0, *sorted({low, high} - {1.0})]
 

@@ -151,11 +151,11 @@ def validate(cls: type[_Model], data: object, where: str) -> _Model:
         if fault["type"] == "extra_forbidden":
             known = _keys_at(cls, fault["loc"][:-1])
             close = ", ".join(nearest(str(fault["loc"][-1]), known))
-            raise SpecError(f"unknown key '{path}'", where=where, mend=f"did you mean {close}?") from None
-        what, mend = str(fault["msg"]), "correct the value"
+            raise SpecError(f"unknown key '{path}'", where=where, hint=f"did you mean {close}?") from None
+        what, hint = str(fault["msg"]), "correct the value"
         if fault["type"] == "literal_error":
-            what, mend = not_one_of(fault["input"], re.findall(r"'([^']*)'", fault["ctx"]["expected"]))
-        raise SpecError(f"key '{path}': {what}", where=where, mend=mend) from None
+            what, hint = not_one_of(fault["input"], re.findall(r"'([^']*)'", fault["ctx"]["expected"]))
+        raise SpecError(f"key '{path}': {what}", where=where, hint=hint) from None
 
 
 def _keys_at(cls: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
@@ -175,13 +175,13 @@ def read_toml(path: Path) -> dict[str, object]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise SpecError("no such file", where=str(path), mend="check the path") from None
+        raise SpecError("no such file", where=str(path), hint="check the path") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise SpecError(f"cannot be read ({error})", where=str(path), mend="check the file") from None
+        raise SpecError(f"cannot be read ({error})", where=str(path), hint="check the file") from None
     except RecursionError:
-        raise SpecError("is nested too deeply", where=str(path), mend="correct the syntax") from None
+        raise SpecError("is nested too deeply", where=str(path), hint="correct the syntax") from None
     except tomllib.TOMLDecodeError as error:
-        raise SpecError(f"is not valid TOML ({error})", where=str(path), mend="correct the syntax") from None
+        raise SpecError(f"is not valid TOML ({error})", where=str(path), hint="correct the syntax") from None
 
 
 def with_tuples(value: object) -> object:
@@ -203,7 +203,7 @@ def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
     # Before the keys: those of another schema are not misspelt.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
-        raise SpecError(f"schema '{schema}'", where=str(path), mend=f'write schema = "{SCHEMA}"')
+        raise SpecError(f"schema '{schema}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
     return validate(RobotSpec, data, str(path))
 
 

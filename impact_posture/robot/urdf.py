@@ -41,7 +41,7 @@ def example_robot_data() -> Path:
             root = Path(*parts[: parts.index("robots") + 1])
             located = Path(str(entry.locate()))
             return located.parents[len(parts) - len(root.parts) - 1]
-    raise PackageNotFound("example-robot-data", [], mend="pip install example-robot-data")
+    raise PackageNotFound("example-robot-data", [], hint="pip install example-robot-data")
 
 
 def robots_data() -> Path:
@@ -94,14 +94,14 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
                 model = pin.buildModelFromUrdf(str(path))
     except Exception as error:  # Pinocchio raises ValueError, RuntimeError or IndexError by version and fault.
         said = words[0] or str(error)
-        raise UrdfError(f"makes no robot ({said})", where=str(path), mend="correct the URDF") from None
+        raise UrdfError(f"makes no robot ({said})", where=str(path), hint="correct the URDF") from None
     if model.nv == 0:
-        raise UrdfError("has no movable joint", where=str(path), mend="use --root free-flyer or another URDF")
+        raise UrdfError("has no movable joint", where=str(path), hint="use --root free-flyer or another URDF")
     if model.nv > MOST_DEGREES_OF_FREEDOM:
         raise UrdfError(
             f"has {model.nv} degrees of freedom, more than the {MOST_DEGREES_OF_FREEDOM} that are computed with",
             where=str(path),
-            mend="make joints that hardly matter fixed in the URDF",
+            hint="make joints that hardly matter fixed in the URDF",
         )
     return model, check_inertias(root, model, path, accept_inertias)
 
@@ -120,23 +120,23 @@ def joint_index(model: pin.Model, joint: str, where: str) -> int:
 
 def _parse(path: Path) -> ET.Element:
     if path.is_dir():
-        raise UrdfError("is a folder", where=str(path), mend="name the .urdf file in it")
+        raise UrdfError("is a folder", where=str(path), hint="name the .urdf file in it")
     try:
         root = ET.parse(path).getroot()
     except FileNotFoundError:
-        raise UrdfError("no such file", where=str(path), mend="check the path") from None
+        raise UrdfError("no such file", where=str(path), hint="check the path") from None
     except OSError as error:
-        raise UrdfError(f"cannot be read ({error.strerror})", where=str(path), mend="check the file") from None
+        raise UrdfError(f"cannot be read ({error.strerror})", where=str(path), hint="check the file") from None
     except (ET.ParseError, UnicodeDecodeError) as error:
-        raise UrdfError(f"is not XML ({error})", where=str(path), mend="give a URDF file") from None
+        raise UrdfError(f"is not XML ({error})", where=str(path), hint="give a URDF file") from None
     if root.tag != "robot":
         raise UrdfError(
             f"is XML but not a URDF: its root is <{root.tag}>, not <robot>",
             where=str(path),
-            mend="expand xacro first, or give the .urdf",
+            hint="expand xacro first, or give the .urdf",
         )
     if root.find("link") is None:
-        raise UrdfError("has no <link>", where=str(path), mend="expand xacro first, or give the .urdf")
+        raise UrdfError("has no <link>", where=str(path), hint="expand xacro first, or give the .urdf")
     return root
 
 

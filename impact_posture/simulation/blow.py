@@ -69,7 +69,7 @@ def interpreted(objective: ImpactObjective) -> Gradient:
         q[:] = at
         evaluate()
         if not np.isfinite(value[0]):
-            raise MetricError("does not exist there", where=objective.name, mend="start elsewhere")
+            raise MetricError("does not exist there", where=objective.name, hint="start elsewhere")
         return float(value[0]), gradient
 
     # The buffer knows addresses only: what lies there must live as long as the call.
@@ -92,7 +92,7 @@ def compiled(objective: ImpactObjective) -> Gradient:
             tell("compiling the gradient")
             written = write_export([objective], folder, prefix="blow", portable=True, build=True, force=True)
             if written.library is None:
-                raise CompilerError("has gone", where="C compiler", mend="try again")
+                raise CompilerError("has gone", where="C compiler", hint="try again")
     return ImpactGradient.load(folder, robot=objective.robot).objective
 
 
@@ -121,7 +121,7 @@ def _locked(path: Path) -> Iterator[None]:
         raise OutputError(
             f"cannot be written ({error.strerror})",
             where=str(path.parent),
-            mend="set IMPACT_POSTURE_CACHE to a folder",
+            hint="set IMPACT_POSTURE_CACHE to a folder",
         ) from None
     with file:
         fcntl.flock(file, fcntl.LOCK_EX)

@@ -111,7 +111,7 @@ def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | Non
         return frame * pin.SE3(np.eye(3), np.array(shape.center, dtype=float))
     if normal is None:
         raise InputError("has no center and no surface to be put against", where=f"shape at '{shape.frame}'",
-                         mend="give a center")  # fmt: skip
+                         hint="give a center")  # fmt: skip
     up = (numeric.data.oMi[point.joint] * frame).rotation.T @ normal
     if shape.kind == "sphere":
         rise = shape.size[0] * up
@@ -127,7 +127,7 @@ def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]])
         return np.array(surface.point, dtype=float)
     if not placed:
         raise InputError("there is no shape that it has a gap to", where=f"surface '{surface.name}'",
-                         mend="give a point, or a shape")  # fmt: skip
+                         hint="give a point, or a shape")  # fmt: skip
     lowest = min((_lowest(shape, place, normal) for shape, place in placed), key=lambda p: float(normal @ p))
     return np.asarray(lowest - surface.gap * normal)
 
@@ -158,7 +158,7 @@ def _add_motors(added: Additions, robot: Robot, joints: Mapping[int, tuple[str, 
             raise UnsupportedJoint(
                 f"no motor drives joint '{slot.name}' ({slot.kind.family})",
                 where="simulation",
-                mend="lock it (--lock), or model it as slides and hinges",
+                hint="lock it (--lock), or model it as slides and hinges",
             )
         if slot.kind.family == "spherical":
             for k, axis in enumerate(np.eye(3)):

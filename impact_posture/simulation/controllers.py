@@ -96,13 +96,13 @@ class Workshop:
             InputError: No such mode; ``held`` for a controller that has nothing to hold.
         """
         if name not in CONTROLLERS:
-            raise ControllerNotFound(name, CONTROLLERS, mend=f"one of: {', '.join(CONTROLLERS)}")
+            raise ControllerNotFound(name, CONTROLLERS, hint=f"one of: {', '.join(CONTROLLERS)}")
         if mode not in get_args(Mode):
             raise InputError(
-                f"there is no mode '{mode}'", where="--mode", mend=f"one of: {', '.join(get_args(Mode))}"
+                f"there is no mode '{mode}'", where="--mode", hint=f"one of: {', '.join(get_args(Mode))}"
             )
         if mode == "held" and not (name.startswith("robust") or name == "walker"):
-            raise InputError(f"'{name}' has no term to hold", where="--mode", mend="only robust… and walker have one")
+            raise InputError(f"'{name}' has no term to hold", where="--mode", hint="only robust… and walker have one")
         setup, robot, gains = self.setup, self.setup.robot, self.setup.scenario.control.posture
         term = setup.scenario.control.robust
         K = term.gain if gain is None else gain

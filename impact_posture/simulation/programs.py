@@ -27,14 +27,14 @@ def end_effector_task(setup: Setup) -> EndEffector | None:
         if gains is not None:
             where = setup.scenario.source
             raise SpecError(
-                "has [control.end_effector], but a push", where=where, mend="remove [control.end_effector]"
+                "has [control.end_effector], but a push", where=where, hint="remove [control.end_effector]"
             )
         return None
     if gains is None:
         raise SpecError(
             "has contacts, but nothing that leads the frame there",
             where=setup.scenario.source,
-            mend="add [control.end_effector]",
+            hint="add [control.end_effector]",
         )
     soften = None if control.apparent_mass is None else Impedance(control.apparent_mass)
     point = Point(task.frame, setup.scenario.shape.offset)
@@ -95,7 +95,7 @@ def _check_gains(setup: Setup) -> None:
         ("base", control.base, stands, "no [control.footing]"),
     ):
         if given is not None and not fits:
-            raise SpecError(f"has [control.{key}], but {why}", where=source, mend=f"remove [control.{key}]")
+            raise SpecError(f"has [control.{key}], but {why}", where=source, hint=f"remove [control.{key}]")
 
 
 def _contacts(setup: Setup, control: Control) -> tuple[Contact, ...]:
@@ -106,7 +106,7 @@ def _contacts(setup: Setup, control: Control) -> tuple[Contact, ...]:
         raise SpecError(
             "has [control.footing], but the robot has no supports",
             where=setup.scenario.source,
-            mend="name [[supports]] in robot.toml",
+            hint="name [[supports]] in robot.toml",
         )
     return tuple(
         Contact(c.point, c.kind, c.half, c.normal, c.friction, footing.least, c.kp, c.kd, c.weight) for c in contacts

@@ -56,7 +56,7 @@ class Reference:
             raise InputError(
                 f"{v:g} m/s at {a:g} m/s² takes {run_up:.3g} m, the gap is {gap:.3g} m",
                 where="contacts",
-                mend="widen the gap, slow down, or accelerate more",
+                hint="widen the gap, slow down, or accelerate more",
             )
         self.task, self._gap = task, gap
         self._depth = gap + task.beyond

@@ -118,7 +118,7 @@ def _follow(world: World, surface: Surface, speed: float) -> Bounce:
         if ended:
             break
     if not ended:
-        raise InputError(f"the ball stays on it (solref {law.solref})", where="contact law", mend="damp it less")
+        raise InputError(f"the ball stays on it (solref {law.solref})", where="contact law", hint="damp it less")
     pushed = np.flatnonzero(forces)
     duration, impulse = (pushed[-1] - pushed[0] + 1) * world.timestep, sum(forces) * world.timestep
     after = float(world.truth().v[2])

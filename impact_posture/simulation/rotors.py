@@ -44,7 +44,7 @@ class Rotors:
         """
         speeds = np.asarray(speeds, dtype=float)
         if speeds.shape != self.speeds.shape or not np.isfinite(speeds).all():
-            raise InputError("no speeds of the rotors", where="reset", mend=f"give {self.speeds.size} finite numbers")
+            raise InputError("no speeds of the rotors", where="reset", hint=f"give {self.speeds.size} finite numbers")
         self.speeds = self.within(speeds)
 
     def within(self, command: Array) -> Array:

@@ -80,7 +80,7 @@ def run(workshop: Workshop, controller: str, *, seed: int = 0, mode: Mode = "liv
     if isinstance(task, RepeatedContacts):
         return (_contacts(workshop, driver, task, seed, mode),)
     if only not in (None, 1, -1):
-        raise InputError(f"{only} is no sign of a push", where=workshop.setup.scenario.source, mend="give 1 or -1")
+        raise InputError(f"{only} is no sign of a push", where=workshop.setup.scenario.source, hint="give 1 or -1")
     return _pushes(workshop, driver, task, task.signs if only is None else (only,), seed, mode)
 
 
@@ -96,7 +96,7 @@ class _Loop:
             raise InputError(
                 f"a tick of {self.period:g} s is no multiple of the physics' {self.world.timestep:g} s",
                 where=setup.scenario.source,
-                mend="change control.period or physics.timestep",
+                hint="change control.period or physics.timestep",
             )
         command = driver.reset(setup.q)
         self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)

@@ -258,7 +258,7 @@ class ImpactScenario:
         raise self._without("shape that hits")
 
     def _without(self, what: str) -> InputError:
-        return InputError(f"there is no {what}", where=self.source, mend="ask only where there are contacts")
+        return InputError(f"there is no {what}", where=self.source, hint="ask only where there are contacts")
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,11 +312,11 @@ def _check_base(robot: Robot, scenario: ImpactScenario) -> None:
             "add [propulsion] or [[supports]] to its robot.toml, or set root to fixed"
         )  # fmt: skip
         missing = "the scenario has no [control.footing]" if robot.spec.supports else "its data names no feet"
-        raise SpecError(f"{robot.name} would fall: it has no rotors and {missing}", where=scenario.source, mend=feet)
+        raise SpecError(f"{robot.name} would fall: it has no rotors and {missing}", where=scenario.source, hint=feet)
     rank = allocation(robot.model, propulsion).rank
     if rank < 6:
         raise SpecError(
             f"the rotors of {robot.name} push and turn its base in {rank} of 6 directions",
             where=scenario.source,
-            mend="the controllers need all 6: tilt the rotors, or take another robot",
+            hint="the controllers need all 6: tilt the rotors, or take another robot",
         )

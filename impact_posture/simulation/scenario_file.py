@@ -217,7 +217,7 @@ def read_scenario(scenario: str | Path) -> ImpactScenario:
     # Before the keys: those of another schema are not misspelt.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
-        raise SpecError(f"schema '{schema}'", where=str(path), mend=f'write schema = "{SCHEMA}"')
+        raise SpecError(f"schema '{schema}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
     data = from_folder(data, path.resolve().parent, ("srdf", "config", "armature", "posture"))
     return _build(validate(ScenarioFile, with_tuples(data), str(path)), str(path))
 
@@ -233,7 +233,7 @@ def scenario_path(scenario: str | Path) -> Path:
         if scenario in known_scenarios():
             return shipped
         if "/" not in scenario and not scenario.endswith(".toml") and not Path(scenario).is_file():
-            raise ScenarioNotFound(scenario, known_scenarios(), mend="(or give a path to a .toml)")
+            raise ScenarioNotFound(scenario, known_scenarios(), hint="(or give a path to a .toml)")
     return Path(scenario).expanduser()
 
 
@@ -282,20 +282,20 @@ def _located(build: Callable[[], _Built], source: str) -> _Built:
     try:
         return build()
     except ImpactPostureError as error:
-        raise SpecError(error.what, where=f"{source}, {error.where}", mend=error.mend) from None
+        raise SpecError(error.what, where=f"{source}, {error.where}", hint=error.hint) from None
 
 
 def _task(file: ScenarioFile, source: str) -> RepeatedContacts | SinglePush:
     if (file.contacts is None) == (file.push is None):
         what = "neither [contacts] nor [push]" if file.push is None else "both [contacts] and [push]"
-        raise SpecError(f"has {what}", where=source, mend="have one of them")
+        raise SpecError(f"has {what}", where=source, hint="have one of them")
     if file.push is not None:
         if not any(file.push.force):
-            raise SpecError("key 'push.force': no force", where=source, mend="give newtons, not all zero")
+            raise SpecError("key 'push.force': no force", where=source, hint="give newtons, not all zero")
         return SinglePush(**file.push.given())  # type: ignore[arg-type]
     contacts = file.contacts
     if contacts is None:
-        raise SpecError("has no task", where=source, mend="have [contacts] or [push]")
+        raise SpecError("has no task", where=source, hint="have [contacts] or [push]")
     for key, name, known in (
         ("surface", contacts.surface, [s.name for s in file.surfaces]),
         ("frame", contacts.frame, [s.frame for s in file.shapes]),
@@ -304,6 +304,6 @@ def _task(file: ScenarioFile, source: str) -> RepeatedContacts | SinglePush:
             raise SpecError(
                 f"key 'contacts.{key}': there is no '{name}'",
                 where=source,
-                mend=f"one of: {', '.join(known)}" if known else f"add it to [[{key.replace('frame', 'shape')}s]]",
+                hint=f"one of: {', '.join(known)}" if known else f"add it to [[{key.replace('frame', 'shape')}s]]",
             )
     return RepeatedContacts(**contacts.given())  # type: ignore[arg-type]

@@ -68,11 +68,11 @@ class Surface:
         n = np.array(self.normal, dtype=float)
         where = f"surface '{self.name}'"
         if not (np.isfinite(n).all() and np.abs(n).max() > 1e-9):
-            raise InputError("the normal has no direction", where=where, mend="give three numbers, not all zero")
+            raise InputError("the normal has no direction", where=where, hint="give three numbers, not all zero")
         if self.point is not None and not np.isfinite(self.point).all():
-            raise InputError("the point is not finite", where=where, mend="give three numbers (m)")
+            raise InputError("the point is not finite", where=where, hint="give three numbers (m)")
         if not np.isfinite(self.gap):
-            raise InputError("the gap is not finite", where=where, mend="give meters")
+            raise InputError("the gap is not finite", where=where, hint="give meters")
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Shape:
             raise InputError(
                 f"size {list(self.size)} is not {words}",
                 where=f"{self.kind} at '{self.frame}'",
-                mend=f"give {words} above zero (m)",
+                hint=f"give {words} above zero (m)",
             )
 
 
@@ -167,9 +167,9 @@ class Sensors:
         """Refuse negative noise."""
         for name, value in vars(self).items():
             if name != "force_frame" and not (np.isfinite(value) and value >= 0):
-                raise InputError(f"{name} is {value:g}", where="sensors", mend="give a number of at least zero")
+                raise InputError(f"{name} is {value:g}", where="sensors", hint="give a number of at least zero")
         if self.force_cutoff == 0:
-            raise InputError("force_cutoff is 0", where="sensors", mend="give Hz above zero")
+            raise InputError("force_cutoff is 0", where="sensors", hint="give Hz above zero")
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class Scene:
         ):
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
-                raise InputError(f"two {words} '{twice[0]}'", where="scene", mend="have one of each")
+                raise InputError(f"two {words} '{twice[0]}'", where="scene", hint="have one of each")
         step = self.physics.timestep
         laws = [("stops", self.physics.stop_solref), *((s.name, s.law.solref) for s in self.surfaces)]
         for name, (a, b) in laws:
@@ -210,16 +210,16 @@ class Scene:
                     raise InputError(
                         f"solref {[a, b]}: {words} is {value:.3g} s, below {least} × the time step of {step:g} s",
                         where=name,
-                        mend="raise it, or lower the time step",
+                        hint="raise it, or lower the time step",
                     )
         frame, frames = self.sensors.force_frame, [s.frame for s in self.shapes]
         if frame is not None and frame not in frames:
             raise InputError(
                 f"force_frame '{frame}' carries no shape",
                 where="sensors",
-                mend=f"one of: {', '.join(frames)}" if frames else "add a shape",
+                hint=f"one of: {', '.join(frames)}" if frames else "add a shape",
             )
 
 
-def _wrong(key: str, value: object, mend: str) -> InputError:
-    return InputError(f"{key} is {value}", where="scene", mend=mend)
+def _wrong(key: str, value: object, hint: str) -> InputError:
+    return InputError(f"{key} is {value}", where="scene", hint=hint)

@@ -109,4 +109,4 @@ class Series:
                 raise ValueError("columns of different lengths")
             return Series(**columns)
         except (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, BadZipFile, zlib.error) as error:
-            raise SpecError(f"is no time series ({error})", where=str(path), mend="run simulate again") from None
+            raise SpecError(f"is no time series ({error})", where=str(path), hint="run simulate again") from None

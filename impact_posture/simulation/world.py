@@ -122,7 +122,7 @@ class World:
         v = np.zeros(self.robot.nv) if v is None else np.asarray(v, dtype=float)
         if v.shape != (self.robot.nv,) or not np.isfinite(v).all():
             raise PostureError(
-                f"no velocity of {self.robot.name}", where="reset", mend=f"give {self.robot.nv} finite numbers"
+                f"no velocity of {self.robot.name}", where="reset", hint=f"give {self.robot.nv} finite numbers"
             )
         self._mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[:] = self._layout.qpos(q)
@@ -159,7 +159,7 @@ class World:
         steps = round(push.duration / self.timestep) if np.isfinite(push.duration) else 0
         if steps < 1 or not np.isfinite(push.force).all():
             raise InputError("has no force or no duration", where=f"push at '{push.frame}'",
-                             mend="give newtons, and seconds of at least a time step")  # fmt: skip
+                             hint="give newtons, and seconds of at least a time step")  # fmt: skip
         body = int(self._model.body(self.built.mjcf.bodies[point.joint]).id)
         force = np.array(push.force, dtype=float)
         self._pushes.append(_ActivePush(body, point.position, force, self._steps + steps))
@@ -271,18 +271,18 @@ class World:
             raise InputError(
                 f"{speed.size} rotor speeds and {torque.size} torques",
                 where="command",
-                mend=f"give {self._count} and {self._effort.size}",
+                hint=f"give {self._count} and {self._effort.size}",
             )
         if not (np.isfinite(speed).all() and np.isfinite(torque).all()):
-            raise InputError("is not finite", where="command", mend="hold the last one instead")
+            raise InputError("is not finite", where="command", hint="hold the last one instead")
         torque = np.clip(torque, -self._effort, self._effort)
         if not np.abs(torque).max(initial=0.0) < _RUNAWAY:
-            raise InputError("asks for endless torque", where="command", mend="give the joints effort limits")
+            raise InputError("asks for endless torque", where="command", hint="give the joints effort limits")
         return speed if self._rotors is None else self._rotors.within(speed), torque
 
     def _check_ready(self) -> None:
         if not self._ready:
-            raise InputError("has not been reset", where="world", mend="call reset(q) first")
+            raise InputError("has not been reset", where="world", hint="call reset(q) first")
 
 
 def build_world(robot: Robot, scene: Scene, q: ArrayLike | None = None) -> World:

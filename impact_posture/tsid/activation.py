@@ -47,7 +47,7 @@ class Activation:
             InputError: A ramp that is not positive.
         """
         if not ramp > 0:
-            raise InputError("the ramp is not positive", where="activation", mend="give seconds above zero")
+            raise InputError("the ramp is not positive", where="activation", hint="give seconds above zero")
         self.ramp, self.live = ramp, live
         self.phase, self.level, self._x, self._goal = Phase.FREE, 0.0, 0.0, 0.0
 
@@ -64,7 +64,7 @@ class Activation:
         if phase not in _FOLLOWS[self.phase]:
             names = " or ".join(p.value for p in _FOLLOWS[self.phase])
             raise InputError(
-                f"'{phase.value}' does not follow '{self.phase.value}'", where="activation", mend=f"ask for {names}"
+                f"'{phase.value}' does not follow '{self.phase.value}'", where="activation", hint=f"ask for {names}"
             )
         self.phase = phase
         on = phase is Phase.BRACE or (phase is Phase.CONTACT and self.live)

@@ -62,7 +62,7 @@ class Tilt(_BaseTurn):
         """
         _ = state.base_rotation
         if not abs(float(np.linalg.norm(self.target)) - 1.0) < 1e-9:
-            raise InputError("the target is no unit vector", where=self.name, mend="normalize it")
+            raise InputError("the target is no unit vector", where=self.name, hint="normalize it")
 
     def error(self, state: State) -> Array:
         """Angle (rad) times axis."""

@@ -52,13 +52,13 @@ class Contact:
         """Refuse what makes no contact."""
         where = f"contact at {self.point.frame}"
         if not self.friction > 0:
-            raise ContactError("friction is not positive", where=where, mend="give a coefficient above zero")
+            raise ContactError("friction is not positive", where=where, hint="give a coefficient above zero")
         if self.kind == "surface" and not min(self.half) > 0:
-            raise ContactError("a surface without extent", where=where, mend="give half extents or kind 'point'")
+            raise ContactError("a surface without extent", where=where, hint="give half extents or kind 'point'")
         if not abs(float(np.linalg.norm(self.normal)) - 1) < 1e-9:
-            raise ContactError("the normal is no unit vector", where=where, mend="normalize it")
+            raise ContactError("the normal is no unit vector", where=where, hint="normalize it")
         if self.weight is not None and not self.weight > 0:
-            raise ContactError("the weight is not positive", where=where, mend="give a positive weight or none")
+            raise ContactError("the weight is not positive", where=where, hint="give a positive weight or none")
 
     @property
     def size(self) -> int:

@@ -122,7 +122,7 @@ class Controller:
             InputError: A period that is not positive.
         """
         if not period > 0:
-            raise InputError("the period is not positive", where="controller", mend="give seconds above zero")
+            raise InputError("the period is not positive", where="controller", hint="give seconds above zero")
         self.robot, self.program, self.period = robot, program, period
         self.state = State(robot, program.points)
         self.actuators = Actuators(robot)
@@ -152,7 +152,7 @@ class Controller:
         v = np.asarray(v, dtype=float)
         if v.shape != (self.robot.nv,) or not np.isfinite(v).all():
             raise PostureError(
-                f"no velocity of {self.robot.name}", where="reset", mend=f"give {self.robot.nv} finite numbers"
+                f"no velocity of {self.robot.name}", where="reset", hint=f"give {self.robot.nv} finite numbers"
             )
         state, assembly = self.state, self.assembly
         state.push(None)
@@ -189,7 +189,7 @@ class Controller:
             ValueError: Arrays of another shape.
         """
         if not self._ready:
-            raise InputError("has not been reset", where="controller", mend="call reset(q, v) first")
+            raise InputError("has not been reset", where="controller", hint="call reset(q, v) first")
         state = self.state
         q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
         if q.shape != state.q.shape or v.shape != state.v.shape:

@@ -36,7 +36,7 @@ class Impedance:
         """Refuse masses that are not positive."""
         if not self.mass > 0 or (self.inertia is not None and not self.inertia > 0):
             raise InputError(
-                "apparent mass or inertia is not positive", where="impedance", mend="give positive numbers"
+                "apparent mass or inertia is not positive", where="impedance", hint="give positive numbers"
             )
 
     def inverse(self) -> Array:
@@ -177,7 +177,7 @@ class FrameAligned(Task):
         self._axis = np.array(axis, dtype=float)
         length = float(np.linalg.norm(self._axis))
         if not (length > 0 and math.isfinite(length)):
-            raise InputError("the axis has no direction", where=self.name, mend="give a vector that is not zero")
+            raise InputError("the axis has no direction", where=self.name, hint="give a vector that is not zero")
         self._axis /= length
         # Across the axis: the other right singular vectors of a row.
         self._across = np.linalg.svd(self._axis[None])[2][1:]
@@ -233,4 +233,4 @@ def placement(point: PointState) -> pin.SE3:
 
 def without_target(name: str) -> InputError:
     """What is wrong with a task that was asked for its error too early."""
-    return InputError("has no target", where=name, mend="set `target`, or reset the controller first")
+    return InputError("has no target", where=name, hint="set `target`, or reset the controller first")

@@ -50,7 +50,7 @@ def to_world(cone: Array, normal: Array, heading: Array) -> Array:
     if np.linalg.norm(x) < 1e-6:
         other = np.eye(3)[int(np.argmin(np.abs(normal)))]
         if cone.shape[1] == 6:
-            raise ContactError("the sole stands on its edge", where="contact", mend="put the sole on the ground")
+            raise ContactError("the sole stands on its edge", where="contact", hint="put the sole on the ground")
         x = other - normal * (normal @ other)
     x /= np.linalg.norm(x)
     R = np.column_stack([x, np.cross(normal, x), normal])

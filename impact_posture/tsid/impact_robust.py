@@ -41,7 +41,7 @@ def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Grad
         return export.objective
     n = np.array(normal, dtype=float)
     if n.shape != (3,) or not abs(float(np.linalg.norm(n)) - 1) < 1e-6:
-        raise InputError("is no unit vector of three", where="normal", mend="normalize it")
+        raise InputError("is no unit vector of three", where="normal", hint="normalize it")
     return lambda q: export.value_and_gradient(q, n)
 
 
@@ -118,7 +118,7 @@ class ImpactRobustPosture(JointPosture):
         """
         super().__init__(robot, target, name=name, kp=kp, kd=kd, weight=weight, base_weight=base_weight)
         if not (K >= 0 and reach > 0 and follow > 0 and 0 <= fade[0] < fade[1] and every >= 1 and (scale or 1) > 0):
-            raise InputError("a gain of the impact-robust term is out of range", where=name, mend="see its docstring")
+            raise InputError("a gain of the impact-robust term is out of range", where=name, hint="see its docstring")
         self._K, self._scale, self._factor = float(K), 1.0 if scale is None else float(scale), np.zeros(())
         self._set_factor()
         self.activation = activation or Activation()
@@ -202,7 +202,7 @@ class ImpactRobustPosture(JointPosture):
         scale = max(curvature, _FLAT * abs(self._function(state.q)[0]))
         if not (np.isfinite(scale) and scale > 0):
             raise MetricError(
-                "the objective vanishes with its curvature", where=self.name, mend="start elsewhere, or give `scale`"
+                "the objective vanishes with its curvature", where=self.name, hint="start elsewhere, or give `scale`"
             )
         self.scale = scale
 

@@ -41,12 +41,12 @@ class LimitLaw:
     def __post_init__(self) -> None:
         """Refuse a law that does not stop."""
         if not (self.approach > 0 and self.deceleration > 0 and self.acceleration > 0 and self.margin >= 0):
-            raise InputError("a number is not positive", where="limit law", mend="give positive numbers")
+            raise InputError("a number is not positive", where="limit law", hint="give positive numbers")
         if not self.rate >= 4 * self.approach:
             raise InputError(
                 f"rate {self.rate:g} is below four times approach {self.approach:g}",
                 where="limit law",
-                mend="raise rate or lower approach",
+                hint="raise rate or lower approach",
             )
 
 

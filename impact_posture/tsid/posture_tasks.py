@@ -78,7 +78,7 @@ class JointPosture(Task):
             InputError: A time that is not positive.
         """
         if not over > 0:
-            raise InputError("the time is not positive", where=self.name, mend="give seconds above zero")
+            raise InputError("the time is not positive", where=self.name, hint="give seconds above zero")
         self._fade_to(self._robot.check_posture(np.asarray(target), limits=False), over)
 
     def advance(self, state: State, dt: float) -> None:

@@ -44,12 +44,12 @@ class Program:
         """Refuse a program without anything to do, and names that stand for two tasks."""
         names = [task.name for task in self.tasks]
         if not names:
-            raise InputError("has no task", where="program", mend="give tasks or a posture")
+            raise InputError("has no task", where="program", hint="give tasks or a posture")
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise InputError(f"two tasks are called '{twice[0]}'", where="program", mend="name them apart")
+            raise InputError(f"two tasks are called '{twice[0]}'", where="program", hint="name them apart")
         if not (self.force_weight > 0 and self.spare_weight > 0):
-            raise InputError("a weight is not positive", where="program", mend="give positive weights")
+            raise InputError("a weight is not positive", where="program", hint="give positive weights")
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -90,9 +90,9 @@ def aerial_program(
         InputError: The robot does not fly, or has no default contact frame.
     """
     if not robot.floating:
-        raise InputError("the base is fixed", where=robot.name, mend="use arm_program")
+        raise InputError("the base is fixed", where=robot.name, hint="use arm_program")
     if robot.spec.propulsion is None:
-        raise InputError("has no propellers", where=robot.name, mend="name [propulsion] in robot.toml")
+        raise InputError("has no propellers", where=robot.name, hint="name [propulsion] in robot.toml")
     end_effector = end_effector or _end_effector(robot)
     tilt = tilt or Tilt()
     point = end_effector.point
@@ -122,7 +122,7 @@ def arm_program(
         InputError: The base floats, or the robot has no default contact frame.
     """
     if robot.floating:
-        raise InputError("the base floats", where=robot.name, mend="use aerial_program or legged_program")
+        raise InputError("the base floats", where=robot.name, hint="use aerial_program or legged_program")
     task = end_effector or _end_effector(robot)
     levels, weighted = (((task,),), ()) if order == "strict" else ((), (task,))
     return Program(levels, weighted, posture, force_point=task.point, law=law)
@@ -159,7 +159,7 @@ def legged_program(
     contacts = support_contacts(robot, friction=friction) if contacts is None else contacts
     if not contacts:
         raise InputError(
-            "has no supports", where=robot.name, mend="name [[supports]] in robot.toml, or give contacts"
+            "has no supports", where=robot.name, hint="name [[supports]] in robot.toml, or give contacts"
         )
     weighted = (
         center_of_mass or CenterOfMass(kp=kp, weight=10.0),
@@ -171,5 +171,5 @@ def legged_program(
 def _end_effector(robot: Robot) -> FramePose:
     frame = robot.spec.contact.frame
     if frame is None:
-        raise InputError("has no default contact frame", where=robot.name, mend="give the end effector's task")
+        raise InputError("has no default contact frame", where=robot.name, hint="give the end effector's task")
     return FramePose(Point(frame), kp=60.0)

@@ -24,10 +24,10 @@ class QpsolversSolver:
         try:
             import qpsolvers
         except ImportError:
-            raise InputError("is not installed", where="qpsolvers", mend="pip install qpsolvers") from None
+            raise InputError("is not installed", where="qpsolvers", hint="pip install qpsolvers") from None
         if name not in qpsolvers.available_solvers:
             known = ", ".join(qpsolvers.available_solvers) or "none"
-            raise InputError(f"solver '{name}' is not installed", where="qpsolvers", mend=f"there are: {known}")
+            raise InputError(f"solver '{name}' is not installed", where="qpsolvers", hint=f"there are: {known}")
         self._solve, self._problem, self._name, self._settings = (
             qpsolvers.solve_problem,
             qpsolvers.Problem,

@@ -118,7 +118,7 @@ class State:
             raise InputError(
                 f"the state does not follow this point of '{point.frame}' (it follows: {known})",
                 where="state",
-                mend="name the point in the task's `points`",
+                hint="name the point in the task's `points`",
             ) from None
 
     @property
@@ -154,5 +154,5 @@ class State:
 
     def _floating_base(self) -> tuple[Array, Array]:
         if self._base is None:
-            raise InputError("the base is fixed", where=self.robot.name, mend="use this on a floating base only")
+            raise InputError("the base is fixed", where=self.robot.name, hint="use this on a floating base only")
         return self._base

@@ -191,7 +191,7 @@ def gain(value: ArrayLike, size: int, where: str) -> Array:
     """
     given = np.asarray(value, dtype=float)
     if given.shape not in ((), (size,)):
-        raise InputError(f"has shape {given.shape}", where=where, mend=f"give one number or {size}")
+        raise InputError(f"has shape {given.shape}", where=where, hint=f"give one number or {size}")
     if not (np.isfinite(given).all() and (given >= 0).all()):
-        raise InputError("is negative or not finite", where=where, mend="give finite numbers from zero up")
+        raise InputError("is negative or not finite", where=where, hint="give finite numbers from zero up")
     return np.array(np.broadcast_to(given, (size,)))

@@ -75,9 +75,9 @@ def verify(
         CompilerError: There is a compiler and it failed: its words and the command.
     """
     if samples < 1:
-        raise InputError(f"asked for {samples}", where="--samples", mend="give one or more")
+        raise InputError(f"asked for {samples}", where="--samples", hint="give one or more")
     if seed < 0:
-        raise InputError(f"the seed is {seed}", where="--seed", mend="give zero or more")
+        raise InputError(f"the seed is {seed}", where="--seed", hint="give zero or more")
     drawn = random_samples(objective.robot, samples, seed, np.array(objective.contact.normal))
     expected = [pinocchio_numbers(objective, sample) for sample in drawn]
     allowed = Tolerances.of(objective)
@@ -127,7 +127,7 @@ def _mujoco(objective: ImpactObjective, tolerances: Mapping[str, float]) -> _Way
     try:
         import_mujoco()
     except InputError as error:
-        return _Way(MUJOCO, tolerances, note=f"not installed: {error.mend}")
+        return _Way(MUJOCO, tolerances, note=f"not installed: {error.hint}")
     try:
         return _Way(MUJOCO, tolerances, MujocoSource(objective))
     except InputError as error:

@@ -79,7 +79,7 @@ def test_the_metric_is_taken_every_tenth_tick_and_may_be_undefined() -> None:
     def sometimes(q: Any) -> tuple[float, Any]:
         calls.append(1)
         if len(calls) == 2:
-            raise MetricError("does not exist there", where="S", mend="move")
+            raise MetricError("does not exist there", where="S", hint="move")
         return 2.0, np.zeros(9)
 
     recorder = Recorder(shop("aerial-vertical").setup, sometimes)

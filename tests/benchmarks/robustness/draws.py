@@ -224,7 +224,7 @@ def _push(scenario: ImpactScenario, task: SinglePush, v: Mapping[str, float]) ->
 def _stiffer(gains: Gains, factor: float) -> Gains:
     """The shipped pushes have one stiffness a task, critically damped."""
     if isinstance(gains.kp, tuple) or gains.kd is not None:
-        raise InputError("a task with a damping of its own", where="robustness study", mend="scale it too")
+        raise InputError("a task with a damping of its own", where="robustness study", hint="scale it too")
     return replace(gains, kp=factor * gains.kp)
 
 
