@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from impact_posture_cli.process import memory_fault, prepare, refuse
+from impact_posture_cli.process import finish, memory_fault, prepare, refuse
 
 
 def main() -> None:
@@ -19,4 +19,6 @@ def main() -> None:
     from impact_posture_cli.boundary import run
     from impact_posture_cli.words import put_right
 
-    sys.exit(run(typer.main.get_command(app), put_right(sys.argv[1:])))
+    code = run(typer.main.get_command(app), put_right(sys.argv[1:]))
+    finish()
+    sys.exit(code)

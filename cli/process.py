@@ -27,6 +27,12 @@ def prepare() -> None:
             signal.signal(number, _end)
 
 
+def finish() -> None:
+    """Take no more signals: all is done, and the interpreter gives their default back while it ends."""
+    for number in _WORDS:
+        signal.signal(number, signal.SIG_IGN)
+
+
 def memory_fault() -> str:
     """What is wrong with the limit on the process's memory; empty for nothing."""
     if sys.platform == "win32":

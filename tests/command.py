@@ -17,10 +17,12 @@ from typing import IO
 # What the commands import when they run, once for all of them.
 import impact_posture.benchmark.measure
 import impact_posture.codegen.export
+import impact_posture.experiment.figures
 import impact_posture.experiment.folders
 import impact_posture.experiment.reproduction
 import impact_posture.job
-import impact_posture.verification.verify  # noqa: F401
+import impact_posture.plot
+import impact_posture.verification.verify
 from impact_posture_cli.main import main
 
 
@@ -30,15 +32,17 @@ def run(
     env: Mapping[str, str] | None = None,
     prepare: Callable[[], None] | None = None,
     timeout: float = 600,
+    pictures: bool = False,
 ) -> subprocess.CompletedProcess[str]:
     """Run ``impact-posture`` with arguments, as its entry point does; ``env`` is added to the environment.
 
+    Without ``pictures`` one of the figures is drawn instead of all: they take most of the time of a small robot's answer.
     The timeout ends what hangs; it is no bound on how long a command takes.
     """
     words = [str(argument) for argument in arguments]
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
         target = (words, cwd, {"COLUMNS": "80", "NO_COLOR": "1", **(env or {})}, prepare, out, errors)
-        child = multiprocessing.get_context("fork").Process(target=_command, args=target)
+        child = multiprocessing.get_context("fork").Process(target=_command, args=(*target, pictures))
         child.start()
         child.join(timeout)
         if child.exitcode is None:
@@ -58,6 +62,7 @@ def _command(
     prepare: Callable[[], None] | None,
     out: IO[bytes],
     errors: IO[bytes],
+    pictures: bool,
 ) -> None:
     """Become what a shell would have started: streams, folder, signals and warnings are those of a new program."""
     os.dup2(out.fileno(), 1)
@@ -70,6 +75,11 @@ def _command(
     warnings.resetwarnings()
     for category in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
         warnings.simplefilter("ignore", category)
+    if not pictures:
+        impact_posture.plot.drawable = lambda view: ["jump"]
+        # Of a run the snapshots stay.
+        figures = impact_posture.experiment.figures
+        figures.draw_run = figures.draw_comparison = lambda *arguments: []
     if prepare is not None:
         prepare()
     sys.argv = ["impact-posture", *words]

@@ -135,7 +135,7 @@ def install(work: Path, wheel: Path, extras: str, lowest: bool) -> None:
 
 def commands(work: Path, programs: Path) -> None:
     """Run every command of the app once, for real."""
-    ask = "import typer, impact_posture_cli.main as m; print(m.__file__, *typer.main.get_command(m.app).commands)"
+    ask = "import typer, impact_posture_cli.app as m; print(m.__file__, *typer.main.get_command(m.app).commands)"
     where, *names = run([str(programs / "python"), "-c", ask], work).stdout.split()
     if not Path(where).is_relative_to(programs.parent):
         raise Failed(f"the command line that ran is {where}")

@@ -30,7 +30,7 @@ FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One result of the main job, pictures and C code included."""
     folder = tmp_path_factory.mktemp("main-job")
-    done = run("optimize", "tilthex_arm", "--frame", "ee", "--normal", 0, 0, 1, cwd=folder)
+    done = run("optimize", "tilthex_arm", "--frame", "ee", "--normal", 0, 0, 1, cwd=folder, pictures=True)
     assert done.returncode == 0, done.stderr
     return folder / "tilthex_arm-ee"
 
@@ -91,7 +91,16 @@ def test_solved_again_from_its_own_problem(result: Path, tmp_path: Path) -> None
 
 def test_plot_draws_again(result: Path, tmp_path: Path) -> None:
     done = run(
-        "plot", result, "--out", tmp_path / "pictures", "--format", "svg", "--figure", "ellipsoid", cwd=tmp_path
+        "plot",
+        result,
+        "--out",
+        tmp_path / "pictures",
+        "--format",
+        "svg",
+        "--figure",
+        "ellipsoid",
+        cwd=tmp_path,
+        pictures=True,
     )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "pictures" / "ellipsoid.svg").is_file()
@@ -308,7 +317,7 @@ def test_file_size_limit_leaves_nothing(tmp_path: Path) -> None:
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 
-    refused(run(*BASE, "--out", "out", cwd=tmp_path, prepare=limit), 1, "out")
+    refused(run(*BASE, "--out", "out", cwd=tmp_path, prepare=limit, pictures=True), 1, "out")
     untouched(tmp_path)
 
 
