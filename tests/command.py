@@ -36,7 +36,7 @@ def run(
 ) -> subprocess.CompletedProcess[str]:
     """Run ``impact-posture`` with arguments, as its entry point does; ``env`` is added to the environment.
 
-    Without ``pictures`` one of the figures is drawn instead of all: they take most of the time of a small robot's answer.
+    Without ``pictures`` one figure is drawn instead of all: they take most of the time of a small robot's answer.
     The timeout ends what hangs; it is no bound on how long a command takes.
     """
     words = [str(argument) for argument in arguments]
