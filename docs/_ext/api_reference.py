@@ -31,6 +31,8 @@ def markdown(names: list[str]) -> str:
             "",
             "```{eval-rst}",
             f".. automodule:: {module}",
+            # matplotlib writes it into every class derived from its artists, in its own markup.
+            "   :exclude-members: set",
             "```",
             "",
         ]
