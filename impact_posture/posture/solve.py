@@ -213,7 +213,7 @@ def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
         raise ContactError(
             f"the contact point at {frames} cannot move along the normal",
             where="--normal",
-            hint="choose another frame, normal or posture: a blow along it moves nothing",
+            hint="choose another frame, normal or posture: an impact along it moves nothing",
         )
     return value
 
