@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from impact_posture.dynamics.mjcf import import_mujoco, write_mjcf
+from impact_posture.dynamics.mjcf import Mjcf, import_mujoco, write_mjcf
+from impact_posture.dynamics.mjcf_additions import WORLD, Additions
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
-from tests.benchmarks.impact.world import BALL, with_surface
-
-Vector = NDArray[np.float64]
+from tests.benchmarks.core import Vector
 
 # Steps of physics in one time constant of the contact, and the constants after which a contact counts as endless.
 _FINE, _PATIENCE = 50, 40
@@ -26,6 +25,16 @@ _STICKY = 10.0
 _INNER = 20
 # Steps without a force after which the contact is over.
 _QUIET = 5
+# Radius of the ball at the contact point, meters: any will do, since the ball touches at the point itself.
+_BALL = 0.01
+# Height of the contact point above the plane, meters: all postures meet it in the same part of a step.
+_GAP = 1e-6
+# The stiffest constraint that MuJoCo takes, at any depth.
+_SOLIMP = "0.9999 0.9999 0.001"
+_OPTION = {
+    "gravity": "0 0 0", "integrator": "Euler", "cone": "elliptic", "solver": "Newton",
+    "tolerance": "0", "iterations": "200", "ls_iterations": "100", "ls_tolerance": "1e-6",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -104,7 +113,7 @@ class Scene:
         self._point, self._feet = oracle.point, oracle.feet
         written = write_mjcf(self._robot.model)
         self._layout = written.layout
-        self._model = with_surface(written, objective, q).compile()
+        self._model = _with_surface(written, objective, q).compile()
         self._ball_body = int(self._model.geom("ball").bodyid[0])
         self.approach = self._approach()
 
@@ -167,7 +176,7 @@ class Scene:
         self._mujoco.mj_forward(self._model, data)
         step, center, n = self._model.opt.timestep, data.geom("ball").xpos, self._n
         J = np.zeros((3, self._model.nv))
-        self._mujoco.mj_jac(self._model, data, J, None, center - BALL * n, self._ball_body)
+        self._mujoco.mj_jac(self._model, data, J, None, center - _BALL * n, self._ball_body)
         sliding, pushed = J @ (data.qvel + step * data.qacc), self._normal_force(data)
         sliding -= (n @ sliding) * n
         across = self._mobility @ n
@@ -206,3 +215,28 @@ class Scene:
             duration=duration,
             feet=float(max(feet, default=0.0)) / speed,
         )
+
+
+def _with_surface(written: Mjcf, objective: ImpactObjective, q: Vector) -> Mjcf:
+    """Add a ball at the contact point, the plane below it, and a tie to the world for each support, at posture ``q``."""
+    robot, oracle = objective.robot, objective.oracle.at(q)
+    numeric, n = Numeric(robot.model).at(q), oracle.n.copy()
+    added = Additions(written)
+    added.option(**_OPTION)
+    added.flag(limit="disable")
+
+    contact = point_on(robot, objective.contact.frame, objective.contact.offset)
+    position = numeric.placement(contact).translation
+    # The ball's lowest point is the contact point.
+    center = numeric.data.oMi[contact.joint].actInv(position + _BALL * n)
+    added.shape(contact.joint, "ball", "sphere", (_BALL,), pin.SE3(np.eye(3), center))
+    added.plane("surface", position - _GAP * n, n)
+    added.pair("surface", "ball", solimp=_SOLIMP, condim="1")
+
+    for k, support in enumerate(objective.supports):
+        foot = point_on(robot, support.frame, support.offset)
+        added.site(foot.joint, f"tie_{k}", pin.SE3(foot.rotation, foot.position))
+        added.site(WORLD, f"ground_{k}", numeric.placement(foot))
+        kind = "connect" if support.kind == "point" else "weld"
+        added.tie(kind, f"tie_{k}", f"ground_{k}", solimp=_SOLIMP)
+    return added.model()

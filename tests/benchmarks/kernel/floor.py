@@ -20,8 +20,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.benchmark.count import Operations
 from impact_posture.robot.robot import Robot
+from tests.benchmarks.kernel.counts import Operations
 
 Pattern = NDArray[np.bool_]
 
@@ -72,7 +72,7 @@ class _Count:
         return M
 
     def total(self) -> Operations:
-        return Operations(self.add, self.mul, self.div, self.trig)
+        return Operations(add=self.add, mul=self.mul, div=self.div, trig=self.trig)
 
 
 class _Joint:
