@@ -12,14 +12,14 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from impact_posture.codegen.build import products
 from impact_posture.codegen.export import Export, export
+from impact_posture.codegen.library import products
 from impact_posture.errors import CompilerError, SpecError
 from impact_posture.escape import file_name
-from impact_posture.folder import whole_folder, write_record
-from impact_posture.posture.path import NullSpacePath, null_space_path
+from impact_posture.output_folder import whole_folder, write_record
+from impact_posture.posture.null_space_path import NullSpacePath, null_space_path
+from impact_posture.posture.problem_settings import Prepared, dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.result import result_arrays
-from impact_posture.posture.settings import Prepared, dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
 from impact_posture.processes import shared_out

@@ -22,7 +22,7 @@ import impact_posture.experiment.folders
 import impact_posture.experiment.reproduction
 import impact_posture.job
 import impact_posture.plot
-import impact_posture.verification.verify
+import impact_posture.verification.verification
 from impact_posture_cli.main import main
 
 

@@ -21,7 +21,7 @@ from impact_posture.errors import (
 )
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.metric import build_metric
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from tests.helpers import NAMES, robot
 
 GOOD = '<mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'

@@ -18,7 +18,7 @@ from impact_posture.benchmark.report import BenchReport
 from impact_posture.benchmark.timing import Disagreement, Harness
 from impact_posture.benchmark.workbench import Absent, Workbench
 from impact_posture.errors import CompilerError, InputError
-from impact_posture.robot.loader import known_robots, load_robot
+from impact_posture.robot.robot_loader import known_robots, load_robot
 from impact_posture_cli.commands.bench import PeerName
 from tests.command import run
 from tests.helpers import robot

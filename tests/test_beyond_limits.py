@@ -20,12 +20,12 @@ from impact_posture.impact.contact import Contact
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.request import ImpactRequest
 from impact_posture.job import load_view
-from impact_posture.posture.settings import read_settings
-from impact_posture.robot.loader import load_robot
+from impact_posture.posture.problem_settings import read_settings
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.spec import read_spec
 from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM, build_model
 from impact_posture.toolchain import find_compiler, words_of
-from impact_posture_cli.boundary import run
+from impact_posture_cli.error_boundary import run
 
 LINK = (
     '<link name="l{0}"><inertial><mass value="1"/>'

@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.codegen.compiler import (
+from impact_posture.codegen.build_check import (
     CompiledExport,
     casadi_difference,
     compile_and_check,
@@ -30,7 +30,7 @@ from impact_posture.escape import c_comment
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.toolchain import find_compiler, run_compiler
 from tests.tools import need, need_compiler
 

@@ -12,19 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impact_posture.codegen.build import products
-from impact_posture.codegen.compiler import casadi_difference, compiled, oracle_difference, self_test_tolerance
+from impact_posture.codegen.build_check import casadi_difference, compiled, oracle_difference, self_test_tolerance
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
-from impact_posture.codegen.folder import write_export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.export_folder import write_export
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.library import products
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.errors import CompilerError, InputError, OutputError
-from impact_posture.folder import RECORD
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.output_folder import RECORD
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.toolchain import run_compiler
 from tests import command
 from tests.tools import need, need_compiler
@@ -308,15 +308,15 @@ def test_a_build_that_fails_leaves_what_was_there(
     if how == "compiler fails":
         monkeypatch.setenv("CC", need("false"))
     elif how == "other numbers":
-        monkeypatch.setattr("impact_posture.codegen.compiler._ORACLE_TOLERANCE", -1.0)
-        monkeypatch.setattr("impact_posture.codegen.compiler.self_test_tolerance", lambda *_: -1.0)
+        monkeypatch.setattr("impact_posture.codegen.build_check._ORACLE_TOLERANCE", -1.0)
+        monkeypatch.setattr("impact_posture.codegen.build_check.self_test_tolerance", lambda *_: -1.0)
     else:
         error = KeyboardInterrupt
 
         def interrupt(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("impact_posture.codegen.build.run_compiler", interrupt)
+        monkeypatch.setattr("impact_posture.codegen.library.run_compiler", interrupt)
     for out in (kept, tmp_path / "none"):
         with pytest.raises(error):
             write_export([arm], out, prefix="arm", build=True, force=True)

@@ -25,9 +25,9 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.nlp import build_nlp
 from impact_posture.posture.problem import Requirements
-from impact_posture.posture.settings import make_settings, prepare
+from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.solve import run_start, solve
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from tests.command import run
 from tests.helpers import (
     assert_close,

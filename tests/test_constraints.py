@@ -22,8 +22,8 @@ from impact_posture.posture.constraint import (
     HeldTurn,
     PositionBox,
 )
-from impact_posture.robot.loader import load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import load_robot
 
 Factory = Callable[[PointOnLink, pin.SE3], Constraint]
 

@@ -14,9 +14,9 @@ import typer.main
 from pydantic import BaseModel
 
 from impact_posture.posture.certificate import Certificate
-from impact_posture.posture.follow import trade_off
+from impact_posture.posture.pareto import trade_off
+from impact_posture.posture.problem_settings import ProblemSettings, make_settings, prepare
 from impact_posture.posture.result import result_document
-from impact_posture.posture.settings import ProblemSettings, make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.spec import ContactPose, RobotSpec
 from impact_posture.simulation.scenario_file import ScenarioFile

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import ContactError, FrameNotFound, InputError
-from impact_posture.impact.classical import classical_ellipsoids, force_ellipsoid, velocity_ellipsoid
+from impact_posture.impact.classical_ellipsoids import classical_ellipsoids, force_ellipsoid, velocity_ellipsoid
 from impact_posture.impact.contact import Support, default_compliance
 from impact_posture.impact.evaluation import Evaluation, evaluate
-from impact_posture.impact.jump import tangent_units
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.parsing import parse_armature, parse_contact
 from impact_posture.impact.request import ImpactRequest
-from impact_posture.impact.texts import parse_armature, parse_contact
+from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.robot.robot import Robot
 from tests.helpers import (
     assert_close,

@@ -17,7 +17,7 @@ from impact_posture.impact.objective import Objective
 from impact_posture.impact.worst_case import Subgradients
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.constraint import Constraint
-from impact_posture.posture.path import null_space_path
+from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.solve import solve
 from impact_posture.robot.robot import Robot

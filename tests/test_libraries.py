@@ -17,21 +17,21 @@ from typing import Any
 import pytest
 
 from impact_posture import libraries
-from impact_posture.codegen.build import build_library
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.library import build_library
 from impact_posture.codegen.reader import read_manifest
 from impact_posture.errors import CompilerError, OutputError, SpecError
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from tests.plot.views import PENDULUM
 from tests.tools import need, need_compiler
 
 # Loads every folder that is named, and says what became of it; a crash ends it, and the last line says where.
 LOADER = """
 import sys
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import ImpactPostureError
 for folder in sys.argv[1:]:
     print(folder, end=" ", flush=True)

@@ -23,7 +23,7 @@ from impact_posture.errors import (
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.robot.urdf import example_robot_data
 from tests.helpers import NAMES, assert_close, mass_matrix, random_configurations, robot
 

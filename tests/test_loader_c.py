@@ -16,7 +16,7 @@ import pytest
 
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.errors import (
     CompilerError,
@@ -29,7 +29,7 @@ from impact_posture.errors import (
 )
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.toolchain import find_compiler
 
 UNIT = np.array([0.6, 0.0, 0.8])
@@ -176,7 +176,7 @@ def test_threads_with_objects_of_their_own(loaded: Loaded) -> None:
 
 def test_no_casadi_and_no_pinocchio(loaded: Loaded) -> None:
     program = (
-        "import sys\nfrom impact_posture.codegen.loader import ImpactGradient\n"
+        "import sys\nfrom impact_posture.codegen.impact_gradient import ImpactGradient\n"
         "g = ImpactGradient.load(sys.argv[1])\nt = g.manifest['self_test']\n"
         "g.value_and_gradient(t['q'], t['n'])\n"
         "assert not {'casadi', 'pinocchio', 'scipy'} & set(sys.modules), 'heavy'\n"

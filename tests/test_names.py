@@ -29,21 +29,21 @@ from impact_posture.codegen.export import default_prefix, export
 from impact_posture.codegen.variants import variants
 from impact_posture.dynamics.mjcf import write_mjcf
 from impact_posture.experiment.reproduction import Reproduction
+from impact_posture.experiment.reproduction_summary import summary
 from impact_posture.experiment.statistics import Row
-from impact_posture.experiment.summary import summary
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.plot import ResultView, jump_figure, save
-from impact_posture.posture.settings import ProblemSettings, dump_settings, read_settings
+from impact_posture.posture.problem_settings import ProblemSettings, dump_settings, read_settings
 from impact_posture.robot.draft import write_draft
-from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.robot.spec import RobotSpec, read_spec
-from impact_posture.simulation.build import build_scene
 from impact_posture.simulation.scene import Scene, Shape, Surface
+from impact_posture.simulation.world_builder import build_scene
 from impact_posture_cli.app import app
-from impact_posture_cli.boundary import run
-from impact_posture_cli.words import put_right
+from impact_posture_cli.argv import put_right
+from impact_posture_cli.error_boundary import run
 from tests.tools import need_compiler
 
 NASTY = (

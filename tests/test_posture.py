@@ -13,9 +13,9 @@ from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.contact import point_on
 from impact_posture.posture.certificate import certify, objective_gradients
 from impact_posture.posture.equalities import equality_jacobian, rank
-from impact_posture.posture.path import null_space_path
+from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.settings import (
+from impact_posture.posture.problem_settings import (
     ProblemSettings,
     dump_settings,
     make_settings,
@@ -326,7 +326,7 @@ def test_blow_that_moves_nothing_is_refused() -> None:
 
 
 def prepare_frames(urdf: str) -> tuple[str, ...]:
-    from impact_posture.robot.loader import load_robot
+    from impact_posture.robot.robot_loader import load_robot
 
     return load_robot(urdf).frame_names
 

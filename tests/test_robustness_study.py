@@ -18,9 +18,9 @@ pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')"
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.impact.contact import point_on
-from impact_posture.robot.loader import load_robot
-from impact_posture.simulation.controllers import Workshop
-from impact_posture.simulation.runs import Run
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.simulation.controller_factory import Workshop
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup, SinglePush, set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from tests.benchmarks.robustness import outcomes

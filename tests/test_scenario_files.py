@@ -13,7 +13,7 @@ import pytest
 
 from impact_posture.errors import ImpactPostureError, InputError, ScenarioNotFound, SpecError
 from impact_posture.simulation import scenario_file
-from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.actuator_command import Drive
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import (
     EndEffectorGains,

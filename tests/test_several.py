@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impact_posture.codegen.build import build_library, library_path
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.library import build_library, library_path
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError
 from impact_posture.impact.contact import Contact, Support
@@ -25,9 +25,9 @@ from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses, corners
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.posture.feet import KeptFeet
+from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.settings import (
+from impact_posture.posture.problem_settings import (
     dump_settings,
     make_settings,
     prepare,
@@ -36,8 +36,8 @@ from impact_posture.posture.settings import (
 )
 from impact_posture.posture.solve import solve
 from impact_posture.posture.starts import feasible_start
-from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.robot.spec import RobotSpec
 from tests.command import run
 from tests.helpers import (

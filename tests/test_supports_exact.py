@@ -14,16 +14,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.codegen.compiler import CompiledExport, compiled
+from impact_posture.codegen.build_check import CompiledExport, compiled
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import Contact, Support, least_compliance
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.impact.request import ImpactRequest
 from impact_posture.robot.robot import Robot
-from impact_posture.verification.verify import verify
+from impact_posture.verification.verification import verify
 from tests.exact import Exact, ExactImpact, digits, distance, exact, rounded
 from tests.exact_bounds import Bounded
 from tests.helpers import Vector, central_gradient, random_configurations, rng, robot, unit

@@ -18,16 +18,17 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
-from impact_posture.posture import follow, nlp
-from impact_posture.posture.distance import WithinDistance, distance, distance_gradient
-from impact_posture.posture.follow import trade_off
+from impact_posture.posture import nlp
+from impact_posture.posture import pareto as follow
+from impact_posture.posture.pareto import trade_off
+from impact_posture.posture.posture_distance import WithinDistance, distance, distance_gradient
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.settings import make_settings, prepare
+from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.posture.starts import Projector
 from impact_posture.posture.tradeoff import TradeOff, find_knee
+from impact_posture_cli.argv import fill_optional
 from impact_posture_cli.options import TRADEOFF_POINTS
-from impact_posture_cli.words import fill_optional
 from tests.command import run
 from tests.helpers import central_gradient, relative, rng
 from tests.test_posture import walk

@@ -19,10 +19,10 @@ from impact_posture.tsid.frame_tasks import FramePose, FramePosition, Impedance
 from impact_posture.tsid.limits import AccelerationBounds, LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program, aerial_program
 from impact_posture.tsid.ranges import JointRanges
 from impact_posture.tsid.relaxation import solve
 from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import Program, aerial_program
 from tests.helpers import rng, robot
 
 DT = 1e-3

@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.contact import Contact as Blow
 from impact_posture.impact.contact import Support
@@ -27,8 +27,8 @@ from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program, aerial_program, legged_program
 from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import Program, aerial_program, legged_program
 from tests.helpers import central_gradient, rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run
 from tests.tools import need_compiler

@@ -12,8 +12,8 @@ from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.friction import point_cone, surface_cone, to_world
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import legged_program
 from impact_posture.tsid.qpsolvers_solver import QpsolversSolver
+from impact_posture.tsid.task_formulation import legged_program
 from tests.helpers import frame_jacobian, mass_matrix, rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, run
 

@@ -16,7 +16,7 @@ from impact_posture.tsid.hierarchy import Level, balanced, lexicographic
 from impact_posture.tsid.impact_robust import Gradient, ImpactRobustPosture, Spring
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program, aerial_program, arm_program, legged_program
+from impact_posture.tsid.task_formulation import Program, aerial_program, arm_program, legged_program
 from tests.helpers import rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits
 

@@ -19,10 +19,10 @@ from impact_posture.tsid.frame_tasks import EndEffector, FrameAligned, FramePose
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program, aerial_program, arm_program
 from impact_posture.tsid.rank import SINGULAR
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Task
+from impact_posture.tsid.task_formulation import Program, aerial_program, arm_program
 from tests.arms import TIP, X, Y, Z, arm, yaw_and_pitches
 from tests.helpers import rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate

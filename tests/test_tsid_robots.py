@@ -14,16 +14,16 @@ import pytest
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import Contact as Blow
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.frame_tasks import FramePosition
 from impact_posture.tsid.impact_robust import Gradient, ImpactRobustPosture, Spring
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program, aerial_program, arm_program, legged_program
 from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import Program, aerial_program, arm_program, legged_program
 from tests.helpers import NAMES, rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run
 from tests.test_tsid_never_fails import ANSWERED, PROGRAMS, bracing, program_of, well

@@ -24,7 +24,7 @@ from impact_posture.errors import (
 from impact_posture.robot.actuation import hover
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RobotSpec
-from impact_posture.simulation.exchange import Drive, Push
+from impact_posture.simulation.actuator_command import Drive, Push
 from impact_posture.simulation.restitution import ball, ideal_restitution, measure_restitution
 from impact_posture.simulation.rotors import Vibration
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors, Shape, Surface
@@ -313,7 +313,7 @@ import impact_posture.simulation as simulation
 for module in pkgutil.iter_modules(simulation.__path__):
     importlib.import_module(f"impact_posture.simulation.{module.name}")
 from impact_posture.errors import InputError
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.scene import Scene
 from impact_posture.simulation.world import build_world
 try:

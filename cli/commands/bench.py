@@ -79,7 +79,7 @@ def bench(
     if not 1 <= patience < 1e6:
         raise typer.BadParameter("give seconds, one or more", param_hint="--patience")
     from impact_posture.benchmark.measure import DEFAULT_ROBOTS, machine, measure
-    from impact_posture_cli.asked import impact_request
+    from impact_posture_cli.impact_options import impact_request
     from impact_posture_cli.output import Page, print_json
 
     wanted = [name for name in get_args(PeerName) if name in peers.split(",")]

@@ -11,7 +11,7 @@ from impact_posture_cli import options
 
 if TYPE_CHECKING:
     from impact_posture.job import Written
-    from impact_posture.posture.settings import Prepared, ProblemSettings
+    from impact_posture.posture.problem_settings import Prepared, ProblemSettings
     from impact_posture.posture.solve import PostureSolution
     from impact_posture_cli.output import Page
 
@@ -84,12 +84,12 @@ def optimize(
     given = _given(context)
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
-    from impact_posture.folder import check_output
     from impact_posture.job import FORMATS, default_out, write_result
-    from impact_posture.posture.follow import trade_off
+    from impact_posture.output_folder import check_output
+    from impact_posture.posture.pareto import trade_off
+    from impact_posture.posture.problem_settings import prepare
     from impact_posture.posture.result import result_document
     from impact_posture.posture.robustness import solve_robustly
-    from impact_posture.posture.settings import prepare
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.progress import progress_bar
 
@@ -157,8 +157,8 @@ def _settings(robot: str, given: dict[str, Any]) -> ProblemSettings:
     contacts = given.get("contact")
     if not from_file or "contact" in given:
         options.check_contact(given.get("frame"), given.get("normal"), contacts)
-    from impact_posture.impact.texts import parse_armature, parse_payload
-    from impact_posture.posture.settings import make_settings, read_settings
+    from impact_posture.impact.parsing import parse_armature, parse_payload
+    from impact_posture.posture.problem_settings import make_settings, read_settings
 
     if "armature" in given:
         given["armature"] = parse_armature(given["armature"])
@@ -184,7 +184,7 @@ def _refuse_idle(given: dict[str, Any], settings: ProblemSettings) -> None:
 
 def _announce(page: Page, prepared: Prepared) -> None:
     from impact_posture_cli.output import vector
-    from impact_posture_cli.worst import contact_names
+    from impact_posture_cli.tables import contact_names
 
     if page.quiet:
         return
@@ -227,7 +227,7 @@ def _announce(page: Page, prepared: Prepared) -> None:
 def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
     from impact_posture.posture.notes import percent
     from impact_posture_cli.output import number, worst_normal
-    from impact_posture_cli.worst import contact_names, contacts_table, impulses_line, scenarios_table
+    from impact_posture_cli.tables import contact_names, contacts_table, impulses_line, scenarios_table
 
     initial, optimal = document["initial"], document["optimal"]
     rows = []

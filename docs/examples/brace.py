@@ -9,11 +9,11 @@ import sys
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.codegen.loader import ImpactGradient
-from impact_posture.robot.loader import load_robot
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.tsid.controller import Controller
 from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
-from impact_posture.tsid.program import aerial_program
+from impact_posture.tsid.task_formulation import aerial_program
 
 robot = load_robot("tilthex_arm")
 export = ImpactGradient.load(sys.argv[1], robot=robot)

@@ -20,10 +20,10 @@ import pinocchio as pin
 import tsid
 
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 
 DT, DURATION = 0.002, 20.0
 FRAME, NORMAL = "tool0", (0.0, 0.0, 1.0)

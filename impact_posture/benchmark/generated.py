@@ -7,7 +7,7 @@ import casadi as ca
 from impact_posture.benchmark.count import count_operations, reachable_kb
 from impact_posture.benchmark.peer import Group, Peer
 from impact_posture.benchmark.workbench import CONTRACT, Absent, Workbench, c_compiler
-from impact_posture.folder import scratch_folder
+from impact_posture.output_folder import scratch_folder
 
 _WRAPPER = """
 int kernel_eval(const double *q, const double *n, double *H, double *grad)

@@ -8,7 +8,7 @@ from impact_posture.benchmark.peer import Peer
 from impact_posture.benchmark.work import eval_operations
 from impact_posture.benchmark.workbench import CONTRACT, Absent, Workbench, c_compiler, processor
 from impact_posture.codegen.export import export
-from impact_posture.folder import scratch_folder
+from impact_posture.output_folder import scratch_folder
 
 PREFIX = "kernel"
 # What gcc and clang mean by x86-64-v3, as the kernel calls it.

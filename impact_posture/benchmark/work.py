@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from impact_posture.benchmark.count import Operations
 from impact_posture.codegen.functions import library
-from impact_posture.codegen.lanes import packed
-from impact_posture.codegen.program import ARITHMETIC, COSINE, SINE, Graph, graph_of
+from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph, graph_of
+from impact_posture.codegen.simd_lanes import packed
 from impact_posture.impact.objective import ImpactObjective
 
 _KINDS = {"+": "add", "-": "add", "*": "mul", "/": "div", "inv": "div", "neg": "neg", SINE: "trig", COSINE: "trig"}

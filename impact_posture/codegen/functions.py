@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from impact_posture.codegen.lanes import Seed
+from impact_posture.codegen.simd_lanes import Seed
 from impact_posture.dynamics.chart import Chart
-from impact_posture.dynamics.twins import Twins
+from impact_posture.dynamics.repeated_limbs import Twins
 from impact_posture.impact.objective import ImpactObjective
 
 

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.joints import joint_quaternion, joint_spin, joint_transform
+from impact_posture.dynamics.repeated_limbs import Twins
 from impact_posture.dynamics.spatial import Spin, constant, quaternion_product
-from impact_posture.dynamics.twins import Twins
 
 # Spatial inertias, forces or motions by joint index.
 ByJoint = dict[int, ca.SX]

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from impact_posture.experiment.batch import Document, Store
 from impact_posture.experiment.jobs import Job, workshop
-from impact_posture.experiment.many import Document, Store
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction
 from impact_posture.plot import Bar, RunView, Span, draw_bars, draw_comparison, draw_run, draw_snapshots
 from impact_posture.progress import tell
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import RepeatedContacts
 from impact_posture.simulation.series import Series, Window
 

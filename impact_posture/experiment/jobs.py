@@ -11,11 +11,11 @@ import numpy as np
 from impact_posture.errors import InputError
 from impact_posture.escape import file_name
 from impact_posture.posture.result import versions
-from impact_posture.simulation.controllers import Mode, Workshop
+from impact_posture.simulation.controller_factory import Mode, Workshop
 from impact_posture.simulation.metrics import Metrics, measure
 from impact_posture.simulation.outcome import gravest, judge
 from impact_posture.simulation.prediction import predict
-from impact_posture.simulation.runs import Run, run
+from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 
@@ -82,7 +82,7 @@ def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
     """Run a job: its runs, and its document.
 
     Raises:
-        ImpactPostureError: As :func:`impact_posture.simulation.runs.run`, or the scenario cannot be set up.
+        ImpactPostureError: As :func:`impact_posture.simulation.run.run`, or the scenario cannot be set up.
     """
     shop = workshop(job.scenario, job.free)
     scenario = shop.setup.scenario

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from impact_posture.experiment.batch import Document, Progress, Store, run_many
 from impact_posture.experiment.jobs import Job, parse_controller
-from impact_posture.experiment.many import Document, Progress, Store, run_many
 from impact_posture.experiment.paper import PAPER, RECOMMENDED
 from impact_posture.experiment.statistics import Row, row_of
-from impact_posture.simulation.controllers import CONTROLLERS
+from impact_posture.simulation.controller_factory import CONTROLLERS
 
 SCHEMA, COMPARISON_SCHEMA = "impact-posture/reproduction/2", "impact-posture/comparison/2"
 # The posture that a term reaches apart from what it does while the blow lasts; and the metric without the feet.

@@ -9,12 +9,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.errors import InputError, MetricError
-from impact_posture.impact.classical import Ellipsoid, ellipsoid_of
+from impact_posture.impact.classical_ellipsoids import Ellipsoid, ellipsoid_of
 from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import LARGEST, point_on
-from impact_posture.impact.footing import Footing, footing
+from impact_posture.impact.contact_stability import Footing, footing
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses
-from impact_posture.impact.jump import Dominance, Jump, find_dominance, weighed_jump
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.impact.scalars import (
@@ -25,6 +24,7 @@ from impact_posture.impact.scalars import (
     scenario_values,
     worst_member,
 )
+from impact_posture.impact.velocity_jump import Dominance, Jump, find_dominance, weighed_jump
 
 Vector = NDArray[np.float64]
 

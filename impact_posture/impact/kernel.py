@@ -15,8 +15,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.repeated_limbs import Twins
 from impact_posture.dynamics.tree import ByJoint, PointOnLink, Product, Response, Tree, Wrench
-from impact_posture.dynamics.twins import Twins
 from impact_posture.impact.contact import support_inertia
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.robot.robot import Robot
@@ -32,7 +32,7 @@ class ImpactKernel:
         case: Robot, contact, metric and supports.
         q: Configuration symbols, shape (nq, 1).
         n: Normal symbols, shape (3, 1), in the axes that the contact's normal is given in.
-        twins: Branches whose expressions are to be alike (:class:`~impact_posture.dynamics.twins.Twins`).
+        twins: Branches whose expressions are to be alike (:class:`~impact_posture.dynamics.repeated_limbs.Twins`).
     """
 
     def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, twins: Twins | None = None) -> None:

@@ -16,8 +16,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.dynamics.repeated_limbs import Twins
 from impact_posture.dynamics.tree import Tree
-from impact_posture.dynamics.twins import Twins
 from impact_posture.impact.contact import Contact, Support, default_compliance
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_kind import ImpactKind, QuadraticKind
@@ -31,8 +31,8 @@ from impact_posture.impact.normal_cone import NormalCone, check_cone
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.impact.single_impact import SingleImpact
 from impact_posture.impact.worst_case import Subgradients, WorstCase
+from impact_posture.robot.model_variant import Scenario
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.scenario import Scenario
 
 Vector = NDArray[np.float64]
 

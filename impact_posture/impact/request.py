@@ -14,13 +14,13 @@ from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.contact import Contact, NormalFrame, Support, least_compliance, point_on
 from impact_posture.impact.metric import Metric, MetricKind, ObjectiveKind, build_metric
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.parsing import parse_contact
 from impact_posture.impact.supports import refuse_held, resolve_supports
-from impact_posture.impact.texts import parse_contact
 from impact_posture.robot.guess import feet, tips
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.robot.model_variant import Payload, build_scenarios
 from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.scenario import Payload, build_scenarios
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.robot.spec import Vector3
 
 Vector = NDArray[np.float64]

@@ -24,9 +24,9 @@ from impact_posture.plot.run_axes import (
     share_height,
     subplots,
 )
+from impact_posture.plot.run_figures import HINT, METRIC, joints_figure
 from impact_posture.plot.run_panels import RUNS, Clip, blows, control_panels, first_blow, joint_panels, whole
 from impact_posture.plot.run_view import RunView, check_same, run_header
-from impact_posture.plot.runs import HINT, METRIC, joints_figure
 from impact_posture.plot.style import DEFAULT_FORMATS, check_formats, framed, save, style
 from impact_posture.plot.view import mixed_unit
 

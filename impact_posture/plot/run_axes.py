@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
 
 from impact_posture.escape import plot_label
-from impact_posture.plot.path import log_axis, spreads
+from impact_posture.plot.path_figure import log_axis, spreads
 from impact_posture.plot.run_panels import LINES, Clip, Panel, first_blow, whole
 from impact_posture.plot.run_view import RunView
 from impact_posture.plot.shapes import Vector

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from impact_posture.escape import plot_label
-from impact_posture.plot.robot import BODY, depth_of, draw_sticks, side_plane
+from impact_posture.plot.robot_drawing import BODY, depth_of, draw_sticks, side_plane
 from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.shapes import Plane, Vector

@@ -23,9 +23,9 @@ from impact_posture.posture.constraint import (
     PositionBox,
 )
 from impact_posture.posture.equalities import base_point
-from impact_posture.posture.every_scenario import in_every_scenario
-from impact_posture.posture.feet import KeptFeet
+from impact_posture.posture.every_variant import in_every_scenario
 from impact_posture.posture.gauge import pin_undetermined
+from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.regular import regularize
 from impact_posture.robot.robot import Robot

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.posture.distance import distance_gradient
 from impact_posture.posture.equalities import RANK_TOLERANCE, equality_jacobian
+from impact_posture.posture.posture_distance import distance_gradient
 from impact_posture.posture.problem import PostureProblem
 
 Vector = NDArray[np.float64]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.posture.distance import distance_squared
 from impact_posture.posture.nlp import IPOPT_OPTIONS, run_solver
+from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import random_posture
 

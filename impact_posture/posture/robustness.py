@@ -17,7 +17,7 @@ from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.notes import percent
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.solve import SAME_POSTURE, PostureSolution, Progress, solve, wrapped_difference
-from impact_posture.robot.scenario import between
+from impact_posture.robot.model_variant import between
 
 Vector = NDArray[np.float64]
 

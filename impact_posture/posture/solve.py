@@ -17,11 +17,11 @@ from impact_posture.errors import ContactError, Infeasible, MetricError, SolverF
 from impact_posture.posture.blas import one_blas_thread
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.distance import distance
 from impact_posture.posture.elastic import elastic
 from impact_posture.posture.equalities import equality_jacobian, rank
 from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp
 from impact_posture.posture.notes import notes_on_impacts
+from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import Projector, feasible_start
 from impact_posture.processes import shared_out

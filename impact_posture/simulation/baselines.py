@@ -7,11 +7,11 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.blow import Gradient
 from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
-from impact_posture.simulation.sensing import Reading
+from impact_posture.simulation.scenario_objective import Gradient
+from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.points import Point

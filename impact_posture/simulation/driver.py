@@ -6,10 +6,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.simulation.programs import build_program, end_effector_task
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Setup
-from impact_posture.simulation.sensing import Reading
+from impact_posture.simulation.sensor_noise import Reading
+from impact_posture.simulation.task_formulations import build_program, end_effector_task
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.impact_robust import ImpactRobustPosture

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.simulation.recorder import STATUSES
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
 from impact_posture.simulation.series import Series, Window
 from impact_posture.tsid.controller import Status

@@ -11,14 +11,14 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
-from impact_posture.posture.distance import distance
-from impact_posture.posture.follow import trade_off
+from impact_posture.posture.pareto import trade_off
+from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.progress import tell
 from impact_posture.simulation.driver import Driver
-from impact_posture.simulation.programs import nominal_posture
 from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.task_formulations import nominal_posture
 from impact_posture.tsid.controller import Status
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ import pinocchio as pin
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RobotSpec
-from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.actuator_command import Drive
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Shape, Surface
 from impact_posture.simulation.world import World, build_world
 

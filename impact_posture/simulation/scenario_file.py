@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field
 
 from impact_posture.errors import ImpactPostureError, ScenarioNotFound, SpecError
-from impact_posture.robot.loader import LoadOptions, from_folder
+from impact_posture.robot.robot_loader import LoadOptions, from_folder
 from impact_posture.robot.spec import NonNegative, Positive, Root, Vector3, read_toml, validate, with_tuples
 from impact_posture.simulation.scenario import (
     Bounds,

@@ -11,11 +11,11 @@ from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.contacts import ContactStack
 from impact_posture.tsid.limits import AccelerationBounds
-from impact_posture.tsid.program import Program
 from impact_posture.tsid.qp import EQUALITY, QP
 from impact_posture.tsid.rank import LevelRank
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import TaskStack
+from impact_posture.tsid.task_formulation import Program
 
 Array = NDArray[np.float64]
 

@@ -15,11 +15,11 @@ from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
-from impact_posture.tsid.program import Program
 from impact_posture.tsid.qp import EQUALITY, Solver
 from impact_posture.tsid.relaxation import Outcome, Relaxed, missed, solve
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Task
+from impact_posture.tsid.task_formulation import Program
 
 Array = NDArray[np.float64]
 

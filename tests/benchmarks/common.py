@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.settings import make_settings, prepare
+from impact_posture.posture.problem_settings import make_settings, prepare
 
 
 def default_problem(

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from impact_posture.benchmark.measure import DEFAULT_ROBOTS, PEERS, machine, measure
 from impact_posture.benchmark.report import BenchReport, BenchRow, Comparison, commands
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 
 PAGE = Path(__file__).parents[2] / "docs" / "generated" / "kernel.md"
 

@@ -17,11 +17,11 @@ import time
 from pathlib import Path
 
 from impact_posture.errors import ImpactPostureError
+from impact_posture.experiment.batch import Store
 from impact_posture.experiment.figures import draw_reproduction
-from impact_posture.experiment.many import Store
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction, controllers_of, jobs_of, reproduce
-from impact_posture.experiment.summary import LEGEND, advice, remarks, scenario_table, table_one
+from impact_posture.experiment.reproduction_summary import LEGEND, advice, remarks, scenario_table, table_one
 
 ROOT = Path(__file__).parents[2]
 PAGE, IMAGES = ROOT / "docs" / "generated" / "reproduction.md", ROOT / "docs" / "images" / "reproduction"

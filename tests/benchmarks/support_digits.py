@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.codegen.compiler import compiled
+from impact_posture.codegen.build_check import compiled
 from impact_posture.codegen.export import export
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from tests.exact import Exact, ExactImpact, digits, distance
 from tests.exact_bounds import Bounded
 from tests.helpers import random_configurations

@@ -27,18 +27,18 @@ import pinocchio as pin
 
 from impact_posture.benchmark.timing import one_core
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError
-from impact_posture.robot.loader import load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.tsid.body_tasks import CenterOfMass
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.frame_tasks import FramePose
 from impact_posture.tsid.impact_robust import Gradient, ImpactRobustPosture, gradient_of
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import aerial_program, legged_program
 from impact_posture.tsid.qp import Solved, Solver
 from impact_posture.tsid.qpsolvers_solver import QpsolversSolver
+from impact_posture.tsid.task_formulation import aerial_program, legged_program
 from tests.benchmarks.common import crba_time, default_problem, machine
 
 PAGE = Path(__file__).parents[2] / "docs" / "generated" / "tsid.md"

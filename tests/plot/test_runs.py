@@ -37,7 +37,7 @@ from impact_posture.plot.run_axes import AT_LIMIT, LIMIT, SHADES, STOP, thin
 from impact_posture.plot.run_panels import SHOWN
 from impact_posture.plot.skeleton import build_skeleton
 from impact_posture.plot.snapshots import instants
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from tests.plot.page import defects
 from tests.plot.views import PENDULUM, text_of
 

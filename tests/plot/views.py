@@ -16,7 +16,7 @@ from impact_posture.plot import (
     TradeOffData,
     sample_path,
 )
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 
 PENDULUM = "example-robot-data:double_pendulum_description/urdf/double_pendulum.urdf"
 

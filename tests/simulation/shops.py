@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impact_posture.simulation.blow import interpreted
-from impact_posture.simulation.controllers import Mode, Workshop
+from impact_posture.simulation.controller_factory import Mode, Workshop
 from impact_posture.simulation.offline import offline_posture
 from impact_posture.simulation.recorder import feet_of
-from impact_posture.simulation.runs import Run, run
+from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup, set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.simulation.series import Series
 
 AERIAL = ("aerial-vertical", "aerial-lateral")

@@ -8,12 +8,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from impact_posture.simulation.actuator_command import Drive
 from impact_posture.simulation.baselines import InvariantDriver, StiffDriver, WalkerDriver
-from impact_posture.simulation.controllers import Workshop
-from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.controller_factory import Workshop
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts
-from impact_posture.simulation.sensing import Reading
+from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.task import Task
 from tests.helpers import Vector, central_gradient, frame_jacobian, mass_matrix, rng
 from tests.simulation.shops import SHIPPED, needs_mujoco, shop

@@ -10,13 +10,13 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import SpecError
-from impact_posture.simulation.controllers import CONTROLLERS, Mode, Workshop
+from impact_posture.simulation.actuator_command import Drive
+from impact_posture.simulation.controller_factory import CONTROLLERS, Mode, Workshop
 from impact_posture.simulation.driver import MOVE, Driver, PostureDriver
-from impact_posture.simulation.exchange import Drive
 from impact_posture.simulation.offline import OfflinePosture
-from impact_posture.simulation.programs import nominal_posture
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Gains
+from impact_posture.simulation.task_formulations import nominal_posture
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.frame_tasks import FramePose
 from tests.simulation.shops import AERIAL, PUSHES, SHIPPED, needs_mujoco, shop

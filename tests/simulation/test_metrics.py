@@ -12,7 +12,7 @@ import pytest
 from impact_posture.errors import SpecError
 from impact_posture.simulation.metrics import JUMP, before, jump, measure
 from impact_posture.simulation.recorder import STATUSES
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Series, Window
 from impact_posture.tsid.controller import Status
 from tests.simulation.shops import by_hand, fields_of, needs_mujoco, shop

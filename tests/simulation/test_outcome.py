@@ -14,7 +14,7 @@ from impact_posture.errors import SpecError
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import Event, judge
 from impact_posture.simulation.recorder import STATUSES
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Bounds, Setup, set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.series import Window

@@ -13,10 +13,10 @@ import pytest
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError
 from impact_posture.impact.contact import point_on
-from impact_posture.simulation.controllers import CONTROLLERS, Workshop
+from impact_posture.simulation.controller_factory import CONTROLLERS, Workshop
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.prediction import predict
-from impact_posture.simulation.runs import run
+from impact_posture.simulation.run import run
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from tests.helpers import robot

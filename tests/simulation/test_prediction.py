@@ -11,14 +11,14 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.blow import blow_of, interpreted
-from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.actuator_command import Drive
 from impact_posture.simulation.metrics import JUMP, before, measure
 from impact_posture.simulation.prediction import Prediction, predict
 from impact_posture.simulation.recorder import Recorder
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_objective import blow_of, interpreted
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene
 from impact_posture.simulation.series import Window
 from impact_posture.simulation.world import build_world

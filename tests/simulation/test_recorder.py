@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import MetricError
-from impact_posture.simulation.exchange import Truth
+from impact_posture.simulation.actuator_command import Truth
+from impact_posture.simulation.contact_forces import ShapeTruth
 from impact_posture.simulation.recorder import STATUSES, Recorder
-from impact_posture.simulation.touching import ShapeTruth
 from impact_posture.tsid.controller import Command, Status
 from tests.simulation.shops import needs_mujoco, shop
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import ControllerNotFound, InputError
-from impact_posture.simulation.controllers import CONTROLLERS, Mode, Workshop
+from impact_posture.simulation.controller_factory import CONTROLLERS, Mode, Workshop
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.reference import Reference
-from impact_posture.simulation.runs import Run, run
+from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush, set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.world import build_world

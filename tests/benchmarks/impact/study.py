@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from impact_posture.errors import ImpactPostureError
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.settings import make_settings, prepare
+from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.posture.starts import feasible_start
 from tests.benchmarks.impact.surface import Measured, NoImpact, Scene, Surface

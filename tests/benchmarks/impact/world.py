@@ -7,7 +7,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.mjcf import Mjcf
-from impact_posture.dynamics.mjcf_additions import WORLD, Additions
+from impact_posture.dynamics.mjcf_scene import WORLD, Additions
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective

@@ -15,8 +15,7 @@ from impact_posture.errors import Infeasible, InputError
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.starts import Projector
-from impact_posture.robot.loader import load_robot
-from impact_posture.simulation.blow import blow_of
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.scenario import (
     Control,
     Footing,
@@ -28,6 +27,7 @@ from impact_posture.simulation.scenario import (
     set_up,
 )
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_objective import blow_of
 from impact_posture.simulation.world import build_world
 
 Array = NDArray[np.float64]

@@ -15,13 +15,13 @@ import pinocchio as pin
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError, SimulationDiverged
 from impact_posture.impact.contact import point_on
-from impact_posture.simulation.blow import interpreted
-from impact_posture.simulation.controllers import Workshop
+from impact_posture.simulation.controller_factory import Workshop
 from impact_posture.simulation.metrics import Metrics, before, measure
 from impact_posture.simulation.offline import holds
 from impact_posture.simulation.prediction import predict
-from impact_posture.simulation.runs import Run, run
+from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
+from impact_posture.simulation.scenario_objective import interpreted
 from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, RANGES, Draw, draw, prepare
 
 SCHEMA = 1

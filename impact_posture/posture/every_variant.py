@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.constraint import CenterOfMassOverFeet, Constraint
-from impact_posture.posture.feet import KeptFeet
+from impact_posture.posture.kept_feet import KeptFeet
 
 
 def in_every_scenario(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.mjcf import Mjcf, write_mjcf
-from impact_posture.dynamics.mjcf_additions import Additions
+from impact_posture.dynamics.mjcf_scene import Additions
 from impact_posture.dynamics.mjcf_text import numbers
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, UnsupportedJoint

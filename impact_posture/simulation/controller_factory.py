@@ -19,11 +19,11 @@ from impact_posture.simulation.baselines import (
     StiffPosture,
     WalkerDriver,
 )
-from impact_posture.simulation.blow import Gradient, blow_of, compiled
 from impact_posture.simulation.driver import Driver, PostureDriver, RobustDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
-from impact_posture.simulation.programs import base_weight, nominal_posture
 from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.scenario_objective import Gradient, blow_of, compiled
+from impact_posture.simulation.task_formulations import base_weight, nominal_posture
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 

@@ -4,9 +4,9 @@
 
     f(d) = min over q  objective(q)    subject to the problem's constraints and ‖q ⊖ q₀‖ ≤ d
 
-for a series of distances d, from zero to that of the optimum, with the distance of
-:func:`~impact_posture.posture.distance.distance_squared`.  A bound and not a penalty: the minimizers of ``objective +
-w·distance²`` reach the convex hull of the curve only and jump over the rest of it.
+for a series of distances d, from zero to that of the optimum.  The distance is that of
+:func:`~impact_posture.posture.posture_distance.distance_squared`.  It is a bound and not a penalty, because the
+minimizers of ``objective + w·distance²`` reach only the convex hull of the curve and jump over the rest of it.
 
 One program, whose bound is a row's bound, is solved along the curve outward from the initial posture and inward from
 the optimum, each solve from the end of the one before.  The best certified end at each distance counts.  Where its
@@ -28,8 +28,8 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import InputError, MetricError
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.distance import WithinDistance, distance
 from impact_posture.posture.nlp import PostureNLP, build_nlp
+from impact_posture.posture.posture_distance import WithinDistance, distance
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.solve import PostureSolution, Progress, run_start
 from impact_posture.posture.tradeoff import TradeOff, TradePoint, find_knee

@@ -10,7 +10,7 @@ from impact_posture.escape import markdown
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction, targets_of
 from impact_posture.experiment.statistics import Interval, Row
-from impact_posture.simulation.controllers import MEANING
+from impact_posture.simulation.controller_factory import MEANING
 
 # Of numbers that are nearly zero.
 _DECIMALS = 4

@@ -20,10 +20,10 @@ from impact_posture.impact.contact import Contact
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
-from impact_posture.simulation import blow
-from impact_posture.simulation.blow import blow_of, compiled, interpreted
+from impact_posture.simulation import scenario_objective
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_objective import blow_of, compiled, interpreted
 from tests.helpers import Vector, assert_close, central_gradient, frame_jacobian, mass_matrix, rng, robot
 from tests.simulation.shops import needs_mujoco, shop
 from tests.tools import need_compiler
@@ -156,13 +156,13 @@ def builds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     need_compiler()
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
     made: list[Path] = []
-    write: Callable[..., Any] = blow.write_export
+    write: Callable[..., Any] = scenario_objective.write_export
 
     def counted(objectives: Any, folder: Path, **options: Any) -> Any:
         made.append(folder)
         return write(objectives, folder, **options)
 
-    monkeypatch.setattr(blow, "write_export", counted)
+    monkeypatch.setattr(scenario_objective, "write_export", counted)
     return made
 
 
@@ -198,7 +198,7 @@ def test_a_damaged_build_is_done_again(builds: list[Path]) -> None:
     library = builds[0] / "libblow.so"
     # Mapped in this process: another file takes its name.
     library.write_bytes(library.rename(builds[0].parents[1] / "mapped.so").read_bytes()[:5000])
-    (builds[0] / "blow.c").write_text("half")
+    (builds[0] / "scenario_objective.c").write_text("half")
     q = near(objective, "again")
     assert compiled(objective)(q)[0] == pytest.approx(objective.value(q), rel=1e-9)
     assert len(builds) == 2
@@ -206,7 +206,7 @@ def test_a_damaged_build_is_done_again(builds: list[Path]) -> None:
 
 def test_without_a_compiler_it_is_interpreted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(blow, "find_compiler", lambda: None)
+    monkeypatch.setattr(scenario_objective, "find_compiler", lambda: None)
     objective = objective_of("ur5", "tool0", "impulse", False)
     q = near(objective, "none")
     assert compiled(objective)(q)[0] == pytest.approx(objective.value(q), rel=1e-9)
@@ -237,16 +237,16 @@ def test_a_compiler_that_fails_is_an_error_and_leaves_nothing(
 def test_two_processes_that_build_at_once_do_it_once(tmp_path: Path) -> None:
     need_compiler()
     program = (
-        "import sys; from impact_posture.robot.loader import load_robot\n"
+        "import sys; from impact_posture.robot.robot_loader import load_robot\n"
         "from impact_posture.impact.contact import Contact\n"
         "from impact_posture.impact.metric import Metric\n"
         "from impact_posture.impact.objective import ImpactObjective\n"
-        "from impact_posture.simulation import blow\n"
-        "write = blow.write_export\n"
+        "from impact_posture.simulation import scenario_objective as blow\n"
+        "write = scenario_objective.write_export\n"
         "def told(*a, **k):\n    print('built'); return write(*a, **k)\n"
-        "blow.write_export = told\n"
+        "scenario_objective.write_export = told\n"
         "o = ImpactObjective(load_robot('ur5'), Contact.create('tool0', (0, 0, 1)), Metric(), 'impulse', ())\n"
-        "print(repr(blow.compiled(o)(o.robot.posture())[0]))\n"
+        "print(repr(scenario_objective.compiled(o)(o.robot.posture())[0]))\n"
     )
     environment = {**os.environ, "IMPACT_POSTURE_CACHE": str(tmp_path)}
     started = [

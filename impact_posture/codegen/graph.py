@@ -202,7 +202,7 @@ def _operation(graph: Graph, operation: int, operands: list[int], divided: int) 
         text = CALLS[operation]
         return graph.add(Node(text, tuple(operands[: 2 if "{1}" in text else 1])))
     raise CompilerError(
-        f"CasADi operation {operation} has no C form", where="codegen", hint="add it to codegen/program.py"
+        f"CasADi operation {operation} has no C form", where="codegen", hint="add it to codegen/graph.py"
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from impact_posture.codegen.program import ARITHMETIC, COSINE, SINE, Graph, Node
+from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph, Node
 
 # What an operand is to the key of an operation: a node of its own, or a place among twins.
 Key = tuple[object, ...]

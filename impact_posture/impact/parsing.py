@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from impact_posture.errors import ContactError, InputError
-from impact_posture.robot.scenario import Payload
+from impact_posture.robot.model_variant import Payload
 from impact_posture.robot.spec import Vector3
 
 

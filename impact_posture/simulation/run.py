@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.processes import in_a_copy
 from impact_posture.progress import tell
-from impact_posture.simulation.blow import interpreted
-from impact_posture.simulation.controllers import Mode, Workshop
+from impact_posture.simulation.actuator_command import Drive
+from impact_posture.simulation.controller_factory import Mode, Workshop
 from impact_posture.simulation.driver import Driver
-from impact_posture.simulation.exchange import Drive
 from impact_posture.simulation.recorder import Recorder
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush
+from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.simulation.series import RECOVERY, Series, Window
 from impact_posture.tsid.controller import Command
 

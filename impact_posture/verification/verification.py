@@ -13,7 +13,6 @@ from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.toolchain import find_compiler
-from impact_posture.verification.report import Deviation, Row, VerificationReport, deviation
 from impact_posture.verification.samples import random_samples
 from impact_posture.verification.sources import (
     MujocoSource,
@@ -24,6 +23,7 @@ from impact_posture.verification.sources import (
     pinocchio_differences,
     pinocchio_numbers,
 )
+from impact_posture.verification.verification_report import Deviation, Row, VerificationReport, deviation
 
 CASADI, COMPILED, DIFFERENCES, MUJOCO = "CasADi", "compiled C", "finite differences", "MuJoCo"
 NO_COMPILER = "no C compiler: install gcc or clang, or set CC"

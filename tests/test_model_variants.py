@@ -11,10 +11,10 @@ import pinocchio as pin
 import pytest
 import scipy.optimize
 
-from impact_posture.codegen.build import build_library, library_path
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.library import build_library, library_path
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import FrameNotFound, ImpactPostureError, InputError, SpecError
@@ -24,13 +24,19 @@ from impact_posture.impact.metric import Metric
 from impact_posture.impact.model_set import ModelSet
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.constraint import CenterOfMassOverFeet
-from impact_posture.posture.feet import KeptFeet
+from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.problem_settings import (
+    dump_settings,
+    make_settings,
+    prepare,
+    read_settings,
+    resolved_settings,
+)
 from impact_posture.posture.robustness import Robustness, ScenarioOptimum, solve_robustly
-from impact_posture.posture.settings import dump_settings, make_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.solve import solve
+from impact_posture.robot.model_variant import MOST_SCENARIOS, Payload, between, build_scenarios
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.scenario import MOST_SCENARIOS, Payload, between, build_scenarios
 from tests.command import run
 from tests.helpers import (
     assert_close,

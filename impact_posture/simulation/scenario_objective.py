@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture import __version__
-from impact_posture.codegen.build import library_path
-from impact_posture.codegen.folder import write_export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.export_folder import write_export
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.library import library_path
 from impact_posture.errors import CompilerError, MetricError, OutputError
 from impact_posture.impact.contact import Contact
 from impact_posture.impact.metric import Metric, ObjectiveKind

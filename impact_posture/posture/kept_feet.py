@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.contact import point_on, support_inertia
-from impact_posture.impact.footing import FrictionCones
+from impact_posture.impact.contact_stability import FrictionCones
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.constraint import Constraint
 
@@ -22,8 +22,9 @@ Vector = NDArray[np.float64]
 class KeptFeet(Constraint):
     """``A f(q) ≤ 0`` of the supports' impulses ``f = −J_s a/ε`` per unit blow, as parts of the largest at the start.
 
-    These are the impulses of feet at compliance ε, one of the set that :mod:`impact_posture.impact.footing` asks
-    about: sufficient for the feet to stay, and where the set has more than one member, more than necessary.
+    These are the impulses of feet at compliance ε.  They are one member of the set that
+    :mod:`impact_posture.impact.contact_stability` asks about.  So the constraint is sufficient for the feet to stay, and
+    more than necessary where that set has several members.
 
     Args:
         objective: Whose blow, one along the contact's normal, and whose feet.

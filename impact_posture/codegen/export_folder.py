@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.codegen.build import GET_ONE, library_path, products
-from impact_posture.codegen.compiler import compile_and_check
+from impact_posture.codegen.build_check import compile_and_check
 from impact_posture.codegen.emitter import DOUBLE, FLOAT
 from impact_posture.codegen.export import Export, default_prefix, export
+from impact_posture.codegen.library import GET_ONE, library_path, products
 from impact_posture.codegen.naming import check_prefix
 from impact_posture.errors import CompilerError
-from impact_posture.folder import whole_folder
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.output_folder import whole_folder
 from impact_posture.toolchain import find_compiler
 
 SCHEMA = "impact-posture/codegen-run/1"

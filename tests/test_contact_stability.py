@@ -12,13 +12,13 @@ import pytest
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.contact import Contact, Support
-from impact_posture.impact.footing import footing
+from impact_posture.impact.contact_stability import footing
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.posture.feet import KeptFeet
-from impact_posture.posture.settings import make_settings, prepare
+from impact_posture.posture.kept_feet import KeptFeet
+from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.robot import Robot
 from tests.command import run

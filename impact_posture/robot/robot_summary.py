@@ -9,8 +9,8 @@ import pinocchio as pin
 
 from impact_posture.errors import ImpactPostureError
 from impact_posture.robot.actuation import allocation, hover, lateral_force_range, thrust_limits
-from impact_posture.robot.loader import known_robots
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import known_robots
 from impact_posture.robot.spec import PropulsionSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, robots_data
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.robot.spec import Vector3
-from impact_posture.simulation.touching import ShapeTruth
+from impact_posture.simulation.contact_forces import ShapeTruth
 
 Array = NDArray[np.float64]
 

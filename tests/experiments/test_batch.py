@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from impact_posture.errors import ControllerNotFound, ScenarioNotFound, SimulationDiverged
-from impact_posture.experiment import many
+from impact_posture.experiment import batch
+from impact_posture.experiment.batch import Store, key_of, run_many
 from impact_posture.experiment.jobs import SCHEMA, Job, execute, workshop
-from impact_posture.experiment.many import Store, key_of, run_many
 
 
 def test_a_run_answers_with_its_document(aerial: Path) -> None:
@@ -50,7 +50,7 @@ def test_what_was_interrupted_goes_on(aerial: Path, tmp_path: Path, monkeypatch:
     jobs = [Job(str(aerial), "nominal", seed) for seed in range(3)]
     store = Store(tmp_path / "kept")
     ran: list[int] = []
-    real = many.execute
+    real = batch.execute
 
     def counted(job: Job) -> Any:
         if len(ran) == 2:
@@ -58,11 +58,11 @@ def test_what_was_interrupted_goes_on(aerial: Path, tmp_path: Path, monkeypatch:
         ran.append(job.seed)
         return real(job)
 
-    monkeypatch.setattr(many, "execute", counted)
+    monkeypatch.setattr(batch, "execute", counted)
     with pytest.raises(KeyboardInterrupt):
         run_many(jobs, store=store)
     assert ran == [0, 1]
-    monkeypatch.setattr(many, "execute", lambda job: (ran.append(job.seed), real(job))[1])
+    monkeypatch.setattr(batch, "execute", lambda job: (ran.append(job.seed), real(job))[1])
     whole = run_many(jobs, store=store)
     assert ran == [0, 1, 2]
     assert whole == run_many(jobs)
@@ -88,7 +88,7 @@ def test_a_changed_scenario_or_a_broken_file_is_run_anew(aerial: Path, tmp_path:
     store.keep(job, {"metrics": {}})
     assert store.find(job) == {"metrics": {}}
     path.write_text(path.read_text(encoding="utf-8") + "\n# another one\n", encoding="utf-8")
-    many._scenario.cache_clear()
+    batch._scenario.cache_clear()
     workshop.cache_clear()
     assert key_of(job) != before and store.find(job) is None
     assert key_of(Job(str(path), "nominal", gain=3.0)) != key_of(job)
@@ -118,15 +118,15 @@ def test_a_damaged_file_is_run_anew(aerial: Path, tmp_path: Path, damage: str) -
 def test_a_damaged_series_is_run_anew(
     push: Path, tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(many, "execute", lambda job: _kept_run(str(push)))
+    monkeypatch.setattr(batch, "execute", lambda job: _kept_run(str(push)))
     store, job = Store(tmp_path / "kept"), Job(str(push), "nominal")
     run_many([job], store=store, keep_series=lambda job: True)
     path = store.series(job, -1)
     whole = path.read_bytes()
     # Nothing is run where all is well.
-    monkeypatch.setattr(many, "execute", None)
+    monkeypatch.setattr(batch, "execute", None)
     run_many([job], store=store, keep_series=lambda job: True)
-    monkeypatch.setattr(many, "execute", lambda job: _kept_run(str(push)))
+    monkeypatch.setattr(batch, "execute", lambda job: _kept_run(str(push)))
     path.unlink()
     if damage != "missing":
         middle = len(whole) // 3
@@ -145,7 +145,7 @@ def test_a_robot_that_ran_away_is_a_result(aerial: Path, monkeypatch: pytest.Mon
     def away(job: Job) -> Any:
         raise SimulationDiverged(1.0, where="it")
 
-    monkeypatch.setattr(many, "execute", away)
+    monkeypatch.setattr(batch, "execute", away)
     (found,) = run_many([Job(str(aerial), "nominal")])
     assert (found["status"], found["seed"], found["runs"]) == ("control lost", 0, [])
     assert "the state ran away at t = 1 s" in found["events"][0]["what"] and found["events"][0]["time"] == 1.0

@@ -16,8 +16,8 @@ from impact_posture.impact.request import FLOATS, ImpactRequest, ResolvedImpact
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.constraint import CenterOfMassOverFeet
 from impact_posture.posture.problem import BaseMode, PostureProblem, Requirements
-from impact_posture.robot.loader import LoadOptions, from_folder, names_a_path
-from impact_posture.robot.scenario import Payload
+from impact_posture.robot.model_variant import Payload
+from impact_posture.robot.robot_loader import LoadOptions, from_folder, names_a_path
 from impact_posture.robot.spec import ContactPose, Root, Vector3, read_toml, validate, with_tuples
 from impact_posture.robot.urdf import EXAMPLE_PREFIX
 

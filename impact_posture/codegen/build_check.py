@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.codegen.build import build_library, library_path
 from impact_posture.codegen.emitter import DOUBLE, Real
 from impact_posture.codegen.functions import ellipsoid_fun, jump_fun, objective_fun
+from impact_posture.codegen.library import build_library, library_path
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.naming import FUNCTIONS
 from impact_posture.codegen.variants import Variant, variants
 from impact_posture.errors import CompilerError
-from impact_posture.folder import scratch_folder
 from impact_posture.impact.contact import heavy_feet_rounding
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.libraries import load_library
+from impact_posture.output_folder import scratch_folder
 
 Vector = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from impact_posture.tsid.contacts import Contact, support_contacts
 from impact_posture.tsid.frame_tasks import EndEffector, FrameAligned, FramePose, FramePosition, Impedance
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program
 from impact_posture.tsid.task import Task
+from impact_posture.tsid.task_formulation import Program
 
 
 def end_effector_task(setup: Setup) -> EndEffector | None:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from impact_posture.plot.ellipsoid import draw_normals, normal_label, normals, square_panel
+from impact_posture.plot.ellipsoid_figure import draw_normals, normal_label, normals, square_panel
 from impact_posture.plot.shapes import COORDINATE_PLANES, Plane, Vector, polar, shadow
 from impact_posture.plot.style import BLUE, GREEN, INK, VERMILLION, framed, shared_legend, style
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number

@@ -13,23 +13,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from impact_posture.codegen.build_check import compiled, oracle_difference
 from impact_posture.codegen.code import build_code
-from impact_posture.codegen.compiler import compiled, oracle_difference
 from impact_posture.codegen.emitter import DOUBLE
 from impact_posture.codegen.export import export
 from impact_posture.codegen.functions import Library, library
-from impact_posture.codegen.lanes import packed
+from impact_posture.codegen.graph import ARITHMETIC, COSINE, Graph, graph_of
 from impact_posture.codegen.layout import lay_out
-from impact_posture.codegen.program import ARITHMETIC, COSINE, Graph, graph_of
+from impact_posture.codegen.simd_lanes import packed
 from impact_posture.codegen.sums import rebuilt
 from impact_posture.codegen.variants import variants
-from impact_posture.dynamics.twins import Twins
+from impact_posture.dynamics.repeated_limbs import Twins
 from impact_posture.impact.contact import Contact, Support
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.toolchain import run_compiler
 from tests.helpers import assert_close, random_configurations, rng, robot, unit
 from tests.tools import need_compiler

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.plot.cone_figure import draw_uncertainty, draw_uncertainty_3d, has_cone, uncertainty_handles
 from impact_posture.plot.labels import Label, draw_end_on
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
@@ -24,7 +25,6 @@ from impact_posture.plot.shapes import (
 )
 from impact_posture.plot.space import Space, frame_space
 from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, framed, style
-from impact_posture.plot.uncertain import draw_uncertainty, draw_uncertainty_3d, has_cone, uncertainty_handles
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
 _FREE = "Free (thin): the same robot as if its feet were not held."

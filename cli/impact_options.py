@@ -16,7 +16,7 @@ from impact_posture_cli.options import (
 
 if TYPE_CHECKING:
     from impact_posture.impact.request import ImpactRequest
-    from impact_posture.robot.loader import LoadOptions
+    from impact_posture.robot.robot_loader import LoadOptions
 
 
 def load_options(
@@ -30,8 +30,8 @@ def load_options(
     lock_massless: bool,
 ) -> LoadOptions:
     """How to load the robot."""
-    from impact_posture.impact.texts import parse_armature
-    from impact_posture.robot.loader import LoadOptions
+    from impact_posture.impact.parsing import parse_armature
+    from impact_posture.robot.robot_loader import LoadOptions
 
     return LoadOptions(
         root=root,
@@ -80,8 +80,8 @@ def impact_request(
     """
     check_contact(frame, normal, contact)
     supports = check_supports(support, no_support)
+    from impact_posture.impact.parsing import parse_payload
     from impact_posture.impact.request import ImpactRequest
-    from impact_posture.impact.texts import parse_payload
 
     return ImpactRequest(
         robot=robot,

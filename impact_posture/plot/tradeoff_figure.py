@@ -1,6 +1,6 @@
 """Figure ``tradeoff``: the best objective within each distance from the initial posture, and H, G, V, S with it.
 
-How the curve is found: :mod:`impact_posture.posture.follow`.
+How the curve is found: :mod:`impact_posture.posture.pareto`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from impact_posture.errors import InputError
-from impact_posture.plot.path import draw_shares, log_axis, share_notes, spreads, undrawn
+from impact_posture.plot.path_figure import draw_shares, log_axis, share_notes, spreads, undrawn
 from impact_posture.plot.style import BLUE, GRAY, INK, VERMILLION, framed, style
 from impact_posture.plot.view import ResultView, TradeOffData, header_lines, objective_unit
 

@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
 from impact_posture.robot.armature import ArmatureOption, armature_warning, set_armature
-from impact_posture.robot.inertia import check_mass_matrix, check_moved_mass, massless_joints
+from impact_posture.robot.inertia_checks import check_mass_matrix, check_moved_mass, massless_joints
 from impact_posture.robot.robot import Robot, Vector
 from impact_posture.robot.spec import RobotSpec, Root, Vector3, read_spec
 from impact_posture.robot.urdf import (
