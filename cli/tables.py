@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from impact_posture.impact.contact import Contact
+    from impact_posture.impact.contact import ImpactContact
     from impact_posture_cli.output import Page
 
 
-def contact_names(contacts: Sequence[Contact]) -> list[str]:
+def contact_names(contacts: Sequence[ImpactContact]) -> list[str]:
     """What each of several contacts is called: its frame, and its normal where one frame is struck along two."""
     frames = [contact.frame for contact in contacts]
     return [
@@ -29,7 +29,7 @@ def impulses_line(frames: Sequence[str], worst: Mapping[str, Any]) -> str:
 
 def alone_line(page: Page, frames: Sequence[str]) -> None:
     """Whose the numbers of one contact are, where there are several."""
-    page.line(f"  (H, G, V, S, E, ellipsoid, gradient and jumps: of a blow at {frames[0]} alone)", style="dim")
+    page.line(f"  (H, G, V, S, E, ellipsoid, gradient and jumps: of an impact at {frames[0]} alone)", style="dim")
 
 
 def contacts_table(page: Page, frames: Sequence[str], blocks: Sequence[Mapping[str, Any]]) -> None:
@@ -44,7 +44,7 @@ def contacts_table(page: Page, frames: Sequence[str], blocks: Sequence[Mapping[s
     page.table(("  each contact alone", "H", "G", "V", "S"), rows, right=(1, 2, 3, 4))
 
 
-def scenarios_table(page: Page, blocks: Sequence[Mapping[str, Any]], titles: Sequence[str]) -> None:
+def variants_table(page: Page, blocks: Sequence[Mapping[str, Any]], titles: Sequence[str]) -> None:
     """The objective in each scenario; one column for each evaluation."""
     from impact_posture_cli.output import number
 

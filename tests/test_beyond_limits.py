@@ -16,7 +16,7 @@ import typer
 
 from impact_posture.codegen.reader import read_manifest
 from impact_posture.errors import CompilerError, ContactError, InputError, PostureError, SpecError, UrdfError
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.request import ImpactRequest
 from impact_posture.job import load_view
@@ -50,7 +50,7 @@ def test_too_many_joints_are_refused_before_anything_is_allocated(tmp_path: Path
 @pytest.mark.parametrize("impulse", [1e308, 1e200, 1e-200, 5e-324])
 def test_an_impulse_whose_objective_overflows(impulse: float) -> None:
     with pytest.raises(ContactError, match="beyond double precision"):
-        Contact.create("ee", (0, 0, 1), impulse=impulse)
+        ImpactContact("ee", (0, 0, 1), impulse=impulse)
 
 
 def test_a_speed_whose_jump_overflows() -> None:

@@ -22,7 +22,7 @@ from impact_posture.benchmark.workbench import Absent, cxx_compiler
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.errors import CompilerError
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.toolchain import run_compiler
 from tests.helpers import Vector, assert_close, central_gradient, frame_placement, robot, unit
@@ -180,7 +180,7 @@ def accelerations(program: Path, states: list[tuple[Vector, ...]]) -> list[str]:
 
 
 def exported(name: str, frame: str, folder: Path, real: Real) -> ImpactObjective:
-    objective = ImpactObjective(robot(name), Contact.create(frame, (0, 0, 1)))
+    objective = ImpactObjective(robot(name), ImpactContact(frame, (0, 0, 1)))
     export(objective, folder, prefix="arm", real=real, check=False)
     run_compiler([*need_compiler(), "-std=c99", "-O0", "-c", "arm.c", "-o", "arm.o"], folder)
     return objective

@@ -11,8 +11,8 @@ import pytest
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.impact.contact import Contact, Support
-from impact_posture.impact.contact_stability import footing
+from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact_stability import contact_stability
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
@@ -34,15 +34,15 @@ def standing(name: str) -> tuple[Robot, tuple[Support, ...]]:
 
 def oracle_of(name: str, normal: tuple[float, float, float], frame: str = "base_link") -> ImpactOracle:
     found, supports = standing(name)
-    return ImpactOracle(ImpactCase(found, Contact.create(frame, normal), Metric(), supports, 1e-6))
+    return ImpactOracle(ImpactCase(found, ImpactContact(frame, normal), Metric(), supports, 1e-6))
 
 
 @pytest.mark.parametrize("name", ["solo8", "solo12"])
-def test_a_blow_from_above_presses_all_feet(name: str) -> None:
-    """Down on the base: every foot pushes up; together less than the blow, for knees that no motor stiffens give."""
+def test_an_impact_from_above_presses_all_feet(name: str) -> None:
+    """Every foot pushes up; together less than the impact, because knees without stiff motors give way."""
     found, supports = standing(name)
     q = found.posture()
-    result = footing(oracle_of(name, (0.0, 0.0, -1.0)), supports, q)
+    result = contact_stability(oracle_of(name, (0.0, 0.0, -1.0)), supports, q)
     assert result.friction is not None and 0 <= result.friction < 3
     assert len(result.feet) == FEET[name]
     assert not any(foot.lifts for foot in result.feet)
@@ -53,20 +53,20 @@ def test_a_blow_from_above_presses_all_feet(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["solo8", "solo12"])
-def test_a_blow_from_below_lifts(name: str) -> None:
+def test_an_impact_from_below_lifts(name: str) -> None:
     found, supports = standing(name)
-    result = footing(oracle_of(name, (0.0, 0.0, 1.0)), supports, found.posture())
+    result = contact_stability(oracle_of(name, (0.0, 0.0, 1.0)), supports, found.posture())
     assert result.friction is None
     assert any(foot.lifts for foot in result.feet)
     assert "lifts" in result.line and result.to_dict()["stays"] is False
 
 
-def test_blows_are_mirrored_in_the_feet() -> None:
+def test_impacts_are_mirrored_in_the_feet() -> None:
     """What one direction presses the opposite one lifts: the set of impulses is the other's, negated."""
     found, supports = standing("solo12")
     q = found.posture()
-    down = footing(oracle_of("solo12", (0.0, 0.0, -1.0)), supports, q)
-    up = footing(oracle_of("solo12", (0.0, 0.0, 1.0)), supports, q)
+    down = contact_stability(oracle_of("solo12", (0.0, 0.0, -1.0)), supports, q)
+    up = contact_stability(oracle_of("solo12", (0.0, 0.0, 1.0)), supports, q)
     assert down.freedom == up.freedom
     if down.freedom == 0:
         for one, other in zip(down.feet, up.feet, strict=True):
@@ -79,8 +79,8 @@ def test_impulses_are_those_of_impulse_dynamics(name: str, normal: tuple[float, 
     found, supports = standing(name)
     frame = "base_link"
     q = np.asarray(pin.integrate(found.model, found.posture(), 0.05 * np.random.default_rng(0).normal(size=found.nv)))
-    oracle = ImpactOracle(ImpactCase(found, Contact.create(frame, normal), Metric(), supports, 1e-9))
-    result = footing(oracle, supports, q)
+    oracle = ImpactOracle(ImpactCase(found, ImpactContact(frame, normal), Metric(), supports, 1e-9))
+    result = contact_stability(oracle, supports, q)
     assert result.freedom == 0
     Js = np.vstack([frame_jacobian(found.model, q, found.frame_id(s.frame), s.offset)[: s.rows] for s in supports])
     n = np.array(normal) / np.linalg.norm(normal)
@@ -101,7 +101,7 @@ def test_the_set_matters_where_the_rank_drops() -> None:
     found, supports = standing("solo8")
     q = found.posture()
     oracle = oracle_of("solo8", (0.0, 1.0, -0.6))
-    result = footing(oracle, supports, q)
+    result = contact_stability(oracle, supports, q)
     assert result.freedom > 0
     own = oracle.quantities(q).support_impulse.reshape(-1, 3)
     before = max(0.0, float(-own[:, 2].min()))
@@ -112,15 +112,15 @@ def test_the_set_matters_where_the_rank_drops() -> None:
 
 
 def test_soles_tip_over_their_edges() -> None:
-    """A blow high up on talos' torso turns the soles: with smaller soles more friction never helps."""
+    """An impact high up on talos' torso turns the soles: with smaller soles more friction never helps."""
     found, supports = standing("talos")
     q = found.posture()
     frame = "torso_2_link"
-    oracle = ImpactOracle(ImpactCase(found, Contact.create(frame, (1.0, 0.0, -0.2)), Metric(), supports, 1e-6))
+    oracle = ImpactOracle(ImpactCase(found, ImpactContact(frame, (1.0, 0.0, -0.2)), Metric(), supports, 1e-6))
     wide = tuple(Support(s.frame, "surface", s.offset, (5.0, 5.0)) for s in supports)
     narrow = tuple(Support(s.frame, "surface", s.offset, (1e-4, 1e-4)) for s in supports)
-    assert footing(oracle, narrow, q).friction is None
-    large = footing(oracle, wide, q)
+    assert contact_stability(oracle, narrow, q).friction is None
+    large = contact_stability(oracle, wide, q)
     assert any(foot.lifts for foot in large.feet) or large.friction is not None
 
 
@@ -133,7 +133,7 @@ def test_soles_tip_over_their_edges() -> None:
 def test_kept_feet_say_the_same_twice(name: str, frame: str) -> None:
     """Expression, Pinocchio's numbers and finite differences."""
     found, supports = standing(name)
-    contact = Contact.create(frame, (0.3, -0.2, -1.0))
+    contact = ImpactContact(frame, (0.3, -0.2, -1.0))
     objective = ImpactObjective(found, contact, supports=supports, compliance=1e-2 / found.mass)
     numeric = Numeric(found.model)
     kept = KeptFeet(objective, numeric.at(found.posture()), 0.7)
@@ -142,10 +142,10 @@ def test_kept_feet_say_the_same_twice(name: str, frame: str) -> None:
     generator = np.random.default_rng(3)
     for _ in range(2):
         q = np.asarray(pin.integrate(found.model, found.posture(), 0.2 * generator.normal(size=found.nv)))
-        values, jacobian = kept.numeric(numeric.at(q))
+        values, jacobian = kept.evaluate(numeric.at(q))
         assert values.shape == kept.upper.shape and len({kept.row_name(k) for k in range(kept.rows)}) >= 2
         assert_close(np.array(symbolic(q, contact.normal)).ravel(), values, 1e-7, "expression")
-        expected = central_gradient(lambda x: kept.numeric(numeric.at(x))[0], found.model, q, 1e-4)
+        expected = central_gradient(lambda x: kept.evaluate(numeric.at(x))[0], found.model, q, 1e-4)
         assert_close(jacobian, expected, 1e-5, "Jacobian")
 
 
@@ -160,7 +160,7 @@ def test_kept_feet_change_the_optimum() -> None:
     found = solve(kept.problem, starts=2, jobs=1)
     assert found.certificate.holds()
     oracle = kept.problem.impact.oracle
-    before, after = footing(oracle, supports, without.q), footing(oracle, supports, found.q)
+    before, after = contact_stability(oracle, supports, without.q), contact_stability(oracle, supports, found.q)
     assert before.friction is None or before.friction > 1.0
     assert after.friction is not None and after.friction <= 1.02
 
@@ -182,4 +182,4 @@ def test_refusals(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None
 
 def test_the_line_stands_in_evaluate(tmp_path: Path) -> None:
     done = run("evaluate", "solo12", "--frame", "base_link", "--normal", "0", "0", "1", cwd=tmp_path)
-    assert done.returncode == 0 and "the blow lifts" in done.stdout
+    assert done.returncode == 0 and "the impact lifts" in done.stdout

@@ -311,7 +311,7 @@ def test_supports_as_text() -> None:
         supports("FL_FOOT", "FL_FOOT:surface")
 
 
-def test_a_blow_at_a_held_point_is_refused() -> None:
+def test_an_impact_at_a_held_point_is_refused() -> None:
     request = ImpactRequest("solo8", frame="FL_FOOT", normal=(1.0, 0.0, 0.0))
     with pytest.raises(ContactError, match="held by the support at 'FL_FOOT'"):
         request.resolve()

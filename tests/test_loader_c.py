@@ -27,7 +27,7 @@ from impact_posture.errors import (
     PostureError,
     SpecError,
 )
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.toolchain import find_compiler
@@ -50,7 +50,7 @@ def loaded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         pytest.skip("no C compiler (cc, gcc, clang)")
     real: Real = request.param
     robot = load_robot("tilthex_arm")
-    objectives = tuple(ImpactObjective(robot, Contact.create(f, (0, 0.6, 0.8)), kind="speed") for f in FRAMES)
+    objectives = tuple(ImpactObjective(robot, ImpactContact(f, (0, 0.6, 0.8)), kind="speed") for f in FRAMES)
     folder = tmp_path_factory.mktemp(real.name)
     export(objectives, folder, prefix="arm", real=real, check=False)
     assert not (folder / "libarm.so").exists()

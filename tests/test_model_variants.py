@@ -18,7 +18,7 @@ from impact_posture.codegen.library import build_library, library_path
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import FrameNotFound, ImpactPostureError, InputError, SpecError
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.model_set import ModelSet
@@ -33,9 +33,9 @@ from impact_posture.posture.problem_settings import (
     read_settings,
     resolved_settings,
 )
-from impact_posture.posture.robustness import Robustness, ScenarioOptimum, solve_robustly
+from impact_posture.posture.robustness import Robustness, VariantOptimum, solve_robustly
 from impact_posture.posture.solve import solve
-from impact_posture.robot.model_variant import MOST_SCENARIOS, Payload, between, build_scenarios
+from impact_posture.robot.model_variant import MOST_SCENARIOS, Payload, between, build_model_variants
 from impact_posture.robot.robot import Robot
 from tests.command import run
 from tests.helpers import (
@@ -67,7 +67,7 @@ def test_a_payload_adds_its_mass_and_a_factor_scales_the_armature(name: str) -> 
     before, armature = found.model_sha256, found.armature.copy()
     frame = FRAMES[name]
     payload = Payload(frame, 0.7)
-    scenarios = build_scenarios(found, (0.5, 3.0), [payload])
+    scenarios = build_model_variants(found, (0.5, 3.0), [payload])
     assert [s.name for s in scenarios] == [
         "as modeled", "armature × 0.5", "armature × 3", f"0.7 kg at {frame}",
         f"armature × 0.5, 0.7 kg at {frame}", f"armature × 3, 0.7 kg at {frame}",
@@ -93,10 +93,10 @@ def test_a_payload_adds_its_mass_and_a_factor_scales_the_armature(name: str) -> 
 
 def test_which_scenarios_there_are() -> None:
     arm = robot("tilthex_arm")
-    assert build_scenarios(arm, None, []) == () == build_scenarios(arm, (1.0, 1.0), [])
-    assert [s.armature_factor for s in build_scenarios(arm, (2.0, 2.0), [])] == [1.0, 2.0]
-    assert [s.armature_factor for s in build_scenarios(arm, (0.5, 1.0), [])] == [1.0, 0.5]
-    two = build_scenarios(arm, None, [Payload("ee", 0.1), Payload("base_link", 0.2)])
+    assert build_model_variants(arm, None, []) == () == build_model_variants(arm, (1.0, 1.0), [])
+    assert [s.armature_factor for s in build_model_variants(arm, (2.0, 2.0), [])] == [1.0, 2.0]
+    assert [s.armature_factor for s in build_model_variants(arm, (0.5, 1.0), [])] == [1.0, 0.5]
+    two = build_model_variants(arm, None, [Payload("ee", 0.1), Payload("base_link", 0.2)])
     assert [s.payload for s in two] == [None, Payload("ee", 0.1), Payload("base_link", 0.2)]
 
 
@@ -124,14 +124,14 @@ def test_refusals(
     words: str,
 ) -> None:
     with pytest.raises(kind) as caught:
-        build_scenarios(robot(name), factors, [Payload(*payload) for payload in payloads])
+        build_model_variants(robot(name), factors, [Payload(*payload) for payload in payloads])
     assert words in caught.value.line and "\n" not in caught.value.line
     assert MOST_SCENARIOS == 12
 
 
 def test_robots_between_the_scenarios() -> None:
     found = robot("talos")
-    scenarios = build_scenarios(
+    scenarios = build_model_variants(
         found, (0.5, 4.0), [Payload("gripper_right_base_link", 2.0), Payload("base_link", 9.0)]
     )
     drawn = between(scenarios, 200, seed=1)
@@ -163,14 +163,14 @@ MORE: dict[str, dict[str, object]] = {
 def objective_of(name: str, more: dict[str, object], *, feet: bool = False) -> ImpactObjective:
     found = robot(name)
     others = {"tilthex_arm": "base_link", "panda": "panda_link4", "bolt": "FL_UPPER_LEG"}
-    several = {"others": (Contact.create(others[name], (1, 0, 0.3), impulse=2.0),)} if more.get("several") else {}
+    several = {"others": (ImpactContact(others[name], (1, 0, 0.3), impulse=2.0),)} if more.get("several") else {}
     rest = {key: value for key, value in more.items() if key != "several"}
     return ImpactObjective(
         found,
-        Contact.create(FRAMES[name], (0.2, -0.4, 1.0), (0.02, 0.0, 0.01)),
+        ImpactContact(FRAMES[name], (0.2, -0.4, 1.0), (0.02, 0.0, 0.01)),
         supports=feet_of(found) if feet else (),
         compliance=1e-3,
-        scenarios=build_scenarios(found, (0.4, 2.0), [Payload(FRAMES[name], 0.8)]),
+        scenarios=build_model_variants(found, (0.4, 2.0), [Payload(FRAMES[name], 0.8)]),
         **several,
         **rest,  # type: ignore[arg-type]
     )
@@ -218,12 +218,12 @@ def test_subgradients_where_two_payloads_are_as_bad() -> None:
     """A weight may hang on either side; of what mass the second is as bad as the first is found by bisection."""
     found = robot("solo12")
     q = random_configurations(found.model, 1, "either side", spread=0.3)[0]
-    contact = Contact.create("base_link", (0.0, 0.3, 1.0))
+    contact = ImpactContact("base_link", (0.0, 0.3, 1.0))
 
     def objective(mass: float) -> ImpactObjective:
         payloads = [Payload("FL_SHOULDER", 1.0), Payload("FR_SHOULDER", mass)]
         return ImpactObjective(
-            found, contact, Metric("kinetic"), "energy", scenarios=build_scenarios(found, None, payloads)
+            found, contact, Metric("kinetic"), "energy", scenarios=build_model_variants(found, None, payloads)
         )
 
     def gap(mass: float) -> float:
@@ -310,7 +310,7 @@ def test_where_nothing_is_uncertain_nothing_is_compared() -> None:
 
 def test_words_of_every_finding() -> None:
     def found(own: float | None, worst_nominal: float | None, broken: tuple[str, ...] = ()) -> str:
-        scenario = ScenarioOptimum(
+        scenario = VariantOptimum(
             "as modeled", 2.0, own, None if own is None else np.zeros(1), None if own is None else 0.5
         )
         return Robustness((scenario,), 4.0, worst_nominal, broken, 3.0, 60).line
@@ -339,16 +339,16 @@ def test_balance_and_feet_hold_in_every_scenario() -> None:
         model = scenario.robot.model
         center = pin.centerOfMass(model, model.createData(), solution.q)[:2]
         assert (centers[0].normals @ center - centers[0].offsets).max() <= -centers[0].margin + 1e-8
-        rows, jacobian = centers[1].numeric(Numeric(problem.robot.model).at(solution.q))
+        rows, jacobian = centers[1].evaluate(Numeric(problem.robot.model).at(solution.q))
         assert rows.shape == centers[1].upper.shape
     expected = central_gradient(
-        lambda x: centers[1].numeric(Numeric(problem.robot.model).at(x))[0], problem.robot.model, solution.q, 1e-4
+        lambda x: centers[1].evaluate(Numeric(problem.robot.model).at(x))[0], problem.robot.model, solution.q, 1e-4
     )
     assert_close(jacobian, expected, 1e-7, "Jacobian of the loaded center of mass")
     # With the plain problem's posture it does tip: the constraint is no decoration.
     plain = prepare(make_settings(task)).problem
     alone = solve(plain, starts=2, jobs=1, compile="never")
-    assert centers[1].numeric(Numeric(plain.robot.model).at(alone.q))[0].max() > -centers[1].margin
+    assert centers[1].evaluate(Numeric(plain.robot.model).at(alone.q))[0].max() > -centers[1].margin
 
     kept = problem_of({"robot": "bolt", "frame": "base_link", "normal": (0, 0, -1)}, keep_contacts=True, com=False)
     names = [c.name for c in kept.constraints if isinstance(c, KeptFeet)]

@@ -189,7 +189,7 @@ def test_planar_legs_get_regular_equalities() -> None:
     problem = problem_of("solo8", (1, 0, 0), frame="base_link")
     assert "base roll" in [c.name for c in problem.constraints]
     numeric, q = Numeric(problem.robot.model).at(problem.given), problem.given
-    carried = [c.numeric(numeric)[1][problem.carried(i)] for i, c in enumerate(problem.constraints) if c.equality]
+    carried = [c.evaluate(numeric)[1][problem.carried(i)] for i, c in enumerate(problem.constraints) if c.equality]
     stacked = np.vstack(carried)
     assert rank(stacked) == len(stacked) == rank(equality_jacobian(problem, numeric.at(q))) == 11
 
@@ -313,7 +313,7 @@ def test_turns_that_nothing_sees_are_fixed() -> None:
     assert solution.redundancy == sideways.robot.nv - 5
 
 
-def test_blow_that_moves_nothing_is_refused() -> None:
+def test_impact_that_moves_nothing_is_refused() -> None:
     urdf = "example-robot-data:double_pendulum_description/urdf/double_pendulum.urdf"
     frame = "link2" if "link2" in prepare_frames(urdf) else prepare_frames(urdf)[-1]
     for objective in ("impulse", "speed"):

@@ -23,8 +23,8 @@ from impact_posture.codegen.layout import lay_out
 from impact_posture.codegen.simd_lanes import packed
 from impact_posture.codegen.sums import rebuilt
 from impact_posture.codegen.variants import variants
-from impact_posture.dynamics.repeated_limbs import Twins
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
@@ -135,12 +135,12 @@ def test_random_twins_against_pinocchio(
     path = tmp_path_factory.mktemp("twins") / "twins.urdf"
     path.write_text(twin_urdf(branch, count, seed, odd=odd))
     loaded = load_robot(str(path), LoadOptions(root=root))  # type: ignore[arg-type]
-    twins = Twins(loaded.model)
+    twins = RepeatedLimbs(loaded.model)
     assert sorted(len(g) for g in twins.groups) == {2: [2], 3: [2], 4: [4], 5: [4]}[count]
     generator = rng("twins", seed)
     weights = tuple(generator.uniform(0.5, 2.0, loaded.nv)) if metric == "weighted" else None
     supports = (Support(f"b1_{len(branch) - 1}"),) if seed % 3 == 0 else ()
-    contact = Contact.create(f"b0_{len(branch) - 1}", (0.3, -0.4, 0.9), (0.05, 0.1, -0.02))
+    contact = ImpactContact(f"b0_{len(branch) - 1}", (0.3, -0.4, 0.9), (0.05, 0.1, -0.02))
     objective = ImpactObjective(loaded, contact, Metric(metric, weights), "speed", supports)  # type: ignore[arg-type]
     found = library([objective], ["twins"])
     graph = packed_of(found)
@@ -167,7 +167,7 @@ def test_random_twins_against_pinocchio(
     [("talos", "gripper_right_base_link", 2, 0.65), ("solo8", "base_link", 4, 0.45), ("romeo", "r_ankle", 2, 0.75)],
 )
 def test_robots_with_twins(name: str, frame: str, width: int, most: float) -> None:
-    objective = ImpactObjective(robot(name), Contact.create(frame, (0.0, 0.6, 0.8)))
+    objective = ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))
     found = library([objective], [name])
     graph = packed_of(found)
     counts = shares(graph)
@@ -193,7 +193,7 @@ def longest(graph: Graph) -> int:
 @pytest.mark.parametrize("name", ["solo8", "panda", "talos"])
 def test_sums_in_another_order_have_the_same_value_sooner(name: str) -> None:
     frame = robot(name).spec.contact.frame if robot(name).spec.contact else robot(name).model.frames[-1].name
-    found = library([ImpactObjective(robot(name), Contact.create(frame, (0.0, 0.6, 0.8)))], [name])
+    found = library([ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))], [name])
     graph = packed_of(found)
     other = rebuilt(graph)
     assert longest(other) < 0.95 * longest(graph)
@@ -207,13 +207,13 @@ def test_sums_in_another_order_have_the_same_value_sooner(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["panda", "tilthex_arm", "anymal_c"])
 def test_robots_without(name: str) -> None:
-    assert Twins(robot(name).model).groups == ()
+    assert RepeatedLimbs(robot(name).model).groups == ()
 
 
 def test_twins_are_outermost_and_disjoint() -> None:
     for name in ("talos", "solo12", "hyq", "g1"):
         model = robot(name).model
-        twins = Twins(model)
+        twins = RepeatedLimbs(model)
         joints = [j for group in twins.groups for branch in group for j in branch]
         assert len(joints) == len(set(joints)) > 0
         for group in twins.groups:
@@ -229,7 +229,7 @@ def test_compiled_twins(tmp_path: Path, count: int, flags: tuple[str, ...]) -> N
     need_compiler()
     (tmp_path / "t.urdf").write_text(twin_urdf([0, 4, 2], count, 7, odd=True))
     loaded = load_robot(str(tmp_path / "t.urdf"), LoadOptions(root="free-flyer"))
-    objective = ImpactObjective(loaded, Contact.create("b1_2", (0.3, -0.4, 0.9)), kind="sticking")
+    objective = ImpactObjective(loaded, ImpactContact("b1_2", (0.3, -0.4, 0.9)), kind="sticking")
     export(objective, tmp_path, prefix="t", check=False)
     strict = ("-Wall", "-Wextra", "-pedantic", "-Werror")
     with compiled(tmp_path, "t", loaded.nq, loaded.nv, (*strict, *flags)) as built:
@@ -238,7 +238,7 @@ def test_compiled_twins(tmp_path: Path, count: int, flags: tuple[str, ...]) -> N
 
 def test_portable_has_no_vectors_and_the_same_numbers(tmp_path: Path) -> None:
     need_compiler()
-    objective = ImpactObjective(robot("solo8"), Contact.create("base_link", (0.0, 0.6, 0.8)))
+    objective = ImpactObjective(robot("solo8"), ImpactContact("base_link", (0.0, 0.6, 0.8)))
     text = build_code(variants([objective], "s"), "s", DOUBLE, portable=True)
     assert "vector_size" not in text.vectors and "_r4" not in text.functions
     assert "vector_size" in build_code(variants([objective], "s"), "s", DOUBLE).vectors
@@ -253,7 +253,7 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
     need_compiler()
     (tmp_path / "t.urdf").write_text(twin_urdf([0, 0], 2, 3, odd=False))
     loaded = load_robot(str(tmp_path / "t.urdf"), LoadOptions(root="fixed"))
-    objective = ImpactObjective(loaded, Contact.create("b0_1", (0.3, -0.4, 0.9)))
+    objective = ImpactObjective(loaded, ImpactContact("b0_1", (0.3, -0.4, 0.9)))
     export(objective, tmp_path, prefix="t", check=False)
     n = np.array(objective.contact.normal)
     with compiled(tmp_path, "t", loaded.nq, loaded.nv, flags) as built:
@@ -269,7 +269,7 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
 
 def test_blocks_are_shared() -> None:
     """What value needs is a part of what eval needs, computed by blocks that both call."""
-    objective = ImpactObjective(robot("talos"), Contact.create("gripper_right_base_link", (0.0, 0.6, 0.8)))
+    objective = ImpactObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
     found = library([objective], ["t"])
     layout = lay_out(packed_of(found), [f.outputs for f in found.functions])
     names = [f.name for f in found.functions]
@@ -289,7 +289,7 @@ def test_a_branch_with_another_axis_is_no_twin() -> None:
     for k, joint in enumerate((pin.JointModelRX(), pin.JointModelRY(), pin.JointModelRX())):
         j = model.addJoint(0, joint, pin.SE3(np.eye(3), np.array([0.0, 0.1 * k, 0.0])), f"j{k}")
         model.appendBodyToJoint(j, inertia, pin.SE3.Identity())
-    assert Twins(model).groups == (((1,), (3,)),)
+    assert RepeatedLimbs(model).groups == (((1,), (3,)),)
 
 
 def test_two_exports_in_one_unit(tmp_path: Path) -> None:
@@ -297,7 +297,7 @@ def test_two_exports_in_one_unit(tmp_path: Path) -> None:
     compiler = need_compiler()
     for name, frame in (("solo8", "base_link"), ("panda", "panda_hand_tcp")):
         (tmp_path / name).mkdir()
-        objective = ImpactObjective(robot(name), Contact.create(frame, (0.0, 0.6, 0.8)))
+        objective = ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))
         export(objective, tmp_path / name, prefix=name, check=False)
     (tmp_path / "both.c").write_text('#include "solo8/solo8.c"\n#include "panda/panda.c"\n')
     strict = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror")
@@ -306,7 +306,7 @@ def test_two_exports_in_one_unit(tmp_path: Path) -> None:
 
 def test_the_prefix_costs_no_room(tmp_path: Path) -> None:
     """The source of a humanoid, by whatever name: what the names of thousands of operations are made of is short."""
-    objective = ImpactObjective(robot("talos"), Contact.create("gripper_right_base_link", (0.0, 0.6, 0.8)))
+    objective = ImpactObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
     export(objective, tmp_path, check=False)
     (source,) = tmp_path.glob("talos*.c")
     assert source.stat().st_size <= 350_000

@@ -19,7 +19,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.simulation.controller_factory import Workshop
+from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup, SinglePush, set_up
 from impact_posture.simulation.scenario_file import read_scenario
@@ -119,13 +119,13 @@ def test_what_goes_wrong_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outcomes, "prepare", short)
     tried: list[str] = []
 
-    def runs(workshop: Workshop, controller: str) -> tuple[Run, ...]:
+    def runs(factory: ControllerFactory, controller: str) -> tuple[Run, ...]:
         tried.append(controller)
         if tried == [NOMINAL] or controller == "robust":
             raise SimulationDiverged(1.0)
         if controller == "posture":
             raise InputError("none")
-        return play(workshop, NOMINAL)
+        return play(factory, NOMINAL)
 
     record = configuration(AERIAL, 0, 0, runs)
     assert tried == [NOMINAL, NOMINAL, "robust", "robust-speed", "posture"]
@@ -148,7 +148,7 @@ def test_what_goes_wrong_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_configuration_that_never_works_says_why() -> None:
-    def runs(workshop: Workshop, controller: str) -> tuple[Run, ...]:
+    def runs(factory: ControllerFactory, controller: str) -> tuple[Run, ...]:
         raise SimulationDiverged(1.0)
 
     with pytest.raises(NotAdmissible, match=rf"{AERIAL} 5: none of {ATTEMPTS} draws .*nominal diverged"):

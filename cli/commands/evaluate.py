@@ -56,7 +56,7 @@ def evaluate(
     from impact_posture.impact.classical_ellipsoids import classical_ellipsoids
     from impact_posture.impact.evaluation import evaluate as evaluate_impact
     from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.tables import alone_line, contact_names, contacts_table, impulses_line, scenarios_table
+    from impact_posture_cli.tables import alone_line, contact_names, contacts_table, impulses_line, variants_table
 
     impact = request.resolve()
     found = evaluate_impact(impact.objective, impact.q, impact.speed, impact.restitution)
@@ -82,14 +82,14 @@ def evaluate(
     if found.contacts:
         contacts_table(page, frames, block["by_contact"])  # type: ignore[arg-type]
     if found.scenarios:
-        scenarios_table(page, [block], ["value"])
+        variants_table(page, [block], ["value"])
     page.gap()
     page.line(found.dominance.line)
     if found.impulses is not None:
         page.line(f"worst impulses: {impulses_line(frames, found.impulses.to_dict())}")
     for name, one in zip(frames, found.contacts or (found,), strict=True):
         if one.footing is not None:
-            page.line(f"feet{f' (blow at {name})' if found.contacts else ''}: {one.footing.line}")
+            page.line(f"feet{f' (impact at {name})' if found.contacts else ''}: {one.footing.line}")
     page.warnings(warnings)
 
 

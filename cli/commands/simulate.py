@@ -30,7 +30,7 @@ RunMode = Annotated[
     Mode,
     typer.Option(
         "--mode", rich_help_panel=RUN,
-        help="live: the term stays on through the blow; held: the reached posture is held before it.",
+        help="live: the term stays on through the impact; held: the reached posture is held before it.",
     ),
 ]  # fmt: skip
 Free = Annotated[

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.impact.contact import Contact, point_on
+from impact_posture.impact.contact import ImpactContact, point_on
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
@@ -59,7 +59,7 @@ class Case:
     @cached_property
     def objective(self) -> ImpactObjective:
         """What is exported."""
-        return ImpactObjective(self.robot, Contact.create(self.frame, (0.0, 0.0, 1.0)))
+        return ImpactObjective(self.robot, ImpactContact(self.frame, (0.0, 0.0, 1.0)))
 
     @property
     def point(self) -> tuple[int, Vector]:
@@ -80,7 +80,7 @@ class Case:
         H, gradients = [], []
         for q, n in zip(self.q, self.n, strict=True):
             x, y, z = (float(v) for v in n)
-            oracle = ImpactOracle(ImpactCase(self.robot, Contact.create(self.frame, (x, y, z))))
+            oracle = ImpactOracle(ImpactCase(self.robot, ImpactContact(self.frame, (x, y, z))))
             H.append(oracle.quantities(q).H)
             gradients.append(oracle.gradient_H(q))
         return np.array(H), np.array(gradients)

@@ -28,8 +28,8 @@ def peers(case: Case, bench: Workbench) -> list[Peer]:
         rest = base_rotation(q).T @ n
         direction = rest - ca.cross(step[3:6], rest)
     tree = Tree(robot.model, at)
-    blow = Wrench(point_on(robot, case.frame), direction, ca.SX.zeros(3))
-    H = solved(tree.mass_matrix(), tree.generalized_force([blow]))
+    impact = Wrench(point_on(robot, case.frame), direction, ca.SX.zeros(3))
+    H = solved(tree.mass_matrix(), tree.generalized_force([impact]))
     source = c_source(function_of(q, n, step, H))
     return compiled("CasADi", "casadi", "CRBA + LDLᵀ, CasADi's reverse mode and C", source, bench)
 

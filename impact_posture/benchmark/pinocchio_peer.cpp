@@ -34,7 +34,7 @@ void factor_crba(Peer & p)
 double value_chol(Peer & p, const Vector3 & n)
 {
   factor_crba(p);
-  generalized(p, blow(p, n), p.a);
+  generalized(p, impact(p, n), p.a);
   pinocchio::cholesky::solve(p.model, p.data, p.a);
   return p.a.squaredNorm();
 }
@@ -44,7 +44,7 @@ double eval_rnea(Peer & p, const Vector3 & n, double * grad)
   const double H = value_chol(p, n);
   p.b = p.a;
   pinocchio::cholesky::solve(p.model, p.data, p.b);
-  const Force w = blow(p, n);
+  const Force w = impact(p, n);
   p.dq.setZero();
   p.dv.setZero();
   p.da.setZero();
@@ -80,7 +80,7 @@ double eval_chol(Peer & p, const Vector3 & n, double * grad)
 {
   factor_crba(p);
   columns(p, true);
-  generalized(p, blow(p, n), p.a);
+  generalized(p, impact(p, n), p.a);
   pinocchio::cholesky::solve(p.model, p.data, p.a);
   p.b = p.a;
   pinocchio::cholesky::solve(p.model, p.data, p.b);
@@ -172,7 +172,7 @@ void outward(Peer & p, Vector & rates, Motions & v)
 }
 
 // M a = Jᵀn: only the contact's own joints carry a bias.
-void solve_blow(Peer & p, const Force & w)
+void solve_impact(Peer & p, const Force & w)
 {
   std::fill(p.torque.begin(), p.torque.end(), 0.0);
   Vector6 bias = -w.toVector();
@@ -210,7 +210,7 @@ double value_hand(Peer & p, const Vector3 & n)
 {
   place(p);
   factor_hand(p);
-  solve_blow(p, blow(p, n));
+  solve_impact(p, impact(p, n));
   return p.a.squaredNorm();
 }
 
@@ -225,7 +225,7 @@ double eval_hand(Peer & p, const Vector3 & n, double * grad)
 double value_aba(Peer & p, const Vector3 & n)
 {
   pinocchio::forwardKinematics(p.model, p.data, p.q);
-  p.fext[p.contact] = p.data.oMi[p.contact].actInv(blow(p, n));
+  p.fext[p.contact] = p.data.oMi[p.contact].actInv(impact(p, n));
   p.a = pinocchio::aba(p.model, p.data, p.q, p.zero, p.zero, p.fext, pinocchio::Convention::WORLD);
   return p.a.squaredNorm();
 }

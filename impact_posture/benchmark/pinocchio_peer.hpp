@@ -138,7 +138,7 @@ void columns(Peer & p, bool inertias)
 }
 
 // The unit impulse as a force at the world's origin.
-Force blow(const Peer & p, const Vector3 & n)
+Force impact(const Peer & p, const Vector3 & n)
 {
   return Force(n, p.data.oMi[p.contact].act(p.position).cross(n));
 }
@@ -183,7 +183,7 @@ Vector3 turning(const Peer & p, const Vector3 & n)
 // ∇H from a, b, their link velocities, and inertias and columns in world axes.
 void gradient(Peer & p, const Vector3 & n, double * grad)
 {
-  const Force w = blow(p, n);
+  const Force w = impact(p, n);
   for (Index i = 1; i < (Index)p.model.njoints; ++i) {
     p.Fa[i] = -(p.data.oinertias[i] * p.vb[i]);
     p.Fb[i] = -(p.data.oinertias[i] * p.va[i]);

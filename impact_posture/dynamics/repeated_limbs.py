@@ -37,7 +37,7 @@ class Place:
     position: int
 
 
-class Twins:
+class RepeatedLimbs:
     """The twin branches of a model, and the parameters that stand for what they differ in.
 
     Attributes:

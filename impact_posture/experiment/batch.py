@@ -15,11 +15,11 @@ from typing import Any
 
 from impact_posture import __version__
 from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError, SpecError
-from impact_posture.experiment.jobs import SCHEMA, Job, execute, workshop
+from impact_posture.experiment.jobs import SCHEMA, Job, controller_factory, execute
 from impact_posture.output_folder import is_ours, write_record
 from impact_posture.posture.blas import one_blas_thread
 from impact_posture.posture.compiled import own_source
-from impact_posture.processes import shared_out
+from impact_posture.processes import fork_map
 from impact_posture.simulation.controller_factory import CONTROLLERS
 from impact_posture.simulation.scenario_file import scenario_path
 from impact_posture.simulation.series import Series
@@ -109,10 +109,11 @@ def _program() -> str:
 @cache
 def _scenario(scenario: str) -> str:
     """The file, and the robot that it leads to."""
-    return f"{scenario_path(scenario).read_text(encoding='utf-8')}\0{workshop(scenario).setup.robot.model_sha256}"
+    model = controller_factory(scenario).setup.robot.model_sha256
+    return f"{scenario_path(scenario).read_text(encoding='utf-8')}\0{model}"
 
 
-def run_many(
+def run_batch(
     jobs: Sequence[Job],
     *,
     processes: int = 1,
@@ -138,8 +139,8 @@ def run_many(
     done: dict[int, Document] = {}
     for k, job in enumerate(jobs):
         if job.controller not in CONTROLLERS:
-            # Refused here, before hours of other runs: the workshop says what is wrong.
-            workshop(job.scenario).driver(job.controller)
+            # Refused here, before hours of other runs: the factory says what is wrong.
+            controller_factory(job.scenario).driver(job.controller)
         found = None if store is None else store.find(job)
         if found is not None and (store is None or not keep_series(job) or _has_series(store, job, found)):
             done[k] = found
@@ -148,13 +149,13 @@ def run_many(
         progress(len(done), len(jobs))
     for job in jobs:
         # Everything that can be wrong with a scenario is said before the first run.
-        workshop(job.scenario, job.free)
+        controller_factory(job.scenario, job.free)
 
     def work(index: int) -> Document:
         job = jobs[waiting[index]]
         return _one(job, store if keep_series(job) else None)
 
-    with one_blas_thread(), shared_out(work, len(waiting), processes) as results:
+    with one_blas_thread(), fork_map(work, len(waiting), processes) as results:
         for index, document in results:
             k = waiting[index]
             done[k] = document

@@ -149,7 +149,7 @@ def _held(rows: Sequence[Row], best: Row) -> str:
     if held.reduction.mean > best.reduction.mean / 2:
         return ""
     return (
-        f" Not its posture does it: held before the blow, that gives {reduction_text(held)}; a stiffer nominal "
+        f" Not its posture does it: held before the impact, that gives {reduction_text(held)}; a stiffer nominal "
         "controller is the simpler way."
     )
 
@@ -165,7 +165,7 @@ def remarks(found: Reproduction, scenario: str) -> list[str]:
             continue
         share = held.reduction.mean / whole.reduction.mean if whole.reduction.mean > 0 else float("nan")
         lines.append(
-            f"`{name}`: with the reached posture held before the blow {reduction_text(held)} remain of "
+            f"`{name}`: with the reached posture held before the impact {reduction_text(held)} remain of "
             f"{reduction_text(whole)}: "
             + ("most of it is posture." if share > 0.5 else "most of it is the term's stiffness, not the posture.")
         )

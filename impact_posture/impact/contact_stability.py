@@ -1,4 +1,4 @@
-"""Whether the feet stay where they are: does any support impulse that the blow allows lie in the friction cones?
+"""Whether the feet stay where they are: does any support impulse that the impact allows lie in the friction cones?
 
 The metric holds the feet by force, pulling if need be.  At rank-deficient postures the impulses that hold them are
 not unique, so the question is about a set: ``f + N z`` with ``N`` a basis of ``{f: J_sᵀ f = 0}``, forces that feet
@@ -30,7 +30,7 @@ _MOST_FRICTION = 10.0
 
 @dataclass(frozen=True, eq=False)
 class FootImpulse:
-    """What one foot gets per unit impulse of the blow.
+    """What one foot gets per unit impulse of the impact.
 
     Attributes:
         frame: The foot.
@@ -55,7 +55,7 @@ class FootImpulse:
 
 
 @dataclass(frozen=True)
-class Footing:
+class ContactStability:
     """Whether the feet can stay.
 
     Attributes:
@@ -74,7 +74,7 @@ class Footing:
         """The verdict in words."""
         lifting = [foot.frame for foot in self.feet if foot.lifts]
         if lifting:
-            return f"the blow lifts {', '.join(lifting)}: the metric holds what the ground cannot"
+            return f"the impact lifts {', '.join(lifting)}: the metric holds what the ground cannot"
         if self.friction is None:
             return "a sole tips over its edge: the metric holds what the ground cannot"
         if self.friction > _MOST_FRICTION:
@@ -93,7 +93,7 @@ class Footing:
         }
 
 
-def footing(oracle: ImpactOracle, supports: tuple[Support, ...], q: Vector) -> Footing:
+def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Vector) -> ContactStability:
     """Find impulses within the friction cones, or those that pull least.
 
     The ground is level: cones stand along world z.  A sole with a ``size`` bears moments only as far as its edges.
@@ -110,18 +110,20 @@ def footing(oracle: ImpactOracle, supports: tuple[Support, ...], q: Vector) -> F
     lifting = rows.least_pull(particular, basis)
     scale = max(float(np.abs(particular).max(initial=0.0)), 1e-300)
     if lifting.pull > _NONE * scale:
-        return Footing(None, rows.feet(lifting.impulse, _NONE * scale), basis.shape[1])
+        return ContactStability(None, rows.feet(lifting.impulse, _NONE * scale), basis.shape[1])
     found = rows.within(particular, basis, _MOST_FRICTION)
     if found is None:
         # No friction that exists, or a sole that tips: without the sliding rows it is the sole.
         tips = rows.within(particular, basis, 1e6) is None
-        return Footing(None if tips else float("inf"), rows.feet(lifting.impulse, _NONE * scale), basis.shape[1])
+        return ContactStability(
+            None if tips else float("inf"), rows.feet(lifting.impulse, _NONE * scale), basis.shape[1]
+        )
     low, high = 0.0, _MOST_FRICTION
     while high - low > 1e-4:
         middle = (low + high) / 2
         tried = rows.within(particular, basis, middle)
         low, high, found = (middle, high, found) if tried is None else (low, middle, tried)
-    return Footing(high, rows.feet(found, _NONE * scale), basis.shape[1])
+    return ContactStability(high, rows.feet(found, _NONE * scale), basis.shape[1])
 
 
 @dataclass(frozen=True)

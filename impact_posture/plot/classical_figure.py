@@ -19,7 +19,7 @@ NOTES = (
     "Velocity J Jᵀ: contact velocities of joint velocities of norm 1. Force (J Jᵀ)⁻¹: contact forces of joint "
     "torques of norm 1 (unbounded where J is singular). Both know nothing of inertia or of supports; impact "
     "Λ$_c$ = J M⁻¹ W M⁻¹ Jᵀ does. Where a robot is easy to move it is hard to push with, and the other way round; "
-    "what a blow does need not follow either.",
+    "what an impact does need not follow either.",
 )
 _LOOKS: dict[str, dict[str, Any]] = {
     "velocity": {"color": GREEN, "linestyle": (0, (5, 2)), "linewidth": 1.4, "zorder": 3.4},

@@ -23,14 +23,14 @@ from impact_posture.plot.run_axes import (
     share_height,
     subplots,
 )
-from impact_posture.plot.run_panels import LINES, control_panels, first_blow, joint_panels, whole
+from impact_posture.plot.run_panels import LINES, control_panels, first_impact, joint_panels, whole
 from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.style import DEFAULT_FORMATS, check_formats, framed, save, style
 from impact_posture.plot.view import mixed_unit
 
 METRIC = "H  [‖Δν‖²/(N·s)²]"
 HINT = "Less H is better: it is the squared velocity jump of an impulse of 1 N·s along n."
-LEFT = "Left: the whole run; right: the first blow."
+LEFT = "Left: the whole run; right: the first impact."
 
 
 def draw_run(view: RunView, out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
@@ -111,7 +111,7 @@ def joints_figure(views: Sequence[RunView]) -> Figure:
     """
     views = check_same(views, "figure joints")
     rows = joint_panels(views)
-    clips = [[clip for clip in (whole(view), first_blow(view)) if clip is not None] for view in views]
+    clips = [[clip for clip in (whole(view), first_impact(view)) if clip is not None] for view in views]
     columns = min(len(pair) for pair in clips)
     notes = " ".join([*dict.fromkeys(panel.note for panel in rows if panel.note), LEFT * (columns == 2)])
     with style():

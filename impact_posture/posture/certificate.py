@@ -152,7 +152,7 @@ def _inequalities(problem: PostureProblem, numeric: Numeric) -> tuple[list[_Near
     near: list[_Near] = []
     violation = 0.0
     for constraint in problem.constraints:
-        value, jacobian = constraint.numeric(numeric)
+        value, jacobian = constraint.evaluate(numeric)
         violation = max(violation, float(np.abs(value - np.clip(value, constraint.lower, constraint.upper)).max()))
         if constraint.equality:
             continue

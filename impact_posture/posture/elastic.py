@@ -91,7 +91,7 @@ def _judge(problem: PostureProblem, chart: Chart, q: Vector) -> ElasticAnswer:
     numeric = Numeric(problem.robot.model).at(q)
     conflicts: dict[str, float] = {}
     for constraint in problem.constraints:
-        value, _ = constraint.numeric(numeric)
+        value, _ = constraint.evaluate(numeric)
         violation = float(np.linalg.norm(value - np.clip(value, constraint.lower, constraint.upper)))
         if violation > _KEPT:
             conflicts[constraint.name] = conflicts.get(constraint.name, 0.0) + violation

@@ -1,7 +1,7 @@
 """What a task asks of the robot as modeled, asked of what it may turn out to be as well.
 
-A pose is the same whatever the robot weighs.  Where its center of mass is and what a blow does to its feet are not: a
-posture against uncertain models that tips over with the payload that it was found for would be no answer.
+A pose is the same whatever the robot weighs.  Its center of mass and the feet's impulses are not.  Without these
+constraints a posture could tip over with the very payload that it was found for.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from impact_posture.posture.constraint import CenterOfMassOverFeet, Constraint
 from impact_posture.posture.kept_feet import KeptFeet
 
 
-def in_every_scenario(
+def in_every_variant(
     objective: ImpactObjective, numeric: Numeric, friction: float, constraints: Sequence[Constraint]
 ) -> list[Constraint]:
     """The constraints of the other scenarios that a problem's own do not imply; none without scenarios.

@@ -1,4 +1,4 @@
-"""Feet that the blow must neither lift nor slide: their impulses stay in the friction cones."""
+"""Feet that the impact must neither lift nor slide: their impulses stay in the friction cones."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ Vector = NDArray[np.float64]
 
 
 class KeptFeet(Constraint):
-    """``A f(q) ≤ 0`` of the supports' impulses ``f = −J_s a/ε`` per unit blow, as parts of the largest at the start.
+    """``A f(q) ≤ 0`` with the supports' impulses ``f = −J_s a/ε`` per unit impulse, scaled to 1 at the start.
 
     These are the impulses of feet at compliance ε.  They are one member of the set that
-    :mod:`impact_posture.impact.contact_stability` asks about.  So the constraint is sufficient for the feet to stay, and
-    more than necessary where that set has several members.
+    :mod:`impact_posture.impact.contact_stability` asks about.  So the constraint is sufficient for the feet to stay,
+    and more than necessary where that set has several members.
 
     Args:
-        objective: Whose blow, one along the contact's normal, and whose feet.
+        objective: Whose impact, one along the contact's normal, and whose feet.
         numeric: At the given posture: soles keep their axes, for the feet are held.
         friction: Coefficient.
         scenario: Name of the model that it is, where there are several.
@@ -68,11 +68,11 @@ class KeptFeet(Constraint):
         parts = [-heavy.point_velocity(foot, found.velocities)[:rows] / compliance for foot, rows in self._feet]
         return ca.densify(ca.SX(self._matrix) @ ca.vertcat(*parts))
 
-    def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
         """See :class:`Constraint`."""
         oracle = self._objective.oracle
-        impulse = oracle.quantities(numeric.q).support_impulse
-        return self._matrix @ impulse, self._matrix @ oracle.support_gradient(numeric.q)
+        impulse = oracle.quantities(model.q).support_impulse
+        return self._matrix @ impulse, self._matrix @ oracle.support_gradient(model.q)
 
     def row_name(self, row: int) -> str:
         """See :class:`Constraint`."""

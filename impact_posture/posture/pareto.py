@@ -46,7 +46,7 @@ _RISE = 1e-6
 _WAYS, _ROUNDS = 3, 3
 
 
-def trade_off(
+def pareto_front(
     solution: PostureSolution,
     points: int = 16,
     *,

@@ -84,7 +84,7 @@ class WithinDistance(Constraint):
         value: ca.SX = distance_squared(self._chart, tree.q, parameters)
         return value
 
-    def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
         """See :class:`Constraint`."""
-        value = distance(self._chart, numeric.q, self.parameters) ** 2
-        return np.array([value]), distance_gradient(self._chart, numeric.q, self.parameters)[None, :]
+        value = distance(self._chart, model.q, self.parameters) ** 2
+        return np.array([value]), distance_gradient(self._chart, model.q, self.parameters)[None, :]

@@ -30,7 +30,7 @@ class Payload:
 
 
 @dataclass(frozen=True, eq=False)
-class Scenario:
+class ModelVariant:
     """One of the models that the robot may turn out to be.
 
     Attributes:
@@ -56,9 +56,9 @@ class Scenario:
         }
 
 
-def build_scenarios(
+def build_model_variants(
     robot: Robot, armature_range: tuple[float, float] | None, payloads: Sequence[Payload]
-) -> tuple[Scenario, ...]:
+) -> tuple[ModelVariant, ...]:
     """All pairs of an armature (as stated, lowest, highest) with a payload (none, or one of those given).
 
     Args:
@@ -118,7 +118,7 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
     return [1.0, *sorted({low, high} - {1.0})]
 
 
-def _scenario(robot: Robot, factor: float, payload: Payload | None) -> Scenario:
+def _scenario(robot: Robot, factor: float, payload: Payload | None) -> ModelVariant:
     words = []
     model = robot.model
     if factor != 1 or payload is not None:
@@ -132,14 +132,14 @@ def _scenario(robot: Robot, factor: float, payload: Payload | None) -> Scenario:
         mass = pin.Inertia(payload.mass, np.array(frame.placement.translation), np.zeros((3, 3)))
         model.inertias[frame.parentJoint] = model.inertias[frame.parentJoint] + mass
     same = robot if model is robot.model else replace(robot, model=model)
-    return Scenario(", ".join(words) or AS_MODELED, same, factor, payload)
+    return ModelVariant(", ".join(words) or AS_MODELED, same, factor, payload)
 
 
-def between(scenarios: Sequence[Scenario], count: int, seed: int) -> list[Robot]:
+def between(scenarios: Sequence[ModelVariant], count: int, seed: int) -> list[Robot]:
     """Robots drawn from between scenarios: any factor on the armature, any share of one of the payloads.
 
     Args:
-        scenarios: As :func:`build_scenarios` gives them, the robot as modeled first.
+        scenarios: As :func:`build_model_variants` gives them, the robot as modeled first.
         count: How many.
         seed: Of the draw.
     """

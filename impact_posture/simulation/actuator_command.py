@@ -27,7 +27,7 @@ class Commands(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class ActuatorCommand:
     """Commands as plain numbers; see :class:`Commands`."""
 
     torque: Array

@@ -22,7 +22,7 @@ from impact_posture.simulation.baselines import (
 from impact_posture.simulation.driver import Driver, PostureDriver, RobustDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
 from impact_posture.simulation.scenario import Setup
-from impact_posture.simulation.scenario_objective import Gradient, blow_of, compiled
+from impact_posture.simulation.scenario_objective import Gradient, compiled, scenario_objective
 from impact_posture.simulation.task_formulations import base_weight, nominal_posture
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
@@ -41,14 +41,14 @@ MEANING: dict[str, str] = {
     "robust-sticking": "the same with the gradient of S, the jump where the contact sticks",
     "posture": "the offline optimum as posture, no gradient",
     "stiff": "the start posture, as stiff as the term would make it",
-    "invariant": "nominal, feedback projected on the impact-invariant subspace around the blow",
+    "invariant": "nominal, feedback projected on the impact-invariant subspace around the impact",
     "walker": "the gradient's flow as reference of the posture task",
 }
 _KINDS: dict[str, ObjectiveKind] = {"robust-speed": "speed", "robust-sticking": "sticking"}
 
 
 @dataclass(eq=False)
-class Workshop:
+class ControllerFactory:
     """A scenario with what its controllers are made of, each part made when first asked for.
 
     Attributes:
@@ -65,9 +65,9 @@ class Workshop:
     _offline: OfflinePosture | None = None
 
     def objective(self, kind: ObjectiveKind = "impulse") -> ImpactObjective:
-        """The scenario's blow in one of the metric family."""
+        """The scenario's impact in one of the metric family."""
         if kind not in self._objectives:
-            self._objectives[kind] = blow_of(self.setup, kind, free=self.free)
+            self._objectives[kind] = scenario_objective(self.setup, kind, free=self.free)
         return self._objectives[kind]
 
     def gradient(self, kind: ObjectiveKind = "impulse") -> Gradient:
@@ -88,7 +88,7 @@ class Workshop:
 
         Args:
             name: Which.
-            mode: Whether the impact-robust term stays on through the blow, or the reached posture is held.
+            mode: Whether the impact-robust term stays on through the impact, or the reached posture is held.
             gain: K instead of the scenario's, 1/s².
 
         Raises:

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import InputError, SimulationDiverged
-from impact_posture.processes import in_a_copy
+from impact_posture.processes import fork_call
 from impact_posture.progress import tell
-from impact_posture.simulation.actuator_command import Drive
-from impact_posture.simulation.controller_factory import Mode, Workshop
+from impact_posture.simulation.actuator_command import ActuatorCommand
+from impact_posture.simulation.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.recorder import Recorder
 from impact_posture.simulation.reference import Reference
@@ -58,15 +58,15 @@ class Run:
         return tuple(w for w in self.windows if w.kind == "impact")
 
 
-def run(workshop: Workshop, controller: str, *, seed: int = 0, mode: Mode = "live", gain: float | None = None,
+def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mode = "live", gain: float | None = None,
         only: int | None = None) -> tuple[Run, ...]:  # fmt: skip
     """Let a controller live through a scenario: one run, or one for each sign of the push.
 
     Args:
-        workshop: The scenario and its parts.
+        factory: The scenario and its parts.
         controller: Its name.
         seed: Of the sensors' noise.
-        mode: ``live``: the term stays on; ``held``: the reached posture is held before the first blow.
+        mode: ``live``: the term stays on; ``held``: the reached posture is held before the first impact.
         gain: K instead of the scenario's, 1/s².
         only: That sign of the push alone.
 
@@ -75,20 +75,20 @@ def run(workshop: Workshop, controller: str, *, seed: int = 0, mode: Mode = "liv
         ControllerNotFound: No such controller.
         InputError: Ticks that are no multiple of the physics' steps, or a sign that is none.
     """
-    driver = workshop.driver(controller, mode, gain)
-    task = workshop.setup.scenario.task
+    driver = factory.driver(controller, mode, gain)
+    task = factory.setup.scenario.task
     if isinstance(task, RepeatedContacts):
-        return (_contacts(workshop, driver, task, seed, mode),)
+        return (_contacts(factory, driver, task, seed, mode),)
     if only not in (None, 1, -1):
-        raise InputError(f"{only} is no sign of a push", where=workshop.setup.scenario.source, hint="give 1 or -1")
-    return _pushes(workshop, driver, task, task.signs if only is None else (only,), seed, mode)
+        raise InputError(f"{only} is no sign of a push", where=factory.setup.scenario.source, hint="give 1 or -1")
+    return _pushes(factory, driver, task, task.signs if only is None else (only,), seed, mode)
 
 
 class _Loop:
     """Controller and world, tick by tick."""
 
-    def __init__(self, workshop: Workshop, driver: Driver, seed: int) -> None:
-        setup = workshop.setup
+    def __init__(self, factory: ControllerFactory, driver: Driver, seed: int) -> None:
+        setup = factory.setup
         self.setup, self.driver, self.world = setup, driver, setup.world
         self.period = setup.scenario.control.period
         self.count = round(self.period / self.world.timestep)
@@ -101,7 +101,7 @@ class _Loop:
         command = driver.reset(setup.q)
         self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
         tell("building the expressions")
-        self.recorder = Recorder(setup, interpreted(workshop.objective()))
+        self.recorder = Recorder(setup, interpreted(factory.objective()))
         self.away: float | None = None
 
     @property
@@ -113,7 +113,7 @@ class _Loop:
         point = None if reference is None else reference.at(self.t)
         command: Command = self.driver.tick(self.world.read(), point)
         try:
-            self.world.step(Drive(command.torque, command.rotor_speed), self.count)
+            self.world.step(ActuatorCommand(command.torque, command.rotor_speed), self.count)
         except SimulationDiverged as error:
             # A picture needs two ticks.
             if self.recorder.ticks < 2:
@@ -127,31 +127,31 @@ class _Loop:
         return True
 
 
-def _contacts(workshop: Workshop, driver: Driver, task: RepeatedContacts, seed: int, mode: Mode) -> Run:
-    loop = _Loop(workshop, driver, seed)
-    reference = Reference(task, workshop.setup.gap)
+def _contacts(factory: ControllerFactory, driver: Driver, task: RepeatedContacts, seed: int, mode: Mode) -> Run:
+    loop = _Loop(factory, driver, seed)
+    reference = Reference(task, factory.setup.gap)
     # Where the way in crosses the surface: what follows is braking behind it.
     crossing = reference.inward - 2 * task.beyond / task.speed
-    blows = [reference.start(k) + crossing for k in range(task.count)]
-    ramp = workshop.setup.scenario.control.robust.ramp
+    impacts = [reference.start(k) + crossing for k in range(task.count)]
+    ramp = factory.setup.scenario.control.robust.ramp
     events = [(_BRACE, driver.brace)]
     if mode == "held":
         events.append((max(_BRACE, reference.start(0) - 2 * ramp), driver.hold))
-    expected = list(blows)
+    expected = list(impacts)
     for _ in range(round(reference.total / loop.period)):
         while events and loop.t >= events[0][0] - 1e-9:
             events.pop(0)[1]()
-        # The way in begins long before: from there on the next blow is the one that is expected.
+        # The way in begins long before: from there on the next impact is the one that is expected.
         if expected and loop.t >= expected[0] - crossing - 1e-9:
             driver.expect(expected.pop(0))
         if not loop.tick(reference):
             break
     series, first = loop.recorder.series(), []
-    for k, blow in enumerate(blows):
+    for k, impact in enumerate(impacts):
         begin, end = reference.start(k), reference.start(k) + reference.cycle
         touch = loop.recorder.first_touch(begin, end)
         leaves = begin + reference.inward + task.dwell
-        at = blow if touch is None else touch
+        at = impact if touch is None else touch
         first.append(Window("impact", k, at, at + task.window, touch is not None))
         first.append(Window("dwell", k, at, max(leaves, at), touch is not None))
         first.append(Window("recovery", k, at, min(at + RECOVERY, end), touch is not None))
@@ -159,11 +159,11 @@ def _contacts(workshop: Workshop, driver: Driver, task: RepeatedContacts, seed: 
 
 
 def _pushes(
-    workshop: Workshop, driver: Driver, task: SinglePush, signs: Sequence[int], seed: int, mode: Mode
+    factory: ControllerFactory, driver: Driver, task: SinglePush, signs: Sequence[int], seed: int, mode: Mode
 ) -> tuple[Run, ...]:
     """Settle once, and push each way from there: the other ways in copies of this process."""
-    loop = _Loop(workshop, driver, seed)
-    ramp, brace = workshop.setup.scenario.control.robust.ramp, [driver.brace]
+    loop = _Loop(factory, driver, seed)
+    ramp, brace = factory.setup.scenario.control.robust.ramp, [driver.brace]
     # Whatever the scenario's patience: all controllers begin to prepare before a push.
     rested = _settle(loop, task, max(task.settle, _BRACE + loop.period), brace)
     if mode == "held":
@@ -174,7 +174,7 @@ def _pushes(
         return tuple(Run(loop.recorder.series(), (), sign, rested=False, away=loop.away) for sign in signs)
     first, *others = (partial(_push, loop, task, sign, rested) for sign in signs)
     with ExitStack() as copies:
-        waiting = [copies.enter_context(in_a_copy(other)) for other in others]
+        waiting = [copies.enter_context(fork_call(other)) for other in others]
         return (first(), *(collect() for collect in waiting))
 
 

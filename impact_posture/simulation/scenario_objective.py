@@ -1,4 +1,4 @@
-"""The blow of a scenario as the offline problem sees it: the objective, its gradient, and the offline optimum."""
+"""The impact of a scenario as the offline problem sees it: the objective, its gradient, and the offline optimum."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from impact_posture.codegen.export_folder import write_export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.library import library_path
 from impact_posture.errors import CompilerError, MetricError, OutputError
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
@@ -33,8 +33,8 @@ Array = NDArray[np.float64]
 Gradient = Callable[[Array], tuple[float, Array]]
 
 
-def blow_of(setup: Setup, kind: ObjectiveKind = "impulse", *, free: bool = False) -> ImpactObjective:
-    """The objective of the scenario's blow: at the shape that hits, or at the frame that is pushed.
+def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: bool = False) -> ImpactObjective:
+    """The objective of the scenario's impact: at the shape that hits, or at the frame that is pushed.
 
     Args:
         setup: The experiment.
@@ -44,7 +44,7 @@ def blow_of(setup: Setup, kind: ObjectiveKind = "impulse", *, free: bool = False
     scenario, robot = setup.scenario, setup.robot
     offset = scenario.shape.offset if isinstance(scenario.task, RepeatedContacts) else (0.0, 0.0, 0.0)
     x, y, z = (float(value) for value in scenario.normal)
-    contact = Contact.create(scenario.task.frame, (x, y, z), offset)
+    contact = ImpactContact(scenario.task.frame, (x, y, z), offset)
     supports = () if free or scenario.control.footing is None else resolve_supports(robot, None)
     return ImpactObjective(robot, contact, Metric(), kind, supports)
 
@@ -88,9 +88,9 @@ def compiled(objective: ImpactObjective) -> Gradient:
         return interpreted(objective)
     folder = cache_folder("gradients") / _key(objective)
     with _locked(folder.with_suffix(".lock")):
-        if not is_cached(library_path(folder, "blow")):
+        if not is_cached(library_path(folder, "impact")):
             tell("compiling the gradient")
-            written = write_export([objective], folder, prefix="blow", portable=True, build=True, force=True)
+            written = write_export([objective], folder, prefix="impact", portable=True, build=True, force=True)
             if written.library is None:
                 raise CompilerError("has gone", where="C compiler", hint="try again")
     return ImpactGradient.load(folder, robot=objective.robot).objective

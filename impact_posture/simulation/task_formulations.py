@@ -7,12 +7,12 @@ from impact_posture.errors import SpecError
 from impact_posture.impact.contact import point_on
 from impact_posture.simulation.scenario import Control, RepeatedContacts, Setup
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
-from impact_posture.tsid.contacts import Contact, support_contacts
+from impact_posture.tsid.contacts import SupportContact, support_contacts
 from impact_posture.tsid.frame_tasks import EndEffector, FrameAligned, FramePose, FramePosition, Impedance
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.task import Task
-from impact_posture.tsid.task_formulation import Program
+from impact_posture.tsid.task_formulation import TaskFormulation
 
 
 def end_effector_task(setup: Setup) -> EndEffector | None:
@@ -46,7 +46,7 @@ def end_effector_task(setup: Setup) -> EndEffector | None:
     return kind(point, **common)  # type: ignore[arg-type]
 
 
-def build_program(setup: Setup, posture: JointPosture, end_effector: EndEffector | None) -> Program:
+def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffector | None) -> TaskFormulation:
     """The program of a scenario with a posture task of its own.
 
     A robot with ``[control.footing]`` stands: contacts and friction constrain, center of mass, base orientation, end
@@ -67,10 +67,10 @@ def build_program(setup: Setup, posture: JointPosture, end_effector: EndEffector
         if end_effector is not None:
             weighted.append(end_effector)
         contacts, cost = _contacts(setup, control), control.footing.force_weight
-        return Program((), tuple(weighted), posture, contacts, force_point=felt, force_weight=cost)
+        return TaskFormulation((), tuple(weighted), posture, contacts, force_point=felt, force_weight=cost)
     tilt = () if control.tilt is None else ((Tilt(kp=control.tilt.kp, kd=control.tilt.kd),),)
     hand = () if end_effector is None else ((end_effector,),)
-    return Program((*tilt, *hand), (), posture, force_point=felt)
+    return TaskFormulation((*tilt, *hand), (), posture, force_point=felt)
 
 
 def base_weight(setup: Setup) -> float | None:
@@ -98,7 +98,7 @@ def _check_gains(setup: Setup) -> None:
             raise SpecError(f"has [control.{key}], but {why}", where=source, hint=f"remove [control.{key}]")
 
 
-def _contacts(setup: Setup, control: Control) -> tuple[Contact, ...]:
+def _contacts(setup: Setup, control: Control) -> tuple[SupportContact, ...]:
     footing = control.footing
     assert footing is not None  # noqa: S101 (narrows a type)
     contacts = support_contacts(setup.robot, friction=footing.friction)
@@ -109,5 +109,6 @@ def _contacts(setup: Setup, control: Control) -> tuple[Contact, ...]:
             hint="name [[supports]] in robot.toml",
         )
     return tuple(
-        Contact(c.point, c.kind, c.half, c.normal, c.friction, footing.least, c.kp, c.kd, c.weight) for c in contacts
+        SupportContact(c.point, c.kind, c.half, c.normal, c.friction, footing.least, c.kp, c.kd, c.weight)
+        for c in contacts
     )

@@ -8,7 +8,7 @@ from typing import Literal
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
-from impact_posture.tsid.contacts import Contact, support_contacts
+from impact_posture.tsid.contacts import SupportContact, support_contacts
 from impact_posture.tsid.frame_tasks import EndEffector, FramePose
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
@@ -17,7 +17,7 @@ from impact_posture.tsid.task import Task
 
 
 @dataclass(frozen=True, eq=False)
-class Program:
+class TaskFormulation:
     """One kind of TSID.
 
     Attributes:
@@ -34,7 +34,7 @@ class Program:
     levels: tuple[tuple[Task, ...], ...] = ()
     weighted: tuple[Task, ...] = ()
     posture: JointPosture | None = None
-    contacts: tuple[Contact, ...] = ()
+    contacts: tuple[SupportContact, ...] = ()
     force_point: Point | None = None
     law: LimitLaw | None = field(default_factory=LimitLaw)
     force_weight: float = 1e-6
@@ -66,7 +66,7 @@ class Program:
         return tuple(dict.fromkeys(found))
 
 
-def aerial_program(
+def aerial_formulation(
     robot: Robot,
     posture: JointPosture,
     *,
@@ -74,7 +74,7 @@ def aerial_program(
     tilt: Tilt | None = None,
     order: Literal["strict", "weighted"] = "strict",
     law: LimitLaw | None = LimitLaw(),
-) -> Program:
+) -> TaskFormulation:
     """The paper's stack for an aerial manipulator: tilt, then end effector, then posture.
 
     Args:
@@ -90,25 +90,25 @@ def aerial_program(
         InputError: The robot does not fly, or has no default contact frame.
     """
     if not robot.floating:
-        raise InputError("the base is fixed", where=robot.name, hint="use arm_program")
+        raise InputError("the base is fixed", where=robot.name, hint="use arm_formulation")
     if robot.spec.propulsion is None:
         raise InputError("has no propellers", where=robot.name, hint="name [propulsion] in robot.toml")
     end_effector = end_effector or _end_effector(robot)
     tilt = tilt or Tilt()
     point = end_effector.point
     if order == "strict":
-        return Program(((tilt,), (end_effector,)), (), posture, force_point=point, law=law)
-    return Program((), (tilt, end_effector), posture, force_point=point, law=law)
+        return TaskFormulation(((tilt,), (end_effector,)), (), posture, force_point=point, law=law)
+    return TaskFormulation((), (tilt, end_effector), posture, force_point=point, law=law)
 
 
-def arm_program(
+def arm_formulation(
     robot: Robot,
     posture: JointPosture,
     *,
     end_effector: EndEffector | None = None,
     order: Literal["strict", "weighted"] = "strict",
     law: LimitLaw | None = LimitLaw(),
-) -> Program:
+) -> TaskFormulation:
     """The same stack for an arm on a fixed base, which has no tilt: end effector, then posture.
 
     Args:
@@ -122,13 +122,13 @@ def arm_program(
         InputError: The base floats, or the robot has no default contact frame.
     """
     if robot.floating:
-        raise InputError("the base floats", where=robot.name, hint="use aerial_program or legged_program")
+        raise InputError("the base floats", where=robot.name, hint="use aerial_formulation or legged_formulation")
     task = end_effector or _end_effector(robot)
     levels, weighted = (((task,),), ()) if order == "strict" else ((), (task,))
-    return Program(levels, weighted, posture, force_point=task.point, law=law)
+    return TaskFormulation(levels, weighted, posture, force_point=task.point, law=law)
 
 
-def legged_program(
+def legged_formulation(
     robot: Robot,
     posture: JointPosture,
     *,
@@ -136,10 +136,10 @@ def legged_program(
     friction: float = 0.7,
     center_of_mass: CenterOfMass | None = None,
     base: BaseOrientation | None = None,
-    contacts: tuple[Contact, ...] | None = None,
+    contacts: tuple[SupportContact, ...] | None = None,
     force_point: Point | None = None,
     law: LimitLaw | None = LimitLaw(),
-) -> Program:
+) -> TaskFormulation:
     """The paper's stack for a standing robot: contacts and friction, center of mass, base orientation, posture.
 
     Args:
@@ -165,7 +165,7 @@ def legged_program(
         center_of_mass or CenterOfMass(kp=kp, weight=10.0),
         base or BaseOrientation(kp=kp, weight=1.0),
     )
-    return Program((), weighted, posture, contacts, force_point, law)
+    return TaskFormulation((), weighted, posture, contacts, force_point, law)
 
 
 def _end_effector(robot: Robot) -> FramePose:

@@ -1,4 +1,4 @@
-"""Do the objectives predict what a blow does?  Random postures meet a stiff surface in MuJoCo.
+"""Do the objectives predict what an impact does?  Random postures meet a stiff surface in MuJoCo.
 
 Run: make study-impacts, or
 python -m tests.benchmarks.impact_bench [--robot NAME] [--postures 30] [--seed 0] [--write]

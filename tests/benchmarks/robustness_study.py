@@ -17,7 +17,7 @@ from pathlib import Path
 
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import ImpactPostureError
-from impact_posture.processes import shared_out
+from impact_posture.processes import fork_map
 from tests.benchmarks.common import machine
 from tests.benchmarks.robustness.draws import RANGES
 from tests.benchmarks.robustness.outcomes import NotAdmissible, Record, Store, configuration
@@ -90,7 +90,7 @@ def study(
         store.keep(run(name, number, seed))
         return f"{name} {number}: {time.perf_counter() - began:.0f} s"
 
-    with shared_out(one, len(missing), jobs) as done:
+    with fork_map(one, len(missing), jobs) as done:
         for count, (_, words) in enumerate(done, 1):
             say(f"{count}/{len(missing)} {words}")
     found: dict[str, list[Record]] = {name: [] for name in scenarios}

@@ -13,7 +13,7 @@ import numpy as np
 
 from impact_posture.codegen.build_check import compiled
 from impact_posture.codegen.export import export
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot_loader import load_robot
 from tests.exact import Exact, ExactImpact, digits, distance
@@ -65,7 +65,7 @@ def _lines() -> list[str]:
 def _row(name: str, normal: tuple[float, float, float], share: float) -> str:
     robot = load_robot(name)
     supports = tuple(Support.from_spec(s) for s in robot.spec.supports)
-    contact = Contact.create(robot.spec.contact.frame or "", normal)
+    contact = ImpactContact(robot.spec.contact.frame or "", normal)
     objective = ImpactObjective(robot, contact, supports=supports, compliance=share / robot.mass)
     kernel = objective.metric_fun()
     kept: dict[str, list[tuple[float, float]]] = {}

@@ -38,7 +38,7 @@ from impact_posture.tsid.impact_robust import Gradient, ImpactRobustPosture, gra
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.qp import Solved, Solver
 from impact_posture.tsid.qpsolvers_solver import QpsolversSolver
-from impact_posture.tsid.task_formulation import aerial_program, legged_program
+from impact_posture.tsid.task_formulation import aerial_formulation, legged_formulation
 from tests.benchmarks.common import crba_time, default_problem, machine
 
 PAGE = Path(__file__).parents[2] / "docs" / "generated" / "tsid.md"
@@ -49,7 +49,7 @@ RATIO = 1.05
 
 @dataclass(frozen=True)
 class Case:
-    """A robot, the blow that it braces for, its reference, and the most that a tick may take, µs."""
+    """A robot, the impact that it braces for, its reference, and the most that a tick may take, µs."""
 
     robot: str
     frame: str
@@ -113,11 +113,11 @@ class Flight:
 
     def __init__(self, case: Case, robot: Robot, posture: JointPosture) -> None:
         aerial = robot.spec.kind == "aerial"
-        program = aerial_program(robot, posture) if aerial else legged_program(robot, posture)
-        self.controller, self.posture, self.robot = Controller(robot, program), posture, robot
+        formulation = aerial_formulation(robot, posture) if aerial else legged_formulation(robot, posture)
+        self.controller, self.posture, self.robot = Controller(robot, formulation), posture, robot
         self.q, self.v = robot.posture(), np.zeros(robot.nv)
         self.controller.reset(self.q, self.v)
-        leading = program.levels[1][0] if aerial else program.weighted[0]
+        leading = formulation.levels[1][0] if aerial else formulation.weighted[0]
         assert isinstance(leading, FramePose | CenterOfMass)
         self.reference = Reference(leading, case.amplitude)
         self.took: list[int] = []

@@ -11,8 +11,8 @@ import pytest
 
 from impact_posture.errors import ControllerNotFound, ScenarioNotFound, SimulationDiverged
 from impact_posture.experiment import batch
-from impact_posture.experiment.batch import Store, key_of, run_many
-from impact_posture.experiment.jobs import SCHEMA, Job, execute, workshop
+from impact_posture.experiment.batch import Store, key_of, run_batch
+from impact_posture.experiment.jobs import SCHEMA, Job, controller_factory, execute
 
 
 def test_a_run_answers_with_its_document(aerial: Path) -> None:
@@ -22,7 +22,7 @@ def test_a_run_answers_with_its_document(aerial: Path) -> None:
     assert {"inside", "outside"} <= set(found["metrics"]["saturation_s"])
     assert [w["kind"] for w in found["windows"]] == ["impact", "dwell", "recovery"]
     assert found["windows"][0]["end"] - found["windows"][0]["begin"] == pytest.approx(0.3)
-    assert found["prediction"]["blows"] == 1 and found["prediction"]["ratio"] > 0
+    assert found["prediction"]["impacts"] == 1 and found["prediction"]["ratio"] > 0
     assert len(runs) == 1
     json.dumps(found, allow_nan=False)
 
@@ -39,8 +39,8 @@ def test_a_push_goes_both_ways(push: Path) -> None:
 def test_processes_and_order_do_not_matter(aerial: Path, tmp_path: Path) -> None:
     jobs = [Job(str(aerial), name, seed) for name, seed in (("nominal", 0), ("nominal", 1), ("robust", 0))]
     seen: list[tuple[int, int]] = []
-    one = run_many(jobs, progress=lambda done, total: seen.append((done, total)))
-    two = run_many(jobs[::-1], processes=2, store=Store(tmp_path / "kept"))
+    one = run_batch(jobs, progress=lambda done, total: seen.append((done, total)))
+    two = run_batch(jobs[::-1], processes=2, store=Store(tmp_path / "kept"))
     assert one == two[::-1]
     assert seen == [(k, 3) for k in range(4)]
     assert one[0] != one[1]
@@ -60,21 +60,21 @@ def test_what_was_interrupted_goes_on(aerial: Path, tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr(batch, "execute", counted)
     with pytest.raises(KeyboardInterrupt):
-        run_many(jobs, store=store)
+        run_batch(jobs, store=store)
     assert ran == [0, 1]
     monkeypatch.setattr(batch, "execute", lambda job: (ran.append(job.seed), real(job))[1])
-    whole = run_many(jobs, store=store)
+    whole = run_batch(jobs, store=store)
     assert ran == [0, 1, 2]
-    assert whole == run_many(jobs)
+    assert whole == run_batch(jobs)
     assert ran == [0, 1, 2, 0, 1, 2]
 
 
 def test_series_are_kept_where_asked_for(push: Path, tmp_path: Path) -> None:
     store, job = Store(tmp_path / "kept"), Job(str(push), "nominal")
-    run_many([job], store=store)
+    run_batch([job], store=store)
     assert not list(store.folder.glob("*.npz"))
     # The document alone is not enough now.
-    run_many([job], store=store, keep_series=lambda job: True)
+    run_batch([job], store=store, keep_series=lambda job: True)
     assert sorted(path.name for path in store.folder.glob("*.npz")) == sorted(
         [store.series(job, 1).name, store.series(job, -1).name]
     )
@@ -89,7 +89,7 @@ def test_a_changed_scenario_or_a_broken_file_is_run_anew(aerial: Path, tmp_path:
     assert store.find(job) == {"metrics": {}}
     path.write_text(path.read_text(encoding="utf-8") + "\n# another one\n", encoding="utf-8")
     batch._scenario.cache_clear()
-    workshop.cache_clear()
+    controller_factory.cache_clear()
     assert key_of(job) != before and store.find(job) is None
     assert key_of(Job(str(path), "nominal", gain=3.0)) != key_of(job)
 
@@ -120,19 +120,19 @@ def test_a_damaged_series_is_run_anew(
 ) -> None:
     monkeypatch.setattr(batch, "execute", lambda job: _kept_run(str(push)))
     store, job = Store(tmp_path / "kept"), Job(str(push), "nominal")
-    run_many([job], store=store, keep_series=lambda job: True)
+    run_batch([job], store=store, keep_series=lambda job: True)
     path = store.series(job, -1)
     whole = path.read_bytes()
     # Nothing is run where all is well.
     monkeypatch.setattr(batch, "execute", None)
-    run_many([job], store=store, keep_series=lambda job: True)
+    run_batch([job], store=store, keep_series=lambda job: True)
     monkeypatch.setattr(batch, "execute", lambda job: _kept_run(str(push)))
     path.unlink()
     if damage != "missing":
         middle = len(whole) // 3
         flipped = whole[:middle] + bytes(255 - b for b in whole[middle : middle + 400]) + whole[middle + 400 :]
         path.write_bytes({"half": whole[: len(whole) // 2], "garbage": b"\x00" * 500, "flipped": flipped}[damage])
-    run_many([job], store=store, keep_series=lambda job: True)
+    run_batch([job], store=store, keep_series=lambda job: True)
     assert path.read_bytes() == whole
 
 
@@ -146,13 +146,13 @@ def test_a_robot_that_ran_away_is_a_result(aerial: Path, monkeypatch: pytest.Mon
         raise SimulationDiverged(1.0, where="it")
 
     monkeypatch.setattr(batch, "execute", away)
-    (found,) = run_many([Job(str(aerial), "nominal")])
+    (found,) = run_batch([Job(str(aerial), "nominal")])
     assert (found["status"], found["seed"], found["runs"]) == ("control lost", 0, [])
     assert "the state ran away at t = 1 s" in found["events"][0]["what"] and found["events"][0]["time"] == 1.0
 
 
 def test_what_is_misspelt_is_said_before_anything_runs(aerial: Path) -> None:
     with pytest.raises(ControllerNotFound, match="did you mean robust"):
-        run_many([Job(str(aerial), "nominal"), Job(str(aerial), "robsut")])
+        run_batch([Job(str(aerial), "nominal"), Job(str(aerial), "robsut")])
     with pytest.raises(ScenarioNotFound, match="aerial-vertical"):
-        run_many([Job("arial-vertical", "nominal")])
+        run_batch([Job("arial-vertical", "nominal")])

@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.plot import (
     FORMATS,
     Bar,
@@ -63,7 +63,7 @@ def make_run(
     force = np.zeros((TICKS, 3))
     inside = np.any([(t > at) & (t <= at + 0.3) for at in hits], axis=0)
     force[inside] = (6.0, 0.0, 0.0)
-    contact = Contact.create(robot.spec.contact.frame or robot.frame_names[-1], (1, 0, 0))
+    contact = ImpactContact(robot.spec.contact.frame or robot.frame_names[-1], (1, 0, 0))
     values: dict[str, Any] = {
         "torque": 0.5 * np.outer(np.sin(3 * t), np.ones(robot.nv - base)),
         "rotor_command": np.full((TICKS, rotors), 60.0),

@@ -1,4 +1,4 @@
-"""The objective of a scenario's blow and its gradient: interpreted, compiled, and against independent numbers."""
+"""The objective of a scenario's impact and its gradient: interpreted, compiled, and against independent numbers."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import CompilerError, MetricError, OutputError
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
-from impact_posture.simulation import scenario_objective
+from impact_posture.simulation import scenario_objective as module
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
-from impact_posture.simulation.scenario_objective import blow_of, compiled, interpreted
+from impact_posture.simulation.scenario_objective import compiled, interpreted, scenario_objective
 from tests.helpers import Vector, assert_close, central_gradient, frame_jacobian, mass_matrix, rng, robot
-from tests.simulation.shops import needs_mujoco, shop
+from tests.simulation.factories import factory, needs_mujoco
 from tests.tools import need_compiler
 
 # Fixed and floating bases, joints of several numbers, with feet and without.
@@ -43,7 +43,7 @@ OBJECTIVES: tuple[tuple[str, str, ObjectiveKind, bool], ...] = (
 def objective_of(name: str, frame: str, kind: ObjectiveKind, feet: bool) -> ImpactObjective:
     found = robot(name)
     supports = resolve_supports(found, None) if feet else ()
-    return ImpactObjective(found, Contact.create(frame, (1.0, -0.5, 2.0)), Metric(), kind, supports)
+    return ImpactObjective(found, ImpactContact(frame, (1.0, -0.5, 2.0)), Metric(), kind, supports)
 
 
 def near(objective: ImpactObjective, *key: object) -> Vector:
@@ -115,7 +115,7 @@ def test_where_the_objective_does_not_exist_it_says_so() -> None:
 # ---- of a scenario ------------------------------------------------------------------------------------------------
 
 
-def test_the_blow_is_the_shapes_or_the_pushs() -> None:
+def test_the_impact_is_the_shapes_or_the_pushs() -> None:
     needs_mujoco()
     for name, frame, normal, feet in (
         ("aerial-vertical", "ee", (0, 0, 1), 0),
@@ -123,28 +123,28 @@ def test_the_blow_is_the_shapes_or_the_pushs() -> None:
         ("solo8-push", "base_link", (1, 0, 0), 4),
         ("talos-push", "torso_2_link", (1, 0, 0), 2),
     ):
-        found = blow_of(shop(name).setup)
+        found = scenario_objective(factory(name).setup)
         assert (found.contact.frame, found.kind, len(found.supports)) == (frame, "impulse", feet)
         np.testing.assert_allclose(found.contact.normal, normal)
 
 
 def test_without_the_feet_the_objective_is_another() -> None:
     needs_mujoco()
-    setup = shop("solo8-push").setup
-    held, free = blow_of(setup), blow_of(setup, free=True)
+    setup = factory("solo8-push").setup
+    held, free = scenario_objective(setup), scenario_objective(setup, free=True)
     assert held.supports and not free.supports
     assert abs(free.value(setup.q) / held.value(setup.q) - 1) > 0.1
 
 
 def test_the_shapes_offset_is_the_contacts() -> None:
     needs_mujoco()
-    setup = shop("aerial-vertical").setup
+    setup = factory("aerial-vertical").setup
     scenario = setup.scenario
     moved = replace(scenario.scene.shapes[0], offset=(0.0, 0.01, 0.02))
     scene = replace(scenario.scene, shapes=(moved, *scenario.scene.shapes[1:]))
-    found = blow_of(replace(setup, scenario=replace(scenario, scene=scene)))
+    found = scenario_objective(replace(setup, scenario=replace(scenario, scene=scene)))
     assert found.contact.offset == (0.0, 0.01, 0.02)
-    assert found.value(setup.q) != pytest.approx(blow_of(setup).value(setup.q), rel=1e-3)
+    assert found.value(setup.q) != pytest.approx(scenario_objective(setup).value(setup.q), rel=1e-3)
 
 
 # ---- compiled -----------------------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ def builds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         made.append(folder)
         return write(objectives, folder, **options)
 
-    monkeypatch.setattr(scenario_objective, "write_export", counted)
+    monkeypatch.setattr(module, "write_export", counted)
     return made
 
 
@@ -184,8 +184,8 @@ def test_a_changed_robot_normal_or_objective_is_built_anew(builds: list[Path]) -
     needs_mujoco()
     scenario = read_scenario("aerial-vertical")
     heavier = replace(scenario, load=replace(scenario.load, armature={"elbow_pitch": 0.05}))
-    first, other = blow_of(shop("aerial-vertical").setup), blow_of(set_up(heavier))
-    turned = replace(first, contact=Contact.create("ee", (0.0, 0.1, 1.0)))
+    first, other = scenario_objective(factory("aerial-vertical").setup), scenario_objective(set_up(heavier))
+    turned = replace(first, contact=ImpactContact("ee", (0.0, 0.1, 1.0)))
     q = first.robot.posture()
     for objective in (first, other, turned):
         assert compiled(objective)(q)[0] == pytest.approx(objective.value(q), rel=1e-9)
@@ -195,7 +195,7 @@ def test_a_changed_robot_normal_or_objective_is_built_anew(builds: list[Path]) -
 def test_a_damaged_build_is_done_again(builds: list[Path]) -> None:
     objective = objective_of("ur5", "tool0", "impulse", False)
     compiled(objective)
-    library = builds[0] / "libblow.so"
+    library = builds[0] / "libimpact.so"
     # Mapped in this process: another file takes its name.
     library.write_bytes(library.rename(builds[0].parents[1] / "mapped.so").read_bytes()[:5000])
     (builds[0] / "scenario_objective.c").write_text("half")
@@ -206,7 +206,7 @@ def test_a_damaged_build_is_done_again(builds: list[Path]) -> None:
 
 def test_without_a_compiler_it_is_interpreted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(scenario_objective, "find_compiler", lambda: None)
+    monkeypatch.setattr(module, "find_compiler", lambda: None)
     objective = objective_of("ur5", "tool0", "impulse", False)
     q = near(objective, "none")
     assert compiled(objective)(q)[0] == pytest.approx(objective.value(q), rel=1e-9)
@@ -238,14 +238,14 @@ def test_two_processes_that_build_at_once_do_it_once(tmp_path: Path) -> None:
     need_compiler()
     program = (
         "import sys; from impact_posture.robot.robot_loader import load_robot\n"
-        "from impact_posture.impact.contact import Contact\n"
+        "from impact_posture.impact.contact import ImpactContact\n"
         "from impact_posture.impact.metric import Metric\n"
         "from impact_posture.impact.objective import ImpactObjective\n"
-        "from impact_posture.simulation import scenario_objective as blow\n"
+        "from impact_posture.simulation import scenario_objective\n"
         "write = scenario_objective.write_export\n"
         "def told(*a, **k):\n    print('built'); return write(*a, **k)\n"
         "scenario_objective.write_export = told\n"
-        "o = ImpactObjective(load_robot('ur5'), Contact.create('tool0', (0, 0, 1)), Metric(), 'impulse', ())\n"
+        "o = ImpactObjective(load_robot('ur5'), ImpactContact('tool0', (0, 0, 1)), Metric(), 'impulse', ())\n"
         "print(repr(scenario_objective.compiled(o)(o.robot.posture())[0]))\n"
     )
     environment = {**os.environ, "IMPACT_POSTURE_CACHE": str(tmp_path)}

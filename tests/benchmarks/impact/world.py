@@ -32,7 +32,7 @@ def with_surface(written: Mjcf, objective: ImpactObjective, q: Vector) -> Mjcf:
 
     Args:
         written: The robot.
-        objective: Contact and supports.
+        objective: ImpactContact and supports.
         q: The posture that they are placed for, shape (nq,).
     """
     robot, oracle = objective.robot, objective.oracle.at(q)

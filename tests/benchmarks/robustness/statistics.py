@@ -117,7 +117,7 @@ def split(records: Sequence[Record], controller: str, choose: Callable[[Record],
 
 
 def fall(record: Record, controller: str, name: str) -> float | None:
-    """How much lower H, V (as ln of the ratio) or the offset (m) is before the blow than nominal's."""
+    """How much lower H, V (as ln of the ratio) or the offset (m) is before the impact than nominal's."""
     before, after = (getattr(record.outcomes[c], name) for c in (NOMINAL, controller))
     if before is None or after is None:
         return None

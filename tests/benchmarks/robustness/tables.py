@@ -85,8 +85,8 @@ def ranks(records: Records) -> list[str]:
         f"; chance alone stays below {1.96 / math.sqrt(least - 1):.2f} nineteen times in twenty" if least > 3 else ""
     )
     return [
-        "Spearman's rank correlation of the reduction of motion by `robust` with what it changed before the blow and",
-        f"with what was drawn{chance}. *Offset*: distance of the center of mass from the line of the blow.",
+        "Spearman's rank correlation of the reduction of motion by `robust` with what it changed before the impact",
+        f"and with what was drawn{chance}. *Offset*: distance of the center of mass from the line of the impact.",
         "",
         *lines,
     ]
@@ -100,7 +100,7 @@ def by_v(records: Records) -> list[str]:
         for controller in controllers(name)[1:] if HELD not in controllers(name) else ():
             lower, higher = _v_parts(own, controller)
             lines.append(f"| `{name}` | `{controller}` | {_part(lower)} | {_part(higher)} |")
-    return ["Where a controller's V before the blow was lower than nominal's, and where it was not:", "", *lines]
+    return ["Where a controller's V before the impact was lower than nominal's, and where it was not:", "", *lines]
 
 
 def _part(part: Split) -> str:
@@ -123,7 +123,7 @@ def splits(records: Records) -> list[str]:
         keys = {r.name for r in RANGES[name]}
         for words, key, choose in ways:
             for controller in ("robust", "posture"):
-                # The offline optimum knows no K; under a wall's blow it is the height that matters.
+                # The offline optimum knows no K; under a wall's impact it is the height that matters.
                 if (
                     key in keys
                     and (name, key) != ("aerial-lateral", "x")

@@ -1,4 +1,4 @@
-"""What these tests share: scenarios that are cut short, workshops kept for a whole process, runs made by hand."""
+"""What these tests share: scenarios that are cut short, controller factories kept for a whole process, runs made by hand."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impact_posture.simulation.controller_factory import Mode, Workshop
+from impact_posture.simulation.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.offline import offline_posture
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run, run
@@ -39,18 +39,18 @@ def shortened(source: str | Path, **changes: Any) -> Setup:
     return set_up(replace(scenario, task=task))
 
 
-def workshop(setup: Setup, free: bool = False) -> Workshop:
+def controller_factory(setup: Setup, free: bool = False) -> ControllerFactory:
     """Gradients at once, and an offline optimum from few starts."""
-    return Workshop(setup, free=free, gradient_of=interpreted)
+    return ControllerFactory(setup, free=free, gradient_of=interpreted)
 
 
 @functools.cache
-def shop(name: str, settle: float | None = None) -> Workshop:
+def factory(name: str, settle: float | None = None) -> ControllerFactory:
     """A shipped scenario cut short; one of each in a process."""
-    return workshop(shortened(name) if settle is None else shortened(name, settle=settle))
+    return controller_factory(shortened(name) if settle is None else shortened(name, settle=settle))
 
 
-def driven(made: Workshop, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
+def driven(made: ControllerFactory, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
     """A run with the push forward alone."""
     if controller == "posture" and made._offline is None:
         # Few starts: what is tested is the driver.
@@ -61,7 +61,7 @@ def driven(made: Workshop, controller: str, *, mode: Mode = "live", seed: int = 
 @functools.cache
 def lived(name: str, controller: str, mode: Mode, settle: float | None) -> Run:
     """A run of a shipped scenario, cut short; one of each in a process.  No defaults: the cache tells them apart."""
-    return driven(shop(name, settle), controller, mode=mode)
+    return driven(factory(name, settle), controller, mode=mode)
 
 
 def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **columns: Any) -> Series:
