@@ -1,4 +1,4 @@
-"""What these tests share: scenarios that are cut short, controller factories kept for a whole process, runs made by hand."""
+"""Shared by these tests: shortened scenarios, controller factories kept for a whole process, runs made by hand."""
 
 from __future__ import annotations
 
