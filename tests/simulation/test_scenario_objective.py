@@ -156,7 +156,7 @@ def builds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     need_compiler()
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
     made: list[Path] = []
-    write: Callable[..., Any] = scenario_objective.write_export
+    write: Callable[..., Any] = module.write_export
 
     def counted(objectives: Any, folder: Path, **options: Any) -> Any:
         made.append(folder)
