@@ -198,7 +198,7 @@ def test_a_damaged_build_is_done_again(builds: list[Path]) -> None:
     library = builds[0] / "libimpact.so"
     # Mapped in this process: another file takes its name.
     library.write_bytes(library.rename(builds[0].parents[1] / "mapped.so").read_bytes()[:5000])
-    (builds[0] / "scenario_objective.c").write_text("half")
+    (builds[0] / "impact.c").write_text("half")
     q = near(objective, "again")
     assert compiled(objective)(q)[0] == pytest.approx(objective.value(q), rel=1e-9)
     assert len(builds) == 2
