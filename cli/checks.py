@@ -71,12 +71,12 @@ def contact(value: str | None) -> str | None:
     if value is None:
         return None
     from impact_posture.errors import ImpactPostureError
-    from impact_posture.impact.contact import Contact
-    from impact_posture.impact.texts import parse_contact
+    from impact_posture.impact.contact import ImpactContact
+    from impact_posture.impact.parsing import parse_contact
 
     try:
         frame, normal, impulse = parse_contact(value)
-        Contact.create(frame, normal, impulse=1.0 if impulse is None else impulse)
+        ImpactContact(frame, normal, impulse=1.0 if impulse is None else impulse)
     except ImpactPostureError as error:
         raise typer.BadParameter(f"{error.what}; {error.hint}") from None
     return value
@@ -92,7 +92,7 @@ def factors(value: Two | None) -> Two | None:
 def payloads(values: list[str] | None) -> list[str] | None:
     """Refuse what is no frame and mass."""
     from impact_posture.errors import ImpactPostureError
-    from impact_posture.impact.texts import parse_payload
+    from impact_posture.impact.parsing import parse_payload
 
     for value in values or ():
         try:

@@ -28,7 +28,7 @@ Processes = Annotated[
 
 def rows_table(page: Page, rows: tuple[Row, ...] | list[Row]) -> None:
     """Controllers of a scenario, a row each."""
-    from impact_posture.experiment.summary import interval_text, percent
+    from impact_posture.experiment.reproduction_summary import interval_text, percent
 
     lines = []
     for row in rows:

@@ -16,8 +16,8 @@ def main() -> None:
     import typer
 
     from impact_posture_cli.app import app
-    from impact_posture_cli.boundary import run
-    from impact_posture_cli.words import put_right
+    from impact_posture_cli.argv import put_right
+    from impact_posture_cli.error_boundary import run
 
     code = run(typer.main.get_command(app), put_right(sys.argv[1:]))
     finish()

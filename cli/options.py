@@ -321,7 +321,7 @@ ComOverFeet = Annotated[
     ),
 ]
 KeepContacts = Annotated[
-    bool, _option("--keep-contacts", panel=TASK, help="The blow must neither lift nor slide a foot.")
+    bool, _option("--keep-contacts", panel=TASK, help="The impact must neither lift nor slide a foot.")
 ]
 Friction = Annotated[
     float, _option("--friction", panel=TASK, callback=not_negative, help="Friction coefficient for --keep-contacts.")

@@ -40,7 +40,6 @@ myst_heading_anchors = 3
 myst_dmath_double_inline = True
 
 autodoc_member_order = "bysource"
-# Two packages may each have a Contact: annotations name the short one.
 suppress_warnings = ["ref.python"]
 autodoc_typehints = "signature"
 autodoc_default_options = {"members": True, "show-inheritance": True}

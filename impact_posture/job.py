@@ -12,17 +12,17 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from impact_posture.codegen.build import products
 from impact_posture.codegen.export import Export, export
+from impact_posture.codegen.library import products
 from impact_posture.errors import CompilerError, SpecError
 from impact_posture.escape import file_name
-from impact_posture.folder import whole_folder, write_record
-from impact_posture.posture.path import NullSpacePath, null_space_path
+from impact_posture.output_folder import whole_folder, write_record
+from impact_posture.posture.null_space_path import NullSpacePath, null_space_path
+from impact_posture.posture.problem_settings import Prepared, dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.result import result_arrays
-from impact_posture.posture.settings import Prepared, dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
-from impact_posture.processes import shared_out
+from impact_posture.processes import fork_map
 from impact_posture.robot.postures import write_posture
 
 # Matplotlib is imported where something is drawn: it takes longer than a small robot's answer.
@@ -95,7 +95,7 @@ def write_result(
         # The C code first: it takes longest.
         tasks: list[Callable[[], Any]] = [partial(_export, prepared, solution, folder / "c")] if codegen else []
         tasks += _drawings(_view(prepared, solution.initial, solution.q, path, document), folder, formats)
-        with shared_out(lambda index: tasks[index](), len(tasks), jobs) as results:
+        with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
             for done, (index, result) in enumerate(results, start=1):
                 if codegen and index == 0:
                     made, failure = result

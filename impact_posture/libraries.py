@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from impact_posture.errors import OutputError, SpecError
-from impact_posture.folder import scratch_folder
+from impact_posture.output_folder import scratch_folder
 
 _REBUILD = "delete it: it is built again"
 # ELF's header behind its 16 bytes of identity, and the entries of its program header up to the length in the file.

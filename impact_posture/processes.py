@@ -94,7 +94,7 @@ def _worker(index: int) -> tuple[int, Any]:
 
 
 @contextmanager
-def shared_out(function: Callable[[int], _Result], count: int, jobs: int) -> Iterator[Iterator[tuple[int, _Result]]]:
+def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Iterator[Iterator[tuple[int, _Result]]]:
     """``(index, function(index))`` for each index below ``count``, as they finish.
 
     In forked processes where ``jobs`` is more than one and the system can fork; else one after the other, here.  When
@@ -130,7 +130,7 @@ def _finished(futures: list[Future[tuple[int, _Result]]]) -> Iterator[tuple[int,
 
 
 @contextmanager
-def in_a_copy(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
+def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
     """Begin ``function()`` in a copy of this process, at the very state that it is in; yield what waits for its end.
 
     For state that cannot be copied otherwise (physics, solvers).  The copy's exceptions are raised here.  When the

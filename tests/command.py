@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import IO
 
 # What the commands import when they run, once for all of them.
-import impact_posture.benchmark.measure
 import impact_posture.codegen.export
 import impact_posture.experiment.figures
 import impact_posture.experiment.folders
 import impact_posture.experiment.reproduction
 import impact_posture.job
 import impact_posture.plot
-import impact_posture.verification.verify
+import impact_posture.verification.verification
 from impact_posture_cli.main import main
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.robot.loader import known_robots, load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import known_robots, load_robot
 
 Vector = NDArray[np.float64]
 

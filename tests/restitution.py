@@ -10,7 +10,7 @@ import pinocchio as pin
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RobotSpec
-from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Shape, Surface
 from impact_posture.simulation.world import World, build_world
 
@@ -99,7 +99,7 @@ def _one(law: ContactLaw, speed: float, timestep: float, mass: float, phase: flo
 def _follow(world: World, surface: Surface, speed: float) -> Bounce:
     """Step until the surface has let go."""
     law = surface.law
-    idle = Drive(np.zeros(0), np.zeros(0))
+    idle = ActuatorCommand(np.zeros(0), np.zeros(0))
     constant = law.solref[0] if law.solref[0] > 0 else 1 / np.sqrt(-law.solref[0])
     forces, depth, ended = [0.0], 0.0, False
     for _ in range(int(_PATIENCE * constant / world.timestep)):

@@ -10,7 +10,7 @@ from tests.helpers import Vector, frame_jacobian, mass_matrix
 
 
 class Rigid:
-    """Jumps and feet's impulses of the three unit blows along the world's axes, by ``pin.impulseDynamics``."""
+    """Jumps and feet's impulses of the three unit impacts along the world's axes, by ``pin.impulseDynamics``."""
 
     def __init__(self, base: ImpactObjective, q: Vector) -> None:
         self._base = base
@@ -24,8 +24,8 @@ class Rigid:
         self.free = np.linalg.solve(mass_matrix(model, q), self.J.T)
         data = model.createData()
         columns, impulses = [], []
-        for blow in self.free.T:
-            columns.append(np.array(pin.impulseDynamics(model, data, q, blow, self.Js, 0.0, 0.0)))
+        for impact in self.free.T:
+            columns.append(np.array(pin.impulseDynamics(model, data, q, impact, self.Js, 0.0, 0.0)))
             impulses.append(np.array(data.impulse_c))
         self.jumps, self.impulses = np.array(columns).T, np.array(impulses).T
         return self

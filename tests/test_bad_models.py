@@ -19,9 +19,9 @@ from impact_posture.errors import (
     SpecError,
     UrdfError,
 )
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import build_metric
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from tests.helpers import NAMES, robot
 
 GOOD = '<mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
@@ -409,22 +409,22 @@ def test_posture_outside_the_limits() -> None:
 @pytest.mark.parametrize("normal", [(0, 0, 0), (0, 0, 1e-12), (np.nan, 0, 1), (np.inf, 0, 0), (0, 1)])
 def test_normals_without_direction(normal: tuple[float, ...]) -> None:
     with pytest.raises(ContactError) as caught:
-        Contact.create("ee", normal)  # type: ignore[arg-type]
+        ImpactContact("ee", normal)  # type: ignore[arg-type]
     one_line(caught.value, "has no direction", "--normal")
 
 
 def test_normals_are_normalized() -> None:
-    assert np.linalg.norm(Contact.create("ee", (3, -4, 12)).normal) == pytest.approx(1.0, abs=1e-15)
-    assert Contact.create("ee", (0, 0, 1e-6)).normal == (0.0, 0.0, 1.0)
+    assert np.linalg.norm(ImpactContact("ee", (3, -4, 12)).normal) == pytest.approx(1.0, abs=1e-15)
+    assert ImpactContact("ee", (0, 0, 1e-6)).normal == (0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("impulse", [0.0, -1.0, np.nan, np.inf])
 def test_impossible_impulses_and_offsets(impulse: float) -> None:
     with pytest.raises(ContactError) as caught:
-        Contact.create("ee", (0, 0, 1), impulse=impulse)
+        ImpactContact("ee", (0, 0, 1), impulse=impulse)
     one_line(caught.value, "--impulse")
     with pytest.raises(ContactError) as caught:
-        Contact.create("ee", (0, 0, 1), offset=(0.0, np.nan, 0.0))
+        ImpactContact("ee", (0, 0, 1), offset=(0.0, np.nan, 0.0))
     one_line(caught.value, "--offset")
 
 

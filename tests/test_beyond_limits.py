@@ -16,16 +16,16 @@ import typer
 
 from impact_posture.codegen.reader import read_manifest
 from impact_posture.errors import CompilerError, ContactError, InputError, PostureError, SpecError, UrdfError
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.request import ImpactRequest
 from impact_posture.job import load_view
-from impact_posture.posture.settings import read_settings
-from impact_posture.robot.loader import load_robot
+from impact_posture.posture.problem_settings import read_settings
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.spec import read_spec
 from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM, build_model
 from impact_posture.toolchain import find_compiler, words_of
-from impact_posture_cli.boundary import run
+from impact_posture_cli.error_boundary import run
 
 LINK = (
     '<link name="l{0}"><inertial><mass value="1"/>'
@@ -50,7 +50,7 @@ def test_too_many_joints_are_refused_before_anything_is_allocated(tmp_path: Path
 @pytest.mark.parametrize("impulse", [1e308, 1e200, 1e-200, 5e-324])
 def test_an_impulse_whose_objective_overflows(impulse: float) -> None:
     with pytest.raises(ContactError, match="beyond double precision"):
-        Contact.create("ee", (0, 0, 1), impulse=impulse)
+        ImpactContact("ee", (0, 0, 1), impulse=impulse)
 
 
 def test_a_speed_whose_jump_overflows() -> None:

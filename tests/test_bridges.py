@@ -17,16 +17,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.benchmark.pinocchio import eigen_headers
-from impact_posture.benchmark.workbench import Absent, cxx_compiler
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.errors import CompilerError
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.toolchain import run_compiler
 from tests.helpers import Vector, assert_close, central_gradient, frame_placement, robot, unit
-from tests.tools import need_compiler
+from tests.tools import cxx_compiler, eigen_headers, need_compiler
 
 DOCS = Path(__file__).parents[1] / "docs"
 EXAMPLES = DOCS / "examples"
@@ -161,10 +159,9 @@ def test_held_tasks_have_the_jacobian_of_their_error(example: ModuleType) -> Non
 
 def eigen_program(folder: Path, floating: bool) -> Path:
     """The C++ example, built against the export in ``folder``; skips where a compiler or Eigen is missing."""
-    try:
-        compiler, eigen = cxx_compiler(), eigen_headers()
-    except Absent as absent:
-        pytest.skip(str(absent))
+    compiler, eigen = cxx_compiler(), eigen_headers()
+    if compiler is None or eigen is None:
+        pytest.skip("no C++ compiler (g++, clang++, $CXX), or no Eigen headers (cmeel-eigen, $EIGEN3_INCLUDE_DIR)")
     target = folder / "posture_acceleration"
     flags = ["-std=c++17", "-O0", "-Wall", "-Wextra", "-Werror", f"-DFLOATING_BASE={int(floating)}"]
     headers = ["-I", str(folder), "-isystem", str(eigen)]
@@ -180,7 +177,7 @@ def accelerations(program: Path, states: list[tuple[Vector, ...]]) -> list[str]:
 
 
 def exported(name: str, frame: str, folder: Path, real: Real) -> ImpactObjective:
-    objective = ImpactObjective(robot(name), Contact.create(frame, (0, 0, 1)))
+    objective = ImpactObjective(robot(name), ImpactContact(frame, (0, 0, 1)))
     export(objective, folder, prefix="arm", real=real, check=False)
     run_compiler([*need_compiler(), "-std=c99", "-O0", "-c", "arm.c", "-o", "arm.o"], folder)
     return objective

@@ -18,9 +18,10 @@ from impact_posture import __version__
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.contact import NormalFrame
 from impact_posture.impact.metric import MetricKind, ObjectiveKind
-from impact_posture.robot.loader import known_robots
+from impact_posture.robot.robot_loader import known_robots
 from impact_posture.robot.spec import ContactPose, Root
-from impact_posture_cli import boundary, options
+from impact_posture_cli import error_boundary as boundary
+from impact_posture_cli import options
 from tests.command import run as start
 from tests.helpers import frame_jacobian, mass_matrix, relative, robot
 

@@ -12,12 +12,12 @@ import typer.main
 from impact_posture.errors import FrameNotFound, InertiaError, JointNotFound, PostureError, not_one_of
 from impact_posture.impact.request import ImpactRequest
 from impact_posture.posture.notes import percent
-from impact_posture.posture.settings import make_settings, prepare, resolved_settings
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.posture.problem_settings import make_settings, prepare, resolved_settings
 from impact_posture.robot.postures import read_posture, write_posture
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture_cli.app import app
-from impact_posture_cli.boundary import run
-from impact_posture_cli.words import put_right
+from impact_posture_cli.argv import put_right
+from impact_posture_cli.error_boundary import run
 from tests.helpers import robot
 
 DATA = "example-robot-data:"

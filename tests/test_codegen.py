@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.codegen.compiler import (
+from impact_posture.codegen.build_check import (
     CompiledExport,
     casadi_difference,
     compile_and_check,
@@ -27,10 +27,10 @@ from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.naming import c_identifier
 from impact_posture.errors import CompilerError, InputError, MetricError, OutputError, PostureError
 from impact_posture.escape import c_comment
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.toolchain import find_compiler, run_compiler
 from tests.tools import need, need_compiler
 
@@ -68,7 +68,7 @@ class Case:
             if self.metric == "weighted"
             else Metric("kinetic" if self.metric == "kinetic" else "euclidean")
         )
-        contact = Contact.create(
+        contact = ImpactContact(
             self.frame, (1.0, 0.3, -0.2), (0.01, 0.02, 0.0), "contact" if self.in_frame else "world", 1.7
         )
         return ImpactObjective(robot, contact, metric, self.kind, supports)
@@ -204,7 +204,7 @@ def test_unit_norm_is_asked_for(built: Built) -> None:
 def test_code_for_a_quantity_that_does_not_exist(pendulum: str, tmp_path: Path) -> None:
     need_compiler()
     robot = load_robot(pendulum)
-    objective = ImpactObjective(robot, Contact.create("tip", (1.0, 0.0, 0.0)), kind="speed")
+    objective = ImpactObjective(robot, ImpactContact("tip", (1.0, 0.0, 0.0)), kind="speed")
     export(objective, tmp_path, prefix="pend")
     with compiled(tmp_path, "pend", 1, 1) as library:
         assert library.objective(np.zeros(1))[0] == 3
@@ -213,7 +213,7 @@ def test_code_for_a_quantity_that_does_not_exist(pendulum: str, tmp_path: Path) 
 
 
 def test_objective_that_exists_nowhere(pendulum: str, tmp_path: Path) -> None:
-    objective = ImpactObjective(load_robot(pendulum), Contact.create("tip", (0.0, 0.0, 1.0)), kind="speed")
+    objective = ImpactObjective(load_robot(pendulum), ImpactContact("tip", (0.0, 0.0, 1.0)), kind="speed")
     with pytest.raises(MetricError, match="not finite"):
         export(objective, tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["pendulum.urdf"]
@@ -338,7 +338,7 @@ def test_example_agrees(small: ImpactObjective, tmp_path: Path) -> None:
 def test_example_notices_a_wrong_number(pendulum: str, tmp_path: Path) -> None:
     make = need("make")
     need_compiler()
-    objective = ImpactObjective(load_robot(pendulum), Contact.create("tip", (1.0, 1.0, 0.0)))
+    objective = ImpactObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
     written = export(objective, tmp_path, prefix="pend", check=False)
     example = (tmp_path / "example.c").read_text()
     H = repr(written.manifest["self_test"]["H"])
@@ -356,7 +356,7 @@ def test_cmake_target_from_outside(pendulum: str, tmp_path: Path) -> None:
     inside = tmp_path / "c"
     inside.mkdir()
     robot = load_robot(pendulum)
-    objective = ImpactObjective(robot, Contact.create("tip", (1.0, 1.0, 0.0)))
+    objective = ImpactObjective(robot, ImpactContact("tip", (1.0, 1.0, 0.0)))
     export(objective, inside, prefix="pend", posture=robot.posture(), check=False)
     (tmp_path / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(controller C)\nadd_subdirectory(c)\n"
@@ -376,7 +376,7 @@ def test_two_exports_in_one_program(pendulum: str, tmp_path: Path) -> None:
     robot = load_robot(pendulum)
     values = []
     for prefix, normal in (("first", (0.0, 1.0, 0.0)), ("second", (1.0, 1.0, 0.0))):
-        objective = ImpactObjective(robot, Contact.create("tip", normal))
+        objective = ImpactObjective(robot, ImpactContact("tip", normal))
         export(objective, tmp_path, prefix=prefix, posture=robot.posture(), check=False, force=True)
         values.append(objective.value(robot.posture()))
     (tmp_path / "both.c").write_text(
@@ -409,7 +409,7 @@ def test_no_compiler(small: ImpactObjective, tmp_path: Path, monkeypatch: pytest
 def test_compiler_that_fails(pendulum: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     need("false")
     monkeypatch.setenv("CC", "false")
-    objective = ImpactObjective(load_robot(pendulum), Contact.create("tip", (1.0, 1.0, 0.0)))
+    objective = ImpactObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
     with pytest.raises(CompilerError) as caught:
         export(objective, tmp_path, prefix="pend")
     assert "exit code 1" in caught.value.line
@@ -420,7 +420,7 @@ def test_compiler_that_fails(pendulum: str, tmp_path: Path, monkeypatch: pytest.
 
 def test_compiler_says_why(pendulum: str, tmp_path: Path) -> None:
     need_compiler()
-    objective = ImpactObjective(load_robot(pendulum), Contact.create("tip", (1.0, 1.0, 0.0)))
+    objective = ImpactObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
     export(objective, tmp_path, prefix="pend", check=False)
     source = tmp_path / "pend.c"
     source.write_text(source.read_text().replace("return 0;", "return nothing_of_that_name;"))
@@ -431,7 +431,7 @@ def test_compiler_says_why(pendulum: str, tmp_path: Path) -> None:
 
 def test_compiled_code_that_computes_something_else(pendulum: str, tmp_path: Path) -> None:
     need_compiler()
-    objective = ImpactObjective(load_robot(pendulum), Contact.create("tip", (1.0, 1.0, 0.0)))
+    objective = ImpactObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
     export(objective, tmp_path, prefix="pend", check=False)
     source = tmp_path / "pend.c"
     changed = source.read_text().replace("*H = ", "*H = 1.000001 * ")
@@ -475,7 +475,7 @@ def test_bad_prefix(small: ImpactObjective, tmp_path: Path, prefix: str) -> None
 
 
 def test_never_overwrites_without_force(pendulum: str, tmp_path: Path) -> None:
-    objective = ImpactObjective(load_robot(pendulum), Contact.create("tip", (1.0, 1.0, 0.0)))
+    objective = ImpactObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
     (tmp_path / "README.md").write_text("mine")
     with pytest.raises(OutputError, match=r"README\.md"):
         export(objective, tmp_path, check=False)
@@ -485,7 +485,7 @@ def test_never_overwrites_without_force(pendulum: str, tmp_path: Path) -> None:
 
 
 def test_bad_folder_and_posture(pendulum: str, tmp_path: Path) -> None:
-    objective = ImpactObjective(load_robot(pendulum), Contact.create("tip", (1.0, 1.0, 0.0)))
+    objective = ImpactObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
     with pytest.raises(OutputError, match="no such folder"):
         export(objective, tmp_path / "absent", check=False)
     with pytest.raises(PostureError):

@@ -12,19 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impact_posture.codegen.build import products
-from impact_posture.codegen.compiler import casadi_difference, compiled, oracle_difference, self_test_tolerance
+from impact_posture.codegen.build_check import casadi_difference, compiled, oracle_difference, self_test_tolerance
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
-from impact_posture.codegen.folder import write_export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.export_folder import write_export
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.library import products
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.errors import CompilerError, InputError, OutputError
-from impact_posture.folder import RECORD
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.output_folder import RECORD
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.toolchain import run_compiler
 from tests import command
 from tests.tools import need, need_compiler
@@ -77,7 +77,7 @@ def test_every_joint_type_metric_and_objective(tmp_path: Path, metric: Any, kind
     assert len(families) == 8
     weights = tuple(np.linspace(0.5, 2.0, robot.nv)) if metric == "weighted" else None
     objective = ImpactObjective(
-        robot, Contact.create("l8", (1.0, 0.3, -0.2), (0.02, 0, 0.1), impulse=1.3), Metric(metric, weights), kind
+        robot, ImpactContact("l8", (1.0, 0.3, -0.2), (0.02, 0, 0.1), impulse=1.3), Metric(metric, weights), kind
     )
     written = export(objective, tmp_path, prefix="chain", real=real, check=False)
     with compiled(tmp_path, "chain", robot.nq, robot.nv, ("-O0", *STRICT), real) as library:
@@ -89,12 +89,12 @@ def test_every_joint_type_metric_and_objective(tmp_path: Path, metric: Any, kind
 
 @pytest.fixture(scope="module")
 def arm() -> ImpactObjective:
-    return ImpactObjective(load_robot("tilthex_arm"), Contact.create("ee", (0, 0.6, 0.8)))
+    return ImpactObjective(load_robot("tilthex_arm"), ImpactContact("ee", (0, 0.6, 0.8)))
 
 
 @pytest.fixture(scope="module")
 def two(arm: ImpactObjective) -> tuple[ImpactObjective, ImpactObjective]:
-    return arm, ImpactObjective(arm.robot, Contact.create("base_link", (1, 0, 0)), arm.metric)
+    return arm, ImpactObjective(arm.robot, ImpactContact("base_link", (1, 0, 0)), arm.metric)
 
 
 # ---- other people's builds ----------------------------------------------------------------------------------------
@@ -147,7 +147,7 @@ def test_stack_of_a_robot_that_stands(tmp_path: Path, tool: str) -> None:
     need(tool)
     solo8 = load_robot("solo8")
     feet = tuple(Support.from_spec(s) for s in solo8.spec.supports)
-    objective = ImpactObjective(solo8, Contact.create("base_link", (1, 0, 0)), supports=feet)
+    objective = ImpactObjective(solo8, ImpactContact("base_link", (1, 0, 0)), supports=feet)
     bound = export(objective, tmp_path, prefix="solo8", check=False).manifest["stack_bytes"]
     deepest = deepest_stack(tmp_path, "solo8", tool, "-O3 -mavx512f -mfma")
     # Not by far: who reserves a stack pays for what is promised.
@@ -308,15 +308,15 @@ def test_a_build_that_fails_leaves_what_was_there(
     if how == "compiler fails":
         monkeypatch.setenv("CC", need("false"))
     elif how == "other numbers":
-        monkeypatch.setattr("impact_posture.codegen.compiler._ORACLE_TOLERANCE", -1.0)
-        monkeypatch.setattr("impact_posture.codegen.compiler.self_test_tolerance", lambda *_: -1.0)
+        monkeypatch.setattr("impact_posture.codegen.build_check._ORACLE_TOLERANCE", -1.0)
+        monkeypatch.setattr("impact_posture.codegen.build_check.self_test_tolerance", lambda *_: -1.0)
     else:
         error = KeyboardInterrupt
 
         def interrupt(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("impact_posture.codegen.build.run_compiler", interrupt)
+        monkeypatch.setattr("impact_posture.codegen.library.run_compiler", interrupt)
     for out in (kept, tmp_path / "none"):
         with pytest.raises(error):
             write_export([arm], out, prefix="arm", build=True, force=True)

@@ -17,8 +17,8 @@ from impact_posture.posture import compiled
 from impact_posture.posture.blas import one_blas_thread
 from impact_posture.posture.nlp import build_nlp
 from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.problem_settings import Prepared, make_settings, prepare
 from impact_posture.posture.result import result_document
-from impact_posture.posture.settings import Prepared, make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.toolchain import run_compilers
 from tests.plot.views import PENDULUM

@@ -17,7 +17,7 @@ from impact_posture.codegen.export import export
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.cone import cone_axes, worst_normal
 from impact_posture.impact.cone_symbolic import worst_normal_symbolic
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.metric import Metric, ObjectiveKind
 from impact_posture.impact.normal_cone import NormalCone
@@ -25,9 +25,9 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.nlp import build_nlp
 from impact_posture.posture.problem import Requirements
-from impact_posture.posture.settings import make_settings, prepare
+from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.solve import run_start, solve
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from tests.command import run
 from tests.helpers import (
     assert_close,
@@ -96,14 +96,14 @@ def test_never_below_and_at_most_a_little_above_a_hundred_thousand_normals(name:
             sampled = along(form, normals)
             worst = 1 / (2 * sampled.min()) if kind == "energy" else 9 * sampled.max()
             worst /= 9 if kind == "sticking" else 1
-            contact = Contact.create(ROBOTS[name], tuple(axis), impulse=3.0)
+            contact = ImpactContact(ROBOTS[name], tuple(axis), impulse=3.0)
             value = ImpactObjective(robot(name), contact, kind=kind, normal_cone_deg=degrees).value(q)
             assert value >= worst * (1 - 1e-11), (name, kind, degrees)
             assert value <= worst * (1 + 1e-4), (name, kind, degrees)
 
 
 def test_no_cone_is_the_plain_problem() -> None:
-    contact = Contact.create("ee", (0.2, -0.5, 1.0), impulse=2.0)
+    contact = ImpactContact("ee", (0.2, -0.5, 1.0), impulse=2.0)
     plain = ImpactObjective(robot("tilthex_arm"), contact)
     none = ImpactObjective(robot("tilthex_arm"), contact, normal_cone_deg=0.0)
     (q,) = random_configurations(plain.robot.model, 1, "plain")
@@ -193,7 +193,7 @@ def test_gradient_where_the_worst_normal_is_unique(name: str, axes: str, kind: O
     found = robot(name)
     feet = tuple(Support.from_spec(s) for s in found.spec.supports) if kind == "impulse" else ()
     for degrees, metric in ((5.0, "kinetic"), (45.0, "euclidean")):
-        contact = Contact.create(ROBOTS[name], tuple(unit(rng(name, axes, kind))), (0.02, 0, 0.01), axes)  # type: ignore[arg-type]
+        contact = ImpactContact(ROBOTS[name], tuple(unit(rng(name, axes, kind))), (0.02, 0, 0.01), axes)  # type: ignore[arg-type]
         objective = ImpactObjective(found, contact, Metric(metric), kind, feet, normal_cone_deg=degrees)  # type: ignore[arg-type]
         (q,) = random_configurations(found.model, 1, name, axes, kind, degrees, spread=0.4)
         assert not cone_of(objective).worst(q).tied
@@ -211,7 +211,7 @@ def test_gradient_where_the_worst_normal_is_unique(name: str, axes: str, kind: O
 def test_subgradients_at_a_mirror_symmetric_posture() -> None:
     """Towards every side the objective rises like the largest of its gradients: they span the subdifferential."""
     found = robot("solo8")
-    objective = ImpactObjective(found, Contact.create("base_link", (1.0, 0.0, 0.0)), normal_cone_deg=20.0)
+    objective = ImpactObjective(found, ImpactContact("base_link", (1.0, 0.0, 0.0)), normal_cone_deg=20.0)
     q = found.posture()
     worst = cone_of(objective).worst(q)
     assert worst.tied and np.allclose(worst.normals[0], worst.normals[1] * [1, 1, -1], atol=1e-9)
@@ -250,7 +250,7 @@ def test_solution_is_that_of_brute_force(degrees: float, tmp_path: Path) -> None
     (tmp_path / "arm.urdf").write_text(ARM.format(links=links))
     arm = load_robot(str(tmp_path / "arm.urdf"))
     axis = np.array([0.6, 0.0, 0.8])
-    objective = ImpactObjective(arm, Contact.create("c", (0.6, 0, 0.8), (0.1, 0.05, 0.3)), normal_cone_deg=degrees)
+    objective = ImpactObjective(arm, ImpactContact("c", (0.6, 0, 0.8), (0.1, 0.05, 0.3)), normal_cone_deg=degrees)
     problem = build_problem(arm, objective, arm.posture(), Requirements(contact_pose="free"))
     solution = solve(problem, starts=8, jobs=1, compile="never")
     assert solution.certified_starts >= 7
@@ -307,7 +307,7 @@ def test_solved_from_and_at_mirror_symmetric_postures() -> None:
 
 
 def test_speed_has_no_dual_and_no_cone_is_half_open() -> None:
-    contact = Contact.create("ee", (0, 0, 1))
+    contact = ImpactContact("ee", (0, 0, 1))
     with pytest.raises(MetricError, match="no quadratic form") as caught:
         ImpactObjective(robot("tilthex_arm"), contact, kind="speed", normal_cone_deg=5.0)
     assert "\n" not in caught.value.line
@@ -320,7 +320,7 @@ def test_export_has_the_worst_case(tmp_path: Path) -> None:
     need_compiler()
     for kind in CONE_KINDS:
         (tmp_path / kind).mkdir()
-        contact = Contact.create("ee", (0.1, -0.2, 1.0), impulse=2.0)
+        contact = ImpactContact("ee", (0.1, -0.2, 1.0), impulse=2.0)
         objective = ImpactObjective(robot("tilthex_arm"), contact, kind=kind, normal_cone_deg=15.0)
         made = export(objective, tmp_path / kind)
         assert made.compiled and made.agreement is not None and made.agreement < 1e-9

@@ -22,8 +22,8 @@ from impact_posture.posture.constraint import (
     HeldTurn,
     PositionBox,
 )
-from impact_posture.robot.loader import load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import load_robot
 
 Factory = Callable[[PointOnLink, pin.SE3], Constraint]
 
@@ -64,7 +64,7 @@ def test_constraint_agrees_with_itself_and_with_finite_differences(name: str, ki
     symbolic = ca.Function("c", [x, p], [constraint.symbolic(tree, p)])
     for _ in range(4):
         q = _random(robot, rng)
-        value, jacobian = constraint.numeric(numeric.at(q))
+        value, jacobian = constraint.evaluate(numeric.at(q))
         said = np.array(symbolic(chart.to_x(q), constraint.parameters)).reshape(-1)
         # A quaternion and its negative are one orientation: rows of an orientation may flip together.
         flipped = said.copy()
@@ -73,8 +73,8 @@ def test_constraint_agrees_with_itself_and_with_finite_differences(name: str, ki
         assert min(np.abs(said - value).max(), np.abs(flipped - value).max()) < 1e-12
         h = 1e-6
         for k, unit in enumerate(np.eye(robot.nv)):
-            ahead = constraint.numeric(numeric.at(pin.integrate(robot.model, q, h * unit)))[0]
-            behind = constraint.numeric(numeric.at(pin.integrate(robot.model, q, -h * unit)))[0]
+            ahead = constraint.evaluate(numeric.at(pin.integrate(robot.model, q, h * unit)))[0]
+            behind = constraint.evaluate(numeric.at(pin.integrate(robot.model, q, -h * unit)))[0]
             assert np.allclose((ahead - behind) / (2 * h), jacobian[:, k], atol=2e-8)
 
 
@@ -87,7 +87,7 @@ def test_orientation_error_is_zero_at_the_target_only(angle: float) -> None:
     q = robot.posture()
     q[3:7] = pin.Quaternion(pin.exp3(angle * AXIS)).coeffs()
     numeric = Numeric(robot.model).at(q)
-    value, _ = constraint.numeric(numeric)
+    value, _ = constraint.evaluate(numeric)
     assert np.linalg.norm(value) == pytest.approx(2 * np.sin(angle / 2), abs=1e-12)
     assert constraint.pose_error(numeric)[1] == pytest.approx(angle, abs=1e-7)
 
@@ -99,7 +99,7 @@ def test_level_base_leaves_yaw_free_and_nothing_else() -> None:
     for yaw in (-3.0, -1.0, 0.5, 2.0):
         q = robot.posture()
         q[3:7] = pin.Quaternion(pin.exp3(np.array([0, 0, yaw]))).coeffs()
-        assert np.abs(level.numeric(Numeric(robot.model).at(q))[0]).max() < 1e-14
+        assert np.abs(level.evaluate(Numeric(robot.model).at(q))[0]).max() < 1e-14
     for tilt in ([0.1, 0, 0], [0, -0.2, 0], [np.pi, 0, 0]):
         q[3:7] = pin.Quaternion(pin.exp3(np.array(tilt))).coeffs()
-        assert np.abs(level.numeric(Numeric(robot.model).at(q))[0]).max() > 0.05
+        assert np.abs(level.evaluate(Numeric(robot.model).at(q))[0]).max() > 0.05

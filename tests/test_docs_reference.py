@@ -14,9 +14,9 @@ import typer.main
 from pydantic import BaseModel
 
 from impact_posture.posture.certificate import Certificate
-from impact_posture.posture.follow import trade_off
+from impact_posture.posture.pareto import pareto_front
+from impact_posture.posture.problem_settings import ProblemSettings, make_settings, prepare
 from impact_posture.posture.result import result_document
-from impact_posture.posture.settings import ProblemSettings, make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.spec import ContactPose, RobotSpec
 from impact_posture.simulation.scenario_file import ScenarioFile
@@ -160,7 +160,7 @@ def test_result_keys_have_their_rows() -> None:
 def test_tradeoff_keys_are_in_their_row() -> None:
     solution = solve(prepare(make_settings({"robot": "panda", "normal": (0, 0, 1)})).problem, starts=1, jobs=1)
     (row,) = rows(DOCS / "reference" / "result-json.md")["tradeoff"]
-    for key in trade_off(solution, 1).to_list()[0]:
+    for key in pareto_front(solution, 1).to_list()[0]:
         assert f"`{key}`" in row, key
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from impact_posture.codegen.emitter import DOUBLE, Constants, Dialect, Emitter, c_double
+from impact_posture.codegen.graph import CALLS, graph_of
 from impact_posture.codegen.layout import lay_out
-from impact_posture.codegen.program import CALLS, graph_of
 from impact_posture.errors import CompilerError
 from impact_posture.toolchain import run_compiler
 from tests.tools import need_compiler

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import ContactError, FrameNotFound, InputError
-from impact_posture.impact.classical import classical_ellipsoids, force_ellipsoid, velocity_ellipsoid
+from impact_posture.impact.classical_ellipsoids import classical_ellipsoids, force_ellipsoid, velocity_ellipsoid
 from impact_posture.impact.contact import Support, default_compliance
 from impact_posture.impact.evaluation import Evaluation, evaluate
-from impact_posture.impact.jump import tangent_units
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.parsing import parse_armature, parse_contact
 from impact_posture.impact.request import ImpactRequest
-from impact_posture.impact.texts import parse_armature, parse_contact
+from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.robot.robot import Robot
 from tests.helpers import (
     assert_close,
@@ -311,7 +311,7 @@ def test_supports_as_text() -> None:
         supports("FL_FOOT", "FL_FOOT:surface")
 
 
-def test_a_blow_at_a_held_point_is_refused() -> None:
+def test_an_impact_at_a_held_point_is_refused() -> None:
     request = ImpactRequest("solo8", frame="FL_FOOT", normal=(1.0, 0.0, 0.0))
     with pytest.raises(ContactError, match="held by the support at 'FL_FOOT'"):
         request.resolve()

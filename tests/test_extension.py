@@ -11,13 +11,13 @@ import pytest
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.lifted import Guess, Lifted
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.worst_case import Subgradients
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.constraint import Constraint
-from impact_posture.posture.path import null_space_path
+from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.solve import solve
 from impact_posture.robot.robot import Robot
@@ -32,7 +32,7 @@ class JointDistance:
     robot: Robot
     target: tuple[float, ...]
     name: str = "joint-distance"
-    contacts: tuple[Contact, ...] = ()
+    contacts: tuple[ImpactContact, ...] = ()
     supports: tuple[Support, ...] = ()
     structure: str = "joint-distance"
     attempts: int = 1
@@ -71,8 +71,8 @@ class Coupled(Constraint):
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
         return tree.q[0] + tree.q[1] - parameters
 
-    def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
-        return np.array([numeric.q[0] + numeric.q[1] - self.parameters[0]]), np.eye(numeric.model.nv)[:2].sum(0)[None]
+    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+        return np.array([model.q[0] + model.q[1] - self.parameters[0]]), np.eye(model.model.nv)[:2].sum(0)[None]
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])

@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.dynamics.tree import Tree
-from impact_posture.impact.contact import Contact, Support, default_compliance
+from impact_posture.impact.contact import ImpactContact, Support, default_compliance
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.metric import Metric, ObjectiveKind, build_metric
@@ -50,7 +50,7 @@ def supports_of(found: Robot) -> tuple[Support, ...]:
     return (Support(str(frame.name), "point", (0.02, 0.03, -0.01)),)
 
 
-def combinations(name: str) -> Iterator[tuple[Robot, Contact, Metric, tuple[Support, ...]]]:
+def combinations(name: str) -> Iterator[tuple[Robot, ImpactContact, Metric, tuple[Support, ...]]]:
     """Metric × supports × frame of the normal; every other one for robots with many joints."""
     found, generator = robot(name), rng(name, "combinations")
     assert found.spec.contact.frame is not None
@@ -62,10 +62,10 @@ def combinations(name: str) -> Iterator[tuple[Robot, Contact, Metric, tuple[Supp
         if found.nv > 14 and (k + k // 2 + NAMES.index(name)) % 2:
             continue
         normal = unit(generator)
-        yield found, Contact.create(found.spec.contact.frame, tuple(normal), OFFSET, axes, 3.0), metric, supports
+        yield found, ImpactContact(found.spec.contact.frame, tuple(normal), OFFSET, axes, 3.0), metric, supports
 
 
-def describe(contact: Contact, metric: Metric, supports: tuple[Support, ...]) -> str:
+def describe(contact: ImpactContact, metric: Metric, supports: tuple[Support, ...]) -> str:
     return f"{metric.kind}, normal in {contact.normal_frame}, {len(supports)} supports"
 
 
@@ -190,7 +190,7 @@ def test_objective_functions_agree_with_its_own_numbers(name: str, kind: Objecti
 
 def test_degenerate_combinations_are_named() -> None:
     found = robot("panda")
-    contact = Contact.create("panda_hand", (0.0, 0.0, 1.0))
+    contact = ImpactContact("panda_hand", (0.0, 0.0, 1.0))
     said = {kind: ImpactObjective(found, contact, Metric("kinetic"), kind).warnings for kind in KINDS}
     assert "opposite" in said["speed"][0]
     assert "effective mass" in said["impulse"][0]

@@ -10,13 +10,13 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import ContactError, MetricError
-from impact_posture.impact.contact import Contact, Support, default_compliance, support_inertia
+from impact_posture.impact.contact import ImpactContact, Support, default_compliance, support_inertia
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
-from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from tests.helpers import (
     NAMES,
     Vector,
@@ -47,7 +47,7 @@ def quantities(
 ) -> ImpactQuantities:
     frame = frame or found.spec.contact.frame
     assert frame is not None
-    contact = Contact.create(frame, tuple(normal), OFFSET)
+    contact = ImpactContact(frame, tuple(normal), OFFSET)
     return ImpactOracle(ImpactCase(found, contact, metric, supports, compliance or 0.0)).quantities(q)
 
 
@@ -297,7 +297,7 @@ def test_feet_are_heavier_links() -> None:
 def test_solo8_on_its_feet_is_not_solo8_in_the_air(normal: tuple[float, float, float]) -> None:
     """Crouching with the feet held: the free ``H`` and the one that knows of the ground disagree about its sign."""
     found = robot("solo8")
-    contact, q = Contact.create("base_link", normal), found.posture()
+    contact, q = ImpactContact("base_link", normal), found.posture()
     free, standing = ImpactObjective(found, contact), ImpactObjective(found, contact, supports=feet(found))
     assert relative(standing.value(q), free.value(q)) > 0.1
     # What the feet allow that lowers the base and does nothing else to it.
@@ -319,7 +319,7 @@ def test_point_feet_lose_rank_and_stay_smooth() -> None:
     _, _, J_s = jacobians(found, q, feet(found))
     assert J_s.shape[0] == 12
     assert np.linalg.matrix_rank(J_s, tol=1e-9) < 12
-    objective = ImpactObjective(found, Contact.create("base_link", (0.0, 1.0, 0.0)), supports=feet(found))
+    objective = ImpactObjective(found, ImpactContact("base_link", (0.0, 1.0, 0.0)), supports=feet(found))
     differences = central_gradient(objective.value, found.model, q, 2e-4)
     assert_close(objective.gradient(q), differences, 1e-6, "gradient", scale=objective.value(q))
 
@@ -351,7 +351,7 @@ def test_s_is_undefined_out_of_the_plane() -> None:
         assert o.S is None
         assert o.sticking_jump is None
         assert o.sticking_impulse is None
-    objective = ImpactObjective(found, Contact.create("link2", tuple(out), OFFSET), kind="sticking")
+    objective = ImpactObjective(found, ImpactContact("link2", tuple(out), OFFSET), kind="sticking")
     with pytest.raises(MetricError, match="S does not exist"):
         objective.value(q)
     with pytest.raises(MetricError, match="S does not exist"):
@@ -373,7 +373,7 @@ def test_s_in_the_plane_by_the_pseudo_inverse() -> None:
         assert_close(o.sticking_jump if o.sticking_jump is not None else np.nan, jump, 1e-8, "jump")
         kinetic = quantities(found, q, n, Metric("kinetic"), frame="link2")
         assert kinetic.S == pytest.approx(float(jump @ M @ jump), rel=1e-8)
-        objective = ImpactObjective(found, Contact.create("link2", tuple(n), OFFSET), kind="sticking")
+        objective = ImpactObjective(found, ImpactContact("link2", tuple(n), OFFSET), kind="sticking")
         differences = central_gradient(objective.value, found.model, q, 2e-4)
         assert_close(objective.gradient(q), differences, 1e-6, "gradient", scale=objective.value(q))
         value, gradient = (np.array(o) for o in objective.gradient_fun()(q, n))
@@ -382,6 +382,6 @@ def test_s_in_the_plane_by_the_pseudo_inverse() -> None:
 
 
 def test_a_frame_that_cannot_move_is_refused() -> None:
-    objective = ImpactObjective(robot("panda"), Contact.create("panda_link0", (1.0, 0.0, 0.0)))
+    objective = ImpactObjective(robot("panda"), ImpactContact("panda_link0", (1.0, 0.0, 0.0)))
     with pytest.raises(ContactError, match="welded to the world"):
         objective.value(robot("panda").posture())

@@ -17,21 +17,21 @@ from typing import Any
 import pytest
 
 from impact_posture import libraries
-from impact_posture.codegen.build import build_library
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.library import build_library
 from impact_posture.codegen.reader import read_manifest
 from impact_posture.errors import CompilerError, OutputError, SpecError
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from tests.plot.views import PENDULUM
 from tests.tools import need, need_compiler
 
 # Loads every folder that is named, and says what became of it; a crash ends it, and the last line says where.
 LOADER = """
 import sys
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import ImpactPostureError
 for folder in sys.argv[1:]:
     print(folder, end=" ", flush=True)
@@ -60,7 +60,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("export")
     robot = load_robot(PENDULUM)
     objectives = [
-        ImpactObjective(robot, Contact.create(f, (0.6, 0.8, 0), (0, 0.1, 0.2))) for f in robot.frame_names[-2:]
+        ImpactObjective(robot, ImpactContact(f, (0.6, 0.8, 0), (0, 0.1, 0.2))) for f in robot.frame_names[-2:]
     ]
     export(objectives, folder, prefix="arm", check=False, portable=True)
     with pytest.MonkeyPatch.context() as patch:
@@ -221,7 +221,7 @@ def test_a_library_of_another_export_is_refused(built: Path, tmp_path: Path) -> 
     robot = load_robot(PENDULUM)
     other, mine = tmp_path / "other", shutil.copytree(built, tmp_path / "mine")
     other.mkdir()
-    objective = ImpactObjective(robot, Contact.create(robot.frame_names[-1], (1, 0, 0), (0, 0.1, 0.2)))
+    objective = ImpactObjective(robot, ImpactContact(robot.frame_names[-1], (1, 0, 0), (0, 0.1, 0.2)))
     export(objective, other, prefix="arm", check=False, portable=True)
     for name in ("libarm.so", "libarm.so.sha256"):
         shutil.copy(mine / name, other / name)

@@ -20,10 +20,10 @@ from impact_posture.errors import (
     UrdfError,
     nearest,
 )
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.robot.urdf import example_robot_data
 from tests.helpers import NAMES, assert_close, mass_matrix, random_configurations, robot
 
@@ -282,7 +282,7 @@ def test_locking_reduces(name: str, lock: tuple[str, ...]) -> None:
         whole.model.upperPositionLimit, [int(whole.model.idx_qs[i]) for i in ids]
     ))  # fmt: skip
     assert whole.spec.contact.frame is not None
-    contact = Contact.create(whole.spec.contact.frame, (0.3, -0.5, 0.8))
+    contact = ImpactContact(whole.spec.contact.frame, (0.3, -0.5, 0.8))
     resisting = load_robot(name, LoadOptions(armature=dict.fromkeys(lock, 1e9)))
     found = ImpactOracle(ImpactCase(locked, contact)).quantities(q_locked)
     expected = ImpactOracle(ImpactCase(resisting, contact)).quantities(q)

@@ -16,7 +16,7 @@ import pytest
 
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.errors import (
     CompilerError,
@@ -27,9 +27,9 @@ from impact_posture.errors import (
     PostureError,
     SpecError,
 )
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.toolchain import find_compiler
 
 UNIT = np.array([0.6, 0.0, 0.8])
@@ -50,7 +50,7 @@ def loaded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         pytest.skip("no C compiler (cc, gcc, clang)")
     real: Real = request.param
     robot = load_robot("tilthex_arm")
-    objectives = tuple(ImpactObjective(robot, Contact.create(f, (0, 0.6, 0.8)), kind="speed") for f in FRAMES)
+    objectives = tuple(ImpactObjective(robot, ImpactContact(f, (0, 0.6, 0.8)), kind="speed") for f in FRAMES)
     folder = tmp_path_factory.mktemp(real.name)
     export(objectives, folder, prefix="arm", real=real, check=False)
     assert not (folder / "libarm.so").exists()
@@ -176,7 +176,7 @@ def test_threads_with_objects_of_their_own(loaded: Loaded) -> None:
 
 def test_no_casadi_and_no_pinocchio(loaded: Loaded) -> None:
     program = (
-        "import sys\nfrom impact_posture.codegen.loader import ImpactGradient\n"
+        "import sys\nfrom impact_posture.codegen.impact_gradient import ImpactGradient\n"
         "g = ImpactGradient.load(sys.argv[1])\nt = g.manifest['self_test']\n"
         "g.value_and_gradient(t['q'], t['n'])\n"
         "assert not {'casadi', 'pinocchio', 'scipy'} & set(sys.modules), 'heavy'\n"

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from impact_posture.dynamics import mjcf
 from impact_posture.dynamics.mjcf import write_mjcf
 from impact_posture.errors import InputError, UnsupportedJoint
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.urdf import build_model
 from tests.helpers import (
     NAMES,

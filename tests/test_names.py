@@ -29,21 +29,21 @@ from impact_posture.codegen.export import default_prefix, export
 from impact_posture.codegen.variants import variants
 from impact_posture.dynamics.mjcf import write_mjcf
 from impact_posture.experiment.reproduction import Reproduction
+from impact_posture.experiment.reproduction_summary import summary
 from impact_posture.experiment.statistics import Row
-from impact_posture.experiment.summary import summary
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.plot import ResultView, jump_figure, save
-from impact_posture.posture.settings import ProblemSettings, dump_settings, read_settings
+from impact_posture.posture.problem_settings import ProblemSettings, dump_settings, read_settings
 from impact_posture.robot.draft import write_draft
-from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.robot.spec import RobotSpec, read_spec
-from impact_posture.simulation.build import build_scene
 from impact_posture.simulation.scene import Scene, Shape, Surface
+from impact_posture.simulation.world_builder import build_scene
 from impact_posture_cli.app import app
-from impact_posture_cli.boundary import run
-from impact_posture_cli.words import put_right
+from impact_posture_cli.argv import put_right
+from impact_posture_cli.error_boundary import run
 from tests.tools import need_compiler
 
 NASTY = (
@@ -116,14 +116,14 @@ def exports(arm: Robot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
     """A folder of C for each name, and for one that is harmless."""
     # Names are no part of the functions: they are made once.
     point = (0.3, 0.0, 0.0)
-    harmless = ImpactObjective(arm, Contact.create("tip", (0, 0.6, 0.8), point))
+    harmless = ImpactObjective(arm, ImpactContact("tip", (0, 0.6, 0.8), point))
     code = build_code(variants([harmless], "arm"), "arm", DOUBLE)
     folders = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("impact_posture.codegen.export.build_code", lambda *_, **__: code)
         for name in ("tip", *NASTY):
             robot = renamed(arm, name)
-            objective = ImpactObjective(robot, Contact.create(name, (0, 0.6, 0.8), point, "contact"))
+            objective = ImpactObjective(robot, ImpactContact(name, (0, 0.6, 0.8), point, "contact"))
             folders[name] = tmp_path_factory.mktemp("c")
             export(objective, folders[name], prefix="arm", check=False, posture=robot.posture())
     return folders
@@ -211,7 +211,7 @@ def test_identifiers_and_file_names() -> None:
 
 def test_default_prefixes_are_identifiers(arm: Robot) -> None:
     for name in NASTY:
-        prefix = default_prefix([ImpactObjective(renamed(arm, name), Contact.create(name, (0, 0, 1)))])
+        prefix = default_prefix([ImpactObjective(renamed(arm, name), ImpactContact(name, (0, 0, 1)))])
         assert re.fullmatch("[A-Za-z][A-Za-z0-9_]{0,110}", prefix), ascii(name)[:60]
 
 
@@ -272,7 +272,7 @@ def test_mujoco_loads_a_scene_with_such_surfaces_and_shapes(arm: Robot) -> None:
 def test_figure_of_such_a_robot(arm: Robot, tmp_path: Path) -> None:
     name = "$\\frac{$\x1b[31m]]>\n--" * 500
     robot = renamed(arm, name)
-    objective = ImpactObjective(robot, Contact.create(name, (0, 1, 0), (0.3, 0, 0), "contact"))
+    objective = ImpactObjective(robot, ImpactContact(name, (0, 1, 0), (0.3, 0, 0), "contact"))
     view = ResultView(robot, objective, robot.posture(), robot.posture() + 0.1)
     (path,) = save(jump_figure(view), tmp_path, "jump", ["svg"])
     assert ElementTree.parse(path).getroot().tag.endswith("svg")

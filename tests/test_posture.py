@@ -13,9 +13,9 @@ from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.contact import point_on
 from impact_posture.posture.certificate import certify, objective_gradients
 from impact_posture.posture.equalities import equality_jacobian, rank
-from impact_posture.posture.path import null_space_path
+from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.settings import (
+from impact_posture.posture.problem_settings import (
     ProblemSettings,
     dump_settings,
     make_settings,
@@ -189,7 +189,7 @@ def test_planar_legs_get_regular_equalities() -> None:
     problem = problem_of("solo8", (1, 0, 0), frame="base_link")
     assert "base roll" in [c.name for c in problem.constraints]
     numeric, q = Numeric(problem.robot.model).at(problem.given), problem.given
-    carried = [c.numeric(numeric)[1][problem.carried(i)] for i, c in enumerate(problem.constraints) if c.equality]
+    carried = [c.evaluate(numeric)[1][problem.carried(i)] for i, c in enumerate(problem.constraints) if c.equality]
     stacked = np.vstack(carried)
     assert rank(stacked) == len(stacked) == rank(equality_jacobian(problem, numeric.at(q))) == 11
 
@@ -313,7 +313,7 @@ def test_turns_that_nothing_sees_are_fixed() -> None:
     assert solution.redundancy == sideways.robot.nv - 5
 
 
-def test_blow_that_moves_nothing_is_refused() -> None:
+def test_impact_that_moves_nothing_is_refused() -> None:
     urdf = "example-robot-data:double_pendulum_description/urdf/double_pendulum.urdf"
     frame = "link2" if "link2" in prepare_frames(urdf) else prepare_frames(urdf)[-1]
     for objective in ("impulse", "speed"):
@@ -326,7 +326,7 @@ def test_blow_that_moves_nothing_is_refused() -> None:
 
 
 def prepare_frames(urdf: str) -> tuple[str, ...]:
-    from impact_posture.robot.loader import load_robot
+    from impact_posture.robot.robot_loader import load_robot
 
     return load_robot(urdf).frame_names
 

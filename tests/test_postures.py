@@ -15,9 +15,9 @@ from impact_posture.errors import (
     PostureError,
     PostureNotFound,
 )
-from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.postures import posture_path, read_posture, write_posture
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from tests.helpers import NAMES, random_configurations, rng, robot
 
 

@@ -21,7 +21,7 @@ from impact_posture.errors import (
     SimulationDiverged,
     WorkerDied,
 )
-from impact_posture.processes import end_early, in_a_copy, shared_out, signals_held, undone
+from impact_posture.processes import end_early, fork_call, fork_map, signals_held, undone
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs /proc to look at processes")
 
@@ -50,7 +50,7 @@ def test_every_index_comes_once_with_its_result_in_whatever_order(jobs: int) -> 
         time.sleep(0.02 * (3 - index) if index < 3 else 0)
         return index**2, os.getpid()
 
-    with shared_out(work, 7, jobs) as results:
+    with fork_map(work, 7, jobs) as results:
         found = dict(results)
     assert {index: square for index, (square, _) in found.items()} == {k: k**2 for k in range(7)}
     pids = {pid for _, pid in found.values()}
@@ -64,20 +64,20 @@ def test_a_worker_that_is_killed_is_noticed() -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         return index
 
-    with pytest.raises(WorkerDied, match="--jobs 1"), shared_out(work, 6, 2) as results:
+    with pytest.raises(WorkerDied, match="--jobs 1"), fork_map(work, 6, 2) as results:
         list(results)
-    with shared_out(lambda index: index, 3, 2) as results:
+    with fork_map(lambda index: index, 3, 2) as results:
         assert sorted(results) == [(k, k) for k in range(3)]
 
 
 def test_what_cannot_be_sent_to_a_process_is_found_there() -> None:
     held = open(__file__, encoding="utf-8")
-    with held, shared_out(lambda index: (index, held.name), 3, 2) as results:
+    with held, fork_map(lambda index: (index, held.name), 3, 2) as results:
         assert sorted(results) == [(k, (k, __file__)) for k in range(3)]
 
 
 def test_nothing_to_do() -> None:
-    with shared_out(lambda index: index, 0, 4) as results:
+    with fork_map(lambda index: index, 0, 4) as results:
         assert list(results) == []
 
 
@@ -97,7 +97,7 @@ def test_a_workers_fault_reaches_the_caller_whole(error: Exception, jobs: int) -
             raise error
         return index
 
-    with pytest.raises(type(error)) as caught, shared_out(work, 6, jobs) as results:
+    with pytest.raises(type(error)) as caught, fork_map(work, 6, jobs) as results:
         for _ in results:
             pass
     assert str(caught.value) == str(error)
@@ -114,11 +114,11 @@ def test_after_a_fault_no_process_is_left_and_the_next_sharing_works(tmp_path: P
         return index
 
     begin = time.monotonic()
-    with pytest.raises(ValueError, match="stop"), shared_out(work, 4, 2) as results:
+    with pytest.raises(ValueError, match="stop"), fork_map(work, 4, 2) as results:
         list(results)
     assert time.monotonic() - begin < 15
     assert gone([int(path.name) for path in tmp_path.iterdir()])
-    with shared_out(lambda index: -index, 4, 2) as results:
+    with fork_map(lambda index: -index, 4, 2) as results:
         assert dict(results) == {k: -k for k in range(4)}
 
 
@@ -128,7 +128,7 @@ def test_leaving_early_leaves_no_process(tmp_path: Path) -> None:
         time.sleep(0 if index == 0 else 30)
         return index
 
-    with shared_out(work, 4, 2) as results:
+    with fork_map(work, 4, 2) as results:
         assert next(results) == (0, 0)
     pids = [int(path.name) for path in tmp_path.iterdir()]
     assert pids and gone(pids)
@@ -137,7 +137,7 @@ def test_leaving_early_leaves_no_process(tmp_path: Path) -> None:
 PROGRAM = """
 import os, signal, sys, time
 from pathlib import Path
-from impact_posture.processes import in_a_copy, shared_out
+from impact_posture.processes import fork_call, fork_map
 
 # A shell ignores Ctrl-C for what it runs in the background, and its children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -147,7 +147,7 @@ def work(index):
     time.sleep(60)
 
 try:
-    with shared_out(work, 4, 2) as results:
+    with fork_map(work, 4, 2) as results:
         list(results)
 except KeyboardInterrupt:
     print("stopped")
@@ -180,7 +180,7 @@ def test_ctrl_c_leaves_no_process_and_no_noise(tmp_path: Path, send: Callable[[i
 KILLED = """
 import os, signal, sys, time
 from pathlib import Path
-from impact_posture.processes import in_a_copy, shared_out
+from impact_posture.processes import fork_call, fork_map
 from impact_posture.toolchain import run_compilers
 
 folder = Path(sys.argv[2])
@@ -190,10 +190,10 @@ def linger(index=0):
     time.sleep(60)
 
 if sys.argv[1] == "workers":
-    with shared_out(linger, 4, 2) as results:
+    with fork_map(linger, 4, 2) as results:
         list(results)
 elif sys.argv[1] == "a copy":
-    with in_a_copy(linger) as collect:
+    with fork_call(linger) as collect:
         collect()
 else:
     # Like a compiler, it starts others.
@@ -243,7 +243,7 @@ def test_what_is_unfinished_is_undone_newest_first_whatever_fails(ended: list[st
 
 def test_a_copy_does_not_undo_what_its_original_has_begun(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
-    with undone((tmp_path / "folder").rmdir), in_a_copy(lambda: end_early(lambda: None)) as collect:
+    with undone((tmp_path / "folder").rmdir), fork_call(lambda: end_early(lambda: None)) as collect:
         collect()
         assert (tmp_path / "folder").is_dir()
 
@@ -266,7 +266,7 @@ def test_a_copy_goes_on_from_the_very_state() -> None:
     def draw() -> np.ndarray:
         return numbers.random(100_000)
 
-    with in_a_copy(draw) as collect:
+    with fork_call(draw) as collect:
         # More than a pipe holds: the copy waits, this process does not.
         here = draw()
         np.testing.assert_array_equal(collect(), here)
@@ -276,12 +276,12 @@ def test_what_a_copy_raises_is_raised_here() -> None:
     def fail() -> None:
         raise InputError("is wrong", where="the copy", hint="correct it")
 
-    with in_a_copy(fail) as collect, pytest.raises(InputError, match="the copy: is wrong; correct it"):
+    with fork_call(fail) as collect, pytest.raises(InputError, match="the copy: is wrong; correct it"):
         collect()
 
 
 def test_a_copy_that_dies_is_an_error() -> None:
-    with in_a_copy(lambda: os.kill(os.getpid(), signal.SIGKILL)) as collect, pytest.raises(OSError, match="has died"):
+    with fork_call(lambda: os.kill(os.getpid(), signal.SIGKILL)) as collect, pytest.raises(OSError, match="has died"):
         collect()
 
 
@@ -293,7 +293,7 @@ def test_no_copy_outlives_its_block(tmp_path: Path) -> None:
         told.with_suffix(".part").replace(told)
         time.sleep(60)
 
-    with pytest.raises(KeyboardInterrupt), in_a_copy(linger):
+    with pytest.raises(KeyboardInterrupt), fork_call(linger):
         while not told.exists():
             time.sleep(0.01)
         raise KeyboardInterrupt

@@ -13,16 +13,16 @@ import pytest
 
 from impact_posture.errors import ImpactPostureError, InputError, ScenarioNotFound, SpecError
 from impact_posture.simulation import scenario_file
-from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import (
     EndEffectorGains,
-    Footing,
     Gains,
-    ImpactScenario,
     RepeatedContacts,
     RobustTerm,
+    Scenario,
     SinglePush,
+    StanceGains,
     set_up,
 )
 from impact_posture.simulation.scenario_file import known_scenarios, read_scenario
@@ -57,7 +57,7 @@ def test_every_shipped_scenario_can_be_set_up_and_run(name: str) -> None:
     assert not any(s.touching for s in before.shapes)
     rotors = before.rotor_speeds
     joints = robot.nv - 6
-    world.step(Drive(np.zeros(joints), rotors), 20)
+    world.step(ActuatorCommand(np.zeros(joints), rotors), 20)
     reading, truth = world.read(), world.truth()
     assert np.isfinite(truth.q).all() and np.isfinite(reading.v).all()
     # A robot that flies is clear of the surface, one that stands is on it, with all its feet.
@@ -163,7 +163,7 @@ def test_anybodys_urdf_and_scenario_run_from_anywhere(folder: Path, monkeypatch:
     np.testing.assert_allclose(setup.scenario.normal, [0, 0, 1])
     assert setup.gap == pytest.approx(0.05)
     setup.world.reset(setup.q)
-    setup.world.step(Drive(np.zeros(setup.robot.nv), np.zeros(0)), 10)
+    setup.world.step(ActuatorCommand(np.zeros(setup.robot.nv), np.zeros(0)), 10)
     assert read_scenario(path).control.posture == Gains(10)
 
 
@@ -226,7 +226,7 @@ def test_surface_and_shape_of_a_push_are_refused() -> None:
         ("PhysicsFile", Physics), ("SurfaceFile", Surface), ("ShapeFile", Shape), ("SensorsFile", Sensors),
         ("ContactsFile", RepeatedContacts), ("PushFile", SinglePush), ("GainsFile", Gains),
         ("EndEffectorFile", EndEffectorGains),
-        ("RobustFile", RobustTerm), ("FootingFile", Footing),
+        ("RobustFile", RobustTerm), ("StanceGainsFile", StanceGains),
     ],
 )  # fmt: skip
 def test_files_and_values_have_the_same_keys_and_defaults(file: str, value: Any) -> None:
@@ -276,7 +276,7 @@ def test_a_gap_too_short_to_come_up_to_speed_in_is_refused() -> None:
 
 def test_the_shipped_references_fit_their_gaps() -> None:
     for name in ("aerial-vertical", "aerial-lateral"):
-        found: ImpactScenario = read_scenario(name)
+        found: Scenario = read_scenario(name)
         assert isinstance(found.task, RepeatedContacts)
         assert Reference(found.task, found.surface.gap).inward > 0.4
 

@@ -14,20 +14,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impact_posture.codegen.build import build_library, library_path
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.library import build_library, library_path
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses, corners
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.posture.feet import KeptFeet
+from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.settings import (
+from impact_posture.posture.problem_settings import (
     dump_settings,
     make_settings,
     prepare,
@@ -36,8 +36,8 @@ from impact_posture.posture.settings import (
 )
 from impact_posture.posture.solve import solve
 from impact_posture.posture.starts import feasible_start
-from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.robot.spec import RobotSpec
 from tests.command import run
 from tests.helpers import (
@@ -76,21 +76,21 @@ def box_of(objective: ImpactObjective) -> ImpulseBox:
 
 
 def jumps_of(objective: ImpactObjective, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit blows' jumps as columns and the weight matrix W, by dense algebra on Pinocchio's M and J."""
+    """Unit impacts' jumps as columns and the weight matrix W, by dense algebra on Pinocchio's M and J."""
     model = objective.robot.model
     M = mass_matrix(model, q)
-    blows = []
+    impacts = []
     for contact in objective.contacts:
         frame = objective.robot.frame_id(contact.frame)
         n = np.array(contact.normal)
         n = frame_placement(model, q, frame).rotation @ n if contact.normal_frame == "contact" else n
-        blows.append(frame_jacobian(model, q, frame, contact.offset)[:3].T @ n)
+        impacts.append(frame_jacobian(model, q, frame, contact.offset)[:3].T @ n)
     rows = [
         frame_jacobian(model, q, objective.robot.frame_id(s.frame), s.offset)[: s.rows] for s in objective.supports
     ]
     Js = np.vstack(rows) if rows else np.zeros((0, model.nv))
     kkt = np.block([[M, -Js.T], [Js, objective.compliance * np.eye(len(Js))]])
-    right = np.vstack([np.array(blows).T, np.zeros((len(Js), len(blows)))])
+    right = np.vstack([np.array(impacts).T, np.zeros((len(Js), len(impacts)))])
     metric = objective.metric
     W = {"euclidean": np.eye(model.nv), "kinetic": M}.get(metric.kind)
     return np.linalg.solve(kkt, right)[: model.nv], np.diag(metric.diagonal(model.nv)) if W is None else W
@@ -121,7 +121,7 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
     generator = rng(seed, "box")
     found = random_robot(generator, floating=floating)
     contacts = [
-        Contact.create(f"f{k}", tuple(unit(generator)), tuple(0.1 * generator.normal(size=3)), axes, impulse)  # type: ignore[arg-type]
+        ImpactContact(f"f{k}", tuple(unit(generator)), tuple(0.1 * generator.normal(size=3)), axes, impulse)  # type: ignore[arg-type]
         for k, impulse in enumerate(generator.uniform(0.3, 3.0, count))
     ]
     weights = tuple(generator.uniform(0.2, 5.0, found.nv)) if metric == "weighted" else None
@@ -165,9 +165,9 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
 @pytest.mark.parametrize(("name", "frames"), [("solo12", ("FL_SHOULDER", "FR_SHOULDER")),
                                               ("solo8", ("FL_UPPER_LEG", "FR_UPPER_LEG"))])  # fmt: skip
 def test_subgradients_at_a_mirror_symmetric_posture(name: str, frames: tuple[str, str]) -> None:
-    """Squeezed from both sides: either blow alone is as bad, and the objective rises like the larger of the two."""
+    """Squeezed from both sides: either impact alone is as bad, and the objective rises like the larger of the two."""
     found = robot(name)
-    one, other = (Contact.create(f, (0.0, side, 0.0)) for f, side in zip(frames, (1.0, -1.0), strict=True))
+    one, other = (ImpactContact(f, (0.0, side, 0.0)) for f, side in zip(frames, (1.0, -1.0), strict=True))
     objective = ImpactObjective(found, one, others=(other,))
     q = found.posture()
     worst, points = box_of(objective).worst(q), objective.subgradients(q)
@@ -193,7 +193,7 @@ def test_both_hands_of_talos_by_hand() -> None:
     found = robot("talos")
     feet = tuple(Support.from_spec(s) for s in found.spec.supports)
     right, left = (
-        Contact.create(frame, (-1.0, 0.0, 0.2), impulse=i) for frame, i in zip(HANDS, (1.0, 2.0), strict=True)
+        ImpactContact(frame, (-1.0, 0.0, 0.2), impulse=i) for frame, i in zip(HANDS, (1.0, 2.0), strict=True)
     )
     objective = ImpactObjective(found, right, supports=feet, others=(left,))
     assert [single.contact for single in objective.singles] == [right, left]
@@ -226,8 +226,8 @@ def test_corners() -> None:
     )
 
 
-def _pair() -> tuple[Contact, Metric, str, tuple[Support, ...], float, float, tuple[Contact, ...]]:
-    hand, elbow = Contact.create("panda_hand_tcp", (0, 0, 1)), Contact.create("panda_link4", (1, 0, 0))
+def _pair() -> tuple[ImpactContact, Metric, str, tuple[Support, ...], float, float, tuple[ImpactContact, ...]]:
+    hand, elbow = ImpactContact("panda_hand_tcp", (0, 0, 1)), ImpactContact("panda_link4", (1, 0, 0))
     return hand, Metric(), "impulse", (), 0.0, 0.0, (elbow,)  # type: ignore[return-value]
 
 
@@ -336,7 +336,7 @@ def test_struck_feet_that_are_balls_are_held_in_place_only() -> None:
     assert "position of FL_FOOT" in names and "pose of FL_FOOT" not in names
 
 
-def test_kept_feet_of_each_blow() -> None:
+def test_kept_feet_of_each_impact() -> None:
     task = {"robot": "bolt", "contact": ("base_link:0,0.1,-1", "base_link:0.1,0,-1"), "contact_pose": "free",
             "keep_contacts": True, "friction": 2.0}  # fmt: skip
     problem = problem_of(task)
@@ -392,7 +392,7 @@ def test_exported_hands_of_talos(tmp_path: Path, real: Real) -> None:
     # Legs and torso are made rigid: half the code to compile, and every hand is where it was.
     legs = tuple(name for name in robot("talos").joint_names if name.startswith(("leg", "head", "gripper", "torso")))
     found = load_robot("talos", LoadOptions(lock=legs))
-    right, left = (Contact.create(frame, (-1.0, 0.1, 0.0), impulse=i) for frame, i in zip(HANDS, (1, 3), strict=True))
+    right, left = (ImpactContact(frame, (-1.0, 0.1, 0.0), impulse=i) for frame, i in zip(HANDS, (1, 3), strict=True))
     objective = ImpactObjective(found, right, others=(left,))
     written = export(objective, tmp_path, prefix="hands", real=real, check=False)
     assert written.manifest["several"]["symbols"] == {"objective": "hands_objective"}
@@ -417,7 +417,7 @@ def test_exported_frame_struck_along_two_normals(tmp_path: Path) -> None:
     need_compiler()
     found = robot("bolt")
     feet = tuple(Support.from_spec(s) for s in found.spec.supports)
-    contacts = [Contact.create("base_link", n, impulse=i) for n, i in (((0, 0, 1), 1.0), ((1, 0, 0.2), 2.0))]
+    contacts = [ImpactContact("base_link", n, impulse=i) for n, i in (((0, 0, 1), 1.0), ((1, 0, 0.2), 2.0))]
     objective = ImpactObjective(
         found, contacts[0], Metric("kinetic"), supports=feet, others=(contacts[1],), bilateral=True
     )
@@ -461,8 +461,8 @@ def test_evaluate_tells_contacts_of_one_frame_apart(tmp_path: Path) -> None:
     for name in (f"{hand} (-1, 0, 0)", f"{hand} (0, 0, 1)", "right_rubber_hand"):
         (row,) = [line for line in lines if line.startswith(f"  {name} ") and not line.startswith("  normal")]
         assert len(row.removeprefix(f"  {name}").split()) == 4, "H, G, V, S in one row"
-        assert any(f"(blow at {name})" in line for line in lines), "feet under each blow"
-    assert "of a blow at" in done.stdout and "alone" in done.stdout
+        assert any(f"(impact at {name})" in line for line in lines), "feet under each impact"
+    assert "of an impact at" in done.stdout and "alone" in done.stdout
 
 
 @pytest.mark.parametrize(

@@ -14,16 +14,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.codegen.compiler import CompiledExport, compiled
+from impact_posture.codegen.build_check import CompiledExport, compiled
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import Contact, Support, least_compliance
+from impact_posture.impact.contact import ImpactContact, Support, least_compliance
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.impact.request import ImpactRequest
 from impact_posture.robot.robot import Robot
-from impact_posture.verification.verify import verify
+from impact_posture.verification.verification import verify
 from tests.exact import Exact, ExactImpact, digits, distance, exact, rounded
 from tests.exact_bounds import Bounded
 from tests.helpers import Vector, central_gradient, random_configurations, rng, robot, unit
@@ -58,7 +58,7 @@ def objective(name: str, relative_compliance: float, normal: Vector | None = Non
     found = robot(name)
     assert found.spec.contact.frame is not None
     n = unit(rng(name, "exact normal")) if normal is None else normal
-    contact = Contact.create(found.spec.contact.frame, tuple(n))
+    contact = ImpactContact(found.spec.contact.frame, tuple(n))
     return ImpactObjective(found, contact, supports=feet(found), compliance=relative_compliance / found.mass)
 
 
@@ -205,13 +205,13 @@ def test_the_effect_of_compliance_is_bounded(name: str, label: str, relative_com
     assert 0 <= float(x.G - rigid.G) <= share * (G_free - float(rigid.G)) * (1 + 1e-6)
     least = np.sqrt(np.linalg.eigvalsh(M)[0])
     assert abs(np.sqrt(float(x.H)) - np.sqrt(float(rigid.H))) <= kinetic / least * (1 + 1e-6)
-    # Along motions that the feet allow the momentum is the blow's, whatever the compliance.
+    # Along motions that the feet allow the momentum is the impact's, whatever the compliance.
     allowed = np.linalg.svd(Js)[2][np.linalg.matrix_rank(Js, tol=1e-9) :]
     assert np.abs(allowed @ M @ off).max() <= 1e-9 * np.abs(M @ off).max()
 
 
 def test_the_limit_of_no_compliance_is_not_smooth() -> None:
-    """A sideways blow at solo8, one knee moved by 1e-6 rad: another limit, and the same value at the default."""
+    """A sideways impact at solo8, one knee moved by 1e-6 rad: another limit, and the same value at the default."""
     sideways = np.array([0.0, 1.0, 0.0])
     values = {}
     for label in ("equal knees", "one knee moved by 1e-6"):

@@ -18,16 +18,17 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
-from impact_posture.posture import follow, nlp
-from impact_posture.posture.distance import WithinDistance, distance, distance_gradient
-from impact_posture.posture.follow import trade_off
+from impact_posture.posture import nlp
+from impact_posture.posture import pareto as follow
+from impact_posture.posture.pareto import pareto_front
+from impact_posture.posture.posture_distance import WithinDistance, distance, distance_gradient
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.settings import make_settings, prepare
+from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.posture.starts import Projector
 from impact_posture.posture.tradeoff import TradeOff, find_knee
+from impact_posture_cli.argv import fill_optional
 from impact_posture_cli.options import TRADEOFF_POINTS
-from impact_posture_cli.words import fill_optional
 from tests.command import run
 from tests.helpers import central_gradient, relative, rng
 from tests.test_posture import walk
@@ -45,7 +46,7 @@ EVERY = pytest.mark.parametrize("case", CASES)
 @cache
 def solved(case: str) -> tuple[PostureSolution, TradeOff]:
     solution = solve(prepare(make_settings(CASES[case])).problem, starts=16, jobs=1)
-    return solution, trade_off(solution, 10)
+    return solution, pareto_front(solution, 10)
 
 
 def moved(problem: PostureProblem, q: np.ndarray, start: np.ndarray) -> float:
@@ -97,7 +98,7 @@ def test_the_bound_says_the_same_to_program_and_certificate() -> None:
     ball = WithinDistance(chart, p, 0.5)
     x, parameters = ca.SX.sym("x", chart.nx), ca.SX.sym("p", model.nq)
     expression = ball.symbolic(Tree(model, chart.configuration(x), x), parameters)
-    value, jacobian = ball.numeric(Numeric(model).at(q))
+    value, jacobian = ball.evaluate(Numeric(model).at(q))
     symbolic = ca.Function("ball", [x, parameters], [expression])(chart.to_x(q), ball.parameters)
     assert float(symbolic) == pytest.approx(value[0], rel=1e-12)
     assert jacobian.shape == (1, model.nv) and not ball.equality
@@ -204,7 +205,7 @@ def test_one_program_serves_all_distances(monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr(follow, "build_nlp", count)
     seen: list[tuple[int, int]] = []
-    curve = trade_off(solution, 4, progress=lambda done, total: seen.append((done, total)))
+    curve = pareto_front(solution, 4, progress=lambda done, total: seen.append((done, total)))
     assert len(built) == 1 and curve.solves >= 7
     assert all(0 < done <= total for done, total in seen) and len(seen) == 7
 
@@ -212,7 +213,7 @@ def test_one_program_serves_all_distances(monkeypatch: pytest.MonkeyPatch) -> No
 def test_regularization_gives_way_to_the_bound() -> None:
     settings = make_settings({**CASES["floating"], "regularization": 0.3})
     solution = solve(prepare(settings).problem, starts=4, jobs=1)
-    curve = trade_off(solution, 4)
+    curve = pareto_front(solution, 4)
     far = solved("floating")[1].points[-1]
     last = curve.points[-1]
     assert last.within < 0.9 * far.within and last.objective > 1.01 * far.objective
@@ -225,7 +226,7 @@ def test_nothing_to_trade_at_an_optimum() -> None:
     settings = {**CASES["floating"], "q": tuple(float(v) for v in solution.q)}
     again = solve(prepare(make_settings(settings)).problem, starts=2, jobs=1)
     assert distance(Chart(solution.problem.robot.model), again.q, again.initial) < 1e-6
-    curve = trade_off(again)
+    curve = pareto_front(again)
     assert len(curve.points) == 1 and curve.points[0].certified
     assert any("nothing to trade" in note for note in curve.notes)
     assert curve.knee is None and curve.solves == 0
@@ -234,7 +235,7 @@ def test_nothing_to_trade_at_an_optimum() -> None:
 def test_points_that_do_not_certify_are_kept_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
     solution, _ = solved("floating")
     monkeypatch.setattr(nlp, "IPOPT_OPTIONS", nlp.IPOPT_OPTIONS | {"ipopt.max_iter": 1})
-    curve = trade_off(solution, 5)
+    curve = pareto_front(solution, 5)
     assert len(curve.points) == 6
     failed = [p for p in curve.points if not p.certified]
     assert len(failed) >= 3
@@ -252,7 +253,7 @@ def test_a_better_posture_than_the_optimum_is_said() -> None:
         q for q in walk(solution.problem, solution.q, 0.02, 40) + walk(solution.problem, solution.q, -0.02, 40)
         if moved(solution.problem, q, solution.initial) > curve.points[-1].within + 0.2
     )  # fmt: skip
-    found = trade_off(replace(solution, q=beyond), 6)
+    found = pareto_front(replace(solution, q=beyond), 6)
     assert any("found a better posture" in note for note in found.notes)
     assert min(p.objective for p in found.points) == pytest.approx(curve.points[-1].objective, rel=1e-6)
     # Within more distance than the optimum needs, the optimum is the answer.
@@ -283,7 +284,7 @@ def test_knee_at_no_distance() -> None:
 @pytest.mark.parametrize("points", [0, -3])
 def test_no_points_are_refused(points: int) -> None:
     with pytest.raises(InputError, match="tradeoff"):
-        trade_off(solved("floating")[0], points)
+        pareto_front(solved("floating")[0], points)
 
 
 # ---- the command line -------------------------------------------------------------------------------------------

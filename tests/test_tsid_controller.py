@@ -19,10 +19,10 @@ from impact_posture.tsid.frame_tasks import FramePose, FramePosition, Impedance
 from impact_posture.tsid.limits import AccelerationBounds, LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program, aerial_program
 from impact_posture.tsid.ranges import JointRanges
 from impact_posture.tsid.relaxation import solve
 from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import TaskFormulation, aerial_formulation
 from tests.helpers import rng, robot
 
 DT = 1e-3
@@ -55,11 +55,11 @@ def assert_dynamics(controller: Controller, command: Command, force: np.ndarray 
     state, r = controller.state, controller.robot
     load = pin.rnea(r.model, r.model.createData(), state.q, state.v, command.acceleration)
     made = controller.actuators.G @ command.u
-    for contact, rows in zip(controller.program.contacts, controller.assembly.contacts.rows, strict=True):
+    for contact, rows in zip(controller.formulation.contacts, controller.assembly.contacts.rows, strict=True):
         made = made + state.at(contact.point).jacobian[: contact.size].T @ command.forces[rows]
     if force is not None:
-        assert controller.program.force_point is not None
-        made = made + state.at(controller.program.force_point).jacobian[: force.size].T @ force
+        assert controller.formulation.force_point is not None
+        made = made + state.at(controller.formulation.force_point).jacobian[: force.size].T @ force
     assert np.abs(load - made).max() <= 1e-8
 
 
@@ -71,7 +71,7 @@ def assert_limits(controller: Controller, command: Command) -> None:
 @pytest.mark.parametrize("order", ["strict", "weighted"])
 def test_every_tick_satisfies_dynamics_and_limits(order: str) -> None:
     r = robot(ARM)
-    controller = Controller(r, aerial_program(r, JointPosture(r, far_posture(r)), order=order))  # type: ignore[arg-type]
+    controller = Controller(r, aerial_formulation(r, JointPosture(r, far_posture(r)), order=order))  # type: ignore[arg-type]
     v = 0.1 * rng("v").normal(size=r.nv)
     controller.reset(r.posture(), v)
     for k, command, _, _ in run(controller, r.posture(), v, 300):
@@ -87,18 +87,18 @@ def test_every_tick_satisfies_dynamics_and_limits(order: str) -> None:
 def test_a_conflicting_posture_moves_neither_tilt_nor_end_effector() -> None:
     r = robot(ARM)
     posture = JointPosture(r, far_posture(r), kp=6.0)
-    controller = Controller(r, aerial_program(r, posture))
+    controller = Controller(r, aerial_formulation(r, posture))
     q, v = r.posture(), np.zeros(r.nv)
     controller.reset(q, v)
-    start = State(r, controller.program.points).update(q, v)
-    pose = start.at(controller.program.points[0]).position.copy()
+    start = State(r, controller.formulation.points).update(q, v)
+    pose = start.at(controller.formulation.points[0]).position.copy()
     moved = 0.0
     for _, command, now, _ in run(controller, q, v, 600):
         report = controller.report()
         assert command.status is Status.SOLVED and not report.active
         assert np.abs(report.residuals["tilt"]).max() <= 1e-8
         assert np.abs(report.residuals["ee pose"]).max() <= 1e-8
-        here = controller.state.at(controller.program.points[0]).position
+        here = controller.state.at(controller.formulation.points[0]).position
         # Integration in steps of a millisecond leaves something: second order, and corrected by the feedback.
         assert np.linalg.norm(here - pose) < 1e-4
         moved = float(np.abs(now[7:] - r.posture()[7:]).max())
@@ -113,7 +113,7 @@ def test_same_inputs_same_bits() -> None:
         return np.array([c.u for _, c, _, _ in run(controller, r.posture(), 0.2 * np.ones(r.nv), 60)])
 
     def make() -> Controller:
-        return Controller(r, aerial_program(r, JointPosture(r, far_posture(r), kp=100.0)))
+        return Controller(r, aerial_formulation(r, JointPosture(r, far_posture(r), kp=100.0)))
 
     one = make()
     first = record(one)
@@ -124,7 +124,7 @@ def test_same_inputs_same_bits() -> None:
 def pushed(r: Robot, meters: float) -> Controller:
     """The end effector is wanted far to the side: more than the rotors can do at level tilt."""
     ee = FramePose(Point("ee"), kp=60.0)
-    controller = Controller(r, aerial_program(r, JointPosture(r), end_effector=ee))
+    controller = Controller(r, aerial_formulation(r, JointPosture(r), end_effector=ee))
     controller.reset(r.posture(), np.zeros(r.nv))
     assert ee.target is not None
     ee.target = pin.SE3(ee.target.rotation, ee.target.translation + np.array([0, meters, 0]))
@@ -157,7 +157,7 @@ def test_a_relaxed_level_comes_as_close_as_it_can() -> None:
     M = pin.crba(r.model, r.model.createData(), q)
     h = pin.rnea(r.model, r.model.createData(), q, v, np.zeros(nv))
     G, low, high = controller.actuators.G, controller.actuators.lower, controller.actuators.upper
-    ee = controller.program.levels[1][0]
+    ee = controller.formulation.levels[1][0]
     J, wanted = np.array(ee.jacobian(state)), ee.desired(state) - ee.drift(state)
     A = np.hstack([J, np.zeros((6, G.shape[1]))])
     tilt = np.hstack([np.eye(2, nv, 3), np.zeros((2, G.shape[1]))])
@@ -188,7 +188,7 @@ def test_a_saturated_flight_never_fails() -> None:
 def test_measured_force_enters_the_dynamics() -> None:
     r = robot(ARM)
     ee = FramePose(Point("ee"), kp=60.0, impedance=Impedance(3.0, 1.0))
-    controller = Controller(r, aerial_program(r, JointPosture(r), end_effector=ee))
+    controller = Controller(r, aerial_formulation(r, JointPosture(r), end_effector=ee))
     q, v = r.posture(), np.zeros(r.nv)
     controller.reset(q, v)
     force = np.array([0.5, 0.2, 3.0])
@@ -203,7 +203,7 @@ def test_measured_force_enters_the_dynamics() -> None:
 @pytest.mark.parametrize("where", ["q", "v", "force", "t", "quaternion"])
 def test_broken_measurements_hold_the_last_command(where: str) -> None:
     r = robot(ARM)
-    controller = Controller(r, aerial_program(r, JointPosture(r)))
+    controller = Controller(r, aerial_formulation(r, JointPosture(r)))
     q, v, force, t = r.posture(), 0.1 * np.ones(r.nv), np.zeros(3), 0.001
     controller.reset(q, v)
     before = controller.tick(0.0, q, v)
@@ -243,7 +243,7 @@ class Refusing:
 
 def test_a_solver_that_gives_up_holds_the_last_command(monkeypatch: pytest.MonkeyPatch) -> None:
     r = robot(ARM)
-    controller = Controller(r, aerial_program(r, JointPosture(r)))
+    controller = Controller(r, aerial_formulation(r, JointPosture(r)))
     controller.reset(r.posture(), np.zeros(r.nv))
     before = controller.tick(0.0, r.posture(), np.zeros(r.nv))
     working, aside = controller._solver, controller._aside
@@ -273,8 +273,10 @@ def test_joints_stop_at_their_limits(margin: float) -> None:
     r = robot(ARM)
     target, end = r.posture(), np.asarray(r.model.upperPositionLimit)[7:] - margin
     target[7:] = end + 2.0
-    program = Program((), (Tilt(weight=10.0),), JointPosture(r, target, kp=60.0), law=LimitLaw(margin=margin))
-    controller = Controller(r, program)
+    formulation = TaskFormulation(
+        (), (Tilt(weight=10.0),), JointPosture(r, target, kp=60.0), law=LimitLaw(margin=margin)
+    )
+    controller = Controller(r, formulation)
     controller.reset(r.posture(), np.zeros(r.nv))
     touched = np.zeros(3, dtype=bool)
     for _, command, q, _ in run(controller, r.posture(), np.zeros(r.nv), 1500):
@@ -323,7 +325,7 @@ def with_rotors(r: Robot, rotors: tuple[RotorSpec, ...]) -> Robot:
 
 def test_more_rotors_than_needed() -> None:
     r = more_rotors(robot(ARM))
-    controller = Controller(r, aerial_program(r, JointPosture(r, far_posture(r))))
+    controller = Controller(r, aerial_formulation(r, JointPosture(r, far_posture(r))))
     assert controller.actuators.rank == 6 and controller.actuators.spare.shape == (8, 2)
     controller.reset(r.posture(), np.zeros(r.nv))
     for _, command, _, _ in run(controller, r.posture(), np.zeros(r.nv), 30):
@@ -339,7 +341,9 @@ def test_rotors_that_cannot_push_sideways() -> None:
     assert r.spec.propulsion is not None
     up = (rotor.model_copy(update={"direction": (0.0, 0.0, 1.0)}) for rotor in r.spec.propulsion.rotors)
     r, point = with_rotors(r, tuple(up)), Point("ee")
-    controller = Controller(r, Program((), (FramePosition(point, kp=20.0),), JointPosture(r), force_point=point))
+    controller = Controller(
+        r, TaskFormulation((), (FramePosition(point, kp=20.0),), JointPosture(r), force_point=point)
+    )
     assert controller.actuators.rank == 4 and controller.actuators.blind.shape == (6, 2)
     assert np.isinf(controller.actuators.condition)
     v = 0.1 * rng("borinot").normal(size=r.nv)
@@ -353,7 +357,7 @@ def test_rotors_that_cannot_push_sideways() -> None:
 def test_a_fixed_arm() -> None:
     r = robot("panda")
     point = Point("panda_hand_tcp")
-    controller = Controller(r, Program(((FramePose(point),),), (), JointPosture(r), force_point=point))
+    controller = Controller(r, TaskFormulation(((FramePose(point),),), (), JointPosture(r), force_point=point))
     v = 0.1 * rng("panda").normal(size=r.nv)
     controller.reset(r.posture(), v)
     for _, command, _, _ in run(controller, r.posture(), v, 30):
@@ -367,10 +371,10 @@ def test_mistakes_are_refused(wrong: str) -> None:
     r = robot(ARM)
     with pytest.raises((InputError, PostureError)):
         if wrong == "program":
-            Program()
+            TaskFormulation()
         elif wrong == "names":
-            Program((), (Tilt(), Tilt()))
-        controller = Controller(r, aerial_program(r, JointPosture(r)), period=0.0 if wrong == "period" else DT)
+            TaskFormulation((), (Tilt(), Tilt()))
+        controller = Controller(r, aerial_formulation(r, JointPosture(r)), period=0.0 if wrong == "period" else DT)
         if wrong == "early":
             controller.tick(0.0, r.posture(), np.zeros(r.nv))
         controller.reset(r.posture(), np.full(r.nv, np.nan if wrong == "velocity" else 0.0))

@@ -12,9 +12,9 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError, MetricError
-from impact_posture.impact.contact import Contact as Blow
+from impact_posture.impact.contact import ImpactContact as Impact
 from impact_posture.impact.contact import Support
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
@@ -27,8 +27,8 @@ from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program, aerial_program, legged_program
 from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import TaskFormulation, aerial_formulation, legged_formulation
 from tests.helpers import central_gradient, rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run
 from tests.tools import need_compiler
@@ -40,7 +40,7 @@ UP = (0.0, 0.0, 1.0)
 @functools.cache
 def problem(objective: str = "impulse") -> PostureProblem:
     r = robot(ARM)
-    value = ImpactObjective(r, Blow.create("ee", UP), kind=objective)  # type: ignore[arg-type]
+    value = ImpactObjective(r, Impact.create("ee", UP), kind=objective)  # type: ignore[arg-type]
     return build_problem(r, value, r.posture(), Requirements(base="level", limit_margin=0.05))
 
 
@@ -58,7 +58,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ImpactGradie
 
 def flying(posture: JointPosture) -> tuple[Controller, np.ndarray, np.ndarray]:
     r = robot(ARM)
-    controller = Controller(r, aerial_program(r, posture))
+    controller = Controller(r, aerial_formulation(r, posture))
     q, v = r.posture(), np.zeros(r.nv)
     controller.reset(q, v)
     return controller, q, v
@@ -85,7 +85,7 @@ def test_scale_is_the_curvature_along_the_redundancy(exported: dict[str, ImpactG
     controller, q, _ = flying(posture)
     Z = controller.assembly.redundancy(controller.state)
     assert Z.shape == (9, 1)
-    for level in controller.program.levels:
+    for level in controller.formulation.levels:
         for task in level:
             assert np.abs(task.jacobian(controller.state) @ Z).max() < 1e-9
     plain, model = gradient_of(exported["impulse"]), robot(ARM).model
@@ -124,8 +124,8 @@ def test_online_meets_offline(exported: dict[str, ImpactGradient], objective: st
         activation=Activation(ramp=1e-6),
     )
     # The offline problem keeps this distance from the limits.
-    program = aerial_program(r, posture, law=LimitLaw(margin=0.05))
-    controller = Controller(r, program, period=dt)
+    formulation = aerial_formulation(r, posture, law=LimitLaw(margin=0.05))
+    controller = Controller(r, formulation, period=dt)
     q, v = r.posture(), np.zeros(r.nv)
     controller.reset(q, v)
     posture.brace()
@@ -190,7 +190,7 @@ def test_the_course_of_an_impact_makes_no_step(exported: dict[str, ImpactGradien
     for k in range(1600):
         if k in events:
             events[k]()
-        state = State(robot(ARM), controller.program.points).update(q, v)
+        state = State(robot(ARM), controller.formulation.points).update(q, v)
         before = posture.desired(state)
         level = posture.activation.level
         bound = posture.step_bound(state, DT)
@@ -306,7 +306,7 @@ def test_a_standing_robot_braces_on_its_feet() -> None:
     """Contact-consistent H of a push at solo8's base, in the cost beside the other tasks: it falls, the feet stay."""
     r = robot("solo8")
     supports = tuple(Support(s.frame, s.kind, s.offset) for s in r.spec.supports)
-    value = ImpactObjective(r, Blow.create("base_link", (1.0, 0.0, 0.0)), supports=supports)
+    value = ImpactObjective(r, Impact.create("base_link", (1.0, 0.0, 0.0)), supports=supports)
     function = value.gradient_fun()
 
     def gradient(q: np.ndarray) -> tuple[float, np.ndarray]:
@@ -314,10 +314,13 @@ def test_a_standing_robot_braces_on_its_feet() -> None:
         return float(H), np.array(slope).ravel()
 
     posture = ImpactRobustPosture(r, gradient, K=80.0, kp=20.0, weight=0.1, base_weight=0.0)
-    controller = Controller(r, legged_program(r, posture))
+    controller = Controller(r, legged_formulation(r, posture))
     q, v = r.posture(), np.zeros(r.nv)
     controller.reset(q, v)
-    start, places = posture.value, [controller.state.at(c.point).position.copy() for c in controller.program.contacts]
+    start, places = (
+        posture.value,
+        [controller.state.at(c.point).position.copy() for c in controller.formulation.contacts],
+    )
     posture.brace()
     for k, command, _, _ in run(controller, q, v, 600):
         assert command.status is Status.SOLVED
@@ -325,7 +328,7 @@ def test_a_standing_robot_braces_on_its_feet() -> None:
             assert_dynamics(controller, command)
             assert_limits(controller, command)
     assert posture.value < 0.99 * start
-    for contact, place in zip(controller.program.contacts, places, strict=True):
+    for contact, place in zip(controller.formulation.contacts, places, strict=True):
         assert np.linalg.norm(controller.state.at(contact.point).position - place) < 1e-3
 
 
@@ -356,7 +359,7 @@ def test_a_fixed_arm_braces_too() -> None:
         return 0.5 * float(away @ away), away
 
     posture = ImpactRobustPosture(r, well, K=20.0, kp=0.0)
-    controller = Controller(r, Program(((FramePose(Point("panda_hand_tcp")),),), (), posture))
+    controller = Controller(r, TaskFormulation(((FramePose(Point("panda_hand_tcp")),),), (), posture))
     q, v = r.posture(), np.zeros(r.nv)
     controller.reset(q, v)
     start = posture.value

@@ -7,13 +7,12 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import ContactError, InputError
-from impact_posture.tsid.contacts import Contact, support_contacts
+from impact_posture.tsid.contacts import SupportContact, support_contacts
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.friction import point_cone, surface_cone, to_world
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import legged_program
-from impact_posture.tsid.qpsolvers_solver import QpsolversSolver
+from impact_posture.tsid.task_formulation import legged_formulation
 from tests.helpers import frame_jacobian, mass_matrix, rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, run
 
@@ -23,7 +22,7 @@ LEGGED = ("solo8", "talos", "solo12")
 def controller_of(name: str, kp: float = 20.0, weight: float = 0.1, **more: float) -> Controller:
     r = robot(name)
     posture = JointPosture(r, kp=kp, weight=weight, base_weight=0.0)
-    return Controller(r, legged_program(r, posture, kp=kp, **more))  # type: ignore[arg-type]
+    return Controller(r, legged_formulation(r, posture, kp=kp, **more))  # type: ignore[arg-type]
 
 
 def displaced(name: str, amount: float) -> np.ndarray:
@@ -59,13 +58,13 @@ def test_feet_stay_where_they_are(name: str) -> None:
     controller = controller_of(name, kp=40.0, weight=1e-3)
     q, v = robot(name).posture(), np.zeros(robot(name).nv)
     controller.reset(q, v)
-    com = controller.program.weighted[0]
+    com = controller.formulation.weighted[0]
     com.target = com.target + np.array([0.01, 0.005, -0.02])  # type: ignore[attr-defined]
-    start = [controller.state.at(c.point).position.copy() for c in controller.program.contacts]
+    start = [controller.state.at(c.point).position.copy() for c in controller.formulation.contacts]
     for _, command, _, _ in run(controller, q, v, 800):
         assert command.status is Status.SOLVED
     reached = controller.state.center_of_mass()[0]
-    for contact, place in zip(controller.program.contacts, start, strict=True):
+    for contact, place in zip(controller.formulation.contacts, start, strict=True):
         assert np.linalg.norm(controller.state.at(contact.point).position - place) < 1e-4
     # solo8 cannot move sideways on its feet; down they all go.
     assert abs(reached[2] - com.target[2]) < 2e-3  # type: ignore[attr-defined]
@@ -88,12 +87,12 @@ def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray, solver: 
 
     The cost on a sole's corner forces is the one of its wrench, so that the optimum is the same.
     """
-    r, program = controller.robot, controller.program
+    r, formulation = controller.robot, controller.formulation
     model, nv, nj = r.model, r.nv, r.nv - 6
     data = model.createData()
     M, h = mass_matrix(model, q), pin.rnea(model, data, q, v, np.zeros(nv))
-    com, base = program.weighted
-    posture = program.posture
+    com, base = formulation.weighted
+    posture = formulation.posture
     assert posture is not None
     pin.centerOfMass(model, data, q, v, np.zeros(nv))
     c, dc, bias = data.com[0].copy(), data.vcom[0].copy(), data.acom[0].copy()
@@ -114,7 +113,7 @@ def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray, solver: 
     add(np.eye(nj, nv, 6), (posture.kp * away - posture.kd * v)[6:], 0.1)
 
     forces, wrenches, hard = [], [], []
-    for contact, home in zip(program.contacts, controller.assembly.contacts._home, strict=True):
+    for contact, home in zip(formulation.contacts, controller.assembly.contacts._home, strict=True):
         index, offset = r.frame_id(contact.point.frame), np.array(contact.point.offset)
         J = frame_jacobian(model, q, index, offset)
         step = 1e-6
@@ -212,7 +211,7 @@ def test_torques_are_those_of_a_dense_program_assembled_apart(name: str, solver:
         q, v = displaced(name, amount), 3 * amount * rng(name, k).normal(size=r.nv)
         command = controller.tick(k * DT, q, v)
         assert command.status is Status.SOLVED
-        # Bounds of joint limits are left out of the dense program: none may be active here.
+        # Bounds of joint limits are left out of the dense formulation: none may be active here.
         assert not [name for name, _ in controller.report().active if name in r.tangent_names[6:]]
         found = dense_torques(controller, q, v, solver)
         assert np.abs(found - command.torque).max() <= 1e-6 * np.abs(command.torque).max()
@@ -221,6 +220,9 @@ def test_torques_are_those_of_a_dense_program_assembled_apart(name: str, solver:
 @pytest.mark.parametrize("name", ["quadprog", "proxqp"])
 def test_other_solvers_agree_on_our_own_program(name: str) -> None:
     pytest.importorskip("quadprog" if name == "quadprog" else "proxsuite")
+    pytest.importorskip("qpsolvers")
+    from tests.qpsolvers_solver import QpsolversSolver
+
     settings = {} if name == "quadprog" else {"eps_abs": 1e-10, "max_iter": 10000}
     other = QpsolversSolver(name, **settings)
     for robot_name in ("solo8", "talos"):
@@ -287,7 +289,7 @@ def test_slippery_ground_binds_the_cone() -> None:
     controller = controller_of("talos", friction=0.05)
     r = robot("talos")
     controller.reset(r.posture(), np.zeros(r.nv))
-    com = controller.program.weighted[0]
+    com = controller.formulation.weighted[0]
     com.target = com.target + np.array([0.0, 0.2, 0.0])  # type: ignore[attr-defined]
     command = controller.tick(0.0, r.posture(), np.zeros(r.nv))
     contacts = controller.assembly.contacts
@@ -318,12 +320,11 @@ def test_motion_of_feet_that_no_force_can_stop_relaxes_and_never_fails() -> None
 @pytest.mark.parametrize(
     "wrong",
     [
-        lambda: Contact(Point("left_sole_link"), friction=0.0),
-        lambda: Contact(Point("left_sole_link"), "surface"),
-        lambda: Contact(Point("left_sole_link"), normal=(0, 0, 2)),
-        lambda: Contact(Point("left_sole_link"), weight=-1.0),
-        lambda: legged_program(robot("panda"), JointPosture(robot("panda"))),
-        lambda: QpsolversSolver("no such solver"),
+        lambda: SupportContact(Point("left_sole_link"), friction=0.0),
+        lambda: SupportContact(Point("left_sole_link"), "surface"),
+        lambda: SupportContact(Point("left_sole_link"), normal=(0, 0, 2)),
+        lambda: SupportContact(Point("left_sole_link"), weight=-1.0),
+        lambda: legged_formulation(robot("panda"), JointPosture(robot("panda"))),
     ],
 )
 def test_what_makes_no_contact_is_refused(wrong: object) -> None:

@@ -16,7 +16,12 @@ from impact_posture.tsid.hierarchy import Level, balanced, lexicographic
 from impact_posture.tsid.impact_robust import Gradient, ImpactRobustPosture, Spring
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program, aerial_program, arm_program, legged_program
+from impact_posture.tsid.task_formulation import (
+    TaskFormulation,
+    aerial_formulation,
+    arm_formulation,
+    legged_formulation,
+)
 from tests.helpers import rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits
 
@@ -38,14 +43,14 @@ def well(r: Robot) -> Gradient:
     return gradient
 
 
-def program_of(r: Robot, kind: str, posture: JointPosture) -> Program:
+def program_of(r: Robot, kind: str, posture: JointPosture) -> TaskFormulation:
     if kind == "legged":
-        return legged_program(r, posture)
+        return legged_formulation(r, posture)
     point = Point(r.spec.contact.frame or "")
     ee = FramePose(point, kp=60.0, impedance=Impedance(3.0, 1.0))
     if kind == "arm":
-        return arm_program(r, posture, end_effector=ee)
-    return aerial_program(r, posture, end_effector=ee, order=kind)  # type: ignore[arg-type]
+        return arm_formulation(r, posture, end_effector=ee)
+    return aerial_formulation(r, posture, end_effector=ee, order=kind)  # type: ignore[arg-type]
 
 
 def bracing(name: str, kind: str, spring: Spring = "keep") -> tuple[Controller, ImpactRobustPosture]:
@@ -176,7 +181,7 @@ def test_gradients_that_fail_leave_the_term_before(how: str) -> None:
         return 1.0, bad  # type: ignore[return-value]
 
     posture = ImpactRobustPosture(r, function, every=1)
-    controller = Controller(r, aerial_program(r, posture))
+    controller = Controller(r, aerial_formulation(r, posture))
     q, v = r.posture(), np.zeros(r.nv)
     controller.reset(q, v)
     posture.brace()

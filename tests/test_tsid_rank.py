@@ -19,10 +19,10 @@ from impact_posture.tsid.frame_tasks import EndEffector, FrameAligned, FramePose
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program, aerial_program, arm_program
 from impact_posture.tsid.rank import SINGULAR
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Task
+from impact_posture.tsid.task_formulation import TaskFormulation, aerial_formulation, arm_formulation
 from tests.arms import TIP, X, Y, Z, arm, yaw_and_pitches
 from tests.helpers import rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate
@@ -50,7 +50,7 @@ MADE: dict[str, Callable[[], Robot]] = {"yaw, three pitches": yaw_and_pitches, "
 def test_gentle_flight_is_solved_at_every_tick(name: str, noise: float) -> None:
     """The arm cannot roll the end effector, hence the base's tilt and the pose share a row."""
     r = MADE[name]()
-    controller, generator = Controller(r, aerial_program(r, JointPosture(r))), rng(name, noise)
+    controller, generator = Controller(r, aerial_formulation(r, JointPosture(r))), rng(name, noise)
     # A nudge: the shared row is asked for two different things, if only in the seventh digit.
     q, v = r.posture(), 1e-7 * generator.normal(size=r.nv)
     assert controller.reset(q, v).status is Status.SOLVED
@@ -68,10 +68,10 @@ def test_gentle_flight_is_solved_at_every_tick(name: str, noise: float) -> None:
 def test_rows_that_agree_hold_exactly_and_rows_that_do_not_say_so(name: str) -> None:
     r = MADE[name]()
     away = pin.integrate(r.model, r.posture(), np.r_[np.zeros(6), 0.3 * rng(name).normal(size=r.nv - 6)])
-    controller = Controller(r, aerial_program(r, JointPosture(r, away)))
+    controller = Controller(r, aerial_formulation(r, JointPosture(r, away)))
     controller.reset(r.posture(), np.zeros(r.nv))
     report = controller.report()
-    hand = controller.program.levels[1][0]
+    hand = controller.formulation.levels[1][0]
     assert report.status is Status.SOLVED and report.relaxed == report.deficient == ()
     assert np.abs(report.residuals["tilt"]).max() <= 1e-8 and np.abs(report.residuals[hand.name]).max() <= 1e-8
     # Rolled about the arm's plane: the tilt wins, the rest of the pose is as near as it comes.
@@ -92,7 +92,7 @@ def test_a_task_that_asks_for_less_needs_no_rank_that_is_missing(kind: type[EndE
     r = arm([Z, Y, Y, Y], [0.3, -0.8, 0.3, -0.5], floating=True)
     axis: Any = {} if kind is FramePosition else {"axis": rotation(r).T @ np.array([np.cos(0.3), np.sin(0.3), 0.0])}
     task = kind(Point(TIP), kp=60.0, **axis)
-    controller = Controller(r, aerial_program(r, JointPosture(r), end_effector=task))
+    controller = Controller(r, aerial_formulation(r, JointPosture(r), end_effector=task))
     controller.reset(r.posture(), np.zeros(r.nv))
     v = 0.1 * rng(kind.__name__).normal(size=r.nv)
     assert controller.tick(0.0, r.posture(), v).status is Status.SOLVED
@@ -183,7 +183,7 @@ def stacks(draw: st.DrawFn, *, limited: bool, far: float, fast: float) -> tuple[
             levels.append([task])
     posture = JointPosture(r, base_weight=draw(st.sampled_from([None, 0.0])))
     law = LimitLaw() if limited else None
-    controller = Controller(r, Program(tuple(map(tuple, levels)), (), posture, law=law))
+    controller = Controller(r, TaskFormulation(tuple(map(tuple, levels)), (), posture, law=law))
     if not limited:
         controller.actuators.lower[:], controller.actuators.upper[:] = -np.inf, np.inf
     controller.reset(r.posture(), np.zeros(r.nv))
@@ -203,7 +203,7 @@ def levels_of(controller: Controller) -> list[tuple[Vector, Vector]]:
             np.vstack([task.jacobian(state) for task in level]),
             np.concatenate([task.desired(state) - task.drift(state) for task in level]),
         )
-        for level in controller.program.levels
+        for level in controller.formulation.levels
     ]
 
 
@@ -233,7 +233,7 @@ def test_any_stack_has_the_lexicographic_answer(drawn: tuple[Controller, Vector,
     assert command.status is Status.SOLVED
     x, Zs, missed, least = free_answer(controller)
     assume(least > 1.5 * SINGULAR)
-    posture = controller.program.posture
+    posture = controller.formulation.posture
     assert posture is not None
     # What nothing weighs has a weight of its own, towards zero.
     weight, wanted = np.maximum(posture.weight, 1e-8), posture.weight * posture.desired(controller.state)
@@ -261,7 +261,7 @@ def test_any_stack_is_answered_within_limits(drawn: tuple[Controller, Vector, Ve
     _, _, free, least = free_answer(controller)
     report, qp = controller.report(), controller.assembly.qp
     assume(least > 1.5 * SINGULAR and all(gave.level != "joint limits" for gave in report.relaxed))
-    count = sum(task.size for level in controller.program.levels for task in level)
+    count = sum(task.size for level in controller.formulation.levels for task in level)
     rows, n = np.vstack([np.eye(qp.n), qp.A[count:]]), qp.n
     lower, upper = np.delete(qp.lower, np.s_[n : n + count]), np.delete(qp.upper, np.s_[n : n + count])
     below, above = np.isfinite(lower), np.isfinite(upper)
@@ -288,33 +288,33 @@ def test_any_stack_is_answered_within_limits(drawn: tuple[Controller, Vector, Ve
 # ---- near a singularity -----------------------------------------------------------------------------------------
 
 
-def planar(position: type[EndEffector] = FramePosition) -> tuple[Robot, Program]:
+def planar(position: type[EndEffector] = FramePosition) -> tuple[Robot, TaskFormulation]:
     """Three parallel hinges: nothing ever moves sideways, and stretched nothing moves along the arm."""
     r = arm([Y, Y, Y], [0.3, 0.4, -0.2], floating=False, effort=0.0)
-    return r, arm_program(r, JointPosture(r), end_effector=position(Point(TIP), kp=60.0))
+    return r, arm_formulation(r, JointPosture(r), end_effector=position(Point(TIP), kp=60.0))
 
 
-def wrist() -> tuple[Robot, Program]:
+def wrist() -> tuple[Robot, TaskFormulation]:
     r = arm([Z, Y, Y, X, Y, X], [0.3, 0.4, 0.8, 0.2, 0.5, 0.1], floating=False, effort=0.0)
-    return r, arm_program(r, JointPosture(r), law=None)
+    return r, arm_formulation(r, JointPosture(r), law=None)
 
 
-def flying() -> tuple[Robot, Program]:
+def flying() -> tuple[Robot, TaskFormulation]:
     """The second hinge rolls the tip; where the first link hangs straight down it yaws instead, as the base does."""
     r = arm([Y, Z, Y], [0.3, 0.4, -0.2], floating=True)
-    return r, aerial_program(r, JointPosture(r), law=None)
+    return r, aerial_formulation(r, JointPosture(r), law=None)
 
 
-def two_levels() -> tuple[Robot, Program]:
+def two_levels() -> tuple[Robot, TaskFormulation]:
     """Both singular at once, and the lower one needs what the upper one lets go."""
     r = arm([Z, Y, Y, X, Y, X], [0.3, 0.4, 0.8, 0.2, 0.5, 0.1], floating=False, effort=0.0)
     tip, elbow = FramePosition(Point(TIP), kp=60.0), FramePosition(Point("link_2", (0, 0, -0.3)), kp=60.0)
-    return r, Program(((tip,), (elbow,)), (), JointPosture(r), law=None)
+    return r, TaskFormulation(((tip,), (elbow,)), (), JointPosture(r), law=None)
 
 
 # How far the targets of a sweep are off, m (rad): no limit is to be reached.
 AHEAD = {"flying": 1e-3}
-SWEEPS: dict[str, tuple[Callable[[], tuple[Robot, Program]], list[float], list[float]]] = {
+SWEEPS: dict[str, tuple[Callable[[], tuple[Robot, TaskFormulation]], list[float], list[float]]] = {
     "planar": (planar, [0.3, 0.0, 0.0], [0.0, 0.8, 0.5]),
     "wrist": (wrist, [0.3, 0.4, 0.2, 0.3, 0.0, 0.1], [0.0, 0.5, 0.8, 0.0, 0.6, 0.0]),
     "flying": (flying, [0.0, 0.1, 0.4], [0.5, 0.1, 0.2]),
@@ -325,15 +325,15 @@ SWEEPS: dict[str, tuple[Callable[[], tuple[Robot, Program]], list[float], list[f
 def swept(name: str, count: int, indices: Vector | None = None) -> tuple[Vector, set[Status], Controller]:
     """Accelerations at ``count`` states on the way through the singular posture; all targets are a bit ahead."""
     make, through, along = SWEEPS[name]
-    r, program = make()
-    controller, state = Controller(r, program), State(r, program.points)
+    r, formulation = make()
+    controller, state = Controller(r, formulation), State(r, formulation.points)
     controller.reset(r.posture(), np.zeros(r.nv))
     found, seen, way = [], set(), np.linspace(-1.0, 1.0, count)
     for k in range(count) if indices is None else indices:
         q, v = r.posture(), np.zeros(r.nv)
         q[-len(along) :], v[-len(along) :] = np.array(through) + way[k] * np.array(along), 0.05 * np.array(along)
         state.update(q, v)
-        for task in (task for level in program.levels for task in level):
+        for task in (task for level in formulation.levels for task in level):
             if not isinstance(task, Tilt):
                 task.target = None  # type: ignore[attr-defined]
                 task.reset(state)
@@ -354,7 +354,7 @@ def test_a_slow_sweep_through_a_singular_posture_is_continuous(name: str) -> Non
     assert steps[1] < 0.6 * steps[0]
     asked = max(float(np.linalg.norm(b)) for _, b in levels_of(controller))
     length = min(float(np.linalg.norm(J, axis=1).max()) for J, _ in levels_of(controller))
-    assert np.abs(fine).max() < len(controller.program.levels) * 3 * asked / (SINGULAR * length)
+    assert np.abs(fine).max() < len(controller.formulation.levels) * 3 * asked / (SINGULAR * length)
 
 
 @pytest.mark.parametrize("name", SWEEPS)

@@ -12,44 +12,49 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import Contact as Blow
+from impact_posture.impact.contact import ImpactContact as Impact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.frame_tasks import FramePosition
 from impact_posture.tsid.impact_robust import Gradient, ImpactRobustPosture, Spring
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import Program, aerial_program, arm_program, legged_program
 from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import (
+    TaskFormulation,
+    aerial_formulation,
+    arm_formulation,
+    legged_formulation,
+)
 from tests.helpers import NAMES, rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run
 from tests.test_tsid_never_fails import ANSWERED, PROGRAMS, bracing, program_of, well
 
 
-def programs(r: Robot, posture: JointPosture) -> list[Program]:
+def programs(r: Robot, posture: JointPosture) -> list[TaskFormulation]:
     """All that suit the robot."""
     found = []
     if not r.floating:
-        found += [arm_program(r, posture, order=order) for order in ("strict", "weighted")]  # type: ignore[arg-type]
+        found += [arm_formulation(r, posture, order=order) for order in ("strict", "weighted")]  # type: ignore[arg-type]
     if r.spec.propulsion is not None:
-        found += [aerial_program(r, posture, order=order) for order in ("strict", "weighted")]  # type: ignore[arg-type]
+        found += [aerial_formulation(r, posture, order=order) for order in ("strict", "weighted")]  # type: ignore[arg-type]
     if r.spec.supports:
-        found.append(legged_program(r, posture))
+        found.append(legged_formulation(r, posture))
     return found
 
 
-def assert_flies(r: Robot, program: Program, ticks: int) -> None:
+def assert_flies(r: Robot, formulation: TaskFormulation, ticks: int) -> None:
     """Finite and within all limits, tick after tick of perfect dynamics."""
-    controller = Controller(r, program)
+    controller = Controller(r, formulation)
     q, v = r.posture(), 0.05 * rng(r.name, "start").normal(size=r.nv)
     # Nobody can stop at once at a limit.
     v[controller.state.update(q, v).room.min(axis=0) < 0.01] = 0.0
     controller.reset(q, v)
-    if isinstance(program.posture, ImpactRobustPosture):
-        program.posture.brace()
+    if isinstance(formulation.posture, ImpactRobustPosture):
+        formulation.posture.brace()
     contacts = controller.assembly.contacts
     for k, command, _, _ in run(controller, q, v, ticks):
         assert command.status is Status.SOLVED
@@ -94,7 +99,7 @@ def test_a_urdf_of_ones_own(root: str, tmp_path: Path) -> None:
     # In free fall, and with a motor that may do anything, a strict task would ask for just that.
     for level in (((FramePosition(Point("d")),),), ()) if root == "fixed" else ((),):
         posture = ImpactRobustPosture(r, well(r), K=20.0, kp=20.0)
-        controller = Controller(r, Program(level, () if level else (FramePosition(Point("d")),), posture))
+        controller = Controller(r, TaskFormulation(level, () if level else (FramePosition(Point("d")),), posture))
         q, v = r.posture(), 0.1 * rng("own").normal(size=r.nv)
         v[r.nv - 2] = 0.0
         controller.reset(q, v)
@@ -109,10 +114,10 @@ def test_a_urdf_of_ones_own(root: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "build", "hint"),
     [
-        ("panda", aerial_program, "arm_program"),
-        ("talos", aerial_program, "propulsion"),
-        ("talos", arm_program, "legged_program"),
-        ("panda", legged_program, "supports"),
+        ("panda", aerial_formulation, "arm_formulation"),
+        ("talos", aerial_formulation, "propulsion"),
+        ("talos", arm_formulation, "legged_formulation"),
+        ("panda", legged_formulation, "supports"),
     ],
 )
 def test_programs_that_do_not_suit_a_robot_say_which_does(name: str, build: type, hint: str) -> None:
@@ -122,8 +127,8 @@ def test_programs_that_do_not_suit_a_robot_say_which_does(name: str, build: type
 
 def test_a_push_at_a_standing_robot_enters_its_dynamics() -> None:
     r, force = robot("solo8"), np.array([3.0, 0.0, -1.0])
-    program = legged_program(r, JointPosture(r, base_weight=0.0), force_point=Point("base_link"))
-    controller = Controller(r, program)
+    formulation = legged_formulation(r, JointPosture(r, base_weight=0.0), force_point=Point("base_link"))
+    controller = Controller(r, formulation)
     controller.reset(r.posture(), np.zeros(r.nv))
     command = controller.tick(0.0, r.posture(), np.zeros(r.nv), force)
     assert command.status is Status.SOLVED
@@ -145,7 +150,7 @@ def test_events_at_odd_moments_make_no_step(name: str, kind: str, spring: Spring
     v = np.zeros(r.nv)
     controller.reset(r.posture(), v)
     q = np.array(pin.integrate(r.model, r.posture(), 0.2 * generator.normal(size=r.nv)))
-    state = State(r, controller.program.points).update(q, v)
+    state = State(r, controller.formulation.points).update(q, v)
     base, steps, t = (6 if r.floating else 0), [], 0.0
     for _ in range(300):
         before = posture.desired(state).copy()
@@ -219,7 +224,7 @@ def test_ticks_leave_no_memory_behind() -> None:
 
 def own_gradient(r: Robot, normal: tuple[float, float, float]) -> Gradient:
     """``H`` at the default contact frame by the library's own interpreted functions."""
-    value = ImpactObjective(r, Blow.create(r.spec.contact.frame or "", normal))
+    value = ImpactObjective(r, Impact.create(r.spec.contact.frame or "", normal))
     function = value.gradient_fun()
 
     def gradient(q: np.ndarray) -> tuple[float, np.ndarray]:
@@ -237,7 +242,7 @@ def test_energy_never_grows(name: str) -> None:
     posture = ImpactRobustPosture(
         r, gradient, K=K, kp=0.0, kd=6.0, every=1, fade=(1e-6, 2e-6), reach=1e6, activation=Activation(ramp=1e-6)
     )
-    controller = Controller(r, arm_program(r, posture), period=dt)
+    controller = Controller(r, arm_formulation(r, posture), period=dt)
     q, v = r.posture(), np.zeros(r.nv)
     controller.reset(q, v)
     Z = controller.assembly.redundancy(controller.state)

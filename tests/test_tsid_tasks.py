@@ -261,15 +261,16 @@ def test_no_casadi_online() -> None:
     """Building a controller and ticking needs numpy, Pinocchio and DAQP."""
     code = """
 import sys, numpy as np
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.tsid.controller import Controller
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
-from impact_posture.tsid.program import aerial_program
+from impact_posture.tsid.task_formulation import aerial_formulation
 robot = load_robot("tilthex_arm")
-controller = Controller(robot, aerial_program(robot, ImpactRobustPosture(robot, lambda q: (1.0, np.ones(robot.nv)))))
+posture = ImpactRobustPosture(robot, lambda q: (1.0, np.ones(robot.nv)))
+controller = Controller(robot, aerial_formulation(robot, posture))
 controller.reset(robot.posture(), np.zeros(robot.nv))
 controller.tick(0.0, robot.posture(), np.zeros(robot.nv))
-import impact_posture.codegen.loader
+import impact_posture.codegen.impact_gradient
 bad = [m for m in ("casadi", "mujoco", "matplotlib", "scipy") if m in sys.modules]
 sys.exit(f"loaded: {bad}" if bad else 0)
 """

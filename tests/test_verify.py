@@ -19,14 +19,14 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.request import ImpactRequest
-from impact_posture.robot.loader import LoadOptions
+from impact_posture.robot.robot_loader import LoadOptions
 from impact_posture.toolchain import find_compiler
-from impact_posture.verification import verify as module
+from impact_posture.verification import verification as module
 from impact_posture.verification.differences import difference_gradient
-from impact_posture.verification.report import Row, VerificationReport, deviation
 from impact_posture.verification.samples import Sample, random_samples
 from impact_posture.verification.sources import Numbers, casadi_source, pinocchio_numbers
-from impact_posture.verification.verify import CASADI, COMPILED, DIFFERENCES, MUJOCO, verify
+from impact_posture.verification.verification import CASADI, COMPILED, DIFFERENCES, MUJOCO, verify
+from impact_posture.verification.verification_report import Row, VerificationReport, deviation
 from tests.command import run
 from tests.helpers import NAMES, Vector, robot
 from tests.test_dynamics import write_urdf
@@ -344,7 +344,7 @@ def test_a_failure_is_exit_code_1_and_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from impact_posture_cli.app import app
-    from impact_posture_cli.boundary import run
+    from impact_posture_cli.error_boundary import run
 
     typer_main = pytest.importorskip("typer.main")
 

@@ -1,4 +1,4 @@
-"""The simulated world: its dynamics are Pinocchio's, its blows the rigid model's, its actuators do as stated."""
+"""The simulated world: its dynamics are Pinocchio's, its impacts the rigid model's, its actuators do as stated."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.actuation import actuation_matrix, hover
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.build import build_scene
-from impact_posture.simulation.exchange import Drive, Push, Truth
-from impact_posture.simulation.restitution import ball
+from impact_posture.simulation.actuator_command import ActuatorCommand, Push, Truth
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors, Shape, Surface
 from impact_posture.simulation.world import World, build_world
+from impact_posture.simulation.world_builder import build_scene
 from tests.helpers import NAMES, Vector, assert_close, mass_matrix, random_configurations, rng, robot
+from tests.restitution import ball
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 
@@ -34,9 +34,9 @@ def without_rotors(name: str) -> Robot:
     return replace(found, spec=found.spec.model_copy(update={"propulsion": None}))
 
 
-def idle(found: Robot) -> Drive:
+def idle(found: Robot) -> ActuatorCommand:
     joints = found.nv - (6 if found.floating else 0)
-    return Drive(np.zeros(joints), NONE)
+    return ActuatorCommand(np.zeros(joints), NONE)
 
 
 # ---- dynamics ---------------------------------------------------------------------------------------------------
@@ -97,10 +97,10 @@ def test_free_flight_keeps_momentum_and_energy() -> None:
     np.testing.assert_allclose(np.array(errors[0]) / errors[1], 2, rtol=0.3)
 
 
-# ---- blows ------------------------------------------------------------------------------------------------------
+# ---- impacts ------------------------------------------------------------------------------------------------------
 
 
-def blow(law: ContactLaw, timestep: float, speed: float = 0.5) -> tuple[ImpactObjective, Vector, Vector, Truth]:
+def impact(law: ContactLaw, timestep: float, speed: float = 0.5) -> tuple[ImpactObjective, Vector, Vector, Truth]:
     """The arm of a robot that flies as one body hits the floor: objective, q, Δν, truth after."""
     found = without_rotors("tilthex_arm")
     q = found.posture()
@@ -120,7 +120,7 @@ def blow(law: ContactLaw, timestep: float, speed: float = 0.5) -> tuple[ImpactOb
         if touched and not truth.shapes[0].touching:
             break
     assert touched and not truth.shapes[0].touching
-    return ImpactObjective(found, Contact.create("ee", (0, 0, 1))), q, truth.v - before, truth
+    return ImpactObjective(found, ImpactContact("ee", (0, 0, 1))), q, truth.v - before, truth
 
 
 def restitution(objective: ImpactObjective, truth: Truth, speed: float) -> float:
@@ -129,10 +129,10 @@ def restitution(objective: ImpactObjective, truth: Truth, speed: float) -> float
 
 
 @pytest.mark.parametrize(("scale", "tolerance"), [(1.0, 0.03), (0.1, 0.003)])
-def test_a_blow_without_friction_is_the_rigid_models(scale: float, tolerance: float) -> None:
+def test_an_impact_without_friction_is_the_rigid_models(scale: float, tolerance: float) -> None:
     default = ContactLaw(friction=0.0)
     law = replace(default, solref=(default.solref[0] * scale, 1.0))
-    objective, q, jump, truth = blow(law, 2.5e-4 * scale)
+    objective, q, jump, truth = impact(law, 2.5e-4 * scale)
     found = objective.oracle.quantities(q)
     impulse = float(truth.shapes[0].impulse[2])
     e = restitution(objective, truth, 0.5)
@@ -141,9 +141,9 @@ def test_a_blow_without_friction_is_the_rigid_models(scale: float, tolerance: fl
     assert_close(jump, found.jump * impulse, tolerance, "jump")
 
 
-def test_a_blow_that_sticks_is_the_rigid_models() -> None:
+def test_an_impact_that_sticks_is_the_rigid_models() -> None:
     law = ContactLaw((2e-4, 1.0), (0.9999, 0.9999, 0.001), friction=10.0)
-    objective, q, jump, truth = blow(law, 2.5e-5)
+    objective, q, jump, truth = impact(law, 2.5e-5)
     found = objective.oracle.quantities(q)
     assert found.sticking_jump is not None
     e = restitution(objective, truth, 0.5)
@@ -154,7 +154,7 @@ def test_a_blow_that_sticks_is_the_rigid_models() -> None:
 
 
 def test_the_surfaces_impulse_is_the_robots_momentum() -> None:
-    objective, q, _, truth = blow(ContactLaw(friction=0.3), 2.5e-4)
+    objective, q, _, truth = impact(ContactLaw(friction=0.3), 2.5e-4)
     found = objective.robot
     before, data = np.zeros(found.nv), found.model.createData()
     before[2] = -0.5
@@ -173,7 +173,7 @@ def test_a_ball_meets_surfaces_of_any_direction_where_they_should_be(normal: tup
     world = build_world(ball(), scene)
     world.reset([0, 0, 0, 0, 0, 0, 1], [*(-2 * n), 0, 0, 0])
     assert world.built.gaps["s", "ball"] == pytest.approx(0.1)
-    world.step(Drive(NONE, NONE), 240)
+    world.step(ActuatorCommand(NONE, NONE), 240)
     truth = world.truth()
     (shape,) = truth.shapes
     assert shape.began == pytest.approx(0.05, abs=5e-4)
@@ -191,7 +191,7 @@ def test_a_box_stands_on_its_faces_and_its_center_is_found() -> None:
     # The frame's −x looks up, so the box's x faces are its top and bottom: its bottom is where the frame is.
     assert world.built.points["floor"][2] == pytest.approx(0.0, abs=1e-12)
     world.reset(turned)
-    world.step(Drive(NONE, NONE), 4000)
+    world.step(ActuatorCommand(NONE, NONE), 4000)
     truth = world.truth()
     assert truth.shapes[0].touching
     assert truth.shapes[0].force[2] == pytest.approx(2 * 9.81, rel=1e-3)
@@ -207,7 +207,7 @@ def test_a_quadruped_stands_on_its_feet() -> None:
     world.reset(q)
     for _ in range(500):
         truth = world.truth()
-        world.step(Drive(20 * (q[7:] - truth.q[7:]) - 0.5 * truth.v[6:], NONE), 4)
+        world.step(ActuatorCommand(20 * (q[7:] - truth.q[7:]) - 0.5 * truth.v[6:], NONE), 4)
     shapes = world.truth().shapes
     assert all(s.touching for s in shapes)
     assert sum(s.force for s in shapes)[2] == pytest.approx(9.81 * found.mass, rel=0.01)
@@ -219,7 +219,7 @@ def test_one_shape_without_friction_on_one_surface_and_with_on_another() -> None
     rough = Surface("rough", (-1, 0, 0), point=(0.02, 0, 0), law=ContactLaw(friction=0.5))
     world = build_world(ball(), Scene((smooth, rough), (Shape("ball", size=(0.02,), center=(0, 0, 0)),)))
     world.reset([0, 0, 0, 0, 0, 0, 1], [1, 0.5, 0, 0, 0, 0])
-    world.step(Drive(NONE, NONE), 100)
+    world.step(ActuatorCommand(NONE, NONE), 100)
     (shape,) = world.truth().shapes
     assert shape.impulse[0] < -1 and shape.impulse[2] > 0
     # Only the wall rubs, and less than it may.
@@ -229,13 +229,13 @@ def test_one_shape_without_friction_on_one_surface_and_with_on_another() -> None
 # ---- actuators --------------------------------------------------------------------------------------------------
 
 
-def flying(**sensors: Any) -> tuple[Robot, World, Drive]:
+def flying(**sensors: Any) -> tuple[Robot, World, ActuatorCommand]:
     found = robot("tilthex_arm")
     assert found.spec.propulsion is not None
     wanted = hover(found.model, found.spec.propulsion, found.posture())
     world = build_world(found, Scene(sensors=Sensors(**sensors)))
     world.reset(found.posture())
-    return found, world, Drive(wanted.joint_torques, wanted.speeds)
+    return found, world, ActuatorCommand(wanted.joint_torques, wanted.speeds)
 
 
 def test_hovering_stays() -> None:
@@ -254,21 +254,21 @@ def test_rotors_lag_up_and_down_and_stay_within_their_limits() -> None:
     start = drive.rotor_speed
     for wanted, constant in ((start + 10, spec.time_constant_up), (start - 10, spec.time_constant_down)):
         world.reset(found.posture())
-        world.step(Drive(drive.torque, wanted), 50)
+        world.step(ActuatorCommand(drive.torque, wanted), 50)
         truth = world.truth()
         expected = wanted + (start - wanted) * np.exp(-0.0125 / constant)
         assert_close(truth.rotor_speeds, expected, 1e-12, "speeds")
         assert_close(truth.thrusts, spec.thrust_coefficient * expected**2, 1e-12, "thrusts")
     for wanted, limit in ((500.0, spec.speed_max), (-3.0, spec.speed_min)):
         world.reset(found.posture())
-        world.step(Drive(drive.torque, np.full(6, wanted)), 4000)
+        world.step(ActuatorCommand(drive.torque, np.full(6, wanted)), 4000)
         assert_close(world.truth().rotor_speeds, np.full(6, limit), 1e-9, "limit")
 
 
 def test_motors_stay_within_their_limits() -> None:
     found, world, drive = flying()
     limits = np.asarray(found.model.effortLimit)[6:]
-    world.step(Drive(np.array([99.0, -99.0, 1.0]), drive.rotor_speed))
+    world.step(ActuatorCommand(np.array([99.0, -99.0, 1.0]), drive.rotor_speed))
     np.testing.assert_array_equal(world.truth().torques, [limits[0], -limits[1], 1.0])
 
 
@@ -277,7 +277,7 @@ def test_a_joint_driven_against_its_stop_is_named_there() -> None:
     world = build_world(found, Scene(physics=WEIGHTLESS))
     world.reset(found.posture())
     assert world.truth().at_stops == ()
-    world.step(Drive(np.array([0.0, 0.0, 3.0]), NONE), 4000)
+    world.step(ActuatorCommand(np.array([0.0, 0.0, 3.0]), NONE), 4000)
     truth = world.truth()
     assert truth.at_stops == ("elbow_pitch",)
     assert found.model.upperPositionLimit[9] <= truth.q[9] < found.model.upperPositionLimit[9] + 0.02
@@ -310,7 +310,7 @@ def test_a_push_acts_at_its_point_and_ends() -> None:
 
 def run(world: World, seed: int) -> list[Vector]:
     found = world.robot
-    drive = Drive(np.array([0.1, 0.4, 0.2]), np.full(6, 60.0))
+    drive = ActuatorCommand(np.array([0.1, 0.4, 0.2]), np.full(6, 60.0))
     world.reset(found.posture(), seed=seed)
     world.push(Push("ee", (1.0, 2.0, 0.0), 0.02))
     rows = []

@@ -24,27 +24,27 @@ from impact_posture.errors import (
 from impact_posture.robot.actuation import hover
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RobotSpec
-from impact_posture.simulation.exchange import Drive, Push
-from impact_posture.simulation.restitution import ball, ideal_restitution, measure_restitution
+from impact_posture.simulation.actuator_command import ActuatorCommand, Push
 from impact_posture.simulation.rotors import Vibration
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors, Shape, Surface
 from impact_posture.simulation.world import World, build_world
 from tests.helpers import assert_close, mass_matrix, random_configurations, robot
+from tests.restitution import ball, ideal_restitution, measure_restitution
 
 pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 
 PAGE = Path(__file__).parents[1] / "docs" / "generated" / "restitution.md"
 NONE = np.zeros(0)
-IDLE = Drive(NONE, NONE)
+IDLE = ActuatorCommand(NONE, NONE)
 
 
-def hovering(sensors: Sensors) -> tuple[Robot, World, Drive]:
+def hovering(sensors: Sensors) -> tuple[Robot, World, ActuatorCommand]:
     found = robot("tilthex_arm")
     assert found.spec.propulsion is not None
     wanted = hover(found.model, found.spec.propulsion, found.posture())
     world = build_world(found, Scene(sensors=sensors))
     world.reset(found.posture(), seed=3)
-    return found, world, Drive(wanted.joint_torques, wanted.speeds)
+    return found, world, ActuatorCommand(wanted.joint_torques, wanted.speeds)
 
 
 # ---- sensors ----------------------------------------------------------------------------------------------------
@@ -253,7 +253,7 @@ def test_wrong_use_is_refused() -> None:
         (np.array([0, np.nan, 0]), np.zeros(6), "not finite"),
     ):
         with pytest.raises(InputError, match=words):
-            world.step(Drive(torque, speeds))
+            world.step(ActuatorCommand(torque, speeds))
     with pytest.raises(PostureError, match="give 9 finite numbers"):
         world.reset(found.posture(), [0.0, 1.0])
     with pytest.raises(InputError, match="give 6 finite numbers"):
@@ -285,7 +285,7 @@ def test_ball_joints_and_translations_are_driven_in_pinocchios_axes() -> None:
     world = build_world(found, Scene())
     world.reset(q)
     u = np.arange(1.0, 8.0)
-    world.step(Drive(u, NONE))
+    world.step(ActuatorCommand(u, NONE))
     a = pin.aba(model, model.createData(), q, np.zeros(7), u)
     assert_close(world.truth().v, a * world.timestep, 1e-9, "first step")
 
@@ -298,7 +298,7 @@ def test_a_state_that_runs_away_is_said_and_leaves_no_log(tmp_path: Path, monkey
     with pytest.raises(SimulationDiverged, match="ran away at t = ") as caught:
         # Damping that overshoots more every time.
         for _ in range(400):
-            world.step(Drive(-2.7 * np.sign(world.truth().v[6:] + 1e-3), NONE))
+            world.step(ActuatorCommand(-2.7 * np.sign(world.truth().v[6:] + 1e-3), NONE))
             world.push(Push("base_link", tuple(-2e3 * world.truth().v[:3] + 1.0), 0.05))  # type: ignore[arg-type]
     one_line(caught.value)
     assert not list(tmp_path.iterdir())
@@ -313,7 +313,7 @@ import impact_posture.simulation as simulation
 for module in pkgutil.iter_modules(simulation.__path__):
     importlib.import_module(f"impact_posture.simulation.{module.name}")
 from impact_posture.errors import InputError
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.scene import Scene
 from impact_posture.simulation.world import build_world
 try:

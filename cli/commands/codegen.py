@@ -57,7 +57,7 @@ def codegen(
     else:
         options.check_contact(frame[0] if frame else None, normal, contact)
     supports = options.check_supports(support, no_support)
-    from impact_posture.codegen.folder import write_export
+    from impact_posture.codegen.export_folder import write_export
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.progress import progress_bar
 
@@ -70,9 +70,9 @@ def codegen(
         view = load_view(Path(robot))
         objectives, posture = [view.objective], view.q_optimal
     else:
+        from impact_posture.impact.parsing import parse_payload
         from impact_posture.impact.request import ImpactRequest
-        from impact_posture.impact.texts import parse_payload
-        from impact_posture_cli.asked import load_options
+        from impact_posture_cli.impact_options import load_options
 
         load = load_options(
             root=root,

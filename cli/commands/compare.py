@@ -44,7 +44,7 @@ def compare(
     from impact_posture.experiment.folders import FORMATS, store_beside, write_comparison
     from impact_posture.experiment.reproduction import compare as run_all
     from impact_posture.experiment.reproduction import comparison_document, jobs_of
-    from impact_posture.folder import check_output
+    from impact_posture.output_folder import check_output
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.progress import progress_line
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from impact_posture_cli import options
 
 if TYPE_CHECKING:
-    from impact_posture.impact.classical import Ellipsoid
+    from impact_posture.impact.classical_ellipsoids import Ellipsoid
     from impact_posture.impact.evaluation import Evaluation
     from impact_posture.impact.request import ResolvedImpact
     from impact_posture_cli.output import Page
@@ -44,7 +44,7 @@ def evaluate(
     quiet: options.Quiet = False,
 ) -> None:
     """Measure an impact at a posture: H, G, V, S, E, ellipsoid, gradient, predicted jump."""
-    from impact_posture_cli.asked import impact_request
+    from impact_posture_cli.impact_options import impact_request
 
     request = impact_request(
         robot, frame=frame, normal=normal, offset=offset, normal_frame=normal_frame, contact=contact,
@@ -53,10 +53,10 @@ def evaluate(
         package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock, bilateral=bilateral,
         lock_massless=lock_massless, armature_range=armature_range, payload=payload,
     )  # fmt: skip
-    from impact_posture.impact.classical import classical_ellipsoids
+    from impact_posture.impact.classical_ellipsoids import classical_ellipsoids
     from impact_posture.impact.evaluation import evaluate as evaluate_impact
     from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.worst import alone_line, contact_names, contacts_table, impulses_line, scenarios_table
+    from impact_posture_cli.tables import alone_line, contact_names, contacts_table, impulses_line, variants_table
 
     impact = request.resolve()
     found = evaluate_impact(impact.objective, impact.q, impact.speed, impact.restitution)
@@ -82,20 +82,20 @@ def evaluate(
     if found.contacts:
         contacts_table(page, frames, block["by_contact"])  # type: ignore[arg-type]
     if found.scenarios:
-        scenarios_table(page, [block], ["value"])
+        variants_table(page, [block], ["value"])
     page.gap()
     page.line(found.dominance.line)
     if found.impulses is not None:
         page.line(f"worst impulses: {impulses_line(frames, found.impulses.to_dict())}")
     for name, one in zip(frames, found.contacts or (found,), strict=True):
         if one.footing is not None:
-            page.line(f"feet{f' (blow at {name})' if found.contacts else ''}: {one.footing.line}")
+            page.line(f"feet{f' (impact at {name})' if found.contacts else ''}: {one.footing.line}")
     page.warnings(warnings)
 
 
 def _asked(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     from impact_posture_cli.output import vector, worst_normal
-    from impact_posture_cli.worst import contact_names
+    from impact_posture_cli.tables import contact_names
 
     contact, metric = impact.contact, impact.metric
     turned = ", given in the contact frame" if contact.normal_frame == "contact" else ""
@@ -179,7 +179,7 @@ def _ellipsoids(page: Page, impact: ResolvedImpact, ellipsoids: dict[str, Ellips
 
 
 def _gradient(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
-    from impact_posture.impact.jump import largest_entries
+    from impact_posture.impact.velocity_jump import largest_entries
     from impact_posture_cli.output import number
 
     page.gap()
@@ -191,7 +191,7 @@ def _gradient(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
 
 
 def _jumps(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
-    from impact_posture.impact.jump import merged_entries
+    from impact_posture.impact.velocity_jump import merged_entries
     from impact_posture_cli.output import number
 
     jumps = (found.frictionless, found.sticking)

@@ -11,7 +11,7 @@ from impact_posture_cli import options
 from impact_posture_cli.checks import UsageError
 
 if TYPE_CHECKING:
-    from impact_posture.robot.loader import LoadOptions
+    from impact_posture.robot.robot_loader import LoadOptions
     from impact_posture_cli.output import Page
 
 
@@ -43,9 +43,9 @@ def inspect(
     quiet: options.Quiet = False,
 ) -> None:
     """Show a robot: joints, frames, mass, limits, armature, postures, actuation."""
-    from impact_posture.robot.loader import load_robot
-    from impact_posture.robot.summary import summarize
-    from impact_posture_cli.asked import load_options
+    from impact_posture.robot.robot_loader import load_robot
+    from impact_posture.robot.robot_summary import summarize
+    from impact_posture_cli.impact_options import load_options
     from impact_posture_cli.output import Page, print_json
 
     load = load_options(

@@ -11,7 +11,7 @@ from impact_posture_cli import options
 
 if TYPE_CHECKING:
     from impact_posture.job import Written
-    from impact_posture.posture.settings import Prepared, ProblemSettings
+    from impact_posture.posture.problem_settings import Prepared, ProblemSettings
     from impact_posture.posture.solve import PostureSolution
     from impact_posture_cli.output import Page
 
@@ -80,16 +80,16 @@ def optimize(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Find the posture that takes the blow best; write posture, pictures and C code."""
+    """Find the posture that takes the impact best; write posture, pictures and C code."""
     given = _given(context)
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
-    from impact_posture.folder import check_output
     from impact_posture.job import FORMATS, default_out, write_result
-    from impact_posture.posture.follow import trade_off
+    from impact_posture.output_folder import check_output
+    from impact_posture.posture.pareto import pareto_front
+    from impact_posture.posture.problem_settings import prepare
     from impact_posture.posture.result import result_document
     from impact_posture.posture.robustness import solve_robustly
-    from impact_posture.posture.settings import prepare
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.progress import progress_bar
 
@@ -114,7 +114,7 @@ def optimize(
     curve = None
     if settings.tradeoff:
         with progress_bar("solving", "points", shown=shown) as progress:
-            curve = trade_off(solution, settings.tradeoff, compile=compile, progress=progress)
+            curve = pareto_front(solution, settings.tradeoff, compile=compile, progress=progress)
     document: dict[str, Any] = result_document(prepared, solution, robustness, curve)
     if not json:
         # Pictures and C code take longer than the answer: nobody waits for it because of them.
@@ -157,8 +157,8 @@ def _settings(robot: str, given: dict[str, Any]) -> ProblemSettings:
     contacts = given.get("contact")
     if not from_file or "contact" in given:
         options.check_contact(given.get("frame"), given.get("normal"), contacts)
-    from impact_posture.impact.texts import parse_armature, parse_payload
-    from impact_posture.posture.settings import make_settings, read_settings
+    from impact_posture.impact.parsing import parse_armature, parse_payload
+    from impact_posture.posture.problem_settings import make_settings, read_settings
 
     if "armature" in given:
         given["armature"] = parse_armature(given["armature"])
@@ -184,7 +184,7 @@ def _refuse_idle(given: dict[str, Any], settings: ProblemSettings) -> None:
 
 def _announce(page: Page, prepared: Prepared) -> None:
     from impact_posture_cli.output import vector
-    from impact_posture_cli.worst import contact_names
+    from impact_posture_cli.tables import contact_names
 
     if page.quiet:
         return
@@ -227,7 +227,7 @@ def _announce(page: Page, prepared: Prepared) -> None:
 def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
     from impact_posture.posture.notes import percent
     from impact_posture_cli.output import number, worst_normal
-    from impact_posture_cli.worst import contact_names, contacts_table, impulses_line, scenarios_table
+    from impact_posture_cli.tables import contact_names, contacts_table, impulses_line, variants_table
 
     initial, optimal = document["initial"], document["optimal"]
     rows = []
@@ -243,10 +243,10 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     page.table(("", "before", "after", "unit", "meaning"), rows, right=(1, 2))
     frames = contact_names(prepared.impact.objective.contacts)
     if len(frames) > 1:
-        page.line(f"  (H, G, V, S, E: of a blow at {frames[0]} alone)", style="dim")
+        page.line(f"  (H, G, V, S, E: of an impact at {frames[0]} alone)", style="dim")
         contacts_table(page, frames, optimal["by_contact"])
     if "by_scenario" in optimal:
-        scenarios_table(page, [initial, optimal], ["before", "after"])
+        variants_table(page, [initial, optimal], ["before", "after"])
     page.gap()
     for when, block in (("before", initial), ("after", optimal)):
         if "cone" in block:
@@ -283,11 +283,11 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
 
 
 def _footings(frames: list[str], block: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    """Whether the feet stay, under each of several blows by name."""
+    """Whether the feet stay, under each of several impacts by name."""
     if "by_contact" not in block:
         return [("", block["footing"])] if "footing" in block else []
     pairs = zip(frames, block["by_contact"], strict=True)
-    return [(f" (blow at {frame})", one["footing"]) for frame, one in pairs if "footing" in one]
+    return [(f" (impact at {frame})", one["footing"]) for frame, one in pairs if "footing" in one]
 
 
 def _tradeoff(page: Page, points: list[dict[str, Any]], notes: list[str]) -> None:

@@ -32,8 +32,8 @@ def plot(
     quiet: options.Quiet = False,
 ) -> None:
     """Draw a result again: ellipsoids, postures, jumps, the null-space path."""
-    from impact_posture.folder import add_to_record
     from impact_posture.job import FORMATS, load_view
+    from impact_posture.output_folder import add_to_record
     from impact_posture.plot import draw_all
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.progress import progress_bar

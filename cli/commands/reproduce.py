@@ -43,8 +43,8 @@ def reproduce(
     from impact_posture.experiment.paper import PAPER
     from impact_posture.experiment.reproduction import controllers_of, jobs_of
     from impact_posture.experiment.reproduction import reproduce as reproduce_all
-    from impact_posture.experiment.summary import advice
-    from impact_posture.folder import check_output
+    from impact_posture.experiment.reproduction_summary import advice
+    from impact_posture.output_folder import check_output
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.progress import progress_line
 

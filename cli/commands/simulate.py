@@ -30,7 +30,7 @@ RunMode = Annotated[
     Mode,
     typer.Option(
         "--mode", rich_help_panel=RUN,
-        help="live: the term stays on through the blow; held: the reached posture is held before it.",
+        help="live: the term stays on through the impact; held: the reached posture is held before it.",
     ),
 ]  # fmt: skip
 Free = Annotated[
@@ -75,7 +75,7 @@ def simulate(
     from impact_posture.experiment.folders import FORMATS, write_simulation
     from impact_posture.experiment.jobs import Job, execute
     from impact_posture.experiment.statistics import fate
-    from impact_posture.folder import check_output
+    from impact_posture.output_folder import check_output
     from impact_posture.posture.blas import one_blas_thread
     from impact_posture.simulation.scenario_file import read_scenario
     from impact_posture_cli.output import Page, complain, print_json

@@ -13,7 +13,7 @@ from impact_posture_cli.checks import Three, direction
 
 if TYPE_CHECKING:
     from impact_posture.impact.request import ResolvedImpact
-    from impact_posture.verification.report import Row, VerificationReport
+    from impact_posture.verification.verification_report import Row, VerificationReport
 
 NormalOfFirst = Annotated[
     Three | None,
@@ -63,7 +63,7 @@ def verify(
     from_result = options.is_result(robot)
     if from_result:
         options.refuse_beside_result(context, _FREE)
-    from impact_posture_cli.asked import impact_request
+    from impact_posture_cli.impact_options import impact_request
 
     if contact is None and normal is None:
         normal = (0.0, 0.0, 1.0)
@@ -74,7 +74,7 @@ def verify(
         normal_cone=0.0, speed=1.0, restitution=0.0, root=root, package_dir=package_dir, srdf=srdf, config=config,
         armature=armature, lock=lock, lock_massless=lock_massless,
     )  # fmt: skip
-    from impact_posture.verification.verify import verify as verify_objective
+    from impact_posture.verification.verification import verify as verify_objective
     from impact_posture_cli.output import Page, complain, print_json
     from impact_posture_cli.progress import progress_bar
 

@@ -1,4 +1,4 @@
-"""An aerial manipulator braces for a blow from below: nominal posture, impact-robust posture, and what changes.
+"""An aerial manipulator braces for an impact from below: nominal posture, impact-robust posture, and what changes.
 
 Run: python brace.py EXPORT
 EXPORT: what `impact-posture codegen tilthex_arm --frame ee --normal 0 0 1 --out EXPORT` wrote.
@@ -9,17 +9,17 @@ import sys
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.codegen.loader import ImpactGradient
-from impact_posture.robot.loader import load_robot
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.tsid.controller import Controller
 from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
-from impact_posture.tsid.program import aerial_program
+from impact_posture.tsid.task_formulation import aerial_formulation
 
 robot = load_robot("tilthex_arm")
 export = ImpactGradient.load(sys.argv[1], robot=robot)
 
 posture = ImpactRobustPosture(robot, gradient_of(export), K=20.0, kp=10.0, spring="release")
-controller = Controller(robot, aerial_program(robot, posture))
+controller = Controller(robot, aerial_formulation(robot, posture))
 
 q, v = robot.posture(), np.zeros(robot.nv)
 controller.reset(q, v)

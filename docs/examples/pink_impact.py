@@ -22,8 +22,8 @@ import pinocchio as pin
 from pink.tasks import FrameTask, Task
 
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
-from impact_posture.posture.settings import Prepared, make_settings, prepare
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.posture.problem_settings import Prepared, make_settings, prepare
 from impact_posture.posture.solve import PostureSolution, solve
 
 DT, DURATION, AT_REST = 0.01, 60.0, 1e-6  # s, s, and a norm of v

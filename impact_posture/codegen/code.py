@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from impact_posture.codegen import templates
 from impact_posture.codegen.emitter import Constants, Dialect, Emitter, Real, c_vector
 from impact_posture.codegen.functions import Exported, Library, library
-from impact_posture.codegen.lanes import packed
+from impact_posture.codegen.graph import ARITHMETIC, Graph, graph_of
 from impact_posture.codegen.layout import Layout, lay_out
-from impact_posture.codegen.program import ARITHMETIC, Graph, graph_of
+from impact_posture.codegen.simd_lanes import packed
 from impact_posture.codegen.sums import rebuilt
 from impact_posture.codegen.variants import Variant
 from impact_posture.codegen.vectors import LARGEST_VECTOR, vector_text

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from impact_posture.codegen.graph import COSINE, Node
 from impact_posture.codegen.layout import Block, Layout, is_leaf
-from impact_posture.codegen.program import COSINE, Node
 
 # Characters of a constant's place, about.
 _PLACE = 7

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.codegen.build_check import compile_and_check
 from impact_posture.codegen.code import build_code
-from impact_posture.codegen.compiler import compile_and_check
 from impact_posture.codegen.emitter import DOUBLE, Real
 from impact_posture.codegen.manifest import build_manifest
 from impact_posture.codegen.naming import c_identifier, check_prefix

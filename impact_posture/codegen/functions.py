@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from impact_posture.codegen.lanes import Seed
+from impact_posture.codegen.simd_lanes import Seed
 from impact_posture.dynamics.chart import Chart
-from impact_posture.dynamics.twins import Twins
+from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.impact.objective import ImpactObjective
 
 
@@ -73,7 +73,7 @@ def library(
     ``objective`` is left out where it is a multiple of H, and so is what only ``V`` needs: C has it from ``H, G``.
     """
     robot = objectives[0].robot
-    q, n, twins = ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3), Twins(robot.model)
+    q, n, twins = ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3), RepeatedLimbs(robot.model)
     values: list[ca.SX] = []
     names: list[str] = []
     functions: list[Exported] = []
@@ -101,7 +101,7 @@ def library(
     return Library(function, tuple(twins.values), _seeds(robot.model, twins), tuple(functions))
 
 
-def _seeds(model: object, twins: Twins) -> dict[tuple[str, int], Seed]:
+def _seeds(model: object, twins: RepeatedLimbs) -> dict[tuple[str, int], Seed]:
     found = {("constants", i): Seed(group, lane, name) for i, (group, lane, name) in enumerate(twins.keys)}
     for slot in Chart(model).slots:
         place = twins.places.get(slot.index)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from impact_posture.codegen.program import ARITHMETIC, COSINE, SINE, Graph
+from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph
 
 # Statements a block: compilers take more than proportionally longer on long functions.
 _BLOCK = 300

@@ -256,7 +256,7 @@ All are re-entrant, allocate nothing, keep no state, and take at most $stack byt
 cos not counted). Code 2: $unit_rule. $convention.
 Metric: $metric. Supports: $supports.
 `$prefix.json` tells the same to programs; its `model_sha256` names the model, so compare it before use. In Python,
-`impact_posture.codegen.loader.ImpactGradient.load` does.
+`impact_posture.codegen.impact_gradient.ImpactGradient.load` does.
 
 `example.cpp` wraps it for Eigen (`make example_cpp EIGEN=/usr/include/eigen3`). CMake: `add_subdirectory`, or install
 and `find_package($prefix)`; the target is `$prefix::$prefix`.

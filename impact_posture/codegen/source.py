@@ -7,8 +7,8 @@ from typing import Any
 
 from impact_posture import __version__
 from impact_posture.codegen import project, templates
+from impact_posture.codegen.build_check import self_test_tolerance
 from impact_posture.codegen.code import Code
-from impact_posture.codegen.compiler import self_test_tolerance
 from impact_posture.codegen.emitter import SHORT_NAMES, Real, c_double, c_vector
 from impact_posture.codegen.manifest import unit_slices
 from impact_posture.codegen.reader import identity

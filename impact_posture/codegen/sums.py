@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
-from impact_posture.codegen.program import Graph, Node
+from impact_posture.codegen.graph import Graph, Node
 
 # Cycles until a result can be used, about the same on today's processors; and for a sine and cosine.
 _LATENCY = {"+": 4, "-": 4, "*": 4, "inv": 15, "/": 15, "neg": 1, "lane": 2, "const": 0, "in": 0, "gather": 1}

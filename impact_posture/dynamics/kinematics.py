@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.joints import joint_quaternion, joint_spin, joint_transform
+from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.spatial import Spin, constant, quaternion_product
-from impact_posture.dynamics.twins import Twins
 
 # Spatial inertias, forces or motions by joint index.
 ByJoint = dict[int, ca.SX]
@@ -56,7 +56,7 @@ class Kinematics:
         q: ca.SX,
         chart_x: ca.SX | None = None,
         extra_inertia: Mapping[int, NDArray[np.float64]] | None = None,
-        twins: Twins | None = None,
+        twins: RepeatedLimbs | None = None,
     ) -> None:
         self.model, self.q = model, q
         self.chart = Chart(model)

@@ -1,7 +1,7 @@
 """MuJoCo's model written out of a ``pin.Model``: the same bodies, joints, inertias and armature, nothing read twice.
 
 A URDF read by MuJoCo itself would lose package paths, the floating base and the armature, and order joints its own
-way.  The model has no geometry: who simulates contact adds it (:mod:`impact_posture.dynamics.mjcf_additions`).
+way.  The model has no geometry: who simulates contact adds it (:mod:`impact_posture.dynamics.mjcf_scene`).
 """
 
 from __future__ import annotations

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.experiment.jobs import Job, workshop
-from impact_posture.experiment.many import Document, Store
+from impact_posture.experiment.batch import Document, Store
+from impact_posture.experiment.jobs import Job, controller_factory
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction
 from impact_posture.plot import Bar, RunView, Span, draw_bars, draw_comparison, draw_run, draw_snapshots
 from impact_posture.progress import tell
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import RepeatedContacts
 from impact_posture.simulation.series import Series, Window
 
@@ -58,9 +58,9 @@ def draw_reproduction(
 
 def run_view(job: Job, series: Series, windows: Sequence[Window], sign: int, status: str) -> RunView:
     """What is drawn of a run; one that did not complete says so wherever its name stands."""
-    shop = workshop(job.scenario, job.free)
-    setup, scenario = shop.setup, shop.setup.scenario
-    objective = shop.objective()
+    factory = controller_factory(job.scenario, job.free)
+    setup, scenario = factory.setup, factory.setup.scenario
+    objective = factory.objective()
     hits = isinstance(scenario.task, RepeatedContacts)
     return RunView(
         scenario=scenario.name,

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from impact_posture.experiment.batch import Store
 from impact_posture.experiment.figures import draw_reproduction, draw_runs, draw_side_by_side
 from impact_posture.experiment.jobs import Job
-from impact_posture.experiment.many import Store
 from impact_posture.experiment.reproduction import Reproduction
-from impact_posture.experiment.summary import summary
-from impact_posture.folder import whole_folder
-from impact_posture.simulation.runs import Run
+from impact_posture.experiment.reproduction_summary import summary
+from impact_posture.output_folder import whole_folder
+from impact_posture.simulation.run import Run
 
 SIMULATION, COMPARISON, REPRODUCTION = "run.json", "comparison.json", "reproduction.json"
 FORMATS = ("png",)

@@ -11,15 +11,15 @@ import numpy as np
 from impact_posture.errors import InputError
 from impact_posture.escape import file_name
 from impact_posture.posture.result import versions
-from impact_posture.simulation.controllers import Mode, Workshop
+from impact_posture.simulation.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.metrics import Metrics, measure
 from impact_posture.simulation.outcome import gravest, judge
 from impact_posture.simulation.prediction import predict
-from impact_posture.simulation.runs import Run, run
+from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 
-SCHEMA = "impact-posture/simulation/2"
+SCHEMA = "impact-posture/simulation/3"
 
 
 @dataclass(frozen=True)
@@ -69,29 +69,29 @@ def parse_controller(text: str) -> tuple[str, Mode, bool]:
 
 
 @lru_cache(maxsize=8)
-def workshop(scenario: str, free: bool = False) -> Workshop:
+def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
     """A scenario ready to run, kept for the next job.
 
     Raises:
         ImpactPostureError: The scenario cannot be read or set up.
     """
-    return Workshop(set_up(read_scenario(scenario)), free)
+    return ControllerFactory(set_up(read_scenario(scenario)), free)
 
 
 def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
     """Run a job: its runs, and its document.
 
     Raises:
-        ImpactPostureError: As :func:`impact_posture.simulation.runs.run`, or the scenario cannot be set up.
+        ImpactPostureError: As :func:`impact_posture.simulation.run.run`, or the scenario cannot be set up.
     """
-    shop = workshop(job.scenario, job.free)
-    scenario = shop.setup.scenario
+    factory = controller_factory(job.scenario, job.free)
+    scenario = factory.setup.scenario
     if job.sign is not None and job.sign not in getattr(scenario.task, "signs", ()):
         raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, hint="leave --sign out")
-    runs = run(shop, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
-    metrics, found = [measure(shop.setup, one) for one in runs], []
+    runs = run(factory, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
+    metrics, found = [measure(factory.setup, one) for one in runs], []
     for one, measured in zip(runs, metrics, strict=True):
-        found.append(_of_run(shop, one, measured))
+        found.append(_of_run(factory, one, measured))
     status = gravest(part["status"] for part in found)
     document = {
         "schema": SCHEMA,
@@ -110,8 +110,8 @@ def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
             _mean_prediction([p for part in found for p in part["prediction"]]) if status == "completed" else None
         ),
         "runs": found,
-        "offline": _offline(shop) if job.controller == "posture" else None,
-        "model_sha256": shop.setup.robot.model_sha256,
+        "offline": _offline(factory) if job.controller == "posture" else None,
+        "model_sha256": factory.setup.robot.model_sha256,
         "versions": versions() | {"mujoco": _mujoco_version()},
     }
     return runs, finite(document)
@@ -141,8 +141,8 @@ def together(metrics: list[Metrics]) -> Metrics:
     return Metrics(**{**values, **ticks, **largest, "stops": stops, "rested": all(m.rested for m in metrics)})
 
 
-def _of_run(shop: Workshop, one: Run, metrics: Metrics) -> dict[str, Any]:
-    events = judge(shop.setup, one)
+def _of_run(factory: ControllerFactory, one: Run, metrics: Metrics) -> dict[str, Any]:
+    events = judge(factory.setup, one)
     return {
         "sign": one.sign,
         "waited": None if np.isnan(one.waited) else one.waited,
@@ -151,21 +151,21 @@ def _of_run(shop: Workshop, one: Run, metrics: Metrics) -> dict[str, Any]:
         "ticks": int(one.series.t.size),
         "metrics": metrics.to_dict(),
         "windows": [window.to_dict() for window in one.windows],
-        "prediction": [p.to_dict() for p in predict(shop.setup, shop.objective(), one)],
+        "prediction": [p.to_dict() for p in predict(factory.setup, factory.objective(), one)],
     }
 
 
-def _mean_prediction(blows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Means over the blows; ``None`` where one is undefined."""
-    found: dict[str, Any] = {"blows": len(blows)}
+def _mean_prediction(impacts: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means over the impacts; ``None`` where one is undefined."""
+    found: dict[str, Any] = {"impacts": len(impacts)}
     for key in ("H", "G", "V", "S", "approach", "frictionless", "sticking", "measured", "ratio"):
-        values = [blow[key] for blow in blows]
+        values = [impact[key] for impact in impacts]
         found[key] = None if not values or None in values else float(np.mean(values))
     return found
 
 
-def _offline(shop: Workshop) -> dict[str, Any]:
-    found = shop.offline
+def _offline(factory: ControllerFactory) -> dict[str, Any]:
+    found = factory.offline
     return {**asdict(found), "q": [float(value) for value in found.q]}
 
 

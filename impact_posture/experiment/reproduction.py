@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from impact_posture.experiment.batch import Document, Progress, Store, run_batch
 from impact_posture.experiment.jobs import Job, parse_controller
-from impact_posture.experiment.many import Document, Progress, Store, run_many
 from impact_posture.experiment.paper import PAPER, RECOMMENDED
 from impact_posture.experiment.statistics import Row, row_of
-from impact_posture.simulation.controllers import CONTROLLERS
+from impact_posture.simulation.controller_factory import CONTROLLERS
 
 SCHEMA, COMPARISON_SCHEMA = "impact-posture/reproduction/2", "impact-posture/comparison/2"
-# The posture that a term reaches apart from what it does while the blow lasts; and the metric without the feet.
+# The posture that a term reaches apart from what it does while the impact lasts; and the metric without the feet.
 HELD, FREE = ("robust:held", "walker:held"), "robust:free"
 
 
@@ -126,7 +126,7 @@ def compare(
         ImpactPostureError: A scenario that cannot be set up, no such controller.
     """
     jobs = jobs_of(scenario, controllers, seeds)
-    documents = run_many(
+    documents = run_batch(
         jobs,
         processes=processes,
         store=store,
@@ -203,7 +203,7 @@ def reproduce(
     """
     plan = [(s, controllers_of(s, everything)) for s in scenarios]
     jobs = [job for scenario, controllers in plan for job in jobs_of(scenario, controllers, seeds)]
-    documents = run_many(
+    documents = run_batch(
         jobs,
         processes=processes,
         store=store,

@@ -66,7 +66,7 @@ class Row:
         change: Of the other quantities likewise, as differences to nominal.
         stops: Joints that reached a position limit within an impact window in any run.
         rested: Whether the robot was at rest before every push.
-        H: Just before the blows, mean.
+        H: Just before the impacts, mean.
         ratio: Measured jump over the rigid model's frictionless one, mean.
     """
 

@@ -1,4 +1,4 @@
-"""Where the blow comes from, and which feet stay on the ground."""
+"""Where the impact comes from, and which feet stay on the ground."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ NormalFrame = Literal["world", "contact"]
 
 # A normal shorter than this is what rounding left of zero.
 _DUST = 1e-9
+# A normal whose length is this near to 1 is a unit vector up to rounding.
+_UNIT = 1e-15
 # Of impulses and speeds: their squares, times whatever a robot has, must stay within the range of doubles.
 LARGEST = 1e100
 # Compliance times the robot's mass: what is taken unless told, and the least that leaves digits enough.
@@ -26,15 +28,19 @@ _DEFAULT_COMPLIANCE, _LEAST_COMPLIANCE = 1e-4, 1e-6
 
 
 @dataclass(frozen=True)
-class Contact:
+class ImpactContact:
     """A point of the robot that will touch a surface.
 
     Attributes:
         frame: The frame that carries the contact point.
-        normal: Unit vector out of the surface, towards the robot, shape (3,).
+        normal: Direction out of the surface, towards the robot, shape (3,).  It may be given with any length; the
+            attribute is a unit vector.
         offset: Contact point from the frame's origin, in the frame, meters.
         normal_frame: Axes of ``normal``: the world, or the contact frame (the normal then turns with the robot).
         impulse: Largest impulse λ̄ along the normal, N·s.
+
+    Raises:
+        ContactError: Zero or non-finite normal, offset or impulse.
     """
 
     frame: str
@@ -43,40 +49,35 @@ class Contact:
     normal_frame: NormalFrame = "world"
     impulse: float = 1.0
 
-    @staticmethod
-    def create(
-        frame: str,
-        normal: Vector3,
-        offset: Vector3 = (0.0, 0.0, 0.0),
-        normal_frame: NormalFrame = "world",
-        impulse: float = 1.0,
-    ) -> Contact:
-        """Check and normalize.
-
-        Raises:
-            ContactError: Zero or non-finite normal, offset or impulse.
-        """
-        n = np.array(normal, dtype=float)
+    def __post_init__(self) -> None:
+        n = np.array(self.normal, dtype=float)
         if n.shape != (3,) or not np.isfinite(n).all() or np.abs(n).max() < _DUST:
             raise ContactError(
-                f"the normal {tuple(normal)} has no direction",
+                f"the normal {tuple(self.normal)} has no direction",
                 where="--normal",
                 hint="give three numbers, not all zero",
             )
-        if not np.isfinite(np.array(offset, dtype=float)).all():
+        offset = np.array(self.offset, dtype=float)
+        if offset.shape != (3,) or not np.isfinite(offset).all():
             raise ContactError("the offset is not finite", where="--offset", hint="give three numbers")
-        if not (np.isfinite(impulse) and impulse > 0):
-            raise ContactError(f"the impulse bound is {impulse:g}", where="--impulse", hint="give N·s above zero")
-        if not 1 / LARGEST <= impulse <= LARGEST:
+        if not (np.isfinite(self.impulse) and self.impulse > 0):
             raise ContactError(
-                f"with an impulse bound of {impulse:g} the objective λ̄²H is beyond double precision",
+                f"the impulse bound is {self.impulse:g}", where="--impulse", hint="give N·s above zero"
+            )
+        if not 1 / LARGEST <= self.impulse <= LARGEST:
+            raise ContactError(
+                f"with an impulse bound of {self.impulse:g} the objective λ̄²H is beyond double precision",
                 where="--impulse",
                 hint=f"give {1 / LARGEST:g} to {LARGEST:g} N·s",
             )
-        n = n / np.abs(n).max()  # first: any length must do, and squares overflow
-        n = n / np.linalg.norm(n)
-        x, y, z = (float(v) for v in n)
-        return Contact(frame, (x, y, z), tuple(float(v) for v in offset), normal_frame, float(impulse))  # type: ignore[arg-type]
+        # The largest entry first, because any length must do and squares overflow.  A unit normal stays as it is, so
+        # that a copy of a contact equals it to the last digit.
+        if abs(np.linalg.norm(n / np.abs(n).max()) * np.abs(n).max() - 1) > _UNIT:
+            n = n / np.abs(n).max()
+            n = n / np.linalg.norm(n)
+        object.__setattr__(self, "normal", tuple(float(v) for v in n))
+        object.__setattr__(self, "offset", tuple(float(v) for v in offset))
+        object.__setattr__(self, "impulse", float(self.impulse))
 
 
 @dataclass(frozen=True)

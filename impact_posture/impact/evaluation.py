@@ -9,22 +9,22 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.errors import InputError, MetricError
-from impact_posture.impact.classical import Ellipsoid, ellipsoid_of
+from impact_posture.impact.classical_ellipsoids import Ellipsoid, ellipsoid_of
 from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import LARGEST, point_on
-from impact_posture.impact.footing import Footing, footing
+from impact_posture.impact.contact_stability import ContactStability, contact_stability
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses
-from impact_posture.impact.jump import Dominance, Jump, find_dominance, weighed_jump
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.impact.scalars import (
     Scalars,
-    ScenarioValue,
+    VariantValue,
     objective_gradient,
     objective_value,
-    scenario_values,
+    variant_values,
     worst_member,
 )
+from impact_posture.impact.velocity_jump import Dominance, Jump, find_dominance, weighed_jump
 
 Vector = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ class Evaluation:
         dominance: Whether one light joint makes up most of H.
         free: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
         compliance_effect: Relative change of H when the supports' compliance is a tenth; ``None`` without supports.
-        footing: Whether the feet stay under the blow; ``None`` without supports.
+        footing: Whether the feet stay under the impact; ``None`` without supports.
         contacts: Of several contacts each one's own evaluation, as if it were alone, the leading one's first.
         impulses: The worst impulses of several contacts; ``None`` of one.
         scenarios: The objective and the scalars in each scenario; empty without any.
@@ -80,10 +80,10 @@ class Evaluation:
     dominance: Dominance
     free: Scalars | None
     compliance_effect: float | None
-    footing: Footing | None
+    footing: ContactStability | None
     contacts: tuple[Evaluation, ...]
     impulses: WorstImpulses | None
-    scenarios: tuple[ScenarioValue, ...]
+    scenarios: tuple[VariantValue, ...]
     warnings: tuple[str, ...]
 
     def to_dict(self) -> dict[str, object]:
@@ -158,7 +158,7 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
     scalars = Scalars.of(found)
     rebound = (1 + restitution) * speed
     free, effect = _without_supports(objective, q, found.H)
-    scenarios = scenario_values(objective, q)
+    scenarios = variant_values(objective, q)
     member = worst_member(objective, scenarios)
     value = objective_value(member, q)
     cone = _worst(member, q)
@@ -188,7 +188,7 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
         dominance=find_dominance(objective, found),
         free=free,
         compliance_effect=effect,
-        footing=footing(oracle, objective.supports, q) if objective.supports else None,
+        footing=contact_stability(oracle, objective.supports, q) if objective.supports else None,
         contacts=tuple(evaluate(single, q, speed, restitution) for single in singles),
         impulses=member.worst_case.worst(q) if isinstance(member.worst_case, ImpulseBox) else None,
         scenarios=scenarios,

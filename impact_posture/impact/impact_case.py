@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.impact.contact import Contact, Support, default_compliance, point_on
+from impact_posture.impact.contact import ImpactContact, Support, default_compliance, point_on
 from impact_posture.impact.metric import Metric
 from impact_posture.robot.robot import Robot
 
@@ -24,7 +24,7 @@ class ImpactCase:
     """
 
     robot: Robot
-    contact: Contact
+    contact: ImpactContact
     metric: Metric = field(default_factory=Metric)
     supports: tuple[Support, ...] = ()
     compliance: float = 0.0

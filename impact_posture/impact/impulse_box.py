@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.errors import ContactError, MetricError
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import (
@@ -66,7 +66,7 @@ class WorstImpulses:
         }
 
 
-def check_contacts(contacts: Sequence[Contact], kind: ImpactKind, *, bilateral: bool, cone: bool) -> None:
+def check_contacts(contacts: Sequence[ImpactContact], kind: ImpactKind, *, bilateral: bool, cone: bool) -> None:
     """Refuse contacts that have no box of impulses to take the worst of.
 
     Raises:

@@ -15,8 +15,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.tree import ByJoint, PointOnLink, Product, Response, Tree, Wrench
-from impact_posture.dynamics.twins import Twins
 from impact_posture.impact.contact import support_inertia
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.robot.robot import Robot
@@ -32,10 +32,11 @@ class ImpactKernel:
         case: Robot, contact, metric and supports.
         q: Configuration symbols, shape (nq, 1).
         n: Normal symbols, shape (3, 1), in the axes that the contact's normal is given in.
-        twins: Branches whose expressions are to be alike (:class:`~impact_posture.dynamics.twins.Twins`).
+        twins: Branches whose expressions are to be alike
+            (:class:`~impact_posture.dynamics.repeated_limbs.RepeatedLimbs`).
     """
 
-    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, twins: Twins | None = None) -> None:
+    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, twins: RepeatedLimbs | None = None) -> None:
         self.case, self.metric, self.q, self.n = case, case.metric, q, n
         extra = support_inertia(case.robot, case.supports, case.compliance)
         self.tree = Tree(case.robot.model, q, extra_inertia=extra, twins=twins)
@@ -43,7 +44,7 @@ class ImpactKernel:
         self._supported = bool(case.supports)
 
     @cached_property
-    def blow(self) -> Wrench:
+    def impact(self) -> Wrench:
         """The unit impulse along the normal."""
         return Wrench(self.point, self.n, ca.SX.zeros(3), in_frame=self.case.in_contact_frame)
 
@@ -54,8 +55,8 @@ class ImpactKernel:
 
     @cached_property
     def jump(self) -> Response:
-        """The robot's answer to the blow; its ``a`` is ``M⁻¹Jᵀn``."""
-        return self.answer([self.blow])
+        """The robot's answer to the impact; its ``a`` is ``M⁻¹Jᵀn``."""
+        return self.answer([self.impact])
 
     def _alike(self, wrench: Wrench) -> list[Wrench]:
         """The wrench; where its link has twins, it and none on them, in one form for all."""
@@ -83,16 +84,16 @@ class ImpactKernel:
     @cached_property
     def G(self) -> ca.SX:
         """``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg."""
-        return self._along(self.blow, self.jump.velocities)
+        return self._along(self.impact, self.jump.velocities)
 
     @cached_property
     def grad_H(self) -> ca.SX:
         """``2 ∂_q[nᵀJb − bᵀMa]`` with ``Mb = Wa`` (plus ``∂_q aᵀMa`` where W = M), shape (nv,)."""
         return self.grad_G if self.metric.kind == "kinetic" and not self._supported else self.size_gradient(self.jump)
 
-    def answer(self, blows: Sequence[Wrench]) -> Response:
+    def answer(self, impacts: Sequence[Wrench]) -> Response:
         """The robot's answer to several impulses at once, wherever they act."""
-        return self.tree.respond(wrenches=[part for blow in blows for part in self._alike(blow)])
+        return self.tree.respond(wrenches=[part for impact in impacts for part in self._alike(impact)])
 
     def product(self, one: Response, other: Response) -> ca.SX:
         """``a₁ᵀWa₂`` of two answers."""

@@ -57,7 +57,7 @@ class UnknownJump:
     Attributes:
         a: Unknown, shape (nv,).
         variables: ``a`` and the supports' impulses.
-        residual: ``M a − J_sᵀf − (the blow)`` and ``J_s a + εf``.
+        residual: ``M a − J_sᵀf − (the impact)`` and ``J_s a + εf``.
         mass_a: ``M a``.
         contact_velocity: ``J a``, world, shape (3,).
     """

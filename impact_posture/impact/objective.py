@@ -16,9 +16,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.tree import Tree
-from impact_posture.dynamics.twins import Twins
-from impact_posture.impact.contact import Contact, Support, default_compliance
+from impact_posture.impact.contact import ImpactContact, Support, default_compliance
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_kind import ImpactKind, QuadraticKind
 from impact_posture.impact.impulse_box import ImpulseBox, check_contacts
@@ -31,8 +31,8 @@ from impact_posture.impact.normal_cone import NormalCone, check_cone
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.impact.single_impact import SingleImpact
 from impact_posture.impact.worst_case import Subgradients, WorstCase
+from impact_posture.robot.model_variant import ModelVariant
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.scenario import Scenario
 
 Vector = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class Objective(Protocol):
         ...
 
     @property
-    def contacts(self) -> tuple[Contact, ...]:
+    def contacts(self) -> tuple[ImpactContact, ...]:
         """Contacts whose frames the problem holds; empty for none."""
         ...
 
@@ -128,15 +128,15 @@ class ImpactObjective:
     """
 
     robot: Robot
-    contact: Contact
+    contact: ImpactContact
     metric: Metric = field(default_factory=Metric)
     kind: ObjectiveKind = "impulse"
     supports: tuple[Support, ...] = ()
     compliance: float = 0.0
     normal_cone_deg: float = 0.0
-    others: tuple[Contact, ...] = ()
+    others: tuple[ImpactContact, ...] = ()
     bilateral: bool = False
-    scenarios: tuple[Scenario, ...] = ()
+    scenarios: tuple[ModelVariant, ...] = ()
 
     def __post_init__(self) -> None:
         check_cone(self.impact_kind, self.normal_cone_deg)
@@ -193,7 +193,7 @@ class ImpactObjective:
         return ()
 
     @property
-    def contacts(self) -> tuple[Contact, ...]:
+    def contacts(self) -> tuple[ImpactContact, ...]:
         """All contacts, the leading one first."""
         return (self.contact, *self.others)
 
@@ -248,7 +248,7 @@ class ImpactObjective:
         """The expressions, on fresh symbols q and n."""
         return self.kernel_of(ca.SX.sym("q", self.robot.nq), ca.SX.sym("n", 3))
 
-    def kernel_of(self, q: ca.SX, n: ca.SX, twins: Twins | None = None) -> ImpactKernel:
+    def kernel_of(self, q: ca.SX, n: ca.SX, twins: RepeatedLimbs | None = None) -> ImpactKernel:
         """The expressions on given symbols; with ``twins``, alike for twin branches."""
         return ImpactKernel(self.case, q, n, twins)
 

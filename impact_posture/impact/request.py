@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import ContactError, FrameNotFound, InputError
-from impact_posture.impact.contact import Contact, NormalFrame, Support, least_compliance, point_on
+from impact_posture.impact.contact import ImpactContact, NormalFrame, Support, least_compliance, point_on
 from impact_posture.impact.metric import Metric, MetricKind, ObjectiveKind, build_metric
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.parsing import parse_contact
 from impact_posture.impact.supports import refuse_held, resolve_supports
-from impact_posture.impact.texts import parse_contact
 from impact_posture.robot.guess import feet, tips
-from impact_posture.robot.loader import LoadOptions, load_robot
+from impact_posture.robot.model_variant import Payload, build_model_variants
 from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.scenario import Payload, build_scenarios
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.robot.spec import Vector3
 
 Vector = NDArray[np.float64]
@@ -105,13 +105,13 @@ class ImpactRequest:
             self.normal_cone,
             tuple(others),
             self.bilateral,
-            build_scenarios(robot, self.armature_range, self.payloads),
+            build_model_variants(robot, self.armature_range, self.payloads),
         )
         held_by = _missing_support(robot) if self.supports is None and not supports else ""
         posture = self.posture or robot.default_posture
         return ResolvedImpact(objective, q, posture, self.speed, self.restitution, held_by)
 
-    def _contacts(self, robot: Robot) -> list[Contact]:
+    def _contacts(self, robot: Robot) -> list[ImpactContact]:
         if not self.contacts:
             if self.normal is None:
                 raise ContactError("there is none", where="--normal", hint="give the direction out of the surface")
@@ -126,14 +126,14 @@ class ImpactRequest:
             )
         return [self._contact(robot, *parse_contact(text)) for text in self.contacts]
 
-    def _contact(self, robot: Robot, frame: str, normal: Vector3, impulse: float | None) -> Contact:
+    def _contact(self, robot: Robot, frame: str, normal: Vector3, impulse: float | None) -> ImpactContact:
         if frame not in robot.frame_names:
             raise FrameNotFound(frame, tips(robot, feet(robot)), where=robot.name)
         offset = self.offset
         if offset is None:
             offset = robot.spec.contact.offset if frame == robot.spec.contact.frame else (0.0, 0.0, 0.0)
         bound = self.impulse if impulse is None else impulse
-        contact = Contact.create(frame, normal, offset, self.normal_frame, bound)
+        contact = ImpactContact(frame, normal, offset, self.normal_frame, bound)
         point_on(robot, contact.frame, contact.offset)
         return contact
 
@@ -164,7 +164,7 @@ class ResolvedImpact:
         return self.objective.robot
 
     @property
-    def contact(self) -> Contact:
+    def contact(self) -> ImpactContact:
         """The contact, its normal a unit vector."""
         return self.objective.contact
 

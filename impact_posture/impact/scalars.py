@@ -55,7 +55,7 @@ class Scalars:
 
 
 @dataclass(frozen=True)
-class ScenarioValue:
+class VariantValue:
     """What an impact means should the robot be another than it was modeled.
 
     Attributes:
@@ -77,16 +77,16 @@ def _blocked(found: ImpactQuantities) -> bool:
     return found.G <= _BLOCKED * float(np.linalg.eigvalsh(found.mobility)[-1])
 
 
-def scenario_values(objective: ImpactObjective, q: Vector) -> tuple[ScenarioValue, ...]:
+def variant_values(objective: ImpactObjective, q: Vector) -> tuple[VariantValue, ...]:
     """The objective and its parts in each scenario."""
     pairs = zip(objective.scenarios, objective.by_scenario, strict=True) if objective.scenarios else ()
     return tuple(
-        ScenarioValue(scenario.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
+        VariantValue(scenario.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
         for scenario, member in pairs
     )
 
 
-def worst_member(objective: ImpactObjective, scenarios: tuple[ScenarioValue, ...]) -> ImpactObjective:
+def worst_member(objective: ImpactObjective, scenarios: tuple[VariantValue, ...]) -> ImpactObjective:
     """The objective in the worst of its scenarios as evaluated, one where it does not exist before all others."""
     if not scenarios:
         return objective

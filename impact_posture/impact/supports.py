@@ -1,4 +1,4 @@
-"""Which feet stay: from what a user named, and what no blow can be at."""
+"""Which feet stay: from what a user named, and what no impact can be at."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import get_args
 import numpy as np
 
 from impact_posture.errors import ContactError, FrameNotFound, InputError
-from impact_posture.impact.contact import Contact, Support, point_on
+from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.robot.guess import feet
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import SupportKind
@@ -47,8 +47,8 @@ def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
     return Support(frame, kind or base.kind, base.offset, base.size)
 
 
-def refuse_held(robot: Robot, contact: Contact, supports: Sequence[Support]) -> None:
-    """Refuse a blow at a point that a support holds: nothing but the compliance would answer it."""
+def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support]) -> None:
+    """Refuse an impact at a point that a support holds: nothing but the compliance would answer it."""
     point = point_on(robot, contact.frame, contact.offset)
     for support in supports:
         foot = point_on(robot, support.frame, support.offset)

@@ -15,17 +15,17 @@ from matplotlib.figure import Figure
 
 from impact_posture.errors import NameNotFound
 from impact_posture.plot.bars import Bar, bars_figure, draw_bars
-from impact_posture.plot.classical import classical_figure
+from impact_posture.plot.classical_figure import classical_figure
 from impact_posture.plot.comparison import comparison_figure, controls_comparison_figure, draw_comparison
-from impact_posture.plot.ellipsoid import ellipsoid_figure
-from impact_posture.plot.jump import jump_figure
-from impact_posture.plot.path import path_figure
-from impact_posture.plot.robot import postures_figure
+from impact_posture.plot.ellipsoid_figure import ellipsoid_figure
+from impact_posture.plot.jump_figure import jump_figure
+from impact_posture.plot.path_figure import path_figure
+from impact_posture.plot.robot_drawing import postures_figure
+from impact_posture.plot.run_figures import controls_figure, draw_run, joints_figure, metric_figure
 from impact_posture.plot.run_view import RunView, Span
-from impact_posture.plot.runs import controls_figure, draw_run, joints_figure, metric_figure
 from impact_posture.plot.snapshots import draw_snapshots, snapshots_figure
 from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save
-from impact_posture.plot.tradeoff import tradeoff_figure
+from impact_posture.plot.tradeoff_figure import tradeoff_figure
 from impact_posture.plot.view import PathData, ResultView, TradeOffData, sample_path
 
 __all__ = [

@@ -24,9 +24,9 @@ from impact_posture.plot.run_axes import (
     share_height,
     subplots,
 )
-from impact_posture.plot.run_panels import RUNS, Clip, blows, control_panels, first_blow, joint_panels, whole
+from impact_posture.plot.run_figures import HINT, METRIC, joints_figure
+from impact_posture.plot.run_panels import RUNS, Clip, control_panels, first_impact, impacts, joint_panels, whole
 from impact_posture.plot.run_view import RunView, check_same, run_header
-from impact_posture.plot.runs import HINT, METRIC, joints_figure
 from impact_posture.plot.style import DEFAULT_FORMATS, check_formats, framed, save, style
 from impact_posture.plot.view import mixed_unit
 
@@ -58,9 +58,9 @@ def draw_comparison(views: Sequence[RunView], out_dir: Path, formats: Iterable[s
 
 
 def comparison_figure(views: Sequence[RunView]) -> Figure:
-    """Draw H over time of all controllers, and below it ``‖ν‖`` around the first blow.
+    """Draw H over time of all controllers, and below it ``‖ν‖`` around the first impact.
 
-    Below, and for pushes above, time counts from each controller's own blow.
+    Below, and for pushes above, time counts from each controller's own impact.
 
     Raises:
         InputError: No view, or views of different scenarios or robots.
@@ -72,7 +72,7 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
         notes += (
             f" Windows above: those of {plot_label(views[0].name)}. Below, time counts from each one's own touch."
         )
-    spans = [_since_blow(view) for view in views]
+    spans = [_since_impact(view) for view in views]
     span = Clip(
         min(one.begin - one.origin for one in spans), max(one.end - one.origin for one in spans), label=spans[0].label
     )
@@ -89,12 +89,12 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
         panels[0].set_ylabel(METRIC)
         panels[0].set_xlabel(span.label)
         if hit:
-            _blow_panel(panels[1], views)
+            _impact_panel(panels[1], views)
         finish(body, list(panels), common_handles(views), [("", panels[0])])
     return figure
 
 
-def _since_blow(view: RunView) -> Clip:
+def _since_impact(view: RunView) -> Clip:
     """All of a run; of a push in seconds from its begin, as runs wait for rest differently long."""
     all_of_it = whole(view)
     if not (view.pushed and view.impacts):
@@ -102,9 +102,9 @@ def _since_blow(view: RunView) -> Clip:
     return replace(all_of_it, origin=view.impacts[0].begin, label="time since push  [s]")
 
 
-def _blow_panel(axes: Any, views: Sequence[RunView]) -> None:
-    """``‖ν‖`` of all controllers around their first blow."""
-    clips = [clip for clip in map(first_blow, views) if clip is not None]
+def _impact_panel(axes: Any, views: Sequence[RunView]) -> None:
+    """``‖ν‖`` of all controllers around their first impact."""
+    clips = [clip for clip in map(first_impact, views) if clip is not None]
     longest = max(clips, key=lambda clip: clip.end - clip.begin)
     frame_time(axes, views[clips.index(longest)], longest)
     for view, clip, look in zip(views, clips, cycle(RUNS), strict=False):
@@ -115,7 +115,7 @@ def _blow_panel(axes: Any, views: Sequence[RunView]) -> None:
 
 
 def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
-    """Draw the commands around the blows with their limits (dashed): a column for each controller, nominal left.
+    """Draw the commands around the impacts with their limits (dashed): a column for each controller, nominal left.
 
     Raises:
         InputError: No view, or views of different scenarios or robots.
@@ -135,11 +135,11 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
                 # Stays as a place for the legend.
                 axes.set_axis_off()
                 continue
-            draw_panel(axes, panel, which, views[which], blows(views[which]))
+            draw_panel(axes, panel, which, views[which], impacts(views[which]))
             if row % len(rows) == 0:
                 axes.set_title(plot_label(views[which].name), fontweight="bold")
             if row % len(rows) == len(rows) - 1:
-                axes.set_xlabel(blows(views[which]).label)
+                axes.set_xlabel(impacts(views[which]).label)
             else:
                 axes.tick_params(labelbottom=False)
             if column == 0:

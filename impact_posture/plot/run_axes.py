@@ -11,8 +11,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
 
 from impact_posture.escape import plot_label
-from impact_posture.plot.path import log_axis, spreads
-from impact_posture.plot.run_panels import LINES, Clip, Panel, first_blow, whole
+from impact_posture.plot.path_figure import log_axis, spreads
+from impact_posture.plot.run_panels import LINES, Clip, Panel, first_impact, whole
 from impact_posture.plot.run_view import RunView
 from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import GRAY, INK, shared_legend
@@ -141,8 +141,8 @@ def subplots(body: Any, rows: int, columns: int, **more: Any) -> Any:
 
 
 def grid(body: Any, view: RunView, rows: int) -> tuple[Any, list[Clip]]:
-    """Rows of panels: the whole run, wide, and beside it the first blow, where there is one; and their clips."""
-    clips = [clip for clip in (whole(view), first_blow(view)) if clip is not None]
+    """Rows of panels: the whole run, wide, and beside it the first impact, where there is one; and their clips."""
+    clips = [clip for clip in (whole(view), first_impact(view)) if clip is not None]
     ratios = [1.7, 1.0][: len(clips)]
     return subplots(body, rows, len(clips), sharey="row", sharex="col", width_ratios=ratios), clips
 

@@ -62,7 +62,7 @@ def whole(view: RunView) -> Clip:
     return Clip(float(view.t[0]), float(view.t[-1]))
 
 
-def first_blow(view: RunView) -> Clip | None:
+def first_impact(view: RunView) -> Clip | None:
     """The first impact window with some air, in ms from its begin; ``None`` without one."""
     if not view.impacts:
         return None
@@ -75,7 +75,7 @@ def first_blow(view: RunView) -> Clip | None:
     )
 
 
-def blows(view: RunView) -> Clip:
+def impacts(view: RunView) -> Clip:
     """From a second before the first impact window to a second after the last; all of a run without any."""
     if not view.impacts:
         return whole(view)

@@ -1,4 +1,4 @@
-"""What the pictures of a simulated run are drawn from: the robot, the blow, and plain arrays, one row a tick."""
+"""What the pictures of a simulated run are drawn from: the robot, the impact, and plain arrays, one row a tick."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.plot.shapes import Vector
 from impact_posture.plot.view import number, velocity_units
 from impact_posture.robot.robot import Robot
@@ -28,7 +28,7 @@ class Span:
         begin: s.
         end: s.
         contact: Which contact, or push, it belongs to, from 0.
-        touched: Whether the blow came; else the span begins where it was expected.
+        touched: Whether the impact came; else the span begins where it was expected.
     """
 
     kind: str
@@ -48,7 +48,7 @@ class RunView:
         scenario: Name of the scenario.
         controller: Name of the controller.
         robot: The robot.
-        contact: Where the blow comes: frame, offset, and the world normal out of the surface (or along the push).
+        contact: Where the impact comes: frame, offset, and the world normal out of the surface (or along the push).
         t: s, increasing, shape (n,).
         q: Configuration, shape (n, nq).
         v: ν, shape (n, nv).
@@ -57,10 +57,10 @@ class RunView:
         rotor_speed: As they turn, shape (n, rotors).
         force: Of the surface on the robot, or of the push, world, N, shape (n, 3).
         peak: Largest normal force within each tick, N, shape (n,).
-        objective: H of the blow, shape (n,); NaN where it was not evaluated.
-        level: Of the term that prepares for the blow, 0 to 1, shape (n,).
+        objective: H of the impact, shape (n,); NaN where it was not evaluated.
+        level: Of the term that prepares for the impact, 0 to 1, shape (n,).
         at_stop: Whether a joint is at a position limit, shape (n, nv).
-        windows: What to shade; the first of kind ``impact`` is the first blow.
+        windows: What to shade; the first of kind ``impact`` is the first impact.
         surface: A point on the surface that is hit, world, m, shape (3,); ``None`` for a push.
         supports: Feet that stay.
         label: What the run is called beside others; the controller's name if empty.
@@ -71,7 +71,7 @@ class RunView:
     scenario: str
     controller: str
     robot: Robot
-    contact: Contact
+    contact: ImpactContact
     t: Vector
     q: Vector
     v: Vector
@@ -124,12 +124,12 @@ class RunView:
 
     @property
     def impacts(self) -> tuple[Span, ...]:
-        """The spans that count as impact, the first blow first."""
+        """The spans that count as impact, the first impact first."""
         return tuple(sorted((w for w in self.windows if w.kind == "impact"), key=lambda w: w.begin))
 
     @property
     def pushed(self) -> bool:
-        """Whether the blow is a push: there is no surface."""
+        """Whether the impact is a push: there is no surface."""
         return self.surface is None
 
     @cached_property

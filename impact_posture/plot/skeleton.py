@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.impact.contact import Contact, Support, point_on
+from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.plot.shapes import Vector
 from impact_posture.robot.robot import Robot
 
@@ -67,7 +67,7 @@ class Skeleton:
 
 
 def build_skeleton(
-    robot: Robot, q: Vector, contacts: Sequence[Contact], supports: Sequence[Support] = ()
+    robot: Robot, q: Vector, contacts: Sequence[ImpactContact], supports: Sequence[Support] = ()
 ) -> Skeleton:
     """Place the sticks at ``q``, shape (nq,).
 
@@ -88,7 +88,7 @@ def build_skeleton(
         for i in range(first, model.njoints)
         if model.parents[i] >= first or not len(body)
     ]
-    held: list[Contact | Support] = [*contacts, *supports]
+    held: list[ImpactContact | Support] = [*contacts, *supports]
     hanging = [point_on(robot, one.frame, one.offset) for one in held]
     frames = [_placed(places, point) for point in hanging]
     ends = [np.array(frame.translation) for frame in frames]

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from impact_posture.escape import plot_label
-from impact_posture.plot.robot import BODY, depth_of, draw_sticks, side_plane
+from impact_posture.plot.robot_drawing import BODY, depth_of, draw_sticks, side_plane
 from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.shapes import Plane, Vector
@@ -34,7 +34,7 @@ from impact_posture.plot.style import (
 NOTES = "Sticks join joint origins; they are not the links' shapes. Gray: where the robot was when the run began."
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
 _START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
-# Just before the blow: a tick that it has no part in, s.
+# Just before the impact: a tick that it has no part in, s.
 _BEFORE = 0.005
 
 
@@ -49,13 +49,16 @@ def draw_snapshots(views: Sequence[RunView], out_dir: Path, formats: Iterable[st
 
 
 def instants(view: RunView) -> list[tuple[str, float]]:
-    """Start, just before the first blow, end of its window: what and when (s); without a blow the start and end."""
+    """Return the start, the moment before the first impact and the end of its window: name and time in s.
+
+    Without an impact these are the start and the end of the run.
+    """
     start = ("start", float(view.t[0]))
     if not view.impacts:
         return [start, ("half of the run", float(view.t[len(view.t) // 2])), ("end", float(view.t[-1]))]
     first = view.impacts[0]
     word = "push" if view.pushed else "impact window"
-    return [start, ("just before the first blow", first.begin - _BEFORE), (f"end of the {word}", first.end)]
+    return [start, ("just before the first impact", first.begin - _BEFORE), (f"end of the {word}", first.end)]
 
 
 def snapshots_figure(views: Sequence[RunView]) -> Figure:

@@ -17,7 +17,7 @@ from matplotlib.textpath import text_to_path
 
 from impact_posture.errors import InputError, OutputError
 from impact_posture.escape import printable
-from impact_posture.folder import scratch_folder
+from impact_posture.output_folder import scratch_folder
 from impact_posture.plot.labels import place_labels
 from impact_posture.plot.view import SEPARATOR
 

@@ -88,7 +88,7 @@ class ResultView:
 
     Attributes:
         robot: The robot.
-        objective: Contact, metric, kind and supports; its oracle gives the numbers.
+        objective: ImpactContact, metric, kind and supports; its oracle gives the numbers.
         q_initial: Posture before, shape (nq,).
         q_optimal: Posture after, shape (nq,).
         speed: Approach speed along the normal, m/s.
@@ -272,7 +272,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
 
 
 def _worst_values(view: ResultView) -> str:
-    """The objective before and after, where it is none of the five quantities but the worst of several blows."""
+    """The objective before and after, where it is none of the five quantities but the worst of several impacts."""
     if isinstance(view.objective.worst_case, SingleImpact):
         return ""
     found = [objective_value(view.objective, q) for q in (view.q_initial, view.q_optimal)]

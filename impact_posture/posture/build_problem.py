@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import Contact, Support, point_on
+from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.constraint import (
     CenterOfMassOverFeet,
@@ -23,9 +23,9 @@ from impact_posture.posture.constraint import (
     PositionBox,
 )
 from impact_posture.posture.equalities import base_point
-from impact_posture.posture.every_scenario import in_every_scenario
-from impact_posture.posture.feet import KeptFeet
+from impact_posture.posture.every_variant import in_every_variant
 from impact_posture.posture.gauge import pin_undetermined
+from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.regular import regularize
 from impact_posture.robot.robot import Robot
@@ -49,7 +49,7 @@ def build_problem(robot: Robot, objective: Objective, given: Vector, requirement
     held = {s.frame for s in objective.supports}
     poses = (requirements.contact_pose, *requirements.other_poses)
     # Two impacts at one frame, along two normals, hold it once.
-    struck: dict[str, tuple[Contact, ContactPose]] = {}
+    struck: dict[str, tuple[ImpactContact, ContactPose]] = {}
     # An objective without contacts leaves the contact pose unused.
     for contact, mode in zip(objective.contacts, poses, strict=bool(objective.contacts)):
         struck.setdefault(contact.frame, (contact, mode))
@@ -71,7 +71,7 @@ def build_problem(robot: Robot, objective: Objective, given: Vector, requirement
     if isinstance(objective, ImpactObjective):
         if requirements.keep_contacts:
             constraints += _kept_feet(objective, numeric, requirements.friction)
-        constraints += in_every_scenario(objective, numeric, requirements.friction, constraints)
+        constraints += in_every_variant(objective, numeric, requirements.friction, constraints)
     lower, upper = _bounds(robot, chart, given, requirements)
     more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
     problem = PostureProblem(
@@ -124,7 +124,7 @@ def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constrain
     return HeldPose(f"foot {support.frame}", point, placement)
 
 
-def contact_target(robot: Robot, contact: Contact, numeric: Numeric, requirements: Requirements) -> pin.SE3:
+def contact_target(robot: Robot, contact: ImpactContact, numeric: Numeric, requirements: Requirements) -> pin.SE3:
     """Where a contact frame is to be: the target given, else where it is at ``numeric.q``."""
     placement = numeric.placement(point_on(robot, contact.frame)).copy()
     if requirements.target_position is not None:
@@ -136,7 +136,7 @@ def contact_target(robot: Robot, contact: Contact, numeric: Numeric, requirement
 
 
 def _contact_constraints(
-    robot: Robot, contact: Contact, numeric: Numeric, requirements: Requirements, mode: ContactPose
+    robot: Robot, contact: ImpactContact, numeric: Numeric, requirements: Requirements, mode: ContactPose
 ) -> list[Constraint]:
     point = point_on(robot, contact.frame)
     target = contact_target(robot, contact, numeric, requirements)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
-from impact_posture.posture.settings import Prepared
+from impact_posture.posture.problem_settings import Prepared
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.robot.actuation import hover
 

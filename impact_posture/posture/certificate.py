@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.posture.distance import distance_gradient
 from impact_posture.posture.equalities import RANK_TOLERANCE, equality_jacobian
+from impact_posture.posture.posture_distance import distance_gradient
 from impact_posture.posture.problem import PostureProblem
 
 Vector = NDArray[np.float64]
@@ -152,7 +152,7 @@ def _inequalities(problem: PostureProblem, numeric: Numeric) -> tuple[list[_Near
     near: list[_Near] = []
     violation = 0.0
     for constraint in problem.constraints:
-        value, jacobian = constraint.numeric(numeric)
+        value, jacobian = constraint.evaluate(numeric)
         violation = max(violation, float(np.abs(value - np.clip(value, constraint.lower, constraint.upper)).max()))
         if constraint.equality:
             continue

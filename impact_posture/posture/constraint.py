@@ -1,6 +1,6 @@
 """What a posture has to satisfy.  A constraint says it twice: as an expression, and in Pinocchio's numbers.
 
-To add one, derive from :class:`Constraint` and give ``symbolic`` and ``numeric``; the program, the search for
+To add one, derive from :class:`Constraint` and give ``symbolic`` and ``evaluate``; the program, the search for
 feasible starts, the certificate and the elastic diagnosis take it from there.
 """
 
@@ -56,8 +56,8 @@ class Constraint(ABC):
         """``c(q)`` as an expression, shape (rows, 1); ``tree`` was built with ``chart_x``."""
 
     @abstractmethod
-    def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
-        """``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``numeric.q``."""
+    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+        """``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``model.q``."""
 
     def describe(self) -> str:
         """The constraint in words, one line."""
@@ -67,7 +67,7 @@ class Constraint(ABC):
         """What one row is called."""
         return self.name if self.rows == 1 else f"{self.name}[{row}]"
 
-    def pose_error(self, numeric: Numeric) -> tuple[float, float]:
+    def pose_error(self, model: Numeric) -> tuple[float, float]:
         """Error in meters and radians where it holds a pose, else zeros."""
         return 0.0, 0.0
 
@@ -84,13 +84,13 @@ class HeldPosition(Constraint):
         """See :class:`Constraint`."""
         return tree.position(self.point) - parameters
 
-    def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
         """See :class:`Constraint`."""
-        return numeric.placement(self.point).translation - self.parameters, numeric.jacobian(self.point)[:3]
+        return model.placement(self.point).translation - self.parameters, model.jacobian(self.point)[:3]
 
-    def pose_error(self, numeric: Numeric) -> tuple[float, float]:
+    def pose_error(self, model: Numeric) -> tuple[float, float]:
         """See :class:`Constraint`."""
-        return float(np.linalg.norm(self.numeric(numeric)[0])), 0.0
+        return float(np.linalg.norm(self.evaluate(model)[0])), 0.0
 
 
 class PositionBox(HeldPosition):
@@ -109,9 +109,9 @@ class PositionBox(HeldPosition):
         """See :class:`Constraint`."""
         return f"{self.name} along {'xyz'[row]}"
 
-    def pose_error(self, numeric: Numeric) -> tuple[float, float]:
+    def pose_error(self, model: Numeric) -> tuple[float, float]:
         """Distance outside the box."""
-        outside = np.maximum(np.abs(self.numeric(numeric)[0]) - self.upper, 0.0)
+        outside = np.maximum(np.abs(self.evaluate(model)[0]) - self.upper, 0.0)
         return float(np.linalg.norm(outside)), 0.0
 
 
@@ -148,21 +148,21 @@ class HeldOrientation(Constraint):
         error = quaternion_product(quaternion_product(parameters[:4], tree.quaternion(self.point)), parameters[4:8])
         return 2 * error[: self.rows]
 
-    def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
         """See :class:`Constraint`."""
         right = pin.Quaternion(self.parameters[4:8])
-        placement = numeric.placement(self.point)
+        placement = model.placement(self.point)
         error = pin.Quaternion(self.parameters[:4]) * pin.Quaternion(placement.rotation) * right
         vector, w = np.array(error.coeffs()[:3]), float(error.w)
         sign = 1.0 if w >= 0 else -1.0
         # d(2 vec(Q)) = (w I + [v]×) ω in the axes that Q turns, here the frame's times `right`.
-        body = (placement.rotation @ right.matrix()).T @ numeric.jacobian(self.point)[3:]
+        body = (placement.rotation @ right.matrix()).T @ model.jacobian(self.point)[3:]
         J = (w * np.eye(3) + pin.skew(vector)) @ body
         return sign * 2 * vector[: self.rows], sign * J[: self.rows]
 
-    def pose_error(self, numeric: Numeric) -> tuple[float, float]:
+    def pose_error(self, model: Numeric) -> tuple[float, float]:
         """See :class:`Constraint`."""
-        rotation = numeric.placement(self.point).rotation
+        rotation = model.placement(self.point).rotation
         if self.axis is None:
             return 0.0, float(np.linalg.norm(pin.log3(self.target.T @ rotation)))
         now, wanted = rotation @ self.axis, self.target @ self.axis
@@ -190,15 +190,15 @@ class HeldPose(Constraint):
         position, orientation = self._parts
         return ca.vertcat(position.symbolic(tree, parameters[:3]), orientation.symbolic(tree, parameters[3:]))
 
-    def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
         """See :class:`Constraint`."""
-        values, jacobians = zip(*(p.numeric(numeric) for p in self._parts), strict=True)
+        values, jacobians = zip(*(p.evaluate(model) for p in self._parts), strict=True)
         return np.concatenate(values), np.vstack(jacobians)
 
-    def pose_error(self, numeric: Numeric) -> tuple[float, float]:
+    def pose_error(self, model: Numeric) -> tuple[float, float]:
         """See :class:`Constraint`."""
         position, orientation = self._parts
-        return position.pose_error(numeric)[0], orientation.pose_error(numeric)[1]
+        return position.pose_error(model)[0], orientation.pose_error(model)[1]
 
 
 class HeldTurn(Constraint):
@@ -222,9 +222,9 @@ class HeldTurn(Constraint):
         """See :class:`Constraint`."""
         return ca.dot(parameters[8:], self._whole.symbolic(tree, parameters[:8]))
 
-    def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
         """See :class:`Constraint`."""
-        value, jacobian = self._whole.numeric(numeric)
+        value, jacobian = self._whole.evaluate(model)
         return np.array([self._axis @ value]), (self._axis @ jacobian)[None, :]
 
 
@@ -259,11 +259,11 @@ class CenterOfMassOverFeet(Constraint):
         center = own.center_of_mass()
         return parameters[:k] * center[0] + parameters[k : 2 * k] * center[1] - parameters[2 * k :]
 
-    def numeric(self, numeric: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
         """See :class:`Constraint`."""
         k = self._k
         normals = self.parameters[: 2 * k].reshape(2, k).T
-        own = numeric if self._model is None else Numeric(self._model).at(numeric.q)
+        own = model if self._model is None else Numeric(self._model).at(model.q)
         center, jacobian = own.center_of_mass()
         return normals @ center[:2] - self.parameters[2 * k :], normals @ jacobian[:2]
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.posture.distance import distance_squared
 from impact_posture.posture.nlp import IPOPT_OPTIONS, run_solver
+from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import random_posture
 
@@ -91,7 +91,7 @@ def _judge(problem: PostureProblem, chart: Chart, q: Vector) -> ElasticAnswer:
     numeric = Numeric(problem.robot.model).at(q)
     conflicts: dict[str, float] = {}
     for constraint in problem.constraints:
-        value, _ = constraint.numeric(numeric)
+        value, _ = constraint.evaluate(numeric)
         violation = float(np.linalg.norm(value - np.clip(value, constraint.lower, constraint.upper)))
         if violation > _KEPT:
             conflicts[constraint.name] = conflicts.get(constraint.name, 0.0) + violation

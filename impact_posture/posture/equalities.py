@@ -26,7 +26,7 @@ def rank(jacobian: Vector) -> int:
 def equality_jacobian(problem: PostureProblem, numeric: Numeric) -> Vector:
     """Tangent Jacobian of all equalities, held joints included, at ``numeric.q``, shape (rows, nv)."""
     blocks = [held_rows(problem.robot, problem.requirements.hold)]
-    blocks += [c.numeric(numeric)[1] for c in problem.constraints if c.equality]
+    blocks += [c.evaluate(numeric)[1] for c in problem.constraints if c.equality]
     return np.vstack(blocks)
 
 

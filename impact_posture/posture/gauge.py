@@ -46,7 +46,7 @@ def pin_undetermined(
 
     def free() -> Vector:
         """Base twists that are still allowed, world axes, shape (6, k)."""
-        rows = [c.numeric(numeric)[1] @ motions for c in (*constraints, *added)]
+        rows = [c.evaluate(numeric)[1] @ motions for c in (*constraints, *added)]
         if not rows:
             return np.asarray(numeric.jacobian(base) @ motions)
         allowed = scipy.linalg.null_space(np.vstack(rows), rcond=RANK_TOLERANCE)
@@ -59,7 +59,7 @@ def pin_undetermined(
     candidates += [("roll", np.eye(3)[0]), ("pitch", np.eye(3)[1])]
     for name, axis in candidates:
         held = HeldTurn(base, placement.rotation, axis, f"base {name}")
-        if np.abs(held.numeric(numeric)[1] @ move @ free()).max(initial=0.0) > 1e-3:
+        if np.abs(held.evaluate(numeric)[1] @ move @ free()).max(initial=0.0) > 1e-3:
             added.append(held)
             notes.append(f"base {name} fixed at its initial value: nothing else determines it")
     if np.abs(free()[:3]).max(initial=0.0) > 1e-3:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.compiled import CompileMode, compiled_solver
-from impact_posture.posture.distance import distance_squared
+from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
 
 Vector = NDArray[np.float64]

@@ -64,24 +64,24 @@ def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTu
     model = problem.robot.model
     jacobian = equality_jacobian(problem, numeric.at(q))
     free = scipy.linalg.null_space(jacobian, rcond=RANK_TOLERANCE)
-    along = free @ (free.T @ turn.numeric(numeric)[1][0])
-    size = float(turn.numeric(numeric)[1][0] @ along)
+    along = free @ (free.T @ turn.evaluate(numeric)[1][0])
+    size = float(turn.evaluate(numeric)[1][0] @ along)
     if size < 1e-3:
         return False
     equalities = [c for c in problem.constraints if c.equality]
-    start = [c.numeric(numeric)[0] for c in equalities]
+    start = [c.evaluate(numeric)[0] for c in equalities]
     q = pin.integrate(model, q, along * (_TRIAL / size))
     for _ in range(60):
         numeric.at(q)
         residual = np.concatenate(
             [np.zeros(len(held_rows(problem.robot, problem.requirements.hold)))]
-            + [c.numeric(numeric)[0] - s for c, s in zip(equalities, start, strict=True)]
+            + [c.evaluate(numeric)[0] - s for c, s in zip(equalities, start, strict=True)]
         )
         step = -np.linalg.pinv(equality_jacobian(problem, numeric), rcond=1e-9) @ residual
         q = pin.integrate(model, q, step)
         if np.abs(step).max() < 1e-12:
             break
-    turned = float(turn.numeric(numeric.at(q))[0][0])
+    turned = float(turn.evaluate(numeric.at(q))[0][0])
     return abs(turned) < _SURVIVES * _TRIAL
 
 
@@ -91,7 +91,7 @@ def _independent_rows(problem: PostureProblem, numeric: Numeric) -> tuple[tuple[
     labels, blocks = [], []
     for index, constraint in enumerate(problem.constraints):
         if constraint.equality:
-            blocks.append(constraint.numeric(numeric)[1])
+            blocks.append(constraint.evaluate(numeric)[1])
             labels += [(index, row) for row in range(constraint.rows)]
     stacked = np.vstack(blocks)
     stacked[:, held] = 0.0

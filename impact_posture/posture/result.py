@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from impact_posture import __version__
 from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.posture.caveats import caveats
-from impact_posture.posture.path import NullSpacePath
+from impact_posture.posture.null_space_path import NullSpacePath
+from impact_posture.posture.problem_settings import Prepared
 from impact_posture.posture.robustness import Robustness
-from impact_posture.posture.settings import Prepared
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
 

@@ -17,7 +17,7 @@ from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.notes import percent
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.solve import SAME_POSTURE, PostureSolution, Progress, solve, wrapped_difference
-from impact_posture.robot.scenario import between
+from impact_posture.robot.model_variant import between
 
 Vector = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ _KEPT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class ScenarioOptimum:
+class VariantOptimum:
     """One scenario, and the posture that would be best if it were known to hold.
 
     Attributes:
@@ -71,7 +71,7 @@ class Robustness:
         drawn: How many were drawn.
     """
 
-    scenarios: tuple[ScenarioOptimum, ...]
+    scenarios: tuple[VariantOptimum, ...]
     worst_robust: float
     worst_nominal: float | None
     broken: tuple[str, ...]
@@ -182,18 +182,18 @@ def solve_robustly(
         # What is best for all is not better for one than its own optimum: that was not the best.
         if q is None or one.objective.value(solution.q) < one.objective.value(q) * (1 - _NOISE):
             optima[k] = _optimum(partial(run, one, (solution.q,), len(alone)))
-    return RobustSolution(solution, compare_scenarios(solution, optima, seed))
+    return RobustSolution(solution, compare_variants(solution, optima, seed))
 
 
-def compare_scenarios(solution: PostureSolution, optima: Sequence[Vector | None], seed: int = 0) -> Robustness:
+def compare_variants(solution: PostureSolution, optima: Sequence[Vector | None], seed: int = 0) -> Robustness:
     """The robust optimum beside the optimum of each scenario alone, and among models drawn between the scenarios."""
     problem, objective = solution.problem, solution.problem.impact
-    found: list[ScenarioOptimum] = []
+    found: list[VariantOptimum] = []
     for scenario, q in zip(objective.scenarios, optima, strict=True):
         member = replace(objective, robot=scenario.robot, scenarios=())
         own = None if q is None else member.value(q)
         step = None if q is None else float(np.linalg.norm(wrapped_difference(problem, solution.q, q)))
-        found.append(ScenarioOptimum(scenario.name, member.value(solution.q), own, q, step))
+        found.append(VariantOptimum(scenario.name, member.value(solution.q), own, q, step))
     nominal = optima[0]
     broken = () if nominal is None else tuple(_broken(problem, nominal))
     drawn = between(objective.scenarios, _BETWEEN, seed)
@@ -221,7 +221,7 @@ def _broken(problem: PostureProblem, q: Vector) -> list[str]:
     """Names of the constraints that a posture does not satisfy."""
     numeric, found = Numeric(problem.robot.model).at(q), []
     for constraint in problem.constraints:
-        value, _ = constraint.numeric(numeric)
+        value, _ = constraint.evaluate(numeric)
         if np.abs(value - np.clip(value, constraint.lower, constraint.upper)).max(initial=0.0) > _KEPT:
             found.append(constraint.name)
     return found

@@ -17,14 +17,14 @@ from impact_posture.errors import ContactError, Infeasible, MetricError, SolverF
 from impact_posture.posture.blas import one_blas_thread
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.distance import distance
 from impact_posture.posture.elastic import elastic
 from impact_posture.posture.equalities import equality_jacobian, rank
 from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp
 from impact_posture.posture.notes import notes_on_impacts
+from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import Projector, feasible_start
-from impact_posture.processes import shared_out
+from impact_posture.processes import fork_map
 
 Vector = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -145,7 +145,7 @@ def solve(
     elif redundancy == 0:
         notes.append("no redundancy left: this is the best of separate postures that the constraints allow")
     elif best.objective > scale * (1 - 1e-6):
-        notes.append("no better posture found: the initial one is already (locally) optimal for this blow")
+        notes.append("no better posture found: the initial one is already (locally) optimal for this impact")
     optima = distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None])
     notes += notes_on_impacts(problem.objective, initial, q)
     hits = sum(o.hits for o in optima)
@@ -268,7 +268,7 @@ def _run(job: _Job, index: int) -> _Run:
 def _run_all(job: _Job, starts: int, jobs: int, progress: Progress | None) -> list[_Run]:
     runs: dict[int, _Run] = {}
     # Forking takes longer than three starts.
-    with shared_out(partial(_run, job), starts, jobs if starts > 3 else 1) as results:
+    with fork_map(partial(_run, job), starts, jobs if starts > 3 else 1) as results:
         for index, run in results:
             runs[index] = run
             if progress:

@@ -54,7 +54,7 @@ class Projector:
         self.numeric.at(q)
         values, jacobians = [np.zeros(0)], [np.zeros((0, self.problem.robot.nv))]
         for constraint in self.problem.constraints:
-            value, jacobian = constraint.numeric(self.numeric)
+            value, jacobian = constraint.evaluate(self.numeric)
             violation = value - np.clip(value, constraint.lower, constraint.upper)
             values.append(violation)
             if not constraint.equality:

@@ -16,8 +16,8 @@ import pinocchio as pin
 from impact_posture.errors import InertiaError, InputError, OutputError, PostureError
 from impact_posture.escape import printable, toml
 from impact_posture.robot import guess
-from impact_posture.robot.loader import LoadOptions, Located, build_robot, known_robots, load_robot, locate
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import LoadOptions, Located, build_robot, known_robots, load_robot, locate
 from impact_posture.robot.spec import SCHEMA, ModelSpec, RobotSpec, Root, SupportSpec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolve_path
 

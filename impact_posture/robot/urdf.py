@@ -14,7 +14,7 @@ from typing import IO
 import pinocchio as pin
 
 from impact_posture.errors import JointNotFound, PackageNotFound, UrdfError
-from impact_posture.robot.inertia import check_inertias
+from impact_posture.robot.inertia_checks import check_inertias
 
 # Pinocchio's data hold 6 nv³ numbers, 0.4 GB at 200 degrees of freedom and 48 GB at 1,000, whatever is asked of it.
 MOST_DEGREES_OF_FREEDOM = 200

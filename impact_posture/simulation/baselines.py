@@ -7,11 +7,11 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.blow import Gradient
 from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
-from impact_posture.simulation.sensing import Reading
+from impact_posture.simulation.scenario_objective import Gradient
+from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.points import Point
@@ -188,18 +188,18 @@ class WalkerDriver(Driver):
 
 
 class InvariantDriver(Driver):
-    """Feedback on the impact-invariant subspace around a blow (Yang and Posa 2021).
+    """Feedback on the impact-invariant subspace around an impact (Yang and Posa 2021).
 
-    No impulse at the contact changes the component of ν in the null space of ``J M⁻¹``.  Around the blow the velocity
-    that the feedback sees is ``ν̂ = ν + α M⁻¹Jᵀ λ*``, with ``λ*`` the impulse that brings the tasks' velocities
+    No impulse at the contact changes the component of ν in the null space of ``J M⁻¹``.  Around the impact the
+    feedback sees ``ν̂ = ν + α M⁻¹Jᵀ λ*``, with ``λ*`` the impulse that brings the tasks' velocities
     nearest to what they are asked for: what an impulse may have done is not fought.  The posture task has no say in
     ``λ*`` beside others: it asks for rest while they move.  ``M⁻¹`` is contact-consistent for a robot that stands.
-    ``α`` is 1 from ``BEFORE`` before the blow, expected or felt, to ``AFTER`` after it, with smooth flanks of
+    ``α`` is 1 from ``BEFORE`` before the impact, expected or felt, to ``AFTER`` after it, with smooth flanks of
     ``FLANK`` (s).
     """
 
     BEFORE, AFTER, FLANK = 0.02, 0.05, 0.03
-    # What is felt as a blow, N.
+    # What is felt as an impact, N.
     FELT = 5.0
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
@@ -208,7 +208,7 @@ class InvariantDriver(Driver):
         scenario = setup.scenario
         offset = scenario.shape.offset if isinstance(scenario.task, RepeatedContacts) else (0.0, 0.0, 0.0)
         self._point = Point(scenario.task.frame, offset)
-        points = (*self.controller.program.points, self._point)
+        points = (*self.controller.formulation.points, self._point)
         self._aside = State(setup.robot, tuple(dict.fromkeys(points)))
         self._at, self._felt = -np.inf, False
 
@@ -218,7 +218,7 @@ class InvariantDriver(Driver):
         return super().reset(q)
 
     def expect(self, t: float) -> None:
-        """Go around this time, unless the blow is felt."""
+        """Go around this time, unless the impact is felt."""
         self._at, self._felt = t, False
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
@@ -242,14 +242,14 @@ class InvariantDriver(Driver):
         return smooth(1 - left / self.FLANK) if left < self.FLANK else 0.0
 
     def _correction(self, reading: Reading) -> Array:
-        state, program = self._aside.update(reading.q, reading.v), self.controller.program
+        state, formulation = self._aside.update(reading.q, reading.v), self.controller.formulation
         inverse = np.linalg.inv(state.M)
-        if program.contacts:
-            feet = np.vstack([state.at(c.point).jacobian[: c.size] for c in program.contacts])
+        if formulation.contacts:
+            feet = np.vstack([state.at(c.point).jacobian[: c.size] for c in formulation.contacts])
             held = feet @ inverse
             inverse = inverse - held.T @ np.linalg.pinv(held @ feet.T, rcond=1e-6, hermitian=True) @ held
         change = inverse @ state.at(self._point).jacobian[:3].T
-        leading = [task for task in program.tasks if task is not self.posture] or [self.posture]
+        leading = [task for task in formulation.tasks if task is not self.posture] or [self.posture]
         J = np.vstack([task.jacobian(state) for task in leading])
         error = np.concatenate([task.target_velocity for task in leading]) - J @ reading.v
         impulse = np.linalg.lstsq(J @ change, error, rcond=1e-9)[0]

@@ -1,4 +1,4 @@
-"""A controller inside a scenario: what it follows, when it prepares for the blow, what it holds."""
+"""A controller inside a scenario: what it follows, when it prepares for the impact, what it holds."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.simulation.programs import build_program, end_effector_task
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Setup
-from impact_posture.simulation.sensing import Reading
+from impact_posture.simulation.sensor_noise import Reading
+from impact_posture.simulation.task_formulations import build_formulation, end_effector_task
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
@@ -34,8 +34,8 @@ class Driver:
         """Build the scenario's program around a posture task."""
         self.setup, self.posture = setup, posture
         self._hand = end_effector_task(setup)
-        program = build_program(setup, posture, self._hand)
-        self.controller = Controller(setup.robot, program, period=setup.scenario.control.period)
+        formulation = build_formulation(setup, posture, self._hand)
+        self.controller = Controller(setup.robot, formulation, period=setup.scenario.control.period)
         self._inward = np.zeros(3 if self._hand is None else self._hand.size)
         self._inward[:3] = -setup.scenario.normal
         self._home: pin.SE3 | Array | None = None
@@ -45,7 +45,7 @@ class Driver:
         if self._hand is not None:
             self._hand.target = None
             self._hand.target_velocity = self._hand.target_acceleration = np.zeros(self._hand.size)
-        for task in self.controller.program.weighted:
+        for task in self.controller.formulation.weighted:
             if isinstance(task, CenterOfMass | BaseOrientation):
                 task.target = None
         command = self.controller.reset(q, np.zeros(self.setup.robot.nv))
@@ -59,13 +59,13 @@ class Driver:
         return self.controller.tick(reading.t, reading.q, reading.v, reading.force)
 
     def brace(self) -> None:
-        """Prepare for blows from now on; a nominal controller does not."""
+        """Prepare for impacts from now on; a nominal controller does not."""
 
     def hold(self) -> None:
         """Keep the posture that was reached and move no further."""
 
     def expect(self, t: float) -> None:
-        """A blow is expected at this time, s."""
+        """An impact is expected at this time, s."""
 
     @property
     def level(self) -> float:
@@ -75,7 +75,7 @@ class Driver:
     def _freeze(self) -> None:
         """Let center of mass and base orientation be wanted where they are now."""
         state = self.controller.state
-        for task in self.controller.program.weighted:
+        for task in self.controller.formulation.weighted:
             if isinstance(task, CenterOfMass):
                 task.target = state.center_of_mass()[0].copy()
             elif isinstance(task, BaseOrientation):
@@ -135,7 +135,7 @@ class PostureDriver(Driver):
         # Feet stay where they are: the goal was found with them there.
         center = np.array(pin.centerOfMass(model, data, self._goal))
         rotation = pin.Quaternion(self._goal[3:7]).matrix() if self.setup.robot.floating else np.eye(3)
-        for task in self.controller.program.weighted:
+        for task in self.controller.formulation.weighted:
             if isinstance(task, CenterOfMass) and task.target is not None:
                 self._from[task.name], self._to[task.name] = task.target.copy(), center
             elif isinstance(task, BaseOrientation) and task.target is not None:
@@ -155,7 +155,7 @@ class PostureDriver(Driver):
         return 0.0 if self._since is None else smooth(self._since / MOVE)
 
     def _move(self, share: float) -> None:
-        for task in self.controller.program.weighted:
+        for task in self.controller.formulation.weighted:
             if task.name not in self._from:
                 continue
             begin, end = self._from[task.name], self._to[task.name]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.simulation.recorder import STATUSES
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
 from impact_posture.simulation.series import Series, Window
 from impact_posture.tsid.controller import Status
@@ -92,7 +92,7 @@ def measure(setup: Setup, run: Run) -> Metrics:
         sum(float(speed[series.slice(w.begin, w.end)].sum()) * period for w in run.windows if w.kind == kind)
         for kind in ("dwell", "recovery")
     )
-    # A blow that never came is no small one.
+    # An impact that never came is no small one.
     jumps = [jump(setup, series, w) for w in impacts if w.touched] or [0.0]
     later = [_peak(setup, series, w, w.end) for w in run.windows if w.kind == "recovery" and w.touched] or [0.0]
     stopped = (series.at_stop[inside] & ~series.at_stop[0]).any(axis=0) if inside.any() else np.zeros(0, bool)

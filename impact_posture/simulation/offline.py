@@ -11,14 +11,14 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
-from impact_posture.posture.distance import distance
-from impact_posture.posture.follow import trade_off
+from impact_posture.posture.pareto import pareto_front
+from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.progress import tell
 from impact_posture.simulation.driver import Driver
-from impact_posture.simulation.programs import nominal_posture
 from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.task_formulations import nominal_posture
 from impact_posture.tsid.controller import Status
 
 Array = NDArray[np.float64]
@@ -29,8 +29,8 @@ _POINTS = 16
 _MARGIN = 0.1
 # Acceleration (rad/s², m/s²) that the least normal forces of the feet may cause in a robot that is held.
 _STILL = 0.5
-# M that the center of mass stays inside the feet's polygon, at least: a blow tips what stands on its heels, which the
-# motors alone would hold.
+# Least distance in m of the center of mass from the edges of the feet's polygon.  The motors alone would hold a robot
+# that stands on its heels, but an impact tips it.
 _COM_MARGIN = 0.05
 
 
@@ -60,7 +60,7 @@ class OfflinePosture:
 def offline_posture(
     setup: Setup, objective: ImpactObjective, *, starts: int = 16, seed: int = 0, share: float = 0.8
 ) -> OfflinePosture:
-    """Optimize the posture for the scenario's blow; stop where the motors can hold it.
+    """Optimize the posture for the scenario's impact; stop where the motors can hold it.
 
     End effector where it starts, as far as its task holds it; base level (a robot that flies); feet where they are,
     center of mass above them (one that stands).  Of the trade-off between objective and distance from the start, the
@@ -69,7 +69,7 @@ def offline_posture(
 
     Args:
         setup: The experiment.
-        objective: The blow.
+        objective: The impact.
         starts: Of the optimizer.
         seed: Of its random starts.
         share: Of the limits that holding the posture may take.
@@ -83,7 +83,7 @@ def offline_posture(
     if holds(setup, solution.q, share):
         value, far = objective.value(solution.q), _far(setup, solution.q, solution.initial)
         return OfflinePosture(solution.q, value, initial, value, far, far)
-    curve = trade_off(solution, _POINTS, progress=_tell)
+    curve = pareto_front(solution, _POINTS, progress=_tell)
     whole, optimum = curve.points[-1].distance, curve.points[-1].objective
     for point in reversed(curve.points):
         if point.certified and holds(setup, point.q, share):

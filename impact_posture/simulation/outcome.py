@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.simulation.recorder import STATUSES, feet_of
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
 from impact_posture.simulation.series import Series
 from impact_posture.tsid.controller import Status

@@ -1,4 +1,4 @@
-"""What the rigid model says of each blow of a run, and what came."""
+"""What the rigid model says of each impact of a run, and what came."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.simulation.metrics import before, jump
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
 
 Array = NDArray[np.float64]
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Prediction:
-    """Of one blow.
+    """Of one impact.
 
     Attributes:
         contact: Which, from 0.
@@ -51,7 +51,7 @@ class Prediction:
 
 
 def predict(setup: Setup, objective: ImpactObjective, run: Run) -> tuple[Prediction, ...]:
-    """Hold a run's blows against the rigid model at the state before each."""
+    """Hold a run's impacts against the rigid model at the state before each."""
     task, found = setup.scenario.task, []
     numeric = Numeric(setup.robot.model)
     point = point_on(setup.robot, objective.contact.frame, objective.contact.offset)

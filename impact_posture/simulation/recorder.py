@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import ImpactPostureError
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.blow import Gradient
-from impact_posture.simulation.exchange import Truth
+from impact_posture.simulation.actuator_command import Truth
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
+from impact_posture.simulation.scenario_objective import Gradient
 from impact_posture.simulation.series import Series
 from impact_posture.tsid.controller import Command, Status
 

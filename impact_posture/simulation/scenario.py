@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from impact_posture.errors import InputError, SpecError
 from impact_posture.progress import tell
 from impact_posture.robot.actuation import allocation
-from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.robot.postures import read_posture, set_joints
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.robot.spec import Vector3
-from impact_posture.simulation.exchange import Push
+from impact_posture.simulation.actuator_command import Push
 from impact_posture.simulation.scene import Scene, Shape, Surface
 from impact_posture.simulation.world import World, build_world
 
@@ -131,7 +131,7 @@ class RobustTerm:
 
 
 @dataclass(frozen=True)
-class Footing:
+class StanceGains:
     """How a controller treats the contacts of a robot that stands.
 
     Attributes:
@@ -169,7 +169,7 @@ class Control:
     apparent_mass: float | None = None
     center_of_mass: Gains | None = None
     base: Gains | None = None
-    footing: Footing | None = None
+    footing: StanceGains | None = None
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class Bounds:
 
 
 @dataclass(frozen=True, eq=False)
-class ImpactScenario:
+class Scenario:
     """An experiment as a file describes it; nothing is loaded yet.
 
     Attributes:
@@ -227,7 +227,7 @@ class ImpactScenario:
 
     @property
     def normal(self) -> Array:
-        """Unit normal of the blow, shape (3,): the surface's, or along the push."""
+        """Unit normal of the impact, shape (3,): the surface's, or along the push."""
         task = self.task
         if isinstance(task, RepeatedContacts):
             n = np.array(self.surface.normal, dtype=float)
@@ -272,7 +272,7 @@ class Setup:
         world: Not reset yet.
     """
 
-    scenario: ImpactScenario
+    scenario: Scenario
     robot: Robot
     q: Array
     world: World
@@ -287,7 +287,7 @@ class Setup:
         return self.world.built.gaps[self.scenario.surface.name, self.scenario.shape.frame]
 
 
-def set_up(scenario: ImpactScenario) -> Setup:
+def set_up(scenario: Scenario) -> Setup:
     """Load the robot, pose it, and build the world around it.
 
     Raises:
@@ -302,7 +302,7 @@ def set_up(scenario: ImpactScenario) -> Setup:
     return Setup(scenario, robot, q, build_world(robot, scenario.scene, q))
 
 
-def _check_base(robot: Robot, scenario: ImpactScenario) -> None:
+def _check_base(robot: Robot, scenario: Scenario) -> None:
     """Refuse a floating base that nothing holds, or that its rotors cannot push in every direction."""
     if not robot.floating or scenario.control.footing is not None:
         return

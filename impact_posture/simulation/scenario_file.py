@@ -9,19 +9,19 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field
 
 from impact_posture.errors import ImpactPostureError, ScenarioNotFound, SpecError
-from impact_posture.robot.loader import LoadOptions, from_folder
+from impact_posture.robot.robot_loader import LoadOptions, from_folder
 from impact_posture.robot.spec import NonNegative, Positive, Root, Vector3, read_toml, validate, with_tuples
 from impact_posture.simulation.scenario import (
     Bounds,
     Control,
     EndEffectorGains,
     EndEffectorPose,
-    Footing,
     Gains,
-    ImpactScenario,
     RepeatedContacts,
     RobustTerm,
+    Scenario,
     SinglePush,
+    StanceGains,
 )
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors, Shape, ShapeKind, Surface
 
@@ -141,8 +141,8 @@ class RobustFile(_Strict):
     fade: tuple[NonNegative, Positive] = (0.05, 0.2)
 
 
-class FootingFile(_Strict):
-    """``[control.footing]``: see :class:`~impact_posture.simulation.scenario.Footing`."""
+class StanceGainsFile(_Strict):
+    """``[control.footing]``: see :class:`~impact_posture.simulation.scenario.StanceGains`."""
 
     friction: Positive = 0.5
     least: Positive = 1.0
@@ -160,7 +160,7 @@ class ControlFile(_Strict):
     apparent_mass: Positive | None = None
     center_of_mass: GainsFile | None = None
     base: GainsFile | None = None
-    footing: FootingFile | None = None
+    footing: StanceGainsFile | None = None
 
 
 class BoundsFile(_Strict):
@@ -205,7 +205,7 @@ def known_scenarios() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))
 
 
-def read_scenario(scenario: str | Path) -> ImpactScenario:
+def read_scenario(scenario: str | Path) -> Scenario:
     """Read a scenario: a shipped one by name, any other by its file, from whose folder its paths start.
 
     Raises:
@@ -237,11 +237,11 @@ def scenario_path(scenario: str | Path) -> Path:
     return Path(scenario).expanduser()
 
 
-def _build(file: ScenarioFile, source: str) -> ImpactScenario:
+def _build(file: ScenarioFile, source: str) -> Scenario:
     control = file.control
     tasks = ("posture", "tilt", "center_of_mass", "base")
     gains = {key: Gains(**part.given()) for key in tasks if (part := getattr(control, key)) is not None}
-    return ImpactScenario(
+    return Scenario(
         name=file.name,
         source=source,
         description=file.description,
@@ -258,7 +258,7 @@ def _build(file: ScenarioFile, source: str) -> ImpactScenario:
             period=control.period,
             apparent_mass=control.apparent_mass,
             end_effector=None if control.end_effector is None else EndEffectorGains(**control.end_effector.given()),  # type: ignore[arg-type]
-            footing=None if control.footing is None else Footing(**control.footing.given()),  # type: ignore[arg-type]
+            footing=None if control.footing is None else StanceGains(**control.footing.given()),  # type: ignore[arg-type]
             **gains,
         ),
         bounds=Bounds(**file.bounds.given()),  # type: ignore[arg-type]

@@ -31,7 +31,7 @@ class Window:
         contact: Which contact, or push, it belongs to, from 0.
         begin: s.
         end: s.
-        touched: Whether the blow came; else the window begins where it was expected.
+        touched: Whether the impact came; else the window begins where it was expected.
     """
 
     kind: str
@@ -61,7 +61,7 @@ class Series:
         slip: Tangential speed of the shape, or of the fastest foot, where it touches, m/s, shape (n,).
         touching: Shapes that touch, shape (n,).
         feet: Whether each foot that is to stay touches, shape (n, feet).
-        objective: H of the blow, shape (n,); NaN where it was not evaluated.
+        objective: H of the impact, shape (n,); NaN where it was not evaluated.
         level: Of the preparing term, shape (n,).
         status: Index into :data:`STATUSES`, shape (n,).
         at_stop: Whether a joint is at a position limit, shape (n, nv).

@@ -13,12 +13,12 @@ from impact_posture.errors import InputError, PostureError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import hover
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.build import BuiltScene, build_scene
-from impact_posture.simulation.exchange import Commands, Push, Truth
+from impact_posture.simulation.actuator_command import Commands, Push, Truth
+from impact_posture.simulation.contact_forces import ContactLog
 from impact_posture.simulation.rotors import Rotors, Vibration
 from impact_posture.simulation.scene import Scene
-from impact_posture.simulation.sensing import Reading, SensorNoise
-from impact_posture.simulation.touching import ContactLog
+from impact_posture.simulation.sensor_noise import Reading, SensorNoise
+from impact_posture.simulation.world_builder import BuiltScene, build_scene
 
 Array = NDArray[np.float64]
 

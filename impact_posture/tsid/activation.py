@@ -29,7 +29,8 @@ _FOLLOWS = {
 class Activation:
     """A level between 0 and 1 that moves along ``3x² − 2x³`` towards what the phase asks for.
 
-    FREE: 0.  BRACE: 1.  CONTACT: 1, or 0 if the blow is taken with the reached posture held.  RELEASE: 0, then FREE.
+    FREE: 0.  BRACE: 1.  CONTACT: 1, or 0 if the robot holds the reached posture during the impact.  RELEASE: 0, then
+    FREE.
 
     Within ``dt`` the level moves by at most ``1.5 dt/ramp`` (:meth:`step_bound`), whatever is asked when.
 

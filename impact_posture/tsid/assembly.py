@@ -11,11 +11,11 @@ from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.contacts import ContactStack
 from impact_posture.tsid.limits import AccelerationBounds
-from impact_posture.tsid.program import Program
 from impact_posture.tsid.qp import EQUALITY, QP
 from impact_posture.tsid.rank import LevelRank
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import TaskStack
+from impact_posture.tsid.task_formulation import TaskFormulation
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class Assembly:
     Bounds on the variables are the acceleration bounds of the joint limits.
 
     Attributes:
-        program: What it is made from.
+        formulation: What it is made from.
         qp: The program of the last :meth:`build_qp`.
         rank: What of its levels is independent, and the program without the rest.
         levels: Names and rows of the strict levels in the order in which they give way last to first; hard contacts
@@ -47,11 +47,11 @@ class Assembly:
         names: A name for each entry of ``[z; A z]``.
     """
 
-    def __init__(self, robot: Robot, program: Program, actuators: Actuators) -> None:
-        self.program, self.actuators = program, actuators
+    def __init__(self, robot: Robot, formulation: TaskFormulation, actuators: Actuators) -> None:
+        self.formulation, self.actuators = formulation, actuators
         nv = self._nv = robot.nv
-        self.contacts = ContactStack(robot, program.contacts)
-        strict = [task for level in program.levels for task in level]
+        self.contacts = ContactStack(robot, formulation.contacts)
+        strict = [task for level in formulation.levels for task in level]
         widths = (actuators.blind.shape[1], int(self.contacts.hard.sum()), sum(task.size for task in strict))
         ends = list(accumulate((*widths, actuators.controls, self.contacts.cone.shape[0])))
         blind, hard, levels, controls, cones = (slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True))
@@ -59,9 +59,11 @@ class Assembly:
         self._w, self._f = slice(nv, nv + spare), slice(nv + spare, nv + spare + forces)
         self.qp = qp = QP.empty(nv + spare + forces, ends[-1])
         self.strict = TaskStack(strict, nv, qp.A[levels, :nv])
-        self.weighted = TaskStack(program.weighted, nv)
+        self.weighted = TaskStack(formulation.weighted, nv)
         self.bounds = (
-            None if program.law is None else AccelerationBounds(robot, program.law, qp.lower[:nv], qp.upper[:nv])
+            None
+            if formulation.law is None
+            else AccelerationBounds(robot, formulation.law, qp.lower[:nv], qp.upper[:nv])
         )
         self._place_rows(blind, hard, levels, controls, cones)
         self._place_cost(robot)
@@ -79,7 +81,7 @@ class Assembly:
             *(f"contact motion {k}" for k in range(hard.stop - hard.start)),
             *(f"{t.name}[{k}]" for t in strict for k in range(t.size)),
             *actuators.names,
-            *(f"cone of {c.point.frame}[{k}]" for c in program.contacts for k in range(5 if c.size == 3 else 17)),
+            *(f"cone of {c.point.frame}[{k}]" for c in formulation.contacts for k in range(5 if c.size == 3 else 17)),
         )
         self._force = np.zeros(nv)
         self._free = np.zeros(nv)
@@ -173,11 +175,11 @@ class Assembly:
         self._root, self._wanted = np.zeros((rows, 1)), np.zeros(rows)
         diagonal = self.qp.H.reshape(-1)[:: self.qp.n + 1]
         self._diagonal = diagonal[:nv]
-        diagonal[self._w] = self.program.spare_weight
-        moments = [6 * [1.0] if c.size == 6 else 3 * [1.0] for c in self.program.contacts]
+        diagonal[self._w] = self.formulation.spare_weight
+        moments = [6 * [1.0] if c.size == 6 else 3 * [1.0] for c in self.formulation.contacts]
         for scale in moments:
             scale[3:] = [100.0] * (len(scale) - 3)
-        diagonal[self._f] = self.program.force_weight * np.array([x for scale in moments for x in scale])
+        diagonal[self._f] = self.formulation.force_weight * np.array([x for scale in moments for x in scale])
         self._H = self.qp.H[:nv, :nv]
         self._g = self.qp.g[:nv]
         self._posture_weight = np.zeros(nv)
@@ -186,7 +188,7 @@ class Assembly:
         count = self.weighted.size
         self._root[:count, 0] = np.sqrt(self.weighted.weight)
         self._root[count:, 0] = np.sqrt(self.contacts.weight[self._soft])
-        posture = self.program.posture
+        posture = self.formulation.posture
         self._posture_weight[:] = 0.0 if posture is None else posture.weight
         self._added = np.maximum(self._posture_weight, _IDLE)
         self._H[:] = 0.0
@@ -195,7 +197,7 @@ class Assembly:
     def _name_levels(self, hard: slice, levels: slice) -> tuple[tuple[str, slice], ...]:
         found = [("contacts", hard)] if hard.stop > hard.start else []
         start = levels.start
-        for tasks in self.program.levels:
+        for tasks in self.formulation.levels:
             stop = start + sum(task.size for task in tasks)
             found.append((", ".join(task.name for task in tasks), slice(start, stop)))
             start = stop
@@ -205,8 +207,8 @@ class Assembly:
         qp, actuators, base, J = self.qp, self.actuators, self.actuators.base, self.contacts.J
         M, free = state.M, self._free
         free[:] = state.h
-        if self.program.force_point is not None and state.pushed:
-            free -= state.force @ state.at(self.program.force_point).jacobian
+        if self.formulation.force_point is not None and state.pushed:
+            free -= state.force @ state.at(self.formulation.force_point).jacobian
         M_base = M[:base]
         if self._A_blind.shape[0]:
             plain = not actuators.rotors
@@ -240,7 +242,7 @@ class Assembly:
             qp.upper[self._at(self._levels)] = self.strict.a
 
     def _fill_cost(self, state: State) -> None:
-        g, count, posture = self._g, self.weighted.size, self.program.posture
+        g, count, posture = self._g, self.weighted.size, self.formulation.posture
         if self._C.shape[0]:
             C, wanted = self._C, self._wanted
             C[:count], wanted[:count] = self.weighted.J, self.weighted.a

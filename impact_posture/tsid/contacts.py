@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Contact:
+class SupportContact:
     """A foot (or hand) on the ground.
 
     Attributes:
@@ -66,7 +66,7 @@ class Contact:
         return 3 if self.kind == "point" else 6
 
 
-def support_contacts(robot: Robot, *, friction: float = 0.7) -> tuple[Contact, ...]:
+def support_contacts(robot: Robot, *, friction: float = 0.7) -> tuple[SupportContact, ...]:
     """The supports of ``robot.toml`` as contacts on level ground: soles as hard constraints, points with a weight.
 
     Args:
@@ -74,7 +74,7 @@ def support_contacts(robot: Robot, *, friction: float = 0.7) -> tuple[Contact, .
         friction: Coulomb coefficient.
     """
     return tuple(
-        Contact(
+        SupportContact(
             Point(s.frame, s.offset),
             s.kind,
             s.size,
@@ -107,7 +107,7 @@ class ContactStack:
         weight: Shape (size,), zero for hard rows.
     """
 
-    def __init__(self, robot: Robot, contacts: Sequence[Contact]) -> None:
+    def __init__(self, robot: Robot, contacts: Sequence[SupportContact]) -> None:
         ends = np.cumsum([0, *(c.size for c in contacts)])
         self.contacts = tuple(contacts)
         self.rows = tuple(slice(int(b), int(e)) for b, e in pairwise(ends))

@@ -15,11 +15,11 @@ from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
-from impact_posture.tsid.program import Program
 from impact_posture.tsid.qp import EQUALITY, Solver
 from impact_posture.tsid.relaxation import Outcome, Relaxed, missed, solve
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Task
+from impact_posture.tsid.task_formulation import TaskFormulation
 
 Array = NDArray[np.float64]
 
@@ -104,17 +104,17 @@ class Controller:
 
     Attributes:
         robot: The robot.
-        program: What it does.
+        formulation: What it does.
         state: The robot's dynamics at the last tick.
         assembly: The QP's buffers.
     """
 
-    def __init__(self, robot: Robot, program: Program, *, period: float = 1e-3) -> None:
+    def __init__(self, robot: Robot, formulation: TaskFormulation, *, period: float = 1e-3) -> None:
         """Size all buffers.
 
         Args:
             robot: The robot.
-            program: What to do.
+            formulation: What to do.
             period: Expected time between ticks, s: of the first tick, and of what counts as a long pause.
 
         Raises:
@@ -123,15 +123,15 @@ class Controller:
         """
         if not period > 0:
             raise InputError("the period is not positive", where="controller", hint="give seconds above zero")
-        self.robot, self.program, self.period = robot, program, period
-        self.state = State(robot, program.points)
+        self.robot, self.formulation, self.period = robot, formulation, period
+        self.state = State(robot, formulation.points)
         self.actuators = Actuators(robot)
-        self.assembly = Assembly(robot, program, self.actuators)
+        self.assembly = Assembly(robot, formulation, self.actuators)
         n, m = self.assembly.qp.n, self.assembly.qp.m
-        dense = robot.nv if program.weighted and robot.nv >= _LARGE else 0
+        dense = robot.nv if formulation.weighted and robot.nv >= _LARGE else 0
         self._solver = _solver(n, m, dense)
         self._aside = DaqpSolver(n, m)
-        self._tasks = program.tasks
+        self._tasks = formulation.tasks
         # Most tasks remember nothing.
         self._advancing = [task for task in self._tasks if type(task).advance is not Task.advance]
         self._ready = False
@@ -161,7 +161,7 @@ class Controller:
             task.reset(state)
         assembly.reset(state)
         assembly.build_qp(state)
-        posture = self.program.posture
+        posture = self.formulation.posture
         if isinstance(posture, ImpactRobustPosture):
             posture.normalize(state, assembly.redundancy(state))
         self._damping = _HOLD * np.diag(state.M)[self.actuators.base :].copy()
@@ -212,7 +212,7 @@ class Controller:
 
     def report(self) -> Report:
         """What the last tick did; computed when asked."""
-        assembly, state, posture = self.assembly, self.state, self.program.posture
+        assembly, state, posture = self.assembly, self.state, self.formulation.posture
         residuals, active, dynamics = {}, [], float("nan")
         deficient: tuple[Relaxed, ...] = ()
         solved = self._outcome.solved

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.activation import Activation, Phase

@@ -1,4 +1,4 @@
-"""Strict levels of any rank: dependent rows leave a tick's program, nearly dependent ones are damped."""
+"""Strict levels of any rank: dependent rows leave a tick's formulation, nearly dependent ones are damped."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class LevelRank:
         """Size the buffers.
 
         Args:
-            qp: The program, in its buffers.
+            qp: The formulation, in its buffers.
             always: How many rows always hold; they are the first.
             levels: Rows of each level, next to each other behind those.
             accelerations: How many variables the levels are about; they are the first.

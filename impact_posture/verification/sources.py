@@ -10,12 +10,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.codegen.compiler import compiled
+from impact_posture.codegen.build_check import compiled
 from impact_posture.codegen.export import export
 from impact_posture.dynamics.mjcf_numeric import MujocoNumeric
-from impact_posture.folder import scratch_folder
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.output_folder import scratch_folder
 from impact_posture.verification.differences import difference_gradient
 from impact_posture.verification.samples import Sample
 

@@ -1,4 +1,4 @@
-"""Run benchmarks and studies: ``python -m tests.benchmarks NAME … [--only TEXT] [--count N] [--seed N] [--write]``."""
+"""Run benchmarks and studies: ``python -m tests.benchmarks NAME … [--only TEXT] [--count N] [--write]``."""
 
 # ruff: noqa: E402 - BLAS counts its threads when numpy is loaded
 

@@ -49,7 +49,7 @@ class Study:
 STUDIES = {
     study.name: study
     for study in (
-        Study("extended", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
+        Study("solve", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
         Study("optima", "optima", "whether 16 starts find what many starts find", 500, page=False),
         Study("formulations", "formulations", "the linear solve inside the program or its objective", 12, page=False),
         Study("kernel", "kernel.times", "H and ∇H beside Pinocchio C++, ADAM and CasADi; passes", 101),

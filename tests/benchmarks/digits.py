@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.codegen.compiler import compiled
+from impact_posture.codegen.build_check import compiled
 from impact_posture.codegen.export import export
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from tests.benchmarks.cases import CASES, Case
 from tests.benchmarks.core import Request, table
 from tests.exact import Exact, ExactImpact, digits, distance
@@ -42,7 +42,7 @@ def lines(request: Request) -> Iterator[str]:
 def _row(case: Case, share: float, postures: int) -> list[str]:
     robot, normal = load_robot(case.robot), case.normal or (0.0, 0.0, 1.0)
     supports = tuple(Support.from_spec(s) for s in robot.spec.supports)
-    contact = Contact.create(robot.spec.contact.frame or "", normal)
+    contact = ImpactContact(robot.spec.contact.frame or "", normal)
     objective = ImpactObjective(robot, contact, supports=supports, compliance=share / robot.mass)
     kernel, oracle = objective.metric_fun(), objective.oracle
     kept: dict[str, list[tuple[float, float]]] = {}

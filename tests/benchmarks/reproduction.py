@@ -12,11 +12,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from impact_posture.experiment.batch import Store
 from impact_posture.experiment.figures import draw_reproduction
-from impact_posture.experiment.many import Store
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction, controllers_of, jobs_of, reproduce
-from impact_posture.experiment.summary import LEGEND, advice, remarks, scenario_table, table_one
+from impact_posture.experiment.reproduction_summary import LEGEND, advice, remarks, scenario_table, table_one
 from tests.benchmarks.core import ROOT, Request, say
 
 IMAGES = ROOT / "docs" / "images" / "reproduction"

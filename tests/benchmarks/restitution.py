@@ -21,8 +21,8 @@ def lines(request: Request) -> Iterator[str]:
     import_mujoco()
     low, high, width = ContactLaw().solimp
     yield (
-        f"A ball at {SPEED:g} m/s, `solimp` [{low:g}, {high:g}, {width:g}]; *e* with the range that comes of where in\n"
-        "a time step the contact begins; *ideal*: of the same spring and damper in continuous time."
+        f"A ball at {SPEED:g} m/s, `solimp` [{low:g}, {high:g}, {width:g}]; *e* with the range that comes of where "
+        "in\na time step the contact begins; *ideal*: of the same spring and damper in continuous time."
     )
     yield ""
     # What is faster than the time steps is refused.

@@ -14,15 +14,15 @@ import pinocchio as pin
 import qpsolvers
 
 from impact_posture.codegen.export import export
-from impact_posture.codegen.loader import ImpactGradient
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.body_tasks import CenterOfMass
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.frame_tasks import FramePose
 from impact_posture.tsid.impact_robust import Gradient, ImpactRobustPosture, gradient_of
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.program import aerial_program, legged_program
 from impact_posture.tsid.qp import QP, Solved, Solver
+from impact_posture.tsid.task_formulation import aerial_formulation, legged_formulation
 from tests.benchmarks.cases import CASES
 from tests.benchmarks.core import Request, Vector, crba_time, machine, one_core, table
 from tests.qpsolvers_solver import QpsolversSolver
@@ -75,7 +75,7 @@ class Flight:
 
     def __init__(self, goal: Goal, robot: Robot, posture: JointPosture) -> None:
         aerial = robot.spec.kind == "aerial"
-        program = aerial_program(robot, posture) if aerial else legged_program(robot, posture)
+        program = aerial_formulation(robot, posture) if aerial else legged_formulation(robot, posture)
         self.controller, self.robot = Controller(robot, program), robot
         self.q, self.v = robot.posture(), np.zeros(robot.nv)
         self.controller.reset(self.q, self.v)

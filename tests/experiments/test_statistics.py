@@ -20,9 +20,9 @@ from impact_posture.experiment.reproduction import (
     jobs_of,
     targets_of,
 )
+from impact_posture.experiment.reproduction_summary import advice, remarks, scenario_table, summary, table_one
 from impact_posture.experiment.statistics import QUANTITIES, Interval, fate, row_of
-from impact_posture.experiment.summary import advice, remarks, scenario_table, summary, table_one
-from impact_posture.simulation.controllers import CONTROLLERS, MEANING
+from impact_posture.simulation.controller_factory import CONTROLLERS, MEANING
 from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.outcome import gravest
 from impact_posture.simulation.scenario_file import known_scenarios

@@ -17,8 +17,8 @@ from pathlib import Path
 import typer
 
 from impact_posture_cli.app import app
-from impact_posture_cli.boundary import run
-from impact_posture_cli.words import put_right
+from impact_posture_cli.argv import put_right
+from impact_posture_cli.error_boundary import run
 
 CODES = {0, 1, 2, 3, 4, 130, 143}
 # Of a usage error: how to call it, and what was wrong.

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from impact_posture import job, plot
+from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.result import result_document
-from impact_posture.posture.settings import make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.simulation.scenario_file import scenario_path
 from tests.hostile.arena import attack

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from impact_posture.impact.contact import Contact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.plot import (
     ResultView,
 )
@@ -38,7 +38,7 @@ def talos() -> ResultView:
 @pytest.fixture(scope="module")
 def two_hands(talos: ResultView) -> ResultView:
     """Both hands at once, along two normals."""
-    other = Contact.create("gripper_left_base_link", (0, -1, 0))
+    other = ImpactContact("gripper_left_base_link", (0, -1, 0))
     return dataclasses.replace(talos, objective=dataclasses.replace(talos.objective, others=(other,)))
 
 

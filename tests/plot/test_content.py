@@ -21,10 +21,10 @@ from impact_posture.plot import (
     postures_figure,
     tradeoff_figure,
 )
-from impact_posture.plot.classical import kinds_of
-from impact_posture.plot.jump import groups_of
-from impact_posture.plot.path import normalized
-from impact_posture.plot.robot import Surface, side_plane, surfaces_of
+from impact_posture.plot.classical_figure import kinds_of
+from impact_posture.plot.jump_figure import groups_of
+from impact_posture.plot.path_figure import normalized
+from impact_posture.plot.robot_drawing import Surface, side_plane, surfaces_of
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
     Plane,

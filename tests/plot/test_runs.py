@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.plot import (
     FORMATS,
     Bar,
@@ -37,7 +37,7 @@ from impact_posture.plot.run_axes import AT_LIMIT, LIMIT, SHADES, STOP, thin
 from impact_posture.plot.run_panels import SHOWN
 from impact_posture.plot.skeleton import build_skeleton
 from impact_posture.plot.snapshots import instants
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from tests.plot.page import defects
 from tests.plot.views import PENDULUM, text_of
 
@@ -63,7 +63,7 @@ def make_run(
     force = np.zeros((TICKS, 3))
     inside = np.any([(t > at) & (t <= at + 0.3) for at in hits], axis=0)
     force[inside] = (6.0, 0.0, 0.0)
-    contact = Contact.create(robot.spec.contact.frame or robot.frame_names[-1], (1, 0, 0))
+    contact = ImpactContact(robot.spec.contact.frame or robot.frame_names[-1], (1, 0, 0))
     values: dict[str, Any] = {
         "torque": 0.5 * np.outer(np.sin(3 * t), np.ones(robot.nv - base)),
         "rotor_command": np.full((TICKS, rotors), 60.0),

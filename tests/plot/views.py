@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 from matplotlib.figure import Figure
 
-from impact_posture.impact.contact import Contact, Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.plot import (
@@ -16,7 +16,7 @@ from impact_posture.plot import (
     TradeOffData,
     sample_path,
 )
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 
 PENDULUM = "example-robot-data:double_pendulum_description/urdf/double_pendulum.urdf"
 
@@ -35,7 +35,7 @@ def make_view(
     supports = tuple(Support.from_spec(s) for s in robot.spec.supports)
     frame = frame or robot.spec.contact.frame or robot.frame_names[-1]
     normal_frame = keys.pop("normal_frame", "world")
-    contact = Contact.create(frame, normal, normal_frame=normal_frame)  # type: ignore[arg-type]
+    contact = ImpactContact(frame, normal, normal_frame=normal_frame)  # type: ignore[arg-type]
     objective = ImpactObjective(robot, contact, keys.pop("metric", Metric()), supports=supports)  # type: ignore[arg-type]
     q0 = robot.posture() if q0 is None else q0
     v = scale * np.random.default_rng(3).normal(size=robot.nv)

@@ -6,7 +6,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from impact_posture.posture.settings import Prepared, ProblemSettings, make_settings, prepare
+from impact_posture.posture.problem_settings import Prepared, ProblemSettings, make_settings, prepare
 from impact_posture.posture.solve import PostureSolution, solve
 
 ROOT = Path(__file__).parents[2]

@@ -8,15 +8,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.baselines import InvariantDriver, StiffDriver, WalkerDriver
-from impact_posture.simulation.controllers import Workshop
-from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts
-from impact_posture.simulation.sensing import Reading
+from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.task import Task
 from tests.helpers import Vector, central_gradient, frame_jacobian, mass_matrix, rng
-from tests.simulation.shops import SHIPPED, needs_mujoco, shop
+from tests.simulation.factories import SHIPPED, factory, needs_mujoco
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -24,7 +24,7 @@ def _mujoco() -> None:
     needs_mujoco()
 
 
-def moving(made: Workshop, *key: object) -> Reading:
+def moving(made: ControllerFactory, *key: object) -> Reading:
     """A state near the start, in motion."""
     generator, robot = rng(*key), made.setup.robot
     q = np.array(pin.integrate(robot.model, made.setup.q, 0.02 * generator.normal(size=robot.nv)))
@@ -35,15 +35,15 @@ def moving(made: Workshop, *key: object) -> Reading:
 
 
 def stiff(name: str) -> StiffDriver:
-    driver = shop(name).driver("stiff")
+    driver = factory(name).driver("stiff")
     assert isinstance(driver, StiffDriver)
-    driver.reset(shop(name).setup.q)
+    driver.reset(factory(name).setup.q)
     return driver
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_the_stiffness_is_the_terms_by_another_route(name: str) -> None:
-    made, driver = shop(name), stiff(name)
+    made, driver = factory(name), stiff(name)
     robot, control, q = made.setup.robot, made.setup.scenario.control, made.setup.q
     objective = made.objective()
     # The oracle's gradients, differentiated with a larger step and to fourth order.
@@ -74,7 +74,7 @@ def test_the_stiffness_is_symmetric_and_critically_damped(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["aerial-lateral", "solo8-push"])
 def test_the_stiff_law_is_a_spring_and_a_damper(name: str) -> None:
-    made, driver = shop(name), stiff(name)
+    made, driver = factory(name), stiff(name)
     reading, state = moving(made, name, "spring"), driver.controller.state
     state.update(reading.q, reading.v)
     away = pin.difference(made.setup.robot.model, reading.q, made.setup.q)
@@ -87,7 +87,7 @@ def test_the_stiff_law_is_a_spring_and_a_damper(name: str) -> None:
 
 def walk(name: str, seconds: float) -> tuple[WalkerDriver, Any, list[Any], list[Vector]]:
     """Let it flow; the driver, the world, states and steps of the reference at every tick."""
-    made = shop(name)
+    made = factory(name)
     driver, world = made.driver("walker"), made.setup.world
     assert isinstance(driver, WalkerDriver)
     command = driver.reset(made.setup.q)
@@ -101,14 +101,14 @@ def walk(name: str, seconds: float) -> tuple[WalkerDriver, Any, list[Any], list[
         command = driver.tick(reading)
         flows.append(pin.difference(made.setup.robot.model, before, driver.posture.target) / period)
         readings.append(reading)
-        world.step(Drive(command.torque, command.rotor_speed), count)
+        world.step(ActuatorCommand(command.torque, command.rotor_speed), count)
     return driver, world, readings, flows
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_the_flow_lies_in_what_the_other_tasks_leave_and_lowers_the_metric(name: str) -> None:
     driver, world, _, flows = walk(name, 0.5)
-    made, assembly, state = shop(name), driver.controller.assembly, driver.controller.state
+    made, assembly, state = factory(name), driver.controller.assembly, driver.controller.state
     flow = flows[-1]
     assert np.linalg.norm(flow) > 1e-3
     rows = np.vstack([assembly.contacts.J, assembly.strict.J, assembly.weighted.J])
@@ -124,7 +124,7 @@ def test_the_flow_lies_in_what_the_other_tasks_leave_and_lowers_the_metric(name:
 
 
 def test_the_flow_is_the_projected_gradient() -> None:
-    made = shop("aerial-vertical")
+    made = factory("aerial-vertical")
     driver = made.driver("walker")
     assert isinstance(driver, WalkerDriver)
     driver.reset(made.setup.q)
@@ -149,7 +149,7 @@ def test_the_flow_is_the_projected_gradient() -> None:
 
 
 def test_without_being_asked_nothing_flows() -> None:
-    made = shop("aerial-vertical")
+    made = factory("aerial-vertical")
     driver = made.driver("walker")
     driver.reset(made.setup.q)
     for k in range(50):
@@ -161,15 +161,15 @@ def test_without_being_asked_nothing_flows() -> None:
 
 
 def invariant(name: str) -> InvariantDriver:
-    driver = shop(name).driver("invariant")
+    driver = factory(name).driver("invariant")
     assert isinstance(driver, InvariantDriver)
-    driver.reset(shop(name).setup.q)
+    driver.reset(factory(name).setup.q)
     return driver
 
 
 def impulses(name: str, q: Vector) -> Vector:
-    """``M⁻¹Jᵀ`` of the blow, feet holding exactly, shape (nv, 3); from raw Pinocchio."""
-    setup = shop(name).setup
+    """``M⁻¹Jᵀ`` of the impact, feet holding exactly, shape (nv, 3); from raw Pinocchio."""
+    setup = factory(name).setup
     model, frame = setup.robot.model, setup.scenario.task.frame
     M = mass_matrix(model, q)
     J = frame_jacobian(model, q, setup.robot.frame_id(frame))[:3]
@@ -185,21 +185,21 @@ def impulses(name: str, q: Vector) -> Vector:
 
 
 def leading(driver: InvariantDriver) -> list[Task]:
-    return [task for task in driver.controller.program.tasks if task is not driver.posture]
+    return [task for task in driver.controller.formulation.tasks if task is not driver.posture]
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_what_an_impulse_does_is_invisible_and_nothing_else(name: str) -> None:
-    made, driver = shop(name), invariant(name)
+    made, driver = factory(name), invariant(name)
     generator = rng(name, "impulse")
     quiet = moving(made, name, "invariant")
     quiet = Reading(quiet.t, quiet.q, np.zeros_like(quiet.v), None)
     change = impulses(name, quiet.q)
     for _ in range(5):
-        blow = change @ generator.normal(size=3)
-        correction = driver._correction(Reading(quiet.t, quiet.q, blow, None))
+        impact = change @ generator.normal(size=3)
+        correction = driver._correction(Reading(quiet.t, quiet.q, impact, None))
         # What the feedback sees is rest.
-        np.testing.assert_allclose(blow + correction, 0, atol=1e-6 * np.abs(blow).max())
+        np.testing.assert_allclose(impact + correction, 0, atol=1e-6 * np.abs(impact).max())
     # A motion that no impulse makes better: the tasks' errors stand square on what an impulse can do to them.
     state = driver._aside.update(quiet.q, quiet.v)
     J = np.vstack([task.jacobian(state) for task in leading(driver)])
@@ -214,7 +214,7 @@ def test_what_an_impulse_does_is_invisible_and_nothing_else(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "talos-push"])
 def test_the_invariant_part_of_a_velocity_is_kept(name: str) -> None:
-    made, driver = shop(name), invariant(name)
+    made, driver = factory(name), invariant(name)
     reading = moving(made, name, "kept")
     # The null space of J M⁻¹: what no impulse changes.
     kept = np.linalg.svd(impulses(name, reading.q).T)[2][3:]
@@ -225,7 +225,7 @@ def test_the_invariant_part_of_a_velocity_is_kept(name: str) -> None:
 
 def test_the_approach_is_no_velocity_error() -> None:
     # On its way in the end effector moves as it is asked to: nothing may be taken for the work of an impulse.
-    made = shop("aerial-vertical")
+    made = factory("aerial-vertical")
     task = made.setup.scenario.task
     assert isinstance(task, RepeatedContacts)
     reference, driver = Reference(task, made.setup.gap), invariant("aerial-vertical")
@@ -244,12 +244,12 @@ def test_when_it_is_on() -> None:
     for t, level in ((0.949, 0), (0.98, 1), (1.0, 1), (1.05, 1), (1.065, 0.5), (0.965, 0.5), (1.081, 0)):
         assert driver.share(t) == pytest.approx(level, abs=1e-9), t
     assert np.abs(np.diff([driver.share(t) for t in np.arange(0.9, 1.15, 1e-3)])).max() < 1.51e-3 / driver.FLANK
-    driver.reset(shop("aerial-vertical").setup.q)
+    driver.reset(factory("aerial-vertical").setup.q)
     assert driver.share(1.0) == 0
 
 
-def test_a_blow_that_is_felt_sets_the_time_once() -> None:
-    made, driver = shop("aerial-vertical"), invariant("aerial-vertical")
+def test_an_impact_that_is_felt_sets_the_time_once() -> None:
+    made, driver = factory("aerial-vertical"), invariant("aerial-vertical")
     q, v = made.setup.q, np.zeros(9)
     driver.expect(1.0)
     for t, force, expected in ((0.5, 50, 1.0), (0.9, 2, 1.0), (0.95, 50, 0.95), (0.97, 50, 0.95)):
@@ -262,7 +262,7 @@ def test_a_blow_that_is_felt_sets_the_time_once() -> None:
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "solo8-push"])
 def test_outside_its_time_the_command_is_nominals_bit_for_bit(name: str) -> None:
-    made, driver, nominal = shop(name), invariant(name), shop(name).driver("nominal")
+    made, driver, nominal = factory(name), invariant(name), factory(name).driver("nominal")
     nominal.reset(made.setup.q)
     driver.expect(0.3)
     other = 0

@@ -1,4 +1,4 @@
-"""Drivers: what each does before the blow, what it holds, and what it leaves behind."""
+"""Drivers: what each does before the impact, what it holds, and what it leaves behind."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import SpecError
-from impact_posture.simulation.controllers import CONTROLLERS, Mode, Workshop
+from impact_posture.simulation.actuator_command import ActuatorCommand
+from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory, Mode
 from impact_posture.simulation.driver import MOVE, Driver, PostureDriver
-from impact_posture.simulation.exchange import Drive
 from impact_posture.simulation.offline import OfflinePosture
-from impact_posture.simulation.programs import nominal_posture
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Gains
+from impact_posture.simulation.task_formulations import nominal_posture
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.frame_tasks import FramePose
-from tests.simulation.shops import AERIAL, PUSHES, SHIPPED, needs_mujoco, shop
+from tests.simulation.factories import AERIAL, PUSHES, SHIPPED, factory, needs_mujoco
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,7 +30,7 @@ def _mujoco() -> None:
 class Stage:
     """A driver in its world, without reference and recorder."""
 
-    def __init__(self, made: Workshop, driver: Driver, seed: int = 0) -> None:
+    def __init__(self, made: ControllerFactory, driver: Driver, seed: int = 0) -> None:
         setup = made.setup
         self.made, self.driver, self.world = made, driver, setup.world
         command = driver.reset(setup.q)
@@ -40,7 +40,7 @@ class Stage:
     def go(self, seconds: float) -> Any:
         for _ in range(round(seconds / (self.count * self.world.timestep))):
             command = self.driver.tick(self.world.read())
-            self.world.step(Drive(command.torque, command.rotor_speed), self.count)
+            self.world.step(ActuatorCommand(command.torque, command.rotor_speed), self.count)
         return self.world.truth()
 
     def moved(self, q: Any) -> float:
@@ -52,11 +52,11 @@ class Stage:
 
 
 def stage(name: str, controller: str, mode: Mode = "live") -> Stage:
-    made = shop(name)
+    made = factory(name)
     return Stage(made, made.driver(controller, mode))
 
 
-# ---- before the blow ----------------------------------------------------------------------------------------------
+# ---- before the impact --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -104,19 +104,19 @@ def test_the_other_gradients_lower_their_own_metric(controller: str) -> None:
 
 def test_all_controllers_share_gains_tasks_and_weights() -> None:
     for name in ("aerial-lateral", "talos-push"):
-        made = shop(name)
+        made = factory(name)
         made._offline = made._offline or OfflinePosture(made.setup.q, 1.0, 1.0, 1.0, 0.0, 0.0)
-        nominal = made.driver("nominal").controller.program
+        nominal = made.driver("nominal").controller.formulation
         for controller in CONTROLLERS:
-            program = made.driver(controller).controller.program
-            assert [t.name for t in program.tasks[:-1]] == [t.name for t in nominal.tasks[:-1]]
-            for task, other in zip(program.tasks, nominal.tasks, strict=True):
+            formulation = made.driver(controller).controller.formulation
+            assert [t.name for t in formulation.tasks[:-1]] == [t.name for t in nominal.tasks[:-1]]
+            for task, other in zip(formulation.tasks, nominal.tasks, strict=True):
                 np.testing.assert_array_equal(task.kp, other.kp)
                 np.testing.assert_array_equal(task.weight, other.weight)
                 # The stiff one is critically damped for a stiffness of its own.
-                if controller != "stiff" or task is not program.posture:
+                if controller != "stiff" or task is not formulation.posture:
                     np.testing.assert_array_equal(task.kd, other.kd)
-            assert [c.friction for c in program.contacts] == [c.friction for c in nominal.contacts]
+            assert [c.friction for c in formulation.contacts] == [c.friction for c in nominal.contacts]
 
 
 # ---- held ---------------------------------------------------------------------------------------------------------
@@ -133,7 +133,7 @@ def test_held_freezes_posture_center_of_mass_and_base_where_they_are(name: str, 
     driver.hold()
     reached = play.world.truth().q
     state = driver.controller.state
-    for task in driver.controller.program.weighted:
+    for task in driver.controller.formulation.weighted:
         if isinstance(task, CenterOfMass):
             np.testing.assert_array_equal(task.target, state.center_of_mass()[0])
         if isinstance(task, BaseOrientation):
@@ -144,17 +144,17 @@ def test_held_freezes_posture_center_of_mass_and_base_where_they_are(name: str, 
     way = pin.difference(play.made.setup.robot.model, reached, target)[6:]
     # What is held is what was measured in the last tick before.
     assert np.abs(way).max() < 0.01
-    wanted = [np.array(t.target) for t in driver.controller.program.weighted]  # type: ignore[attr-defined]
+    wanted = [np.array(t.target) for t in driver.controller.formulation.weighted]  # type: ignore[attr-defined]
     last = play.go(2.5 if name in AERIAL else 0.8).q
     np.testing.assert_array_equal(driver.posture.target, target)
-    for task, kept in zip(driver.controller.program.weighted, wanted, strict=True):
+    for task, kept in zip(driver.controller.formulation.weighted, wanted, strict=True):
         np.testing.assert_array_equal(task.target, kept)  # type: ignore[attr-defined]
     assert np.abs(pin.difference(play.made.setup.robot.model, last, target)[6:]).max() < 0.04
 
 
 @pytest.mark.parametrize("controller", ["robust", "walker", "posture"])
 def test_nothing_of_a_run_survives_a_reset(controller: str) -> None:
-    made = shop("solo8-push")
+    made = factory("solo8-push")
     goal = np.array(pin.integrate(made.setup.robot.model, made.setup.q, 0.05 * np.ones(14)))
     driver: Driver
     if controller == "posture":
@@ -175,7 +175,7 @@ def test_nothing_of_a_run_survives_a_reset(controller: str) -> None:
 
 
 def test_a_reference_of_the_hand_does_not_survive_a_reset() -> None:
-    made = shop("aerial-vertical")
+    made = factory("aerial-vertical")
     driver = made.driver("nominal")
     fresh = driver.reset(made.setup.q)
     made.setup.world.reset(made.setup.q)
@@ -185,11 +185,11 @@ def test_a_reference_of_the_hand_does_not_survive_a_reset() -> None:
 
 
 def test_the_hand_follows_its_reference_into_the_surface() -> None:
-    made = shop("aerial-lateral")
+    made = factory("aerial-lateral")
     driver = made.driver("nominal")
     driver.reset(made.setup.q)
     made.setup.world.reset(made.setup.q)
-    (hand,) = [t for t in driver.controller.program.tasks if isinstance(t, FramePose)]
+    (hand,) = [t for t in driver.controller.formulation.tasks if isinstance(t, FramePose)]
     assert hand.target is not None
     home = hand.target.translation.copy()
     driver.tick(made.setup.world.read(), ReferencePoint(0.1, 0.3, 0.8, 0))
@@ -204,7 +204,7 @@ def test_the_hand_follows_its_reference_into_the_surface() -> None:
 
 @pytest.mark.parametrize("name", ["aerial-lateral", "solo8-push"])
 def test_the_posture_driver_reaches_its_goal(name: str) -> None:
-    made = shop(name)
+    made = factory(name)
     robot = made.setup.robot
     goal = made.setup.q.copy()
     if name in AERIAL:
@@ -229,7 +229,7 @@ def test_the_posture_driver_reaches_its_goal(name: str) -> None:
     np.testing.assert_array_equal(play.driver.posture.target, goal)
     if name in PUSHES:
         assert np.abs(pin.difference(robot.model, reached, goal)[6:]).max() < 0.02
-        (center,) = [t for t in play.driver.controller.program.weighted if isinstance(t, CenterOfMass)]
+        (center,) = [t for t in play.driver.controller.formulation.weighted if isinstance(t, CenterOfMass)]
         data = robot.model.createData()
         np.testing.assert_allclose(center.target, pin.centerOfMass(robot.model, data, goal), atol=1e-12)
 
@@ -249,8 +249,8 @@ def test_the_posture_driver_reaches_its_goal(name: str) -> None:
     ],
 )
 def test_gains_that_no_task_takes_are_refused(name: str, change: dict[str, Any], words: str) -> None:
-    setup = shop(name).setup
+    setup = factory(name).setup
     control = replace(setup.scenario.control, **change)
     with pytest.raises(SpecError, match=words) as caught:
-        Workshop(replace(setup, scenario=replace(setup.scenario, control=control))).driver("nominal")
+        ControllerFactory(replace(setup, scenario=replace(setup.scenario, control=control))).driver("nominal")
     assert "\n" not in caught.value.line and name in caught.value.line

@@ -12,10 +12,10 @@ import pytest
 from impact_posture.errors import SpecError
 from impact_posture.simulation.metrics import JUMP, before, jump, measure
 from impact_posture.simulation.recorder import STATUSES
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Series, Window
 from impact_posture.tsid.controller import Status
-from tests.simulation.shops import by_hand, fields_of, needs_mujoco, shop
+from tests.simulation.factories import by_hand, factory, fields_of, needs_mujoco
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -28,7 +28,7 @@ def touch(begin: float, length: float = 0.3, contact: int = 0, kind: str = "impa
 
 
 def measured(columns: dict[str, Any], *windows: Window, n: int = 1000) -> Any:
-    setup = shop("aerial-vertical").setup
+    setup = factory("aerial-vertical").setup
     return measure(setup, Run(by_hand(setup, n, **columns), windows))
 
 
@@ -68,7 +68,7 @@ def test_what_lies_outside_the_windows_does_not_count() -> None:
 
 @pytest.mark.parametrize("begin", [0.2, 0.20000000000001, 0.19999999999999, 0.2003, 0.2007, 0.3 - 0.1])
 def test_a_window_has_as_many_ticks_wherever_it_begins(begin: float) -> None:
-    setup = shop("aerial-vertical").setup
+    setup = factory("aerial-vertical").setup
     # As the world counts (steps times the time step), and as MuJoCo does (their sum).
     for t in (0.25e-3 * 4 * np.arange(1, 1001), np.cumsum(np.full(4000, 0.25e-3))[3::4]):
         part = by_hand(setup, 1000, t=t).slice(begin, begin + 0.3)
@@ -77,7 +77,7 @@ def test_a_window_has_as_many_ticks_wherever_it_begins(begin: float) -> None:
 
 
 def test_what_is_given_back_later_is_in_the_recovery() -> None:
-    setup = shop("aerial-vertical").setup
+    setup = factory("aerial-vertical").setup
     v = np.zeros((1000, 9))
     v[:201, 0] = 0.5
     # Quiet in the window, and all of it afterwards.
@@ -108,7 +108,7 @@ def test_the_jump_is_the_largest_within_fifteen_milliseconds() -> None:
 
 
 def test_the_jump_begins_at_the_last_tick_before_the_touch() -> None:
-    setup = shop("aerial-vertical").setup
+    setup = factory("aerial-vertical").setup
     v = np.arange(1000)[:, None] * np.ones(9)
     series = by_hand(setup, 1000, v=v)
     # Touched in the middle of the tick that ends at 0.201 (index 200): index 199 is before.
@@ -129,7 +129,7 @@ def test_mean_and_largest_jump_of_the_contacts_that_came_about() -> None:
 
 
 def test_saturation_inside_outside_and_of_which_motors() -> None:
-    setup = shop("aerial-vertical").setup
+    setup = factory("aerial-vertical").setup
     propulsion = setup.robot.spec.propulsion
     assert propulsion is not None
     limits = np.asarray(setup.robot.model.effortLimit)[6:]
@@ -158,7 +158,7 @@ def test_relaxed_and_failed_ticks_stops_and_contacts() -> None:
 
 
 def test_a_pushs_jump_is_the_largest_speed_and_its_force_the_pushs() -> None:
-    setup = shop("solo8-push").setup
+    setup = factory("solo8-push").setup
     v, peak = np.zeros((1000, 14)), np.zeros(1000)
     v[:, 0], v[350, 0], v[700, 0] = 0.1, -0.6, 5.0
     peak[200:600] = 6.5
@@ -177,7 +177,7 @@ def test_metrics_are_json() -> None:
 
 
 def test_a_series_comes_back_from_its_file(tmp_path: Path) -> None:
-    setup = shop("aerial-vertical").setup
+    setup = factory("aerial-vertical").setup
     series = by_hand(setup, 20, v=np.random.default_rng(0).normal(size=(20, 9)))
     series.save(tmp_path / "series.npz", more=np.arange(3))
     again = Series.load(tmp_path / "series.npz")

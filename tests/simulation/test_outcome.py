@@ -14,12 +14,12 @@ from impact_posture.errors import SpecError
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import Event, judge
 from impact_posture.simulation.recorder import STATUSES
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Bounds, Setup, set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.series import Window
 from impact_posture.tsid.controller import Status
-from tests.simulation.shops import SHIPPED, by_hand, driven, needs_mujoco, shop, shortened, workshop
+from tests.simulation.factories import SHIPPED, by_hand, controller_factory, driven, factory, needs_mujoco, shortened
 
 RELAXED, HELD = STATUSES.index(Status.RELAXED), STATUSES.index(Status.INFEASIBLE)
 HEXTILT = Path(__file__).parent / "hextilt.toml"
@@ -45,12 +45,12 @@ def turned(setup: Setup, axis: tuple[float, float, float], degrees: float) -> np
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_robot_that_stays_where_it_is_completes(name: str) -> None:
-    assert judged(shop(name).setup, {}) == ()
+    assert judged(factory(name).setup, {}) == ()
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_tilt_is_measured_from_the_start_and_yaw_is_none(name: str) -> None:
-    setup = shop(name).setup
+    setup = factory(name).setup
     assert judged(setup, {"q": turned(setup, (0, 0, 1), 170)}) == ()
     assert judged(setup, {"q": turned(setup, (1, 0, 0), 59)}) == ()
     (event,) = judged(setup, {"q": turned(setup, (0, 1, 0), -61)})
@@ -59,7 +59,7 @@ def test_tilt_is_measured_from_the_start_and_yaw_is_none(name: str) -> None:
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_below_the_surface_and_far_below_the_start(name: str) -> None:
-    setup = shop(name).setup
+    setup = factory(name).setup
     surface = setup.scenario.scene.surfaces[0].name
     n, point = setup.world.built.normals[surface], setup.world.built.points[surface]
     q = np.tile(setup.q, (1000, 1))
@@ -90,7 +90,7 @@ def test_relaxed_and_held_ticks(status: int, begin: int, length: int, words: str
     column = np.zeros(1000, int)
     column[begin : begin + length] = status
     for name in ("aerial-lateral", "solo8-push"):
-        found = judged(shop(name).setup, {"status": column})
+        found = judged(factory(name).setup, {"status": column})
         if words is None:
             assert found == ()
         else:
@@ -99,7 +99,7 @@ def test_relaxed_and_held_ticks(status: int, begin: int, length: int, words: str
 
 
 def test_feet_that_leave_the_ground_and_contacts_that_never_come() -> None:
-    setup = shop("solo8-push").setup
+    setup = factory("solo8-push").setup
     feet = np.ones((1000, 4), bool)
     feet[200:300, 1] = False
     assert judged(setup, {"feet": feet}) == ()
@@ -107,12 +107,12 @@ def test_feet_that_leave_the_ground_and_contacts_that_never_come() -> None:
     (event,) = judged(setup, {"feet": feet})
     assert event.status == "lost contact" and event.what == "FR_FOOT left the ground for 0.101 s"
     windows = [Window("impact", k, 0.1 + 0.2 * k, 0.2 + 0.2 * k, k != 2) for k in range(4)]
-    (event,) = judged(shop("aerial-vertical").setup, {}, windows=tuple(windows))
+    (event,) = judged(factory("aerial-vertical").setup, {}, windows=tuple(windows))
     assert event.status == "lost contact" and event.what.startswith("1 of 4 contacts") and event.time == 0.5
 
 
 def test_the_scenario_sets_the_bounds() -> None:
-    setup = shop("solo8-push").setup
+    setup = factory("solo8-push").setup
     feet, status = np.ones((1000, 4), bool), np.zeros(1000, int)
     feet[200:400, 1], status[500:600] = False, HELD
     columns = {"feet": feet, "status": status, "q": turned(setup, (0, 1, 0), 70)}
@@ -125,7 +125,7 @@ def test_the_scenario_sets_the_bounds() -> None:
 
 
 def test_a_robot_that_is_pushed_over_fell() -> None:
-    made = workshop(shortened("solo8-push", force=(60.0, 0.0, 0.0), after=0.5))
+    made = controller_factory(shortened("solo8-push", force=(60.0, 0.0, 0.0), after=0.5))
     found = driven(made, "nominal")
     events = judge(made.setup, found)
     assert "fell" in {e.status for e in events}
@@ -134,7 +134,7 @@ def test_a_robot_that_is_pushed_over_fell() -> None:
 
 def test_a_run_whose_state_runs_away_ends_there(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("aerial-lateral", "solo8-push"):
-        made = workshop(shortened(name))
+        made = controller_factory(shortened(name))
         world, step = made.setup.world, made.setup.world.step
 
         def away(command: Any, count: int = 1, world: Any = world, step: Any = step) -> None:
@@ -151,7 +151,7 @@ def test_a_run_whose_state_runs_away_ends_there(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("controller", ["nominal", "robust"])
 def test_a_hextilt_flies_on_its_own_rotors_and_touches_the_floor(controller: str) -> None:
-    made = workshop(set_up(read_scenario(HEXTILT)))
+    made = controller_factory(set_up(read_scenario(HEXTILT)))
     found = driven(made, controller)
     assert judge(made.setup, found) == ()
     metrics = measure(made.setup, found)

@@ -13,14 +13,14 @@ import pytest
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError
 from impact_posture.impact.contact import point_on
-from impact_posture.simulation.controllers import CONTROLLERS, Workshop
+from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.prediction import predict
-from impact_posture.simulation.runs import run
+from impact_posture.simulation.run import run
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from tests.helpers import robot
-from tests.simulation.shops import driven, fields_of, needs_mujoco, workshop
+from tests.simulation.factories import controller_factory, driven, fields_of, needs_mujoco
 
 RAIL = Path(__file__).parents[2] / "docs" / "examples" / "rail_arm"
 
@@ -111,7 +111,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @functools.cache
-def arm(folder: Path, which: str) -> Workshop:
+def arm(folder: Path, which: str) -> ControllerFactory:
     """A fixed-base arm above a table."""
     path, more = folder / f"{which}.toml", ""
     name, frame = which, robot(which).spec.contact.frame if which in ("panda", "ur5") else "tool"
@@ -124,17 +124,17 @@ def arm(folder: Path, which: str) -> Workshop:
         name = "stranger.urdf"
         more = "armature = { rail = 6.0 }\njoints = { shoulder_pitch = 0.6, elbow = 1.2, wrist_pitch = 0.9 }"
     path.write_text(HIT.format(robot=name, frame=frame, more=more), encoding="utf-8")
-    return workshop(set_up(read_scenario(path)))
+    return controller_factory(set_up(read_scenario(path)))
 
 
-def standing(folder: Path, name: str, force: float) -> Workshop:
+def standing(folder: Path, name: str, force: float) -> ControllerFactory:
     """A robot of the catalogue on its own supports."""
     found = robot(name)
     shapes = "\n".join(f'[[shapes]]\nframe = "{s.frame}"\nsize = [0.016]' for s in found.spec.supports)
     path = folder / f"{name}.toml"
     text = PUSH.format(robot=name, frame=found.spec.contact.frame, shapes=shapes, force=force)
     path.write_text(text, encoding="utf-8")
-    return workshop(set_up(read_scenario(path)))
+    return controller_factory(set_up(read_scenario(path)))
 
 
 @pytest.mark.parametrize(
@@ -152,9 +152,9 @@ def test_an_arm_on_a_fixed_base_meets_a_table(folder: Path, which: str, controll
     assert 0 < metrics.q_total_impact < 1
     # There is no base to move.
     assert metrics.q_total_impact_base == 0 and metrics.q_total_impact_joints == metrics.q_total_impact
-    (blow,) = predict(made.setup, made.objective(), found)
+    (impact,) = predict(made.setup, made.objective(), found)
     # It arrives as fast as the reference does, whatever prepares it.
-    assert blow.approach == pytest.approx(0.2, rel=0.1)
+    assert impact.approach == pytest.approx(0.2, rel=0.1)
 
 
 @pytest.mark.parametrize(("pose", "size"), [("position", 3), ("aligned", 5)])
@@ -163,15 +163,15 @@ def test_the_end_effector_can_be_led_by_less_than_its_pose(folder: Path, pose: s
     text = HIT.format(robot="panda", frame=robot("panda").spec.contact.frame, more="")
     path = folder / f"{pose}.toml"
     path.write_text(text.replace("kp = 100", f'pose = "{pose}"\nkp = 100'), encoding="utf-8")
-    made = workshop(set_up(read_scenario(path)))
+    made = controller_factory(set_up(read_scenario(path)))
     found = driven(made, "posture")
     metrics = measure(made.setup, found)
     assert metrics.contacts == 1 and metrics.failed_ticks == 0 and metrics.relaxed_ticks < 30
     for controller in CONTROLLERS:
-        program = made.driver(controller).controller.program
-        assert [[task.size for task in level] for level in program.levels] == [[size]], controller
-    (blow,) = predict(made.setup, made.objective(), found)
-    assert blow.approach == pytest.approx(0.2, rel=0.1)
+        formulation = made.driver(controller).controller.formulation
+        assert [[task.size for task in level] for level in formulation.levels] == [[size]], controller
+    (impact,) = predict(made.setup, made.objective(), found)
+    assert impact.approach == pytest.approx(0.2, rel=0.1)
     point = point_on(made.setup.robot, made.setup.scenario.task.frame)
     begin, end = (Numeric(made.setup.robot.model).at(q).placement(point) for q in found.series.q[[0, -1]])
     axis = begin.rotation.T @ made.setup.scenario.normal
@@ -205,7 +205,7 @@ def test_a_robot_that_stands_can_hit_something_too(folder: Path) -> None:
     )
     path = folder / "bump.toml"
     path.write_text(text[:begin] + wall + text[end:], encoding="utf-8")
-    made = workshop(set_up(read_scenario(path)))
+    made = controller_factory(set_up(read_scenario(path)))
     for controller in ("nominal", "robust"):
         (bump,) = run(made, controller)
         metrics = measure(made.setup, bump)
@@ -222,7 +222,7 @@ def test_a_pushed_arm_without_a_hand_task_still_runs(folder: Path) -> None:
     )
     path = folder / "pushed.toml"
     path.write_text(text[:begin] + push + text[end:], encoding="utf-8")
-    made = workshop(set_up(read_scenario(path)))
+    made = controller_factory(set_up(read_scenario(path)))
     for controller in ("nominal", "robust", "posture", "invariant"):
         found = driven(made, controller)
         assert np.isfinite(found.series.v).all() and measure(made.setup, found).q_total_impact > 0, controller
@@ -250,5 +250,5 @@ def test_what_does_not_fit_the_arm_is_one_line(folder: Path, old: str, new: str,
     path = folder / "wrong.toml"
     path.write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(ImpactPostureError, match=words) as caught:
-        run(workshop(set_up(read_scenario(path))), "nominal")
+        run(controller_factory(set_up(read_scenario(path))), "nominal")
     assert "\n" not in caught.value.line

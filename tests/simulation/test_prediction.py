@@ -1,4 +1,4 @@
-"""Blows of a robot that nobody controls against the rigid model, and flights without any."""
+"""Impacts of a robot that nobody controls against the rigid model, and flights without any."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.blow import blow_of, interpreted
-from impact_posture.simulation.exchange import Drive
+from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.metrics import JUMP, before, measure
 from impact_posture.simulation.prediction import Prediction, predict
 from impact_posture.simulation.recorder import Recorder
-from impact_posture.simulation.runs import Run
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_objective import interpreted, scenario_objective
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene
 from impact_posture.simulation.series import Window
 from impact_posture.simulation.world import build_world
 from impact_posture.tsid.controller import Command, Status
 from tests.helpers import Vector, frame_jacobian, mass_matrix, rng, robot
-from tests.simulation.shops import driven, needs_mujoco, shop
+from tests.simulation.factories import driven, factory, needs_mujoco
 
 NONE = np.zeros(0)
 WEIGHTLESS = Physics(gravity=(0.0, 0.0, 0.0))
@@ -38,7 +38,7 @@ def _mujoco() -> None:
 @functools.cache
 def adrift(law: ContactLaw, timestep: float) -> Setup:
     """The vertical scenario's robot without rotors and weight, its tip 2 mm above the floor."""
-    scenario, found = read_scenario("aerial-vertical"), shop("aerial-vertical").setup
+    scenario, found = read_scenario("aerial-vertical"), factory("aerial-vertical").setup
     body = replace(found.robot, spec=found.robot.spec.model_copy(update={"propulsion": None}))
     floor = replace(scenario.scene.surfaces[0], gap=0.002, law=law)
     scene = Scene((floor,), scenario.scene.shapes, replace(WEIGHTLESS, timestep=timestep))
@@ -48,14 +48,14 @@ def adrift(law: ContactLaw, timestep: float) -> Setup:
 def drop(law: ContactLaw, q: Vector, speed: float = 0.5, timestep: float = 2.5e-4) -> tuple[Prediction, Run, Setup]:
     """Let it drift into the floor as one body, its motors at rest."""
     setup = adrift(law, timestep)
-    objective, world = blow_of(setup), setup.world
+    objective, world = scenario_objective(setup), setup.world
     v = np.zeros(9)
     v[:3] = pin.Quaternion(q[3:7]).matrix().T @ np.array([0, 0, -speed])
     world.reset(q, v)
     recorder = Recorder(setup, interpreted(objective))
     rest = Command(np.zeros(3), np.zeros(3), NONE, Status.SOLVED, np.zeros(9), NONE)
     for _ in range(60):
-        world.step(Drive(np.zeros(3), NONE), round(1e-3 / timestep))
+        world.step(ActuatorCommand(np.zeros(3), NONE), round(1e-3 / timestep))
         recorder.take(world.truth(), rest, 0.0, 0.0)
     touch = recorder.first_touch(0.0, np.inf)
     assert touch is not None
@@ -76,7 +76,7 @@ def restitution(setup: Setup, run: Run, speed: float) -> float:
 
 def postures() -> list[Vector]:
     """The scenario's start and others in which the lower link, too, hangs straight down: the same point touches."""
-    start = shop("aerial-vertical").setup.q
+    start = factory("aerial-vertical").setup.q
     found = [start]
     for pitch, elbow in ((-0.3, 0.3), (-0.6, 0.6), (-1.2, 1.2)):
         q = start.copy()
@@ -101,7 +101,7 @@ def test_a_drop_without_friction_jumps_as_predicted(k: int) -> None:
     assert found.approach == pytest.approx(0.5, rel=1e-6)
     e = restitution(setup, run, 0.5)
     assert 0.05 < e < 0.25
-    # Stated band: 5 %, for the 4 ms that the contact takes (tests/test_world.py has 3 % for the blow alone).
+    # Stated band: 5 %, for the 4 ms that the contact takes (tests/test_world.py has 3 % for the impact alone).
     assert found.measured == pytest.approx((1 + e) * 0.5 * np.sqrt(found.V), rel=0.05)
     assert found.frictionless == pytest.approx(0.5 * np.sqrt(found.V))
     # And V is the formula's.
@@ -114,7 +114,7 @@ def test_a_drop_without_friction_jumps_as_predicted(k: int) -> None:
 
 def test_a_drop_that_sticks_jumps_as_predicted() -> None:
     law = ContactLaw((2e-4, 1.0), (0.9999, 0.9999, 0.001), friction=10.0)
-    found, run, setup = drop(law, shop("aerial-vertical").setup.q, timestep=2.5e-5)
+    found, run, setup = drop(law, factory("aerial-vertical").setup.q, timestep=2.5e-5)
     e = restitution(setup, run, 0.5)
     assert found.S is not None and found.sticking == pytest.approx(0.5 * np.sqrt(found.S))
     # Stated band: 5 %; the frictionless prediction is far off.
@@ -122,8 +122,8 @@ def test_a_drop_that_sticks_jumps_as_predicted() -> None:
     assert abs(found.measured / ((1 + e) * found.frictionless) - 1) > 0.2
 
 
-def test_the_peak_is_the_blows_and_nothing_else_moves_it() -> None:
-    found, run, setup = drop(ContactLaw(friction=0.0), shop("aerial-vertical").setup.q)
+def test_the_peak_is_the_impacts_and_nothing_else_moves_it() -> None:
+    found, run, setup = drop(ContactLaw(friction=0.0), factory("aerial-vertical").setup.q)
     metrics = measure(setup, run)
     assert metrics.peak_jump == found.measured and metrics.contacts == 1
     k = before(run.series, run.windows[0])
@@ -134,7 +134,7 @@ def test_the_peak_is_the_blows_and_nothing_else_moves_it() -> None:
 
 
 def test_a_pushs_prediction_is_the_impulses() -> None:
-    made = shop("solo8-push")
+    made = factory("solo8-push")
     run = driven(made, "nominal")
     (found,) = predict(made.setup, made.objective(), run)
     assert found.approach == pytest.approx(6.5 * 0.2) and found.sticking is None
@@ -167,7 +167,7 @@ def test_a_robot_thrown_through_the_air_keeps_momentum_and_energy(name: str) -> 
     world.reset(q, v)
     rows = []
     for steps in (0, 1000):
-        world.step(Drive(np.zeros(found.nv - 6), NONE), steps)
+        world.step(ActuatorCommand(np.zeros(found.nv - 6), NONE), steps)
         truth = world.truth()
         assert not truth.at_stops
         momentum = np.array(pin.computeCentroidalMomentum(model, data, truth.q, truth.v).vector)
@@ -182,14 +182,14 @@ def test_a_robot_thrown_through_the_air_keeps_momentum_and_energy(name: str) -> 
 
 
 def test_rotors_give_the_momentum_that_their_thrust_is() -> None:
-    setup = shop("aerial-vertical").setup
+    setup = factory("aerial-vertical").setup
     found, world, propulsion = setup.robot, setup.world, setup.robot.spec.propulsion
     assert propulsion is not None
     speeds = np.full(6, 60.0)
     world.reset(setup.q, rotor_speed=speeds)
     data, momenta = found.model.createData(), []
     for steps in (0, 80):
-        world.step(Drive(np.zeros(3), speeds), steps)
+        world.step(ActuatorCommand(np.zeros(3), speeds), steps)
         truth = world.truth()
         momenta.append(np.array(pin.computeCentroidalMomentum(found.model, data, truth.q, truth.v).linear))
     thrust = sum(propulsion.thrust_coefficient * 3600 * np.array(r.direction) for r in propulsion.rotors)

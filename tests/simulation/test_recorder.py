@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import MetricError
-from impact_posture.simulation.exchange import Truth
+from impact_posture.simulation.actuator_command import Truth
+from impact_posture.simulation.contact_forces import ShapeTruth
 from impact_posture.simulation.recorder import STATUSES, Recorder
-from impact_posture.simulation.touching import ShapeTruth
 from impact_posture.tsid.controller import Command, Status
-from tests.simulation.shops import needs_mujoco, shop
+from tests.simulation.factories import factory, needs_mujoco
 
 NOTHING = np.zeros(3)
 
@@ -27,7 +27,7 @@ def metric(q: Any) -> tuple[float, Any]:
 
 
 def truth(t: float, *, began: float | None = None, touching: bool = False, stops: tuple[str, ...] = ()) -> Truth:
-    q = shop("aerial-vertical").setup.q
+    q = factory("aerial-vertical").setup.q
     shape = ShapeTruth(
         "ee", touching, np.array([0, 0, 5.0 * touching]), NOTHING, 9.0 * touching, began, 0.1 * touching
     )
@@ -39,7 +39,7 @@ def command(speed: float = 50.0, status: Status = Status.SOLVED) -> Command:
 
 
 def test_a_touch_is_told_once_however_long_it_lasts() -> None:
-    recorder = Recorder(shop("aerial-vertical").setup, metric)
+    recorder = Recorder(factory("aerial-vertical").setup, metric)
     # Touches in the third tick, stays for four, and bounces: the world tells of the last push at every look.
     course = [(None, False), (None, False), (0.0025, True), (0.003, True), (0.004, True), (0.005, False),
               (None, False), (0.0072, True), (0.008, True)]  # fmt: skip
@@ -57,7 +57,7 @@ def test_a_touch_is_told_once_however_long_it_lasts() -> None:
 
 
 def test_columns_are_what_was_true_then() -> None:
-    setup = shop("aerial-vertical").setup
+    setup = factory("aerial-vertical").setup
     propulsion = setup.robot.spec.propulsion
     assert propulsion is not None
     recorder = Recorder(setup, metric)
@@ -82,7 +82,7 @@ def test_the_metric_is_taken_every_tenth_tick_and_may_be_undefined() -> None:
             raise MetricError("does not exist there", where="S", hint="move")
         return 2.0, np.zeros(9)
 
-    recorder = Recorder(shop("aerial-vertical").setup, sometimes)
+    recorder = Recorder(factory("aerial-vertical").setup, sometimes)
     for k in range(25):
         recorder.take(truth(1e-3 * k), command(), 0.0, 0.0)
     found = recorder.series().objective
@@ -91,7 +91,7 @@ def test_the_metric_is_taken_every_tenth_tick_and_may_be_undefined() -> None:
 
 
 def test_a_push_acts_from_its_begin_to_its_end() -> None:
-    setup = shop("solo8-push").setup
+    setup = factory("solo8-push").setup
     recorder = Recorder(setup, lambda q: (1.0, np.zeros(14)))
     recorder.pushed(np.array([6.5, 0, 0]), 0.1 + 0.2, 0.1 + 0.2 + 0.003)
     ticks = [0.299, 0.3, 0.301, 0.302, 0.303, 0.304]

@@ -14,7 +14,7 @@ import pytest
 
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.prediction import predict
-from tests.simulation.shops import driven, needs_mujoco, shortened, workshop
+from tests.simulation.factories import controller_factory, driven, needs_mujoco, shortened
 
 Band = tuple[float, float]
 
@@ -38,14 +38,14 @@ def _mujoco() -> None:
 def test_robust_against_nominal(
     name: str, changes: dict[str, Any], nominal: Band, reduction: Band, lowered: Band
 ) -> None:
-    made = workshop(shortened(name, **changes))
+    made = controller_factory(shortened(name, **changes))
     metrics, before = [], []
     for controller in ("nominal", "robust"):
         found = driven(made, controller)
         metrics.append(measure(made.setup, found))
         before.append(predict(made.setup, made.objective(), found)[0].H)
         assert found.rested and metrics[-1].failed_ticks == 0 and metrics[-1].stops == ()
-        # H as recorded on the way is H before the blow, but for what happens within ten ticks.
+        # H as recorded on the way is H before the impact, but for what happens within ten ticks.
         (window,) = found.impacts
         course = found.series.objective[: found.series.slice(window.begin, window.end).start]
         assert course[np.isfinite(course)][-1] == pytest.approx(before[-1], rel=0.05)

@@ -9,26 +9,26 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import ControllerNotFound, InputError
-from impact_posture.simulation.controllers import CONTROLLERS, Mode, Workshop
+from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory, Mode
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.reference import Reference
-from impact_posture.simulation.runs import Run, run
+from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush, set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.world import build_world
-from tests.simulation.shops import (
+from tests.simulation.factories import (
     AERIAL,
     PUSHES,
     SHIPPED,
+    controller_factory,
     driven,
+    factory,
     fields_of,
     lived,
     needs_mujoco,
-    shop,
     shortened,
-    workshop,
 )
 
 # The other robust ones are held by the same code.
@@ -43,7 +43,7 @@ def _mujoco() -> None:
 # ---- survival -----------------------------------------------------------------------------------------------------
 
 
-def check(made: Workshop, found: Run, controller: str, mode: str) -> None:
+def check(made: ControllerFactory, found: Run, controller: str, mode: str) -> None:
     series, setup = found.series, made.setup
     for name, column in fields_of(series).items():
         # Where the metric is not evaluated there is nothing to draw.
@@ -72,11 +72,11 @@ def check(made: Workshop, found: Run, controller: str, mode: str) -> None:
 def test_every_controller_survives_every_scenario(name: str, controller: str, mode: Mode) -> None:
     # What is held must have been reached before.
     settle = 1.0 if mode == "held" and name in AERIAL else None
-    check(shop(name, settle), lived(name, controller, mode, settle), controller, mode)
+    check(factory(name, settle), lived(name, controller, mode, settle), controller, mode)
 
 
 def test_both_signs_are_run_and_mirror_each_other_roughly() -> None:
-    made = shop("solo8-push")
+    made = factory("solo8-push")
     forward, backward = run(made, "nominal")
     assert (forward.sign, backward.sign) == (1, -1)
     moved = [
@@ -91,7 +91,7 @@ def test_both_signs_are_run_and_mirror_each_other_roughly() -> None:
 
 
 def test_the_second_sign_is_the_same_alone_and_after_the_first() -> None:
-    made = shop("solo8-push")
+    made = factory("solo8-push")
     for controller, mode in (("robust", "held"), ("walker", "live")):
         together = run(made, controller, mode=mode)[1]
         alone = run(made, controller, mode=mode, only=-1)[0]
@@ -104,20 +104,20 @@ def test_the_second_sign_is_the_same_alone_and_after_the_first() -> None:
 
 @pytest.mark.parametrize(("name", "controller"), [("aerial-vertical", "robust"), ("solo8-push", "robust")])
 def test_a_seed_is_a_run_and_another_seed_another(name: str, controller: str) -> None:
-    first = driven(shop(name), controller, seed=3)
+    first = driven(factory(name), controller, seed=3)
     # A world, a robot and gradients of its own.
-    again = driven(workshop(shortened(name)), controller, seed=3)
-    other = driven(shop(name), controller, seed=4)
+    again = driven(controller_factory(shortened(name)), controller, seed=3)
+    other = driven(factory(name), controller, seed=4)
     assert [w.to_dict() for w in first.windows] == [w.to_dict() for w in again.windows]
     for key, column in fields_of(first.series).items():
         np.testing.assert_array_equal(column, getattr(again.series, key), err_msg=key)
     size = min(first.series.t.size, other.series.t.size)
     assert not np.array_equal(first.series.v[:size], other.series.v[:size])
-    assert measure(shop(name).setup, first).q_total_impact != measure(shop(name).setup, other).q_total_impact
+    assert measure(factory(name).setup, first).q_total_impact != measure(factory(name).setup, other).q_total_impact
 
 
 def test_a_run_does_not_remember_the_one_before() -> None:
-    made = shop("aerial-vertical")
+    made = factory("aerial-vertical")
     first = driven(made, "walker", seed=1)
     driven(made, "invariant", seed=2)
     again = driven(made, "walker", seed=1)
@@ -129,7 +129,7 @@ def test_a_run_does_not_remember_the_one_before() -> None:
 
 @pytest.mark.parametrize("name", AERIAL)
 def test_windows_begin_at_the_first_touch_and_are_as_long_for_every_controller(name: str) -> None:
-    made = shop(name)
+    made = factory(name)
     task = made.setup.scenario.task
     assert isinstance(task, RepeatedContacts)
     reference = Reference(task, made.setup.gap)
@@ -155,7 +155,7 @@ def test_windows_begin_at_the_first_touch_and_are_as_long_for_every_controller(n
 
 @pytest.mark.parametrize("name", PUSHES)
 def test_pushes_have_windows_as_long_as_they_last_and_wait_for_rest(name: str) -> None:
-    made = shop(name)
+    made = factory(name)
     task = made.setup.scenario.task
     assert isinstance(task, SinglePush)
     found = lived(name, "nominal", "live", None)
@@ -173,7 +173,7 @@ def test_pushes_have_windows_as_long_as_they_last_and_wait_for_rest(name: str) -
 
 
 def test_a_contact_that_never_comes_has_a_window_where_it_was_expected(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = workshop(shortened("aerial-vertical", beyond=0.0, window=0.1))
+    made = controller_factory(shortened("aerial-vertical", beyond=0.0, window=0.1))
     # A reference that ends before the surface.
     for key in made.setup.world.built.gaps:
         monkeypatch.setitem(made.setup.world.built.gaps, key, 0.14)  # type: ignore[arg-type]
@@ -201,7 +201,7 @@ def test_limits_that_the_tasks_break_relax_them(name: str, controller: str) -> N
     weak[6:] /= 3
     setup.robot.model.effortLimit = weak
     # A world for the robot as it has become.
-    made = workshop(replace(setup, world=build_world(setup.robot, setup.scenario.scene, setup.q)))
+    made = controller_factory(replace(setup, world=build_world(setup.robot, setup.scenario.scene, setup.q)))
     found = driven(made, controller)
     metrics = measure(made.setup, found)
     assert metrics.relaxed_ticks > 20 and metrics.failed_ticks == 0
@@ -226,7 +226,7 @@ def test_limits_that_the_tasks_break_relax_them(name: str, controller: str) -> N
 )
 def test_what_is_asked_wrongly_is_one_line(ask: dict[str, Any], error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words) as caught:
-        run(shop("solo8-push"), **ask)
+        run(factory("solo8-push"), **ask)
     assert "\n" not in str(caught.value)
 
 
@@ -234,4 +234,4 @@ def test_ticks_that_are_no_multiple_of_the_steps_are_refused() -> None:
     scenario = read_scenario("aerial-vertical")
     odd = set_up(replace(scenario, control=replace(scenario.control, period=1.1e-3)))
     with pytest.raises(InputError, match="no multiple of the physics"):
-        run(workshop(odd), "nominal")
+        run(controller_factory(odd), "nominal")

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.dynamics.mjcf import Mjcf, import_mujoco, write_mjcf
-from impact_posture.dynamics.mjcf_additions import WORLD, Additions
+from impact_posture.dynamics.mjcf_scene import WORLD, Additions
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
@@ -218,7 +218,7 @@ class Scene:
 
 
 def _with_surface(written: Mjcf, objective: ImpactObjective, q: Vector) -> Mjcf:
-    """Add a ball at the contact point, the plane below it, and a tie to the world for each support, at posture ``q``."""
+    """Add a ball at the contact point, the plane below it, and a tie to the world for each support, at ``q``."""
     robot, oracle = objective.robot, objective.oracle.at(q)
     numeric, n = Numeric(robot.model).at(q), oracle.n.copy()
     added = Additions(written)

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import casadi as ca
 
 from impact_posture.codegen.functions import library
-from impact_posture.codegen.lanes import packed
-from impact_posture.codegen.program import ARITHMETIC, COSINE, SINE, Graph, graph_of
+from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph, graph_of
+from impact_posture.codegen.simd_lanes import packed
 from impact_posture.impact.objective import ImpactObjective
 
 # How often: "add" (and subtract), "mul", "div", "trig" (sines and cosines), "neg" (sign changes).

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.errors import CompilerError
-from impact_posture.impact.contact import Contact, point_on
+from impact_posture.impact.contact import ImpactContact, point_on
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
@@ -87,14 +87,14 @@ class Samples:
     @cached_property
     def objective(self) -> ImpactObjective:
         """What is exported: W = I."""
-        return ImpactObjective(self.robot, Contact.create(self.frame, (0.0, 0.0, 1.0)))
+        return ImpactObjective(self.robot, ImpactContact(self.frame, (0.0, 0.0, 1.0)))
 
     @cached_property
     def reference(self) -> tuple[Vector, Vector]:
         """H and ∇H by the dense linear algebra of the oracle, which shares no code with any of the kernels."""
         found = []
         for q, (x, y, z) in zip(*self.drawn, strict=True):
-            oracle = ImpactOracle(ImpactCase(self.robot, Contact.create(self.frame, (float(x), float(y), float(z)))))
+            oracle = ImpactOracle(ImpactCase(self.robot, ImpactContact(self.frame, (float(x), float(y), float(z)))))
             found.append((oracle.quantities(q).H, oracle.gradient_H(q)))
         return np.array([H for H, _ in found]), np.array([gradient for _, gradient in found])
 

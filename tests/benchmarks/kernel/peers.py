@@ -1,4 +1,4 @@
-"""Ours, and what a user would take instead of it: each group is a function of the samples that returns its kernels."""
+"""Ours, and what a user would take instead of it: each group is a function of the samples that gives its kernels."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def ours(samples: Samples) -> list[Kernel]:
 
 
 def same_graph(samples: Samples) -> list[Kernel]:
-    """The expressions that our export is written from, printed by CasADi, compiled as ours: what the emitter gains."""
+    """The expressions that our export is written from, printed by CasADi, compiled as ours."""
     found = library([samples.objective], ["kernel"])
     q, n, _ = found.function.sx_in()
     values = found.function.call([q, n, ca.DM(found.constants)])
@@ -105,8 +105,8 @@ def adam(samples: Samples) -> list[Kernel]:
     """ADAM's mass matrix and Jacobian, LDLᵀ, reverse mode.
 
     ADAM is parametrized by the homogeneous transform of the base and the joint positions.  The transform here is that
-    of ``q`` times the rotation ``1 + ε̂``; reverse mode with respect to (ε, joints) at ε = 0 is the tangent gradient in
-    the base's axes, and the base's position does not enter H.  BODY_FIXED is the representation whose M is
+    of ``q`` times the rotation ``1 + ε̂``: reverse mode with respect to (ε, joints) at ε = 0 is the tangent gradient
+    in the base's axes.  The position of the base does not enter H.  BODY_FIXED is the representation whose M is
     Pinocchio's; its Jacobian is in the frame's axes, so that the normal goes there.  Armature, which ADAM does not
     know, is added to the diagonal; of a fixed base the rows and columns of its floating base are left out.
 

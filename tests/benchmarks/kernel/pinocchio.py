@@ -19,7 +19,7 @@ _DEFINITIONS = (
     "BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_LIMIT_VECTOR_SIZE=30", "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
     "BOOST_FUSION_INVOKE_MAX_ARITY=12", "FUSION_MAX_VECTOR_SIZE=12", "NDEBUG",
 )  # fmt: skip
-# With GCC's default budget for inlining, what is inlined of one row depends on the other rows: up to a fifth of its time.
+# With GCC's default budget, what is inlined of one row depends on the other rows: up to a fifth of its time.
 _INLINE = ("inline-unit-growth=400", "large-function-growth=2000", "large-stack-frame-growth=10000")
 _PARAMETERS = [*[f"--param={p}" for p in _INLINE], *[f"-D{d}" for d in _DEFINITIONS]]
 _FLAGS = ("-std=c++17", "-O3", "-march=native", CONTRACT, *_PARAMETERS)

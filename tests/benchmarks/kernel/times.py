@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from impact_posture.errors import CompilerError
-from impact_posture.robot.loader import load_robot
+from impact_posture.robot.robot_loader import load_robot
 from tests.benchmarks.core import Request, cell, machine, say, table
 from tests.benchmarks.kernel.counts import total
 from tests.benchmarks.kernel.floor import floor

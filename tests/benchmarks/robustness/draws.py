@@ -14,19 +14,19 @@ from impact_posture.errors import Infeasible, InputError
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.starts import Projector
-from impact_posture.robot.loader import load_robot
-from impact_posture.simulation.blow import blow_of
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.scenario import (
     Control,
-    Footing,
     Gains,
-    ImpactScenario,
     RepeatedContacts,
+    Scenario,
     Setup,
     SinglePush,
+    StanceGains,
     set_up,
 )
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_objective import scenario_objective
 from impact_posture.simulation.world import build_world
 from tests.benchmarks.core import Vector
 
@@ -116,7 +116,7 @@ _URDF_X, _URDF_Z = 0.08, -0.06
 
 @dataclass(frozen=True)
 class Draw:
-    """The values of one configuration by the names of the ranges, after ``attempt`` draws that were not admissible."""
+    """Values of one configuration by the names of the ranges, after ``attempt`` draws that were not admissible."""
 
     scenario: str
     number: int
@@ -152,7 +152,7 @@ def prepare(chosen: Draw) -> Setup:
     return Setup(pushed, shipped.robot, q, build_world(shipped.robot, pushed.scene, q))
 
 
-def _armature(scenario: ImpactScenario, factor: float) -> dict[str, float]:
+def _armature(scenario: Scenario, factor: float) -> dict[str, float]:
     """By joint; those that have none stay without."""
     model = load_robot(scenario.robot, scenario.load).model
     own = {str(name): float(model.armature[k]) for name, k in zip(model.names, model.idx_vs, strict=True) if k >= 0}
@@ -163,7 +163,7 @@ def _robust(control: Control, factor: float) -> Control:
     return replace(control, robust=replace(control.robust, gain=factor * control.robust.gain))
 
 
-def _contacts(scenario: ImpactScenario, task: RepeatedContacts, v: Mapping[str, float]) -> ImpactScenario:
+def _contacts(scenario: Scenario, task: RepeatedContacts, v: Mapping[str, float]) -> Scenario:
     tilt, roll = math.radians(v["tilt"]), math.radians(v["roll"])
     if "elbow" in v:
         elbow = v["fold"] * v["elbow"]
@@ -180,9 +180,9 @@ def _contacts(scenario: ImpactScenario, task: RepeatedContacts, v: Mapping[str, 
     )
 
 
-def _push(scenario: ImpactScenario, task: SinglePush, v: Mapping[str, float]) -> ImpactScenario:
+def _push(scenario: Scenario, task: SinglePush, v: Mapping[str, float]) -> Scenario:
     control, (x, y, z), stiffer = scenario.control, task.force, v["stiffness"]
-    footing = replace(control.footing or Footing(), friction=_TRUST * v["friction"])
+    footing = replace(control.footing or StanceGains(), friction=_TRUST * v["friction"])
     surfaces = tuple(replace(s, law=replace(s.law, friction=v["friction"])) for s in scenario.scene.surfaces)
     force = (v["force"] * x, v["force"] * y, v["force"] * z)
     return replace(
@@ -214,7 +214,7 @@ def _start(setup: Setup, chosen: Draw) -> Vector:
     requirements = Requirements(
         contact_pose="free", hold=hold, com_over_feet=True, com_margin=_COM_MARGIN, com_asked=False
     )
-    problem = build_problem(robot, blow_of(setup), setup.q, requirements)
+    problem = build_problem(robot, scenario_objective(setup), setup.q, requirements)
     step = chosen.values["stir"] * rng.normal(size=robot.nv)
     step[:6] *= _BASE
     found = Projector(problem).project(np.asarray(pin.integrate(robot.model, setup.q, step)))

@@ -13,13 +13,13 @@ import pinocchio as pin
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError, SimulationDiverged
 from impact_posture.impact.contact import point_on
-from impact_posture.simulation.blow import interpreted
-from impact_posture.simulation.controllers import Workshop
+from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import Metrics, before, measure
 from impact_posture.simulation.offline import holds
 from impact_posture.simulation.prediction import predict
-from impact_posture.simulation.runs import Run, run
+from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
+from impact_posture.simulation.scenario_objective import interpreted
 from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, RANGES, Draw, draw, prepare
 
 SCHEMA = 1
@@ -36,7 +36,7 @@ ATTEMPTS = 40
 # Tilt (rad) from which on a robot that flies has lost itself; share of its height below which one that stands has
 # fallen: only its feet meet the ground, the rest falls through.
 _TILT, _HEIGHT = math.pi / 4, 0.3
-_RUNS = Callable[[Workshop, str], tuple[Run, ...]]
+_RUNS = Callable[[ControllerFactory, str], tuple[Run, ...]]
 
 
 @dataclass(frozen=True)
@@ -90,10 +90,10 @@ class NotAdmissible(Exception):
     """A draw that makes no experiment: the nominal controller itself does not get through it."""
 
 
-def play(workshop: Workshop, controller: str) -> tuple[Run, ...]:
+def play(factory: ControllerFactory, controller: str) -> tuple[Run, ...]:
     """One run, noise of seed 0."""
     name, _, mode = controller.partition(":")
-    return run(workshop, name, mode="held" if mode else "live")
+    return run(factory, name, mode="held" if mode else "live")
 
 
 def configuration(scenario: str, number: int, seed: int, runs: _RUNS = play) -> Record:
@@ -106,51 +106,51 @@ def configuration(scenario: str, number: int, seed: int, runs: _RUNS = play) -> 
     for attempt in range(ATTEMPTS):
         chosen = draw(scenario, number, attempt, seed)
         try:
-            workshop, nominal = _admit(chosen, runs)
+            factory, nominal = _admit(chosen, runs)
         except NotAdmissible as error:
             rejected.append(str(error))
             continue
         outcomes = {NOMINAL: nominal}
         for name in controllers(scenario)[1:]:
-            outcomes[name] = outcome(workshop, name, runs)
-        return Record(chosen, tuple(rejected), tuple(float(x) for x in workshop.setup.q), outcomes)
+            outcomes[name] = outcome(factory, name, runs)
+        return Record(chosen, tuple(rejected), tuple(float(x) for x in factory.setup.q), outcomes)
     raise NotAdmissible(f"{scenario} {number}: none of {ATTEMPTS} draws is admissible: {sorted(set(rejected))}")
 
 
-def _admit(chosen: Draw, runs: _RUNS) -> tuple[Workshop, Outcome]:
+def _admit(chosen: Draw, runs: _RUNS) -> tuple[ControllerFactory, Outcome]:
     try:
         setup = prepare(chosen)
     except ImpactPostureError as error:
         raise NotAdmissible(f"no start ({type(error).__name__})") from None
     if not holds(setup, setup.q, SHARE):
         raise NotAdmissible(f"the motors do not hold the start with {100 * SHARE:.0f} % of their limits")
-    workshop = Workshop(setup, gradient_of=interpreted)
-    nominal = outcome(workshop, NOMINAL, runs)
+    factory = ControllerFactory(setup, gradient_of=interpreted)
+    nominal = outcome(factory, NOMINAL, runs)
     if nominal.failure:
         raise NotAdmissible(f"nominal {nominal.failure}")
     if nominal.metrics["saturation_outside"] > SATURATED * nominal.metrics["duration"]:
-        raise NotAdmissible(f"nominal is at a limit for over {100 * SATURATED:.0f} % of the time between the blows")
-    return workshop, nominal
+        raise NotAdmissible(f"nominal is at a limit for over {100 * SATURATED:.0f} % of the time between the impacts")
+    return factory, nominal
 
 
-def outcome(workshop: Workshop, controller: str, runs: _RUNS = play) -> Outcome:
+def outcome(factory: ControllerFactory, controller: str, runs: _RUNS = play) -> Outcome:
     """Let a controller run; what it raises is what becomes of it."""
     try:
-        [found] = runs(workshop, controller)
+        [found] = runs(factory, controller)
     except SimulationDiverged:
         return Outcome("diverged")
     except (ImpactPostureError, np.linalg.LinAlgError) as error:
         return Outcome(f"raised {type(error).__name__}")
-    setup, metrics = workshop.setup, measure(workshop.setup, found)
-    blows = predict(setup, workshop.objective(), found)
+    setup, metrics = factory.setup, measure(factory.setup, found)
+    impacts = predict(setup, factory.objective(), found)
     numbers = {name: float(value) for name, value in asdict(metrics).items() if isinstance(value, int | float)}
     return Outcome(
         _failure(setup, found, metrics),
         {**numbers, "duration": float(found.series.t[-1])},
         metrics.stops,
-        float(np.mean([b.H for b in blows])) if blows else None,
-        float(np.mean([b.V for b in blows])) if blows else None,
-        _offset(workshop, found),
+        float(np.mean([b.H for b in impacts])) if impacts else None,
+        float(np.mean([b.V for b in impacts])) if impacts else None,
+        _offset(factory, found),
     )
 
 
@@ -167,11 +167,11 @@ def _failure(setup: Setup, found: Run, metrics: Metrics) -> str:
     return "" if metrics.rested else "did not come to rest"
 
 
-def _offset(workshop: Workshop, found: Run) -> float | None:
-    """Distance of the center of mass from the line along which the first blow acts."""
-    robot, contact = workshop.setup.robot, workshop.objective().contact
+def _offset(factory: ControllerFactory, found: Run) -> float | None:
+    """Distance of the center of mass from the line along which the first impact acts."""
+    robot, contact = factory.setup.robot, factory.objective().contact
     q = found.series.q[before(found.series, found.impacts[0])]
     place = Numeric(robot.model).at(q).placement(point_on(robot, contact.frame, contact.offset)).translation
     arm = np.array(pin.centerOfMass(robot.model, robot.model.createData(), q)) - place
-    n = workshop.setup.scenario.normal
+    n = factory.setup.scenario.normal
     return float(np.linalg.norm(arm - n * (n @ arm)))

@@ -78,9 +78,10 @@ def _choices(records: Records) -> Iterator[str]:
         low, middle, high = (percent(v) for v in best.quartiles)
         yield (
             f"- **{_WORDS[name]}** (`{name}`): {lead} moved the robot less than the nominal controller in "
-            f"{best.helps} of {best.count} configurations (median {middle}, quartiles {low} and {high}), with a lower "
-            f"jump in {best.gentler}{f', and failed in {fails}' if fails else ''}. At a control limit in all, in the "
-            f"windows + outside: {_limits(best)} s, nominal {_limits(summarize(own, NOMINAL))} s. The others: {others}."
+            f"{best.helps} of {best.count} configurations (median {middle}, quartiles {low} and {high}), with a "
+            f"lower jump in {best.gentler}{f', and failed in {fails}' if fails else ''}. At a control limit in all, in "
+            f"the windows + outside: {_limits(best)} s, nominal {_limits(summarize(own, NOMINAL))} s. The others: "
+            f"{others}."
         )
 
 
@@ -130,9 +131,9 @@ def _by_V(records: Records) -> list[str]:
     *first, last = (f"`{name}`" for name in AERIAL[1:])
     return [
         f"- **{lead}** `robust` came to a lower H in {len(fallen)} of {len(aerial)} aerial configurations; in {less} "
-        f"of those the motion fell, in {lower} the jump. Of all {count} aerial runs of {', '.join(first)} and {last}, "
-        f"the jump went the way of V in {jump['V']} and the way of H in {jump['H']}, the motion in {motion['V']} and "
-        f"{motion['H']}."
+        f"of those the motion fell, in {lower} the jump. Of all {count} aerial runs of {', '.join(first)} and "
+        f"{last}, the jump went the way of V in {jump['V']} and the way of H in {jump['H']}, the motion in "
+        f"{motion['V']} and {motion['H']}."
     ]
 
 
@@ -160,9 +161,11 @@ def _ranks(records: Records) -> Iterator[str]:
     }
     least = min((len(own) for own in records.values()), default=0)
     bound = f"{1.96 / math.sqrt(least - 1):.2f}" if least > 3 else ""
-    yield "Spearman's rank correlation of the reduction of motion by `robust` with what it changed before the blow and"
     chance = f"; chance alone stays below {bound} nineteen times in twenty" if bound else ""
-    yield f"with what was drawn{chance}. *Offset*: distance of the center of mass from the line of the blow."
+    yield (
+        "Spearman's rank correlation of the reduction of motion by `robust` with what it changed before the impact "
+        f"and\nwith what was drawn{chance}. *Offset*: distance of the center of mass from the line of the impact."
+    )
     yield ""
     found = {words: [rank(own, "robust", of) for own in records.values()] for words, of in rows.items()}
     body = [[words, *("–" if math.isnan(v) else _minus(f"{v:+.2f}") for v in row)] for words, row in found.items()]
@@ -170,7 +173,7 @@ def _ranks(records: Records) -> Iterator[str]:
 
 
 def _V_splits(records: Records) -> Iterator[str]:
-    yield from ("Where a controller's V before the blow was lower than nominal's, and where it was not:", "")
+    yield from ("Where a controller's V before the impact was lower than nominal's, and where it was not:", "")
     body = []
     for name, own in records.items():
         # A push gives its impulse, not its speed.

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from impact_posture.dynamics.mjcf import import_mujoco
-from impact_posture.processes import shared_out
+from impact_posture.processes import fork_map
 from tests.benchmarks.core import ROOT, Request, machine, say
 from tests.benchmarks.robustness.draws import RANGES
 from tests.benchmarks.robustness.outcomes import NotAdmissible, Record, configuration
@@ -57,7 +57,7 @@ def study(
         store.keep(run(name, number, seed))
         return f"{name} {number}: {time.perf_counter() - began:.0f} s"
 
-    with shared_out(one, len(missing), jobs) as done:
+    with fork_map(one, len(missing), jobs) as done:
         for count, (_, words) in enumerate(done, 1):
             tell(f"{count}/{len(missing)} {words}")
     found = [store.get(*each) for each in wanted]

@@ -1,0 +1,188 @@
+"""Figure ``ellipsoid``: the dynamic impact ellipsoid Λ_c before and after, as shadows and in space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.plot.cone_figure import draw_uncertainty, draw_uncertainty_3d, has_cone, uncertainty_handles
+from impact_posture.plot.labels import Label, draw_end_on
+from impact_posture.plot.shapes import (
+    COORDINATE_PLANES,
+    Plane,
+    Vector,
+    half_width,
+    principal_sections,
+    shadow,
+    square,
+    surface,
+    upright_plane,
+)
+from impact_posture.plot.space import Space, frame_space
+from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, framed, style
+from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
+
+_FREE = "Free (thin): the same robot as if its feet were not held."
+_CONE = "The objective counts the worst normal of the cone; equally bad ones are all drawn."
+NOTES = (
+    "The half-width of Λ$_c$ along any direction is the size ‖Δν‖ of the velocity jump that an impulse of 1 N·s "
+    "along it causes. Planes show shadows (projections), not slices; √H is the distance of the tangent planes along "
+    "n, not the ellipsoid's radius there.",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """One posture's curve: its name in the legend, quantities, line, and whether the feet stay."""
+
+    word: str
+    found: ImpactQuantities
+    line: dict[str, Any]
+    free: bool = False
+
+
+def ellipsoid_figure(view: ResultView) -> Figure:
+    """Draw Λ_c before (dashed) and after (solid): shadows on the coordinate planes, and in 3-D with √H along n.
+
+    A shadow on a plane that contains n has its tangent lines at ±√H drawn; where no coordinate plane contains n, the
+    upright plane through n is added.  Equal axes; all panels share one scale.  Of a robot that stands, the ellipsoids
+    without its feet are drawn thin beside the contact-consistent ones; of an uncertain normal, its cone and the worst
+    normals in it.
+    """
+    states = [_State("before", view.before, BEFORE), _State("after", view.after, AFTER)]
+    for word, found, line in (("before", view.free_before, FREE_BEFORE), ("after", view.free_after, FREE_AFTER)):
+        if found is not None:
+            states.append(_State(f"{word}, free", found, line, free=True))
+    unit = f"{jump_unit(view)}/(N·s)"
+    limit = common_limit([state.found.ellipsoid for state in states])
+    n = view.after.normal
+    notes = " ".join([*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if has_cone(view) else [])])
+    with style():
+        figure, body = framed(*header_lines(view), 5.8, [notes])
+        grid = body.add_gridspec(2, 3, height_ratios=[1, 1.4])
+        oblique = not any(plane.contains(n) for plane in COORDINATE_PLANES)
+        panels = [(grid[0, column], plane) for column, plane in enumerate(COORDINATE_PLANES)]
+        panels += [(grid[1, 0], upright_plane(n))] if oblique else []
+        for spot, plane in panels:
+            axes = body.add_subplot(spot)
+            _panel(axes, plane, states, limit, unit)
+            draw_uncertainty(axes, plane, view, limit)
+            draw_normals(axes, plane, normals(view.before, view.after), limit)
+        space = body.add_subplot(grid[1, 1] if oblique else grid[1, :2], axes_class=Space)
+        _space(space, states, limit, unit)
+        draw_uncertainty_3d(space, view, limit)
+        _legend(body.add_subplot(grid[1, 2]), states, unit, view)
+    return figure
+
+
+def common_limit(matrices: list[Vector]) -> float:
+    """Half the side of a cube in which all the ellipsoids lie, with some air; 1 if they are all points."""
+    widest = max(float(np.linalg.eigvalsh(matrix)[-1]) for matrix in matrices)
+    return 1.18 * float(np.sqrt(widest)) if widest > 0 else 1.0
+
+
+def square_panel(axes: Any, plane: Plane, limit: float, unit: str) -> None:
+    """Make a panel with equal axes from ``-limit`` to ``limit``, a faint cross and labels with the unit."""
+    axes.set_xlim(-limit, limit)
+    axes.set_ylim(-limit, limit)
+    axes.set_aspect("equal", adjustable="box")
+    axes.locator_params(nbins=5)
+    axes.axhline(0.0, color="#d9d9d9", linewidth=0.6, zorder=0)
+    axes.axvline(0.0, color="#d9d9d9", linewidth=0.6, zorder=0)
+    axes.set_xlabel(f"{plane.right}  [{unit}]")
+    axes.set_ylabel(f"{plane.up}  [{unit}]", labelpad=1)
+    axes.set_title(f"shadow on {plane.name}")
+
+
+def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Vector]], limit: float) -> None:
+    """Draw each normal's projection as an arrow, or a dot (towards the reader) or cross (away) where it has none."""
+    for name, n in named:
+        flat = plane.axes @ n
+        if np.linalg.norm(flat) < 0.05:
+            draw_end_on(axes, name, plane, n, np.zeros(2))
+            continue
+        tip = flat * limit * 0.92
+        arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", tuple(tip), (0, 0), arrowprops=arrow, zorder=5)
+        axes.add_artist(Label(name, tip, (flat[0], flat[1])))
+
+
+def _panel(axes: Any, plane: Plane, states: list[_State], limit: float, unit: str) -> None:
+    square_panel(axes, plane, limit, unit)
+    for state in states:
+        axes.plot(*shadow(state.found.ellipsoid, plane.axes), solid_joinstyle="round", **state.line)
+        if plane.contains(state.found.normal) and not state.free:
+            _tangents(axes, plane, state.found, state.line, limit)
+
+
+def _tangents(axes: Any, plane: Plane, state: ImpactQuantities, line: dict[str, Any], limit: float) -> None:
+    """The two lines on which the shadow ends along n."""
+    flat = plane.axes @ state.normal
+    flat = flat / np.linalg.norm(flat)
+    along = np.array([-flat[1], flat[0]]) * 3 * limit
+    width = half_width(state.ellipsoid, state.normal)
+    for sign in (1, -1):
+        ends = np.array([sign * width * flat - along, sign * width * flat + along])
+        axes.plot(ends[:, 0], ends[:, 1], color=line["color"], linestyle=line["linestyle"], linewidth=0.7, zorder=2)
+
+
+def normals(before: ImpactQuantities, after: ImpactQuantities) -> list[tuple[str, Vector]]:
+    """Name and direction of n: one, or two where it turned with the contact frame."""
+    if np.linalg.norm(before.normal - after.normal) < 1e-3:
+        return [("n", after.normal)]
+    return [("n₀", before.normal), ("n₁", after.normal)]
+
+
+def normal_label(named: list[tuple[str, Vector]]) -> str:
+    """What the legend says of :func:`normals`."""
+    return "n, out of the surface" if len(named) == 1 else "n₀ before, n₁ after"
+
+
+def _space(axes: Any, states: list[_State], limit: float, unit: str) -> None:
+    frame_space(axes, np.full(3, -limit), np.full(3, limit), unit, 4, azimuth=-55)
+    axes.plot_surface(
+        *surface(states[1].found.ellipsoid), color=BLUE, alpha=0.12, shade=False, linewidth=0, antialiased=True
+    )
+    for one in states:
+        state, line = one.found, one.line
+        for section in principal_sections(state.ellipsoid):
+            axes.plot(*section, **(line | {"linewidth": 0.7 if one.free else 1.0}))
+        if one.free:
+            continue
+        width = half_width(state.ellipsoid, state.normal)
+        for sign in (1, -1):
+            corners = square(sign * width * state.normal, state.normal, 0.7 * limit)
+            axes.plot(*corners, **(line | {"linewidth": 0.7}))
+    for name, n in normals(states[0].found, states[1].found):
+        axes.plot(*np.outer(n, [-limit, limit]), color=GRAY, linewidth=0.6)
+        axes.quiver(0, 0, 0, *(n * limit), color=INK, linewidth=1.1, arrow_length_ratio=0.12)
+        axes.add_artist(Label(name, n * limit))
+    axes.set_title("Λ$_c$ and its tangent planes along n")
+
+
+def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> None:
+    axes.set_axis_off()
+    named = normals(view.before, view.after)
+    handles = []
+    for state in states:
+        width = half_width(state.found.ellipsoid, state.found.normal)
+        handles.append(Line2D([], [], label=f"{state.word}:  √H = {number(width)}", **state.line))
+    handles.append(Line2D([], [], color=GRAY, linewidth=0.7, label="tangents at ±√H along n"))
+    handles.append(Line2D([], [], color=INK, linewidth=1.1, label=normal_label(named)))
+    handles += uncertainty_handles(view)
+    legend = axes.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=(0.0, 1.0), borderpad=0, handlelength=2.6, labelspacing=0.4
+    )
+    rows = [f"semi-axes of Λ$_c$  [{unit}]"]
+    for state in states:
+        radii = np.sqrt(np.maximum(np.linalg.eigvalsh(state.found.ellipsoid)[::-1], 0.0))
+        largest = max(float(radii[0]), 1e-300)
+        rows.append(f"{state.word}  " + "  ".join(number(r if r > 1e-7 * largest else 0.0) for r in radii))
+    # Below the legend, however long that is.
+    look = {"xycoords": legend, "textcoords": "offset points", "va": "top", "fontsize": 7.0, "linespacing": 1.4}
+    axes.annotate("\n".join(rows), (0, 0), (0, -8), **look)

@@ -1,0 +1,232 @@
+"""What a smaller change would buy: the best objective within each distance from the initial posture.
+
+::
+
+    f(d) = min over q  objective(q)    subject to the problem's constraints and ‖q ⊖ q₀‖ ≤ d
+
+for a series of distances d, from zero to that of the optimum.  The distance is that of
+:func:`~impact_posture.posture.posture_distance.distance_squared`.  It is a bound and not a penalty, because the
+minimizers of ``objective + w·distance²`` reach only the convex hull of the curve and jump over the rest of it.
+
+One program, whose bound is a row's bound, is solved along the curve outward from the initial posture and inward from
+the optimum, each solve from the end of the one before.  The best certified end at each distance counts.  Where its
+neighbor's end was found on another way, that way is tried here, too: so the curve is the lower envelope of the ways,
+and falls because better postures were found, not because it was made to.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.errors import InputError, MetricError
+from impact_posture.posture.certificate import Certificate, certify
+from impact_posture.posture.compiled import CompileMode
+from impact_posture.posture.nlp import PostureNLP, build_nlp
+from impact_posture.posture.posture_distance import WithinDistance, distance
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.solve import PostureSolution, Progress, run_start
+from impact_posture.posture.tradeoff import TradeOff, TradePoint, find_knee
+
+Vector = NDArray[np.float64]
+
+# Moves below this (rad, m) are none.
+_STILL = 1e-6
+# A posture that is better by less (of the initial objective) is as good.
+_EQUAL = 1e-9
+# From this rise (of the initial objective) on, a curve that should fall is said to rise.
+_RISE = 1e-6
+# Other optima whose ways are followed, and rounds in which neighbors learn from each other.
+_WAYS, _ROUNDS = 3, 3
+
+
+def pareto_front(
+    solution: PostureSolution,
+    points: int = 16,
+    *,
+    compile: CompileMode = "auto",
+    progress: Progress | None = None,
+) -> TradeOff:
+    """Follow the curve in ``points`` equal steps from the initial posture to the optimum's distance.
+
+    A regularization, which prices the distance that is bounded here, is left out.
+
+    Raises:
+        InputError: No points asked for.
+    """
+    if points < 1:
+        raise InputError(f"{points} points are asked for", where="--tradeoff", hint="give 1 or more")
+    problem = solution.problem
+    chart = Chart(problem.robot.model)
+    whole = distance(chart, solution.q, solution.initial)
+    bounded = _bounded(problem, solution.initial)
+    if whole < _STILL:
+        curve = _Curve(bounded, None, solution.initial, [0.0])
+        return curve.finish(solution, 0.0, 0.0, ["trade-off: the optimum is the initial posture, nothing to trade"])
+    nlp = build_nlp(bounded, compile=compile, starts=2 * points)
+    began = time.perf_counter()
+    curve = _Curve(bounded, nlp, solution.initial, [float(r) for r in whole * np.arange(points + 1) / points])
+    curve.follow(solution, progress)
+    return curve.finish(solution, time.perf_counter() - began, nlp.build_time_s, [])
+
+
+def _bounded(problem: PostureProblem, center: Vector) -> PostureProblem:
+    """The problem with the bound as its last constraint, and without its regularization."""
+    ball = WithinDistance(Chart(problem.robot.model), center, 1.0)
+    return replace(
+        problem,
+        requirements=replace(problem.requirements, regularization=0.0),
+        constraints=(*problem.constraints, ball),
+        rows=(*problem.rows, (0,)) if problem.rows else (),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """An end of a solve: the way that it was found on, and the point."""
+
+    way: str
+    point: TradePoint
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Certified ones first, then the better ones."""
+        return not self.point.certified, self.point.objective
+
+
+class _Curve:
+    """The curve while it is found."""
+
+    def __init__(self, problem: PostureProblem, nlp: PostureNLP | None, initial: Vector, radii: list[float]) -> None:
+        self._problem, self._nlp, self._initial, self._radii = problem, nlp, initial, radii
+        self._chart = Chart(problem.robot.model)
+        self._scale = problem.objective.value(initial)
+        self._best: list[_Found | None] = [None] * len(radii)
+        self._tried: set[tuple[int, bytes]] = set()
+        self.solves = 0
+        self._take(0, "outward", initial)
+
+    def follow(self, solution: PostureSolution, progress: Progress | None) -> None:
+        """Outward from the initial posture, inward from the optimum and the other optima nearer than it."""
+        last = len(self._radii) - 1
+        planned = 2 * last
+        self._take(last, "inward", solution.q)
+        ways = [("inward", last, solution.q)]
+        for number, optimum in enumerate(solution.optima[1 : 1 + _WAYS]):
+            away = distance(self._chart, optimum.q, self._initial)
+            if away <= self._radii[last]:
+                k = int(np.searchsorted(self._radii, away))
+                ways.append((f"optimum {number}", k, optimum.q))
+                self._take(k, ways[-1][0], optimum.q)
+                planned += k - 1
+
+        def step() -> None:
+            if progress:
+                progress(min(self.solves, planned), planned)
+
+        for way, k, q in ways:
+            for inner in range(k - 1, 0, -1):
+                q = self._solve(inner, way, q)
+                step()
+        q = self._initial
+        for k in range(1, last + 1):
+            q = self._solve(k, "outward", q)
+            step()
+        for _ in range(_ROUNDS):
+            if not (self._learn(range(1, last + 1), -1) | self._learn(range(last - 1, 0, -1), +1)):
+                break
+
+    def _learn(self, order: range, neighbor: int) -> bool:
+        """Try each neighbor's way, where it is another one or does better; whether anything got better."""
+        better = False
+        for k in order:
+            own, other = self._best[k], self._best[k + neighbor]
+            if other is None:
+                continue
+            rises = own is not None and neighbor < 0 and other.point.objective < own.point.objective
+            if own is None or own.way != other.way or rises:
+                self._solve(k, other.way, other.point.q)
+                better |= self._best[k] is not own
+        return better
+
+    def _solve(self, k: int, way: str, start: Vector) -> Vector:
+        """Solve within radius ``k``, from ``start`` pulled back towards the initial posture if it is outside."""
+        radius = self._radii[k]
+        key = (k, start.tobytes())
+        if self._nlp is None or key in self._tried:
+            return start
+        self._tried.add(key)
+        away = distance(self._chart, start, self._initial)
+        if away > radius:
+            start = np.array(pin.interpolate(self._problem.robot.model, self._initial, start, radius / away))
+        try:
+            record, certificate = run_start(replace(self._nlp, problem=self._at(radius)), start, self._scale)
+            self._take(k, way, record.q, certificate)
+        except MetricError:
+            # This way led to where the objective does not exist.
+            return start
+        finally:
+            self.solves += 1
+        return record.q if certificate.holds() else start
+
+    def _at(self, radius: float) -> PostureProblem:
+        ball = WithinDistance(self._chart, self._initial, radius)
+        return replace(self._problem, constraints=(*self._problem.constraints[:-1], ball))
+
+    def _take(self, k: int, way: str, q: Vector, certificate: Certificate | None = None) -> None:
+        """Keep a posture if it keeps the constraints and is the best within radius ``k``."""
+        found = _Found(way, self._point(k, q, certificate))
+        feasible = replace(found.point.certificate, stationarity=0.0, complementarity=0.0).holds()
+        own = self._best[k]
+        margin = _EQUAL * self._scale
+        if feasible and (own is None or (found.rank[0], found.rank[1] + margin) < own.rank):
+            self._best[k] = found
+
+    def _point(self, k: int, q: Vector, certificate: Certificate | None = None) -> TradePoint:
+        problem = self._at(self._radii[k])
+        found = problem.impact.oracle.quantities(q)
+        return TradePoint(
+            within=self._radii[k],
+            distance=distance(self._chart, q, self._initial),
+            q=q,
+            objective=problem.objective.value(q),
+            H=found.H,
+            G=found.G,
+            V=found.V,
+            S=found.S,
+            certificate=certificate or certify(problem, q, self._scale),
+        )
+
+    def finish(self, solution: PostureSolution, solve: float, build: float, notes: list[str]) -> TradeOff:
+        """The curve as it is now."""
+        points: list[TradePoint] = []
+        for k, found in enumerate(self._best):
+            # Where no solve ended on the constraints, the posture of the distance before keeps them.
+            before = points[-1].q if points else self._initial
+            points.append(self._point(k, before) if found is None else found.point)
+        best = solution.problem.objective.value(solution.q)
+        open_ = [f"{p.within:.3g}" for p in points if not p.certified]
+        if open_:
+            notes.append(
+                f"trade-off: {len(open_)} of {len(points)} points are not certified, within {', '.join(open_)}"
+            )
+        risen = [b for a, b in pairwise(points) if b.objective > a.objective + _RISE * self._scale]
+        if risen:
+            notes.append(
+                f"trade-off: within {', '.join(f'{p.within:.3g}' for p in risen)} a worse posture was found than "
+                "within less: it is not the best there"
+            )
+        lowest = min(p.objective for p in points)
+        if lowest < best - _RISE * self._scale and not solution.problem.requirements.regularization:
+            notes.append(
+                f"trade-off: it found a better posture ({lowest:.4g}) than the starts did ({best:.4g}); "
+                "more --starts may find it, too"
+            )
+        knee = find_knee(np.array([p.distance for p in points]), np.array([p.objective for p in points]))
+        return TradeOff(tuple(points), knee, self.solves, solve, build, tuple(notes))

@@ -1,0 +1,185 @@
+"""What there is to know about a robot, as plain JSON values: the content of ``robots`` and ``inspect``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.errors import ImpactPostureError
+from impact_posture.robot.actuation import allocation, hover, lateral_force_range, thrust_limits
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import known_robots
+from impact_posture.robot.spec import PropulsionSpec, read_spec
+from impact_posture.robot.urdf import EXAMPLE_PREFIX, robots_data
+
+# Pinocchio writes "no limit" as the largest double.
+_NO_LIMIT = 1e10
+
+WAYS_TO_NAME = (
+    "a known name, as listed",
+    "a path to a .urdf; a robot.toml beside it, or --config, says what URDF cannot",
+    f"{EXAMPLE_PREFIX}<path below its robots/ folder>",
+)
+
+
+def catalogue() -> list[dict[str, Any]]:
+    """One entry for each robot known by name: what its ``robot.toml`` says, no URDF read."""
+    entries = []
+    for name in known_robots():
+        spec = read_spec(robots_data() / name / "robot.toml")
+        urdf = spec.model.urdf or ""
+        own = not urdf.startswith(EXAMPLE_PREFIX)
+        entries.append(
+            {
+                "name": name,
+                "kind": spec.kind,
+                "description": spec.description,
+                "root": spec.model.root,
+                "frame": spec.contact.frame,
+                "supports": [support.frame for support in spec.supports],
+                "urdf": f"impact-posture:{name}/{urdf}" if own else urdf,
+                "from": "impact-posture" if own else EXAMPLE_PREFIX.rstrip(":"),
+                "sources": list(spec.sources),
+            }
+        )
+    return entries
+
+
+def summarize(robot: Robot) -> dict[str, Any]:
+    """Everything that ``inspect`` shows: joints, frames, mass, limits, postures, contact, supports, actuation."""
+    spec = robot.spec
+    return {
+        "name": robot.name,
+        "kind": spec.kind,
+        "description": spec.description,
+        "source": robot.source,
+        "model_sha256": robot.model_sha256,
+        "root": robot.root,
+        "convention": robot.convention,
+        "nq": robot.nq,
+        "nv": robot.nv,
+        "mass": robot.mass,
+        "locked": list(robot.locked),
+        "armature_source": robot.armature_source,
+        "joints": [_joint(robot, name) for name in robot.joint_names],
+        "frames": _frames(robot),
+        "postures": [_posture(robot, name) for name in robot.postures],
+        "default_posture": robot.default_posture,
+        "contact": {
+            "frame": spec.contact.frame,
+            "offset": list(spec.contact.offset),
+            "pose": None if spec.contact.frame is None else robot.contact_pose(spec.contact.frame),
+            "frames": dict(spec.contact.frames),
+        },
+        "supports": [
+            {"frame": s.frame, "kind": s.kind, "offset": list(s.offset), "size": list(s.size)} for s in spec.supports
+        ],
+        "constraints": spec.constraints.model_dump(mode="json"),
+        "actuation": _actuation(robot, spec.propulsion) if spec.propulsion and robot.floating else None,
+        "sources": list(spec.sources),
+        "warnings": list(robot.warnings),
+    }
+
+
+def _joint(robot: Robot, name: str) -> dict[str, Any]:
+    model, index = robot.model, robot.joint_id(name)
+    k, v = int(model.idx_qs[index]), int(model.idx_vs[index])
+    nq, nv = int(model.nqs[index]), int(model.nvs[index])
+    family = _family(model.joints[index])
+    bounded = nq == nv == 1
+    return {
+        "name": name,
+        "type": family,
+        "unit": "m" if family == "prismatic" else "rad",
+        "nq": nq,
+        "nv": nv,
+        "lower": _limit(model.lowerPositionLimit[k]) if bounded else None,
+        "upper": _limit(model.upperPositionLimit[k]) if bounded else None,
+        "velocity": _limit(model.upperVelocityLimit[v]),
+        "effort": _limit(model.upperEffortLimit[v]),
+        "armature": float(robot.armature[v]),
+    }
+
+
+def _family(joint: pin.JointModel) -> str:
+    short = str(joint.shortname()).removeprefix("JointModel")
+    if joint.nv > 1:
+        return short.lower()
+    if short.startswith("Prismatic") or short in ("PX", "PY", "PZ"):
+        return "prismatic"
+    return "continuous" if joint.nq == 2 else "revolute"
+
+
+def _frames(robot: Robot) -> list[dict[str, Any]]:
+    """Each name once, as :meth:`Robot.frame_id` finds it: a link's frame where a link and a joint share it."""
+    frames = [robot.model.frames[robot.frame_id(name)] for name in dict.fromkeys(robot.frame_names)]
+    return [
+        {
+            "name": str(frame.name),
+            "joint": str(robot.model.names[frame.parentJoint]),
+            "link": frame.type == pin.FrameType.BODY,
+        }
+        for frame in frames
+    ]
+
+
+def _posture(robot: Robot, name: str) -> dict[str, Any]:
+    q = robot.posture(name)
+    fault: str | None = None
+    try:
+        robot.check_posture(q, where=name)
+    except ImpactPostureError as error:
+        fault = error.what
+    return {"name": name, "default": name == robot.default_posture, "q": [float(v) for v in q], "fault": fault}
+
+
+def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
+    """Rotors: rank and condition of the allocation, lateral force and hover at each posture.
+
+    The condition mixes N and N·m; it and the forces are ``None`` where they do not exist.
+    """
+    model = robot.model
+    found = allocation(model, propulsion)
+    low, high = thrust_limits(propulsion)
+    postures = []
+    for name in robot.postures:
+        q = robot.posture(name)
+        held = hover(model, propulsion, q)
+        entry: dict[str, Any] = {
+            "posture": name,
+            "feasible": held.feasible,
+            "thrusts": [float(v) for v in held.thrusts],
+            "thrust_margin": held.thrust_margin,
+            "torque_margin": _finite(held.torque_margin),
+            "violations": list(held.violations),
+            "lateral_force": None,
+        }
+        if _level(robot, q):
+            lateral = lateral_force_range(model, propulsion, q)
+            sides = ("forward", "backward", "left", "right")
+            entry["lateral_force"] = {side: _finite(getattr(lateral, side)) for side in sides}
+        postures.append(entry)
+    return {
+        "rotors": len(propulsion.rotors),
+        "frame": propulsion.frame,
+        "thrust_min": low,
+        "thrust_max": high,
+        "rank": found.rank,
+        "condition": _finite(found.condition),
+        "postures": postures,
+        "source": propulsion.source,
+    }
+
+
+def _level(robot: Robot, q: np.ndarray[Any, np.dtype[np.float64]]) -> bool:
+    return bool(pin.Quaternion(np.array(q[3:7])).toRotationMatrix()[2, 2] > 1 - 1e-6)
+
+
+def _limit(value: float) -> float | None:
+    return float(value) if np.isfinite(value) and abs(value) < _NO_LIMIT else None
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,86 @@
+"""Shared by these tests: shortened scenarios, controller factories kept for a whole process, runs made by hand."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impact_posture.simulation.controller_factory import ControllerFactory, Mode
+from impact_posture.simulation.offline import offline_posture
+from impact_posture.simulation.recorder import feet_of
+from impact_posture.simulation.run import Run, run
+from impact_posture.simulation.scenario import RepeatedContacts, Setup, set_up
+from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_objective import interpreted
+from impact_posture.simulation.series import Series
+
+AERIAL = ("aerial-vertical", "aerial-lateral")
+PUSHES = ("solo8-push", "talos-push")
+SHIPPED = (*AERIAL, *PUSHES)
+
+
+def needs_mujoco() -> None:
+    pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
+
+
+def shortened(source: str | Path, **changes: Any) -> Setup:
+    """A scenario with one contact or a short wait, and whatever else is to change in its task."""
+    scenario = read_scenario(source)
+    if isinstance(scenario.task, RepeatedContacts):
+        short: dict[str, Any] = {"count": 1, "settle": 0.3, "dwell": 0.2, "pause": 0.05}
+    else:
+        short = {"settle": 0.1, "patience": 0.3, "duration": 0.2, "after": 0.05}
+    task: Any = replace(scenario.task, **{**short, **changes})
+    return set_up(replace(scenario, task=task))
+
+
+def controller_factory(setup: Setup, free: bool = False) -> ControllerFactory:
+    """Gradients at once, and an offline optimum from few starts."""
+    return ControllerFactory(setup, free=free, gradient_of=interpreted)
+
+
+@functools.cache
+def factory(name: str, settle: float | None = None) -> ControllerFactory:
+    """A shipped scenario cut short; one of each in a process."""
+    return controller_factory(shortened(name) if settle is None else shortened(name, settle=settle))
+
+
+def driven(made: ControllerFactory, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
+    """A run with the push forward alone."""
+    if controller == "posture" and made._offline is None:
+        # Few starts: what is tested is the driver.
+        made._offline = offline_posture(made.setup, made.objective(), starts=1)
+    return run(made, controller, mode=mode, seed=seed, only=1)[0]
+
+
+@functools.cache
+def lived(name: str, controller: str, mode: Mode, settle: float | None) -> Run:
+    """A run of a shipped scenario, cut short; one of each in a process.  No defaults: the cache tells them apart."""
+    return driven(factory(name, settle), controller, mode=mode)
+
+
+def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **columns: Any) -> Series:
+    """A record of ``n`` ticks in which nothing happens but what ``columns`` say."""
+    robot, propulsion = setup.robot, setup.robot.spec.propulsion
+    joints = robot.nv - (6 if robot.floating else 0)
+    rotors = 0 if propulsion is None else len(propulsion.rotors)
+    middle = 0.0 if propulsion is None else (propulsion.speed_min + propulsion.speed_max) / 2
+    nothing: dict[str, Any] = {
+        "t": begin + period * np.arange(1, n + 1), "q": np.tile(setup.q, (n, 1)), "v": np.zeros((n, robot.nv)),
+        "torque": np.zeros((n, joints)), "rotor_command": np.full((n, rotors), middle),
+        "rotor_speed": np.full((n, rotors), middle), "force": np.zeros((n, 3)), "peak": np.zeros(n),
+        "slip": np.zeros(n), "touching": np.zeros(n, int),
+        "feet": np.ones((n, len(feet_of(setup))), bool), "objective": np.full(n, np.nan), "level": np.zeros(n),
+        "status": np.zeros(n, int), "at_stop": np.zeros((n, robot.nv), bool), "reference": np.zeros(n),
+    }  # fmt: skip
+    return Series(**{**nothing, **columns})
+
+
+def fields_of(series: Series) -> dict[str, np.ndarray[Any, Any]]:
+    """Its columns by name."""
+    return {name: getattr(series, name) for name in series.__dataclass_fields__}
