@@ -11,7 +11,6 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import argparse
 import sys
-from importlib import import_module
 
 from impact_posture.errors import ImpactPostureError
 from impact_posture.posture.blas import one_blas_thread
@@ -44,16 +43,16 @@ def main() -> int:
 
 def _run(study: Study, asked: argparse.Namespace) -> int:
     request = Request(asked.only, asked.count or study.count, asked.seed, asked.number, asked.jobs, asked.write)
-    lines = []
+    lines = [study.head, ""]
     try:
-        for line in import_module(f"tests.benchmarks.{study.module}").lines(request):
+        for line in study.lines(request):
             print(line, flush=True)
             lines.append(line)
     except ImpactPostureError as error:
         print(error, file=sys.stderr)
         return 1
     if asked.write:
-        page_of(study.name).write_text("\n".join([study.head, "", *lines, ""]), encoding="utf-8")
+        page_of(study.name).write_text("\n".join([*lines, ""]), encoding="utf-8")
     for word in request.missed:
         print(f"missed: {word}", file=sys.stderr)
     return int(bool(request.missed))

@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
+from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -30,14 +31,19 @@ CRBA_CALLS = 2000
 
 @dataclass(frozen=True)
 class Study:
-    """A module here with ``lines(request)``; ``made_by`` is the ``make`` target or command that writes its page."""
+    """A generator ``lines(request)`` of a module here, or another one by ``module:name``."""
 
     name: str
-    module: str
+    source: str
     about: str
     count: int = 1
     page: bool = True
-    target: str = ""
+    target: str = ""  # of make, which writes its page
+
+    def lines(self, request: Request) -> Iterator[str]:
+        """Lines of its page, or of what it prints."""
+        module, _, function = self.source.partition(":")
+        return getattr(import_module(f"tests.benchmarks.{module}"), function or "lines")(request)
 
     @property
     def head(self) -> str:
@@ -50,10 +56,10 @@ STUDIES = {
     study.name: study
     for study in (
         Study("solve", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
-        Study("optima", "optima", "whether 16 starts find what many starts find", 500, page=False),
+        Study("optima", "solve:optima", "whether 16 starts find what many starts find", 500, page=False),
         Study("formulations", "formulations", "the linear solve inside the program or its objective", 12, page=False),
         Study("kernel", "kernel.times", "H and ∇H beside Pinocchio C++, ADAM and CasADi; passes", 101),
-        Study("loader", "exported", "a call of exported code from Python; passes", 100, page=False),
+        Study("loader", "exported:loader", "a call of exported code from Python; passes", 100, page=False),
         Study("tsid", "tsid", "a tick of the online controllers; ticks", 2000),
         Study("digits", "digits", "the digits that double precision keeps with feet; random postures", 3),
         Study("restitution", "restitution", "rebound of each contact law", target="calibration"),
@@ -89,13 +95,9 @@ def say(words: str, end: str = "\n") -> None:
 
 def table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> Iterator[str]:
     """Lines of a Markdown table, each as soon as its row is there."""
-    yield _row(head)
+    yield f"| {' | '.join(head)} |"
     yield "|" + "---|" * len(head)
-    yield from (_row(row) for row in rows)
-
-
-def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+    yield from (f"| {' | '.join(row)} |" for row in rows)
 
 
 def cell(value: float | None, digits: int) -> str:
@@ -106,32 +108,24 @@ def cell(value: float | None, digits: int) -> str:
 def machine(*packages: str) -> str:
     """What this runs on and with: the processor, the compiler, and versions of packages."""
     compiler = find_compiler()
-    versions = ", ".join(f"{name} {_version(name)}" for name in ("casadi", "pin", "numpy", *packages))
+    versions = ", ".join(f"{name} {version(name)}" for name in ("casadi", "pin", "numpy", *packages))
     return (
         f"{processor()['name']} ({platform.machine()}), {os.cpu_count()} cores, load {os.getloadavg()[0]:.2f}; "
         f"{compiler_version(compiler) if compiler else 'no compiler'}; Python {platform.python_version()}, {versions}"
     )
 
 
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "absent"
-
-
 @contextmanager
 def one_core() -> Iterator[None]:
     """Keep this process on one core, where the system can."""
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(allowed)})
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
+    if allowed:
+        os.sched_setaffinity(0, {max(allowed)})
     try:
         yield
     finally:
-        os.sched_setaffinity(0, allowed)
+        if allowed:
+            os.sched_setaffinity(0, allowed)
 
 
 def median_time(call: Callable[[], object], repeats: int) -> float:

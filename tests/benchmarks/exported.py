@@ -37,7 +37,7 @@ def _standing(name: str, target: str) -> Iterator[list[str]]:
         yield [objective.robot.name, label, f"{standing:.3f}", f"{free:.3f}", f"{standing / free:.2f}", target]
 
 
-def lines(request: Request) -> Iterator[str]:
+def loader(request: Request) -> Iterator[str]:
     """A row a robot: a call through the loader, the same function called from C, and the difference."""
     yield from (machine(), "")
     rows = (_loaded(name, request.count) for name in _LOADED if request.only in name)

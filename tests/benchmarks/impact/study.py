@@ -134,15 +134,13 @@ class Dropped:
         left_out: Counter[str] = Counter()
         scenes = []
         for index in range(1, count + 1):
-            q = feasible_start(problem, index, seed)
-            if q is None:
-                left_out["not on the constraints"] += 1
-                continue
-            found = problem.impact.oracle.quantities(q)
-            if found.S is None:
-                left_out["S undefined"] += 1
-                continue
             try:
+                q = feasible_start(problem, index, seed)
+                if q is None:
+                    raise NoImpact("not on the constraints")
+                found = problem.impact.oracle.quantities(q)
+                if found.S is None:
+                    raise NoImpact("S undefined")
                 scenes.append((Scene(problem.objective, q), found))
             except NoImpact as reason:
                 left_out[str(reason)] += 1

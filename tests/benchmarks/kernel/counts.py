@@ -32,12 +32,6 @@ def of_function(function: ca.Function) -> Operations:
     return Counter(kind for kind in kinds if kind)
 
 
-def of_graph(graph: Graph, outputs: Sequence[str]) -> Operations:
-    """Operations of a graph that some output needs."""
-    kinds = (_NODES.get(graph.nodes[k].op) for k in _reached(graph, outputs))
-    return Counter(kind for kind in kinds if kind)
-
-
 def of_export(objective: ImpactObjective) -> tuple[Operations, int | None]:
     """What one call of ``eval`` of the export does, on single numbers; and how many operations vectors make of it.
 
@@ -49,7 +43,9 @@ def of_export(objective: ImpactObjective) -> tuple[Operations, int | None]:
     found = library([objective], ["kernel"])
     outputs = next(f.outputs for f in found.functions if f.name == "eval")
     constants = {"constants": list(found.constants)}
-    single = of_graph(graph_of(found.function, constants), outputs)
+    graph = graph_of(found.function, constants)
+    kinds = (_NODES.get(graph.nodes[k].op) for k in _reached(graph, outputs))
+    single = Counter(kind for kind in kinds if kind)
     if not found.seeds:
         return single, None
     graph = packed(graph_of(found.function), found.seeds, constants)

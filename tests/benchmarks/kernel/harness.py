@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.errors import CompilerError
-from impact_posture.impact.contact import ImpactContact, point_on
+from impact_posture.impact.contact import ImpactContact, PointOnLink, point_on
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
@@ -55,19 +55,14 @@ def c_compiler() -> list[str]:
 
 @dataclass(frozen=True)
 class Samples:
-    """A robot free of supports, with a configuration and a normal for each call, the same on every run.
-
-    Attributes:
-        robot: The robot.
-        frame: Contact frame.
-    """
+    """A robot free of supports, its contact frame, and a configuration and a normal for each call."""
 
     robot: Robot
     frame: str
 
     @cached_property
     def drawn(self) -> tuple[Vector, Vector]:
-        """Configurations, shape (COUNT, nq), and world unit normals, shape (COUNT, 3)."""
+        """Configurations, shape (COUNT, nq), and world unit normals, shape (COUNT, 3); the same on every run."""
         rng, robot = np.random.default_rng(0), self.robot
         # The base anywhere in any attitude, the joints some way around the default posture.
         width = np.full(robot.nv, 1.0)
@@ -99,10 +94,9 @@ class Samples:
         return np.array([H for H, _ in found]), np.array([gradient for _, gradient in found])
 
     @property
-    def point(self) -> tuple[int, Vector]:
-        """Joint that carries the contact point, and the point in its link."""
-        found = point_on(self.robot, self.frame)
-        return found.joint, np.array(found.position, dtype=float)
+    def point(self) -> PointOnLink:
+        """The contact point in its link."""
+        return point_on(self.robot, self.frame)
 
     @property
     def plain(self) -> bool:
@@ -115,38 +109,29 @@ class Samples:
 class Kernel:
     """One way of computing H and ∇H.
 
-    Attributes:
-        name: Row of the table.
-        group: Whose it is.
-        built: The library that holds it.
-        functions: Kind → address: ``eval`` is ``int f(q, n, H, grad)``, ``value`` and ``differences`` are
-            ``int f(q, n, H)``, ``batch`` is ``int f(q, n, count, H, grad)``.
-        operations: Of H with ∇H; ``None`` where it is a library of templates.
-        packed: How many they are once vectors do several numbers at a time; ``None``: no vectors.
-        source_kb: Size of the source, kB; ``None`` as for operations.
+    Addresses by kind: ``eval`` is ``int f(q, n, H, grad)``, ``value`` and ``differences`` are ``int f(q, n, H)``,
+    ``batch`` is ``int f(q, n, count, H, grad)``.
     """
 
     name: str
     group: str
     built: Built
     functions: dict[Kind, ctypes.c_void_p]
-    operations: Operations | None = None
-    packed: int | None = None
+    operations: Operations | None = None  # of H with ∇H; None: a library of templates
+    packed: int | None = None  # how many they are once vectors do several numbers at a time; None: no vectors
     source_kb: float | None = None
 
 
-@dataclass
 class Harness:
     """The loops of ``harness.c`` over one robot's samples."""
 
-    samples: Samples
-    _failed: ctypes.c_int = field(default_factory=ctypes.c_int)
-
-    def __post_init__(self) -> None:
+    def __init__(self, samples: Samples) -> None:
+        self.samples = samples
         text = Path(__file__).with_name("harness.c").read_text(encoding="utf-8")
         self._loop = build({"harness.c": text}, c_compiler(), ["-std=c99", "-O2"]).library.time_pass
         self._loop.restype = ctypes.c_double
-        self._H, self._gradient = np.zeros(COUNT), np.zeros((COUNT, self.samples.robot.nv))
+        # H and ∇H.
+        self._results = np.zeros(COUNT), np.zeros((COUNT, samples.robot.nv))
 
     def pass_s(self, kind: Kind, function: ctypes.c_void_p) -> float:
         """Processor seconds a configuration of one pass, after one that does not count.
@@ -156,19 +141,12 @@ class Harness:
         """
         robot, (q, n) = self.samples.robot, self.samples.drawn
         at, count = (self.samples.moved, FEW) if kind == "differences" else (q, COUNT)
-        arrays = [ctypes.c_void_p(a.ctypes.data) for a in (at, n, self._H, self._gradient)]
-        sizes = (robot.nq, robot.nv, count, ctypes.c_double(STEP))
+        sizes, failed = (robot.nq, robot.nv, count, ctypes.c_double(STEP)), ctypes.c_int(0)
+        inputs, outputs = ([ctypes.c_void_p(a.ctypes.data) for a in some] for some in ((at, n), self._results))
+        letter = ctypes.c_char(kind[0].encode())
         for _ in range(2):
-            took = self._loop(
-                ctypes.c_char(kind[0].encode()),
-                function,
-                *arrays[:2],
-                *sizes,
-                *arrays[2:],
-                ctypes.byref(self._failed),
-            )
-        if self._failed.value:
-            self._failed.value = 0
+            took = self._loop(letter, function, *inputs, *sizes, *outputs, ctypes.byref(failed))
+        if failed.value:
             raise Disagreement("calls returned an error code")
         return float(took)
 
@@ -180,14 +158,17 @@ class Harness:
         """
         worst = 0.0
         for kind, function in kernel.functions.items():
-            self._H[:], self._gradient[:] = np.nan, np.nan
+            for result in self._results:
+                result[:] = np.nan
             self.pass_s(kind, function)
-            few = slice(FEW if kind == "differences" else COUNT)
-            H, gradient = (a[few] for a in self.samples.reference)
-            found = [worst, np.abs(self._H[few] / H - 1).max()]
+            few = FEW if kind == "differences" else COUNT
+            (H, gradient), (own_H, own) = (
+                (a[:few] for a in some) for some in (self.samples.reference, self._results)
+            )
+            found = [worst, np.abs(own_H / H - 1).max()]
             if kind != "value":
                 scale = np.maximum(np.abs(gradient).max(axis=1), 1e-3 * np.abs(H))
-                found.append((np.abs(self._gradient[few] - gradient).max(axis=1) / scale).max())
+                found.append((np.abs(own - gradient).max(axis=1) / scale).max())
             # np.max keeps a NaN, which max() may drop.
             worst = float(np.max(found))
         # Not ">": that is false for a NaN.

@@ -16,6 +16,7 @@ import numpy as np
 from impact_posture.codegen.export import export
 from impact_posture.codegen.functions import library
 from impact_posture.dynamics.chart import Chart, integrate
+from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
@@ -64,10 +65,8 @@ def ours(samples: Samples) -> list[Kernel]:
         kinds = {"eval": "kernel_eval", "value": "kernel_value", "batch": "kernel_eval_batch"}
         functions = {kind: built.symbol(name) for kind, name in kinds.items()}
         found.append(Kernel(f"ours {label}", "ours", built, functions, count, packed, size))
-    return found + [
-        Kernel(f"differences {own.name[5:]}", "differences", own.built, {"differences": own.functions["value"]})
-        for own in found
-    ]
+        found.append(Kernel(f"differences {label}", "differences", built, {"differences": functions["value"]}))
+    return sorted(found, key=lambda kernel: kernel.group != "ours")
 
 
 # ---- CasADi's own C -----------------------------------------------------------------------------------------------
@@ -93,7 +92,7 @@ def dense(samples: Samples) -> list[Kernel]:
     if robot.floating:
         # M does not depend on the base's pose: leave it at rest and give the normal in the base's axes.
         at = ca.vertcat(ca.DM([0, 0, 0, 0, 0, 0, 1]), at[7:])
-        rest = _base_rotation(q).T @ n
+        rest = quaternion_matrix(q[3:7]).T @ n
         direction = rest - ca.cross(step[3:6], rest)
     tree = Tree(robot.model, at)
     impact = Wrench(point_on(robot, samples.frame), direction, ca.SX.zeros(3))
@@ -126,16 +125,13 @@ def adam(samples: Samples) -> list[Kernel]:
         with contextlib.redirect_stderr(quiet), contextlib.redirect_stdout(quiet), _prismatic_joints_repaired():
             kinematics = KinDynComputations(_urdf(samples), list(robot.joint_names))
             kinematics.set_frame_velocity_representation(Representations.BODY_FIXED_REPRESENTATION)
-            functions = (
-                kinematics.mass_matrix_fun(),
-                kinematics.jacobian_fun(samples.frame),
-                kinematics.forward_kinematics_fun(samples.frame),
-            )
+            functions = [kinematics.mass_matrix_fun(), kinematics.jacobian_fun(samples.frame)]
+            functions.append(kinematics.forward_kinematics_fun(samples.frame))
     except Exception as failed:  # whatever its URDF reader raises
         raise Absent(f"cannot read this robot ({type(failed).__name__}: {failed})") from None
     q, n, step = ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3), ca.SX.sym("step", robot.nv)
     floating = robot.floating
-    rotation = _base_rotation(q) @ (ca.SX.eye(3) + ca.skew(step[3:6])) if floating else ca.SX.eye(3)
+    rotation = quaternion_matrix(q[3:7]) @ (ca.SX.eye(3) + ca.skew(step[3:6])) if floating else ca.SX.eye(3)
     origin = q[:3] if floating else ca.SX.zeros(3)
     pose = ca.vertcat(ca.horzcat(rotation, origin), ca.DM([[0, 0, 0, 1]]))
     first, joints = (0, q[7:] + step[6:]) if floating else (6, q + step)
@@ -172,22 +168,9 @@ def _printed(label: str, group: str, function: ca.Function, ways: dict[str, Sequ
     for way, flags in ways.items():
         say(f"{label} {way}")
         built = build({"peer.c": source}, c_compiler(), [*flags, CONTRACT])
-        functions = {"eval": built.symbol("kernel_eval")}
-        size = len(source.encode()) / 1e3
+        functions, size = {"eval": built.symbol("kernel_eval")}, len(source.encode()) / 1e3
         found.append(Kernel(f"{label} {way}", group, built, functions, of_function(function), None, size))
     return found
-
-
-def _base_rotation(q: ca.SX) -> ca.SX:
-    """Rotation of the quaternion ``q[3:7]``, x y z w, of unit norm."""
-    x, y, z, w = (q[k] for k in range(3, 7))
-    return ca.blockcat(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _urdf(samples: Samples) -> str:

@@ -49,16 +49,14 @@ def kernels(samples: Samples) -> list[Kernel]:
     say("Pinocchio C++, once for all robots")
     text = Path(__file__).with_name("pinocchio_peer.cpp").read_text(encoding="utf-8")
     built = build({"pinocchio_peer.cpp": text}, compiler, _FLAGS, (headers, eigen))
-    joint, position = samples.point
-    pointers = [ctypes.c_void_p(a.ctypes.data) for a in (*arrays, position)]
-    built.library.peer_load(len(arrays[0]), *pointers[:-1], joint, pointers[-1])
-    return [
-        Kernel(
-            name, "pinocchio", built,
-            {"eval": built.symbol(f"peer_eval_{of_eval}"), "value": built.symbol(f"peer_value_{of_value}")},
-        )
-        for name, (of_eval, of_value) in FORMULATIONS.items()
-    ]  # fmt: skip
+    arrays.append(np.array(samples.point.position, dtype=float))
+    *pointers, position = (ctypes.c_void_p(a.ctypes.data) for a in arrays)
+    built.library.peer_load(len(arrays[0]), *pointers, samples.point.joint, position)
+    kinds = {
+        name: {"eval": built.symbol(f"peer_eval_{one}"), "value": built.symbol(f"peer_value_{other}")}
+        for name, (one, other) in FORMULATIONS.items()
+    }
+    return [Kernel(name, "pinocchio", built, functions) for name, functions in kinds.items()]
 
 
 def model_arrays(model: pin.Model) -> list[np.ndarray]:

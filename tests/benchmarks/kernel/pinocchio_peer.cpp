@@ -11,7 +11,6 @@
 #include <algorithm>
 #include <cmath>
 #include <string>
-#include <type_traits>
 #include <vector>
 
 #include "pinocchio/algorithm/aba.hpp"
@@ -23,9 +22,19 @@
 
 #include <Eigen/Cholesky>
 
-namespace impact_peer
+namespace
 {
 namespace pin = pinocchio;
+using pin::Force;
+using pin::Motion;
+using pin::SE3;
+using Matrix6 = Eigen::Matrix<double, 6, 6>;
+using Vector3 = Eigen::Vector3d;
+using Vector6 = Eigen::Matrix<double, 6, 1>;
+using Vector = Eigen::VectorXd;
+using Index = pin::JointIndex;
+template<typename T>
+using Links = std::vector<T, Eigen::aligned_allocator<T>>;
 
 // The one-dof joints that a URDF makes, a free-flyer, and what Pinocchio's own code names.  With all of Pinocchio's
 // joint types these few algorithms take g++ -O3 above ten minutes and 5 GB; the run-time dispatch is the same.
@@ -34,43 +43,20 @@ struct FewJointsTpl
 {
   typedef S Scalar;
   static constexpr int Options = O;
-  template<typename M>
-  using Wrapped = boost::recursive_wrapper<M>;
   typedef pin::JointModelMimicTpl<S, O, FewJointsTpl> JointModelMimic;
   typedef pin::JointDataMimicTpl<S, O, FewJointsTpl> JointDataMimic;
-  typedef boost::variant<
-    pin::JointModelRevoluteTpl<S, O, 0>, pin::JointModelRevoluteTpl<S, O, 1>, pin::JointModelRevoluteTpl<S, O, 2>,
-    pin::JointModelFreeFlyerTpl<S, O>, pin::JointModelRevoluteUnalignedTpl<S, O>,
-    pin::JointModelPrismaticTpl<S, O, 0>, pin::JointModelPrismaticTpl<S, O, 1>, pin::JointModelPrismaticTpl<S, O, 2>,
-    pin::JointModelPrismaticUnalignedTpl<S, O>, Wrapped<JointModelMimic>>
-    JointModelVariant;
-  typedef boost::variant<
-    pin::JointDataRevoluteTpl<S, O, 0>, pin::JointDataRevoluteTpl<S, O, 1>, pin::JointDataRevoluteTpl<S, O, 2>,
-    pin::JointDataFreeFlyerTpl<S, O>, pin::JointDataRevoluteUnalignedTpl<S, O>, pin::JointDataPrismaticTpl<S, O, 0>,
-    pin::JointDataPrismaticTpl<S, O, 1>, pin::JointDataPrismaticTpl<S, O, 2>,
-    pin::JointDataPrismaticUnalignedTpl<S, O>, Wrapped<JointDataMimic>>
-    JointDataVariant;
+#define JOINTS(Kind) \
+  pin::Joint##Kind##RevoluteTpl<S, O, 0>, pin::Joint##Kind##RevoluteTpl<S, O, 1>, \
+  pin::Joint##Kind##RevoluteTpl<S, O, 2>, pin::Joint##Kind##RevoluteUnalignedTpl<S, O>, \
+  pin::Joint##Kind##PrismaticTpl<S, O, 0>, pin::Joint##Kind##PrismaticTpl<S, O, 1>, \
+  pin::Joint##Kind##PrismaticTpl<S, O, 2>, pin::Joint##Kind##PrismaticUnalignedTpl<S, O>, \
+  pin::Joint##Kind##FreeFlyerTpl<S, O>, boost::recursive_wrapper<Joint##Kind##Mimic>
+  typedef boost::variant<JOINTS(Model)> JointModelVariant;
+  typedef boost::variant<JOINTS(Data)> JointDataVariant;
 };
 typedef pin::ModelTpl<double, 0, FewJointsTpl> Model;
 typedef pin::DataTpl<double, 0, FewJointsTpl> Data;
 typedef pin::JointModelTpl<double, 0, FewJointsTpl> Joint;
-}  // namespace impact_peer
-
-namespace
-{
-using impact_peer::Data;
-using impact_peer::Joint;
-using impact_peer::Model;
-using pinocchio::Force;
-using pinocchio::Motion;
-using pinocchio::SE3;
-using Matrix6 = Eigen::Matrix<double, 6, 6>;
-using Vector3 = Eigen::Vector3d;
-using Vector6 = Eigen::Matrix<double, 6, 1>;
-using Vector = Eigen::VectorXd;
-using Index = pinocchio::JointIndex;
-template<typename T>
-using Links = std::vector<T, Eigen::aligned_allocator<T>>;
 
 struct Peer
 {
@@ -196,11 +182,11 @@ void gradient(Peer & p, const Vector3 & n, double * grad)
 
 double value_chol(Peer & p, const Vector3 & n)
 {
-  pinocchio::crba(p.model, p.data, p.q, pinocchio::Convention::WORLD);
-  pinocchio::cholesky::decompose(p.model, p.data);
+  pin::crba(p.model, p.data, p.q, pin::Convention::WORLD);
+  pin::cholesky::decompose(p.model, p.data);
   columns(p);
   generalized(p, impulse(p, n), p.a);
-  pinocchio::cholesky::solve(p.model, p.data, p.a);
+  pin::cholesky::solve(p.model, p.data, p.a);
   return p.a.squaredNorm();
 }
 
@@ -208,11 +194,11 @@ double eval_rnea(Peer & p, const Vector3 & n, double * grad)
 {
   const double H = value_chol(p, n);
   p.b = p.a;
-  pinocchio::cholesky::solve(p.model, p.data, p.b);
+  pin::cholesky::solve(p.model, p.data, p.b);
   p.dq.setZero();
   p.dv.setZero();
   p.da.setZero();
-  pinocchio::computeRNEADerivatives(p.model, p.data, p.q, p.zero, p.a, p.dq, p.dv, p.da);
+  pin::computeRNEADerivatives(p.model, p.data, p.q, p.zero, p.a, p.dq, p.dv, p.da);
   Eigen::Map<Vector>(grad, p.model.nv).noalias() = -2.0 * (p.dq.transpose() * p.b);
   // The contact direction's term: ∂_q nᵀJb along the contact's joints.
   for (auto at = p.support.rbegin(); at != p.support.rend(); ++at) {
@@ -232,7 +218,7 @@ double eval_chol(Peer & p, const Vector3 & n, double * grad)
 {
   const double H = value_chol(p, n);
   p.b = p.a;
-  pinocchio::cholesky::solve(p.model, p.data, p.b);
+  pin::cholesky::solve(p.model, p.data, p.b);
   for (Index i = 1; i < p.links; ++i) {
     p.data.oinertias[i] = p.data.oMi[i].act(p.model.inertias[i]);
     velocity(p, i, p.a, p.va);
@@ -262,62 +248,38 @@ void factor_hand(Peer & p)
   }
 }
 
-// Steps over Pinocchio's joint models: NV is a constant there.
-template<typename Step>
-struct Visit : pinocchio::fusion::JointUnaryVisitorBase<Visit<Step>>
+// A step over Pinocchio's joint models.  Placing: forward kinematics of one joint, its inertia and column in world axes;
+// else: what aba() leaves of its factorization.
+template<bool placing>
+struct Visit : pin::fusion::JointUnaryVisitorBase<Visit<placing>>
 {
   typedef boost::fusion::vector<Peer &> ArgsType;
 
   template<typename JointModel>
   static void algo(
-    const pinocchio::JointModelBase<JointModel> & joint,
-    pinocchio::JointDataBase<typename JointModel::JointDataDerived> & jdata, Peer & p)
-  {
-    Step::run(p, joint, jdata, std::integral_constant<bool, JointModel::NV == 1>());
-  }
-};
-
-template<typename Step>
-void visit(Peer & p, Index i)
-{
-  Visit<Step>::run(p.model.joints[i], p.data.joints[i], typename Visit<Step>::ArgsType(p));
-}
-
-// Forward kinematics of one joint, its inertia and column in world axes.
-struct Place
-{
-  template<typename JointModel, typename JointData, bool one>
-  static void run(Peer & p, const JointModel & joint, JointData & jdata, std::integral_constant<bool, one> has_column)
+    const pin::JointModelBase<JointModel> & joint, pin::JointDataBase<typename JointModel::JointDataDerived> & jdata,
+    Peer & p)
   {
     const Index i = joint.id(), parent = p.model.parents[i];
-    joint.calc(jdata.derived(), p.q);
-    const SE3 moved = p.model.jointPlacements[i] * jdata.M();
-    p.data.oMi[i] = parent > 0 ? p.data.oMi[parent] * moved : moved;
-    p.data.oinertias[i] = p.data.oMi[i].act(p.model.inertias[i]);
-    column(p, i, jdata, has_column);
+    if constexpr (placing) {
+      joint.calc(jdata.derived(), p.q);
+      const SE3 moved = p.model.jointPlacements[i] * jdata.M();
+      p.data.oMi[i] = parent > 0 ? p.data.oMi[parent] * moved : moved;
+      p.data.oinertias[i] = p.data.oMi[i].act(p.model.inertias[i]);
+      if constexpr (JointModel::NV == 1) {
+        p.S[i] = p.data.oMi[i].act(jdata.S());
+      }
+    } else if constexpr (JointModel::NV == 1) {
+      p.U[i] = jdata.U();
+      p.reciprocal[i] = jdata.Dinv()(0, 0);
+    } else {
+      p.base.compute(p.data.oYaba[i]);
+    }
   }
 
-  template<typename JointData>
-  static void column(Peer & p, Index i, JointData & jdata, std::true_type) { p.S[i] = p.data.oMi[i].act(jdata.S()); }
-
-  template<typename JointData>
-  static void column(Peer &, Index, JointData &, std::false_type) {}
-};
-
-// What aba() leaves of its factorization in one joint.
-struct Factors
-{
-  template<typename JointModel, typename JointData>
-  static void run(Peer & p, const JointModel & joint, JointData & jdata, std::true_type)
+  static void run(Peer & p, Index i)
   {
-    p.U[joint.id()] = jdata.U();
-    p.reciprocal[joint.id()] = jdata.Dinv()(0, 0);
-  }
-
-  template<typename JointModel, typename JointData>
-  static void run(Peer & p, const JointModel & joint, JointData &, std::false_type)
-  {
-    p.base.compute(p.data.oYaba[joint.id()]);
+    pin::fusion::JointUnaryVisitorBase<Visit>::run(p.model.joints[i], p.data.joints[i], ArgsType(p));
   }
 };
 
@@ -360,7 +322,7 @@ void solve_rates(Peer & p)
 double value_hand(Peer & p, const Vector3 & n)
 {
   for (Index i = 1; i < p.links; ++i) {
-    visit<Place>(p, i);
+    Visit<true>::run(p, i);
     p.Ia[i] = p.data.oinertias[i].matrix();
   }
   factor_hand(p);
@@ -389,9 +351,9 @@ double eval_hand(Peer & p, const Vector3 & n, double * grad)
 
 double value_aba(Peer & p, const Vector3 & n)
 {
-  pinocchio::forwardKinematics(p.model, p.data, p.q);
+  pin::forwardKinematics(p.model, p.data, p.q);
   p.local[p.contact] = p.data.oMi[p.contact].actInv(impulse(p, n));
-  p.a = pinocchio::aba(p.model, p.data, p.q, p.zero, p.zero, p.local, pinocchio::Convention::WORLD);
+  p.a = pin::aba(p.model, p.data, p.q, p.zero, p.zero, p.local, pin::Convention::WORLD);
   return p.a.squaredNorm();
 }
 
@@ -399,7 +361,7 @@ double eval_aba(Peer & p, const Vector3 & n, double * grad)
 {
   const double H = value_aba(p, n);
   for (Index i = 1; i < p.links; ++i) {
-    visit<Factors>(p, i);
+    Visit<false>::run(p, i);
     p.va[i] = p.data.oa_gf[i];
   }
   columns(p);
@@ -411,15 +373,15 @@ double eval_aba(Peer & p, const Vector3 & n, double * grad)
 Joint joint(int kind, const Vector3 & axis)
 {
   switch (kind) {
-  case 0: return Joint(pinocchio::JointModelRevoluteTpl<double, 0, 0>());
-  case 1: return Joint(pinocchio::JointModelRevoluteTpl<double, 0, 1>());
-  case 2: return Joint(pinocchio::JointModelRevoluteTpl<double, 0, 2>());
-  case 3: return Joint(pinocchio::JointModelRevoluteUnalignedTpl<double, 0>(axis));
-  case 4: return Joint(pinocchio::JointModelPrismaticTpl<double, 0, 0>());
-  case 5: return Joint(pinocchio::JointModelPrismaticTpl<double, 0, 1>());
-  case 6: return Joint(pinocchio::JointModelPrismaticTpl<double, 0, 2>());
-  case 7: return Joint(pinocchio::JointModelPrismaticUnalignedTpl<double, 0>(axis));
-  default: return Joint(pinocchio::JointModelFreeFlyerTpl<double, 0>());
+  case 0: return pin::JointModelRevoluteTpl<double, 0, 0>();
+  case 1: return pin::JointModelRevoluteTpl<double, 0, 1>();
+  case 2: return pin::JointModelRevoluteTpl<double, 0, 2>();
+  case 3: return pin::JointModelRevoluteUnalignedTpl<double, 0>(axis);
+  case 4: return pin::JointModelPrismaticTpl<double, 0, 0>();
+  case 5: return pin::JointModelPrismaticTpl<double, 0, 1>();
+  case 6: return pin::JointModelPrismaticTpl<double, 0, 2>();
+  case 7: return pin::JointModelPrismaticUnalignedTpl<double, 0>(axis);
+  default: return pin::JointModelFreeFlyerTpl<double, 0>();
   }
 }
 
@@ -447,7 +409,7 @@ void peer_load(
     const SE3 placement(Eigen::Map<const Eigen::Matrix3d>(place + 3), Eigen::Map<const Vector3>(place));
     const Index i = model.addJoint((Index)parents[k], joint(kinds[k], axis), placement, "joint" + std::to_string(k));
     const Eigen::Matrix3d I = Eigen::Map<const Eigen::Matrix3d>(body + 4);
-    model.inertias[i] = pinocchio::Inertia(body[0], Eigen::Map<const Vector3>(body + 1), I);
+    model.inertias[i] = pin::Inertia(body[0], Eigen::Map<const Vector3>(body + 1), I);
   }
   model.armature = Eigen::Map<const Vector>(armature, model.nv);
   model.gravity.setZero();

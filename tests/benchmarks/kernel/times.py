@@ -122,6 +122,6 @@ def _robot(report: Report) -> Iterator[str]:
         ]  # fmt: skip
         rows.append([kernel.name, *[cell(*number) for number in numbers], f"{error:.0e}"])
     if samples.plain:
-        rows.append(["floor", *["–"] * 5, str(total(floor(robot, samples.point[0]))), *["–"] * 4])
+        rows.append(["floor", *["–"] * 5, str(floor(robot, samples.point.joint)), *["–"] * 4])
     yield from table(_HEAD, rows)
     yield from ("", *[f"- {words}" for words in report.skipped], *[""] * bool(report.skipped))

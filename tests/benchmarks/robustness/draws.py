@@ -165,12 +165,8 @@ def _robust(control: Control, factor: float) -> Control:
 
 def _contacts(scenario: Scenario, task: RepeatedContacts, v: Mapping[str, float]) -> Scenario:
     tilt, roll = math.radians(v["tilt"]), math.radians(v["roll"])
-    if "elbow" in v:
-        elbow = v["fold"] * v["elbow"]
-        shoulder = tilt - elbow
-    else:
-        shoulder = v["shoulder"]
-        elbow = tilt - math.pi / 2 - shoulder
+    elbow = v["fold"] * v["elbow"] if "elbow" in v else tilt - math.pi / 2 - v["shoulder"]
+    shoulder = v.get("shoulder", tilt - elbow)
     return replace(
         scenario,
         joints={"shoulder_roll": roll, "shoulder_pitch": shoulder, "elbow_pitch": elbow},

@@ -79,8 +79,8 @@ def _choices(records: Records) -> Iterator[str]:
         yield (
             f"- **{_WORDS[name]}** (`{name}`): {lead} moved the robot less than the nominal controller in "
             f"{best.helps} of {best.count} configurations (median {middle}, quartiles {low} and {high}), with a "
-            f"lower jump in {best.gentler}{f', and failed in {fails}' if fails else ''}. At a control limit in all, in "
-            f"the windows + outside: {_limits(best)} s, nominal {_limits(summarize(own, NOMINAL))} s. The others: "
+            f"lower jump in {best.gentler}{f', and failed in {fails}' if fails else ''}. At a control limit in all, "
+            f"in the windows + outside: {_limits(best)} s, nominal {_limits(summarize(own, NOMINAL))} s. The others: "
             f"{others}."
         )
 

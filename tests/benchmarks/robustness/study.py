@@ -41,7 +41,6 @@ def study(
     seed: int,
     jobs: int,
     store: Store,
-    *,
     run: Callable[[str, int, int], Record] = configuration,
     tell: Callable[[str], None] = say,
 ) -> dict[str, list[Record]]:
