@@ -82,8 +82,9 @@ def measure(samples: Samples, rounds: int, peers: Sequence[str] = tuple(PEERS)) 
     times = harness.times([kernel for kernel, _ in right], rounds)
     rows = [(kernel, found, error) for (kernel, error), found in zip(right, times, strict=True)]
     # Of the differences by each of our builds the fastest alone.
-    slower = sorted((t["differences"] for _, t, _ in rows if "differences" in t))[1:]
-    return Report(samples, [row for row in rows if row[1].get("differences") not in slower], skipped)
+    differences = {kernel.name: t["differences"] for kernel, t, _ in rows if "differences" in t}
+    slower = sorted(differences, key=lambda name: differences[name])[1:]
+    return Report(samples, [row for row in rows if row[0].name not in slower], skipped)
 
 
 def lines(request: Request) -> Iterator[str]:
