@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from impact_posture.errors import InputError
-from impact_posture.robot.spec import Vector3
+from impact_posture.settings import Vector3
 
 ShapeKind = Literal["sphere", "box"]
 
