@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.dynamics.mjcf import import_mujoco, write_mjcf
+from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.objective import ImpactObjective
 from tests.benchmarks.impact.world import BALL, with_surface
@@ -102,7 +102,7 @@ class Scene:
         self._M, self._J, self._Js, self._n = (np.array(x) for x in (oracle.M, oracle.J, oracle.Js, oracle.n))
         self._mobility = self._J @ oracle.solve(self._J.T)
         self._point, self._feet = oracle.point, oracle.feet
-        written = write_mjcf(self._robot.model)
+        written = build_mjcf(self._robot.model)
         self._layout = written.layout
         self._model = with_surface(written, objective, q).compile()
         self._ball_body = int(self._model.geom("ball").bodyid[0])
