@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.reference import ReferencePoint
-from impact_posture.simulation.scenario import RepeatedContacts, Setup
+from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient
 from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.controller import Command
@@ -205,9 +205,7 @@ class InvariantDriver(Driver):
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
         """Build the nominal controller."""
         super().__init__(setup, posture)
-        scenario = setup.scenario
-        offset = scenario.shape.offset if isinstance(scenario.task, RepeatedContacts) else (0.0, 0.0, 0.0)
-        self._point = Point(scenario.task.frame, offset)
+        self._point = Point(setup.scenario.task.frame, setup.scenario.offset)
         points = (*self.controller.formulation.points, self._point)
         self._aside = State(setup.robot, tuple(dict.fromkeys(points)))
         self._at, self._felt = -np.inf, False

@@ -27,7 +27,7 @@ def feet_of(setup: Setup) -> tuple[str, ...]:
         return ()
     held = {_joint(robot, support.frame) for support in robot.spec.supports}
     led = scenario.task.frame if isinstance(scenario.task, RepeatedContacts) else None
-    return tuple(s.frame for s in scenario.scene.shapes if s.frame != led and _joint(robot, s.frame) in held)
+    return tuple(s.frame for s in scenario.shapes if s.frame != led and _joint(robot, s.frame) in held)
 
 
 def _joint(robot: Robot, frame: str) -> int:
@@ -45,7 +45,7 @@ class Recorder:
     def __init__(self, setup: Setup, metric: Gradient) -> None:
         self._setup, self._metric = setup, metric
         robot, task = setup.robot, setup.scenario.task
-        shapes = [s.frame for s in setup.scenario.scene.shapes]
+        shapes = [s.frame for s in setup.scenario.shapes]
         self._shape = shapes.index(task.frame) if isinstance(task, RepeatedContacts) else None
         feet = feet_of(setup)
         self._feet = [k for k, frame in enumerate(shapes) if frame in feet]

@@ -94,7 +94,7 @@ def measure_restitution(
 def _one(law: ContactLaw, speed: float, timestep: float, mass: float, phase: float) -> Bounce:
     robot = ball(mass)
     scene = Scene(
-        surfaces=(Surface("floor", (0, 0, 1), gap=phase * speed * timestep, law=law),),
+        surfaces=(Surface("floor", (0, 0, 1), gap=phase * speed * timestep, **vars(law)),),
         shapes=(Shape("ball", size=(_RADIUS,), center=(0, 0, 0)),),
         physics=Physics(timestep, gravity=(0, 0, 0)),
     )
@@ -105,9 +105,9 @@ def _one(law: ContactLaw, speed: float, timestep: float, mass: float, phase: flo
 
 def _follow(world: World, surface: Surface, speed: float) -> Bounce:
     """Step until the surface has let go."""
-    law = surface.law
     idle = ActuatorCommand(np.zeros(0), np.zeros(0))
-    constant = law.solref[0] if law.solref[0] > 0 else 1 / np.sqrt(-law.solref[0])
+    time = surface.solref[0]
+    constant = time if time > 0 else 1 / np.sqrt(-time)
     forces, depth, ended = [0.0], 0.0, False
     for _ in range(int(_PATIENCE * constant / world.timestep)):
         world.step(idle)
@@ -118,7 +118,7 @@ def _follow(world: World, surface: Surface, speed: float) -> Bounce:
         if ended:
             break
     if not ended:
-        raise InputError(f"the ball stays on it (solref {law.solref})", where="contact law", hint="damp it less")
+        raise InputError(f"the ball stays on it (solref {surface.solref})", where="contact law", hint="damp it less")
     pushed = np.flatnonzero(forces)
     duration, impulse = (pushed[-1] - pushed[0] + 1) * world.timestep, sum(forces) * world.timestep
     after = float(world.truth().v[2])

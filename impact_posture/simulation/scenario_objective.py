@@ -26,7 +26,7 @@ from impact_posture.impact.supports import resolve_supports
 from impact_posture.libraries import cache_folder, is_cached
 from impact_posture.posture.compiled import own_source
 from impact_posture.progress import tell
-from impact_posture.simulation.scenario import RepeatedContacts, Setup
+from impact_posture.simulation.scenario import Setup
 from impact_posture.toolchain import find_compiler
 
 Array = NDArray[np.float64]
@@ -42,9 +42,8 @@ def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: b
         free: Without the feet that hold a robot that stands.
     """
     scenario, robot = setup.scenario, setup.robot
-    offset = scenario.shape.offset if isinstance(scenario.task, RepeatedContacts) else (0.0, 0.0, 0.0)
     x, y, z = (float(value) for value in scenario.normal)
-    contact = ImpactContact(scenario.task.frame, (x, y, z), offset)
+    contact = ImpactContact(scenario.task.frame, (x, y, z), scenario.offset)
     supports = () if free or scenario.control.footing is None else resolve_supports(robot, None)
     return ImpactObjective(robot, contact, Metric(), kind, supports)
 

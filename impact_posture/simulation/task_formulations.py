@@ -57,7 +57,7 @@ def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffe
     """
     control, scenario = setup.scenario.control, setup.scenario
     _check_gains(setup)
-    felt = None if end_effector is None or scenario.scene.sensors.force_frame is None else end_effector.point
+    felt = None if end_effector is None or scenario.sensors.force_frame is None else end_effector.point
     if control.footing is not None:
         weighted: list[Task] = [
             task(kp=gains.kp, kd=gains.kd, weight=gains.weight)

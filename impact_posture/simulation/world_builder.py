@@ -80,16 +80,16 @@ def build_scene(robot: Robot, scene: Scene, q: Array) -> BuiltScene:
         for shape, place in placed
     }
     for surface in scene.surfaces:
-        name, law = xml_name(f"surface {surface.name}"), surface.law
+        name = xml_name(f"surface {surface.name}")
         written.add_plane(name, points[surface.name], normals[surface.name])
         for geom in geoms:
             written.spec.add_pair(
                 geomname1=name,
                 geomname2=geom,
-                condim=3 if law.friction else 1,
-                friction=(law.friction, law.friction, 0.0, 0.0, 0.0),
-                solref=law.solref,
-                solimp=(*law.solimp, *_SOLIMP_SHAPE),
+                condim=3 if surface.friction else 1,
+                friction=(surface.friction, surface.friction, 0.0, 0.0, 0.0),
+                solref=surface.solref,
+                solimp=(*surface.solimp, *_SOLIMP_SHAPE),
             )
     _add_rotors(written, robot)
     _add_motors(written, robot)

@@ -53,7 +53,7 @@ def table() -> list[str]:
         for time in TIMES:
             # What is faster than the time steps is refused.
             for damping in (z for z in DAMPINGS if time >= 2 * step and time * z >= step * (1 - 1e-9)):
-                b = measure_restitution(ContactLaw((time, damping)), speed=SPEED, timestep=step)
+                b = measure_restitution(ContactLaw(solref=(time, damping)), speed=SPEED, timestep=step)
                 lines.append(
                     f"| {step * 1e3:g} ms | {time * 1e3:g} ms | {damping:g} | {b.restitution:.3f} | {b.spread:.3f} "
                     f"| {ideal_restitution(damping):.3f} | {b.duration * 1e3:.1f} ms | {b.depth * 1e3:.2f} mm "

@@ -15,7 +15,7 @@ from impact_posture.simulation.controller_factory import CONTROLLERS, Controller
 from impact_posture.simulation.driver import MOVE, Driver, PostureDriver
 from impact_posture.simulation.offline import OfflinePosture
 from impact_posture.simulation.reference import ReferencePoint
-from impact_posture.simulation.scenario import Gains
+from impact_posture.simulation.scenario import EndEffectorGains, Gains
 from impact_posture.simulation.task_formulations import nominal_posture
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.frame_tasks import FramePose
@@ -244,7 +244,7 @@ def test_the_posture_driver_reaches_its_goal(name: str) -> None:
         ("aerial-vertical", {"center_of_mass": Gains(10)}, r"has \[control.center_of_mass\], but no"),
         ("aerial-vertical", {"base": Gains(10)}, r"has \[control.base\], but no \[control.footing\]"),
         ("solo8-push", {"tilt": Gains(10)}, r"has \[control.tilt\], but feet"),
-        ("solo8-push", {"end_effector": Gains(10)}, r"has \[control.end_effector\], but a push"),
+        ("solo8-push", {"end_effector": EndEffectorGains(10)}, r"has \[control.end_effector\], but a push"),
         ("solo8-push", {"footing": None}, r"but no \[control.footing\]"),
     ],
 )

@@ -201,7 +201,7 @@ def test_limits_that_the_tasks_break_relax_them(name: str, controller: str) -> N
     weak[6:] /= 3
     setup.robot.model.effortLimit = weak
     # A world for the robot as it has become.
-    made = controller_factory(replace(setup, world=build_world(setup.robot, setup.scenario.scene, setup.q)))
+    made = controller_factory(replace(setup, world=build_world(setup.robot, setup.scenario, setup.q)))
     found = driven(made, controller)
     metrics = measure(made.setup, found)
     assert metrics.relaxed_ticks > 20 and metrics.failed_ticks == 0

@@ -140,9 +140,9 @@ def test_the_shapes_offset_is_the_contacts() -> None:
     needs_mujoco()
     setup = factory("aerial-vertical").setup
     scenario = setup.scenario
-    moved = replace(scenario.scene.shapes[0], offset=(0.0, 0.01, 0.02))
-    scene = replace(scenario.scene, shapes=(moved, *scenario.scene.shapes[1:]))
-    found = scenario_objective(replace(setup, scenario=replace(scenario, scene=scene)))
+    moved = replace(scenario.shapes[0], offset=(0.0, 0.01, 0.02))
+    moved_scenario = replace(scenario, shapes=(moved, *scenario.shapes[1:]))
+    found = scenario_objective(replace(setup, scenario=moved_scenario))
     assert found.contact.offset == (0.0, 0.01, 0.02)
     assert found.value(setup.q) != pytest.approx(scenario_objective(setup).value(setup.q), rel=1e-3)
 
@@ -183,7 +183,7 @@ def test_compiled_equals_interpreted_and_is_built_once(which: Any, builds: list[
 def test_a_changed_robot_normal_or_objective_is_built_anew(builds: list[Path]) -> None:
     needs_mujoco()
     scenario = read_scenario("aerial-vertical")
-    heavier = replace(scenario, load=replace(scenario.load, armature={"elbow_pitch": 0.05}))
+    heavier = replace(scenario, armature={"elbow_pitch": 0.05})
     first, other = scenario_objective(factory("aerial-vertical").setup), scenario_objective(set_up(heavier))
     turned = replace(first, contact=ImpactContact("ee", (0.0, 0.1, 1.0)))
     q = first.robot.posture()
