@@ -252,12 +252,9 @@ class ScenarioTable(Scene):
             ("frame", self.contacts.frame, [s.frame for s in self.shapes]),
         ):
             if name not in known:
-                raise InputError(
-                    f"key 'contacts.{key}': there is no '{name}'",
-                    hint=f"one of: {', '.join(known)}"
-                    if known
-                    else f"add it to [[{key.replace('frame', 'shape')}s]]",
-                )
+                table = "surfaces" if key == "surface" else "shapes"
+                hint = f"one of: {', '.join(known)}" if known else f"add it to [[{table}]]"
+                raise InputError(f"key 'contacts.{key}': there is no '{name}'", hint=hint)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -297,9 +294,8 @@ class Scenario(ScenarioTable):
         Raises:
             InputError: The robot is pushed instead.
         """
-        if self.contacts is None:
-            raise self._without("surface that is hit")
-        return next(s for s in self.surfaces if s.name == self.task.surface)
+        name = self._contacts("surface that is hit").surface
+        return next(s for s in self.surfaces if s.name == name)
 
     @property
     def shape(self) -> Shape:
@@ -308,17 +304,18 @@ class Scenario(ScenarioTable):
         Raises:
             InputError: The robot is pushed instead.
         """
-        if self.contacts is None:
-            raise self._without("shape that hits")
-        return next(s for s in self.shapes if s.frame == self.contacts.frame)
+        frame = self._contacts("shape that hits").frame
+        return next(s for s in self.shapes if s.frame == frame)
 
     @property
     def offset(self) -> Vector3:
         """Contact point of the shape that hits, or of the pushed frame, in the frame, m."""
         return self.shape.offset if self.contacts else (0.0, 0.0, 0.0)
 
-    def _without(self, what: str) -> InputError:
-        return InputError(f"there is no {what}", where=self.source, hint="ask only where there are contacts")
+    def _contacts(self, what: str) -> RepeatedContacts:
+        if self.contacts is None:
+            raise InputError(f"there is no {what}", where=self.source, hint="ask only where there are contacts")
+        return self.contacts
 
 
 @dataclass(frozen=True, eq=False)

@@ -195,7 +195,7 @@ class Scene(Checked):
         step = self.physics.timestep
         laws = [("stops", self.physics.stop_solref), *((s.name, s.solref) for s in self.surfaces)]
         for name, (a, b) in laws:
-            # MuJoCo silently applies the first two rules itself (refsafe).  A spring whose 1/√k is below the time step
+            # MuJoCo silently applies the first two rules (refsafe).  A spring whose 1/√k is below the time step
             # gives more energy than it took (measured, docs/generated/restitution.md).
             slow = (("the time constant", a, 2), ("its product with the damping ratio", a * b, 1))
             for words, value, least in slow if a > 0 else (("1/√k", (-a) ** -0.5, 1),):
