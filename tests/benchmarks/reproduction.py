@@ -35,14 +35,13 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--write", action="store_true", help="write docs/generated and docs/images")
     args = parser.parse_args()
-    store, scenarios = Store(ROOT / "build" / "reproduction"), tuple(PAPER)
+    store, plan = Store(ROOT / "build" / "reproduction"), {s: controllers_of(s, False) for s in PAPER}
     began = time.perf_counter()
     try:
-        main_rows = reproduce(scenarios, seeds=args.seeds, processes=args.jobs, store=store, progress=_say)
+        shared = {"processes": args.jobs, "store": store, "progress": _say}
+        main_rows = reproduce(plan, seeds=args.seeds, **shared)
         took = time.perf_counter() - began
-        every = reproduce(
-            scenarios, seeds=args.others, everything=True, processes=args.jobs, store=store, progress=_say
-        )
+        every = reproduce({s: controllers_of(s, True) for s in PAPER}, seeds=args.others, **shared)
     except ImpactPostureError as error:
         print(error, file=sys.stderr)
         return 1
@@ -50,9 +49,8 @@ def main() -> int:
     print(f"\n{page}\nthe first part took {took:.0f} s with {args.jobs} processes, less what was kept")
     if args.write:
         PAGE.write_text(f"<!-- Written by `make reproduction`; do not edit. -->\n\n{page}", encoding="utf-8")
-        first = [job for s in scenarios for job in jobs_of(s, controllers_of(s, False), 1)]
         with tempfile.TemporaryDirectory() as folder:
-            draw_reproduction(main_rows, first, store, Path(folder), ["png"])
+            draw_reproduction(main_rows, jobs_of(plan, seeds=1), store, Path(folder), ["png"])
             _take_shown(Path(folder))
     return 0
 
