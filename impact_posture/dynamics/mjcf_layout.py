@@ -33,6 +33,8 @@ _WIDTH = {
     "translation": 3,
     "free-flyer": 7,
 }
+# Families with the same single number in Pinocchio and MuJoCo.
+_PLAIN = ("revolute", "prismatic")
 
 
 @dataclass(frozen=True)
@@ -83,16 +85,15 @@ class MjcfLayout:
             q, v = q + width, v + rates
         self.nqpos, self.nv, self.nq = q, v, int(model.nq)
         # A simulation converts in every tick.  Joints with one number on both sides are copied by index, all at once.
-        plain = [slot for slot in self.slots if slot.joint.kind.family in ("revolute", "prismatic")]
+        plain = [slot for slot in self.slots if slot.joint.kind.family in _PLAIN]
         self._plain_q = np.array([slot.joint.q.start for slot in plain], dtype=int)
         self._plain_qpos = np.array([slot.qpos.start for slot in plain], dtype=int)
-        self._others = [slot for slot in self.slots if slot.joint.kind.family not in ("revolute", "prismatic")]
+        self._others = [slot for slot in self.slots if slot.joint.kind.family not in _PLAIN]
         self._turning = [slot for slot in self.slots if slot.joint.kind.family in ("free-flyer", "planar")]
-        # qvel[k] = v[_from[k]], before the linear parts are rotated.
-        self._from = np.concatenate(
-            [np.arange(s.joint.v.start, s.joint.v.stop) for s in self.slots] or [np.arange(0)]
-        )
-        self._back = np.argsort(self._from)
+        # The velocity map before the linear parts are rotated.
+        self._permutation = np.zeros((self.nv, self.nv))
+        for slot in self.slots:
+            self._permutation[slot.qvel, slot.joint.v] = np.eye(slot.joint.kind.nv)
 
     def qpos(self, q: Vector) -> Vector:
         """Return ``qpos``, shape (nqpos,), of a configuration, shape (nq,)."""
@@ -145,57 +146,29 @@ class MjcfLayout:
 
         It follows that ``M = Tᵀ M_mj T``, ``J = J_mj T`` and ``τ = Tᵀ τ_mj``.
         """
-        found = np.zeros((self.nv, self.nv))
-        for slot in self.slots:
-            block = np.eye(slot.joint.kind.nv)
+        found = self._permutation.copy()
+        for slot in self._turning:
             turn = _turn(slot, q[slot.joint.q])
-            block[: len(turn), : len(turn)] = turn
-            found[slot.qvel, slot.joint.v] = block
+            row, column, size = slot.qvel.start, slot.joint.v.start, len(turn)
+            found[row : row + size, column : column + size] = turn
         return found
 
     def qvel(self, q: Vector, v: Vector) -> Vector:
         """Return ``qvel`` of a velocity, shape (nv,)."""
-        found: Vector = np.asarray(v, dtype=float)[self._from]
-        for slot in self._turning:
-            turn = _turn(slot, q[slot.joint.q])
-            rows = slice(slot.qvel.start, slot.qvel.start + len(turn))
-            found[rows] = turn @ found[rows]
-        return found
-
-    def v(self, qpos: Vector, qvel: Vector) -> Vector:
-        """Return the Pinocchio velocity of a ``qvel``, shape (nv,)."""
-        return self.state(qpos, qvel)[1]
+        return np.asarray(self.velocity_map(q) @ v)
 
     def state(self, qpos: Vector, qvel: Vector) -> tuple[Vector, Vector]:
-        """Return the Pinocchio configuration and velocity, shapes (nq,) and (nv,), together."""
-        q, found = self.q(qpos), np.array(qvel, dtype=float)
-        for slot in self._turning:
-            turn = _turn(slot, q[slot.joint.q])
-            rows = slice(slot.qvel.start, slot.qvel.start + len(turn))
-            found[rows] = turn.T @ found[rows]
-        return q, np.asarray(found[self._back])
-
-    def qacc(self, q: Vector, v: Vector, a: Vector) -> Vector:
-        """Return ``qacc = T a + Ṫ v``, shape (nv,).  ``Ṫ`` is due to linear parts that rotate with their body."""
-        turning = np.zeros(self.nv)
-        for slot in self.slots:
-            piece = v[slot.joint.v]
-            if slot.joint.kind.family == "free-flyer":
-                turning[slot.joint.v.start : slot.joint.v.start + 3] = np.cross(piece[3:], piece[:3])
-            elif slot.joint.kind.family == "planar":
-                turning[slot.joint.v.start : slot.joint.v.start + 2] = -piece[2] * piece[1], piece[2] * piece[0]
-        return self.qvel(q, a + turning)
+        """Return the Pinocchio configuration, shape (nq,), and velocity, shape (nv,)."""
+        q = self.q(qpos)
+        return q, np.asarray(self.velocity_map(q).T @ qvel)
 
 
 def _turn(slot: MjcfSlot, piece: Vector) -> Vector:
-    """Return the rotation of the first velocity entries of a joint, or an empty matrix where none rotate."""
-    family = slot.joint.kind.family
-    if family == "free-flyer":
-        R = pin.Quaternion(np.array(piece[3:])).matrix()
-        return np.asarray(slot.placement.rotation @ R if slot.free and slot.moved else R)
-    if family == "planar":
+    """Return the rotation of the linear velocity of a free-flyer or planar joint."""
+    if slot.joint.kind.family == "planar":
         return np.array([[piece[2], -piece[3]], [piece[3], piece[2]]])
-    return np.zeros((0, 0))
+    R = pin.Quaternion(np.array(piece[3:])).matrix()
+    return np.asarray(slot.placement.rotation @ R if slot.free and slot.moved else R)
 
 
 def _scalar_first(xyzw: Vector) -> Vector:

@@ -18,8 +18,8 @@ class Rotors:
 
     A speed follows its command ω*, cut to ``[speed_min, speed_max]``, with ``ω̇ = (ω* − ω)/τ``.  τ is the time
     constant up (ω* > ω) or down, and a step integrates exactly.  The thrust is ``c_f ω²`` along the direction of the
-    rotor, and the drag moment is ``κ`` times the thrust against its spin.  The inertia of the propellers is not in the
-    model, so there is no gyroscopic moment.
+    rotor, and the drag moment is ``κ`` times the thrust against its spin.  There is no gyroscopic moment, because the
+    inertia of the propellers is not in the model.
 
     Args:
         propulsion: Data of the rotors.

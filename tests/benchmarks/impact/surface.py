@@ -192,7 +192,7 @@ class Scene:
         model.pair_friction[:, :2] = min(surface.friction, _STICKY)
 
     def _measure(self, data: Any, speed: float, before: Vector, impulse: float, duration: float) -> Measured:
-        after = self._layout.v(data.qpos, data.qvel)
+        after = self._layout.state(data.qpos, data.qvel)[1]
         numeric = Numeric(self._robot.model).at(self._layout.q(data.qpos))
         moved = numeric.jacobian(self._point)[:3] @ after
         normal = float(self._n @ moved)
