@@ -25,7 +25,7 @@ class ContactLaw(Checked):
     ``k = d/(d₁Tζ)²`` of ``solref = (T, ζ)``.  If both numbers are negative, they are ``(−k, −b)``.  The contact gets
     the share d of it, ``r'' = d r* + (1 − d) r''₀``, where ``r''₀`` is the acceleration without contact.  With
     ``solimp = (d₀, d₁, width)``, d rises from ``d₀`` at depth 0 to ``d₁`` at depth ``width`` (m).
-    :mod:`impact_posture.simulation.restitution` measures the restitution of a law.
+    The page on simulation has the measured restitution of many laws.
 
     Attributes:
         solref: Time constant T in s and damping ratio ζ.

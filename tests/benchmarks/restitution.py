@@ -12,8 +12,8 @@ from pathlib import Path
 
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import ImpactPostureError
-from impact_posture.simulation.restitution import ideal_restitution, measure_restitution
 from impact_posture.simulation.scene import ContactLaw, Physics
+from tests.benchmarks.bounce import ideal_restitution, measure_restitution
 
 PAGE = Path(__file__).parents[2] / "docs" / "generated" / "restitution.md"
 TIMES = (0.002, 0.005, 0.01, 0.02)
