@@ -103,7 +103,7 @@ class Checked:
         """
         from pydantic import ValidationError
 
-        for name, adapter in _field_adapters(type(self)).items():
+        for name, adapter in _field_adapters(type(self)).items():  # type: ignore[arg-type]
             try:
                 adapter.validate_python(getattr(self, name))
             except ValidationError as error:
@@ -123,4 +123,4 @@ def _field_adapters(cls: type) -> dict[str, Any]:
     from pydantic import TypeAdapter
 
     hints = get_type_hints(cls, include_extras=True)
-    return {field.name: TypeAdapter(hints[field.name]) for field in fields(cls)}  # type: ignore[arg-type]
+    return {field.name: TypeAdapter(hints[field.name]) for field in fields(cls)}

@@ -202,8 +202,9 @@ def percent(value: Interval | None, unit: str = " %") -> str:
 def _plus_minus(value: Interval, decimals: int, factor: int = 1) -> str:
     # Adding zero turns -0.0 into 0.0.
     text = f"{round(factor * value.mean, decimals) + 0.0:.{decimals}f}"
-    few = value.half_width is None or value.samples < 3
-    return text if few else f"{text} ± {factor * value.half_width:.{decimals}f}"
+    if value.half_width is None or value.samples < 3:
+        return text
+    return f"{text} ± {factor * value.half_width:.{decimals}f}"
 
 
 def reduction_text(row: Row | None) -> str:
