@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_type_hints
@@ -33,7 +33,7 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
 
     try:
         # As JSON, since strict dataclasses take no table of Python.
-        text = json.dumps(data, default=str)
+        text = json.dumps(data, default=_plain)
         made: _Table = _adapter(cls).validate_json(text)  # type: ignore[arg-type]
         return made
     except ValidationError as error:
@@ -45,10 +45,19 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
         if fault["type"] in _UNKNOWN:
             close = ", ".join(nearest(str(location[-1]), _keys_at(cls, location[:-1])))
             raise SpecError(f"unknown key '{path}'", where=where, hint=f"did you mean {close}?") from None
-        what, hint = str(fault["msg"]).removeprefix("Value error, "), "correct the value"
+        what, hint = str(fault["msg"]), "correct the value"
+        if fault["type"] == "value_error":
+            # The demand of a setting is what to do.
+            raise SpecError(
+                f"key '{path}' is {fault['input']}", where=where, hint=str(fault["ctx"]["error"])
+            ) from None
         if fault["type"] == "literal_error":
             what, hint = not_one_of(fault["input"], re.findall(r"'([^']*)'", fault["ctx"]["expected"]))
         raise SpecError(f"key '{path}': {what}", where=where, hint=hint) from None
+
+
+def _plain(value: Any) -> Any:
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
 
 
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
@@ -64,12 +73,10 @@ def _adapter(cls: type) -> Any:
 def _keys_at(cls: type, location: tuple[int | str, ...]) -> list[str]:
     """The keys of the table at a place inside the table of ``cls``."""
     for part in location:
-        if hasattr(cls, "model_fields"):
-            return list(cls.model_fields)
-        hint = get_type_hints(cls).get(str(part)) if is_dataclass(cls) else None
+        hint = get_type_hints(cls).get(str(part))
         inner = [c for c in (hint, *getattr(hint, "__args__", ())) if isinstance(c, type) and is_dataclass(c)]
         cls = inner[0] if inner else cls
-    return [field.name.rstrip("_") for field in fields(cls)]
+    return [field.name for field in fields(cls)]  # type: ignore[arg-type]
 
 
 def read_toml(path: Path) -> dict[str, object]:

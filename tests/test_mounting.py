@@ -10,7 +10,8 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import ImpactPostureError, InputError, JointNotFound
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import LoadOptions
 from impact_posture.simulation.scenario_file import read_scenario
 from tests.helpers import frame_placement, mass_matrix, rng
 
@@ -99,7 +100,7 @@ def test_the_floating_base_itself_is_not_mounted() -> None:
 
 def test_a_scenarios_mounting_reaches_the_robot(tmp_path: Path) -> None:
     found = read_scenario("aerial-vertical")
-    assert found.load.mounting == {"shoulder_roll": (-0.08, 0.0, 0.0)}
+    assert found.mounting == {"shoulder_roll": (-0.08, 0.0, 0.0)}
     text = Path(found.source).read_text(encoding="utf-8")
     assert "mounting = " in text
     without = tmp_path / "plain.toml"

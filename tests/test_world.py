@@ -32,7 +32,7 @@ FLOOR = Surface("floor", (0, 0, 1))
 @functools.cache
 def without_rotors(name: str) -> Robot:
     found = robot(name)
-    return replace(found, spec=found.spec.model_copy(update={"propulsion": None}))
+    return replace(found, spec=replace(found.spec, propulsion=None))
 
 
 def idle(found: Robot) -> ActuatorCommand:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from impact_posture import __version__
 from impact_posture.codegen import project, templates
 from impact_posture.codegen.build_check import self_test_tolerance
 from impact_posture.codegen.code import Code
@@ -15,6 +14,7 @@ from impact_posture.codegen.reader import identity
 from impact_posture.codegen.variants import Variant
 from impact_posture.escape import c_comment, markdown
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.version import __version__
 
 # C names among the facts: they stand as they are everywhere.
 _NAMES = {"prefix", "upper", "stem", "real"}

@@ -67,7 +67,7 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
     raise UnsupportedJoint(
         f"joint '{name}' is of type {short}",
         where="symbolic dynamics",
-        hint="lock it (--lock) or model it by revolute and prismatic joints",
+        hint="lock it (`lock`) or model it by revolute and prismatic joints",
     )
 
 

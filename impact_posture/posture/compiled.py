@@ -14,11 +14,11 @@ from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 
-from impact_posture import __version__
 from impact_posture.errors import CompilerError, OutputError
 from impact_posture.libraries import building, cache_folder, cache_path, is_cached
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.toolchain import find_compiler, run_compiler, run_compilers
+from impact_posture.version import __version__
 
 CompileMode = Literal["auto", "always", "never"]
 

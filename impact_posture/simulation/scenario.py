@@ -15,8 +15,9 @@ from impact_posture.progress import tell
 from impact_posture.robot.actuation import allocation
 from impact_posture.robot.postures import read_posture, set_joints
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
-from impact_posture.robot.spec import NonNegative, Positive, Root, Vector3
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.robot.spec import NonNegative, Positive
+from impact_posture.settings import RobotSettings, Vector3
 from impact_posture.simulation.actuator_command import Push
 from impact_posture.simulation.scene import Finite, FiniteVector, Scene, Shape, Surface
 from impact_posture.simulation.world import World, build_world
@@ -206,13 +207,12 @@ class Bounds(Checked):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ScenarioTable(Scene):
+class ScenarioTable(Scene, RobotSettings):
     """Content of a ``scenario.toml``.
 
     Attributes:
         name: Name of the experiment.
         description: One line.
-        robot: Known name, path, or ``example-robot-data:`` URI.
         posture: Name or file of the start posture.  ``None`` takes the default posture of the robot.
         joints: Values that replace those of the start posture, by joint, rad or m.
         contacts: The contacts, or ``None`` if the robot is pushed.
@@ -224,14 +224,6 @@ class ScenarioTable(Scene):
     schema: Literal["impact-posture/scenario/1"] = "impact-posture/scenario/1"
     name: str
     description: str = ""
-    robot: str
-    root: Root | None = None
-    package_dir: tuple[str, ...] = ()
-    srdf: str | None = None
-    config: str | None = None
-    armature: str | Mapping[str, float] | None = None
-    lock: tuple[str, ...] = ()
-    mounting: Mapping[str, Vector3] = field(default_factory=dict)
     posture: str | None = None
     joints: Mapping[str, float] = field(default_factory=dict)
     contacts: RepeatedContacts | None = None
@@ -266,13 +258,6 @@ class Scenario(ScenarioTable):
     """
 
     source: str = ""
-
-    @property
-    def load(self) -> LoadOptions:
-        """Options for loading the robot."""
-        return LoadOptions(
-            self.root, self.package_dir, self.srdf, self.config, self.armature, self.lock, self.mounting
-        )
 
     @property
     def task(self) -> RepeatedContacts | SinglePush:
@@ -351,7 +336,7 @@ def set_up(scenario: Scenario) -> Setup:
         ImpactPostureError: The first thing that does not fit, in one line.
     """
     tell(f"loading {scenario.robot}")
-    robot = load_robot(scenario.robot, scenario.load)
+    robot = load_robot(scenario.robot, scenario)
     _check_base(robot, scenario)
     q = set_joints(robot, read_posture(robot, scenario.posture, where="posture"), scenario.joints, scenario.source)
     q = robot.check_posture(q, where=scenario.source)

@@ -13,20 +13,21 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture import __version__
 from impact_posture.codegen.export_folder import write_export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.library import library_path
 from impact_posture.errors import CompilerError, MetricError, OutputError
 from impact_posture.impact.contact import ImpactContact
-from impact_posture.impact.metric import Metric, ObjectiveKind
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
 from impact_posture.libraries import cache_folder, is_cached
 from impact_posture.posture.compiled import own_source
 from impact_posture.progress import tell
+from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.scenario import Setup
 from impact_posture.toolchain import find_compiler
+from impact_posture.version import __version__
 
 Array = NDArray[np.float64]
 Gradient = Callable[[Array], tuple[float, Array]]

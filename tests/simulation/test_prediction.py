@@ -38,7 +38,7 @@ def _mujoco() -> None:
 def adrift(law: ContactLaw, timestep: float) -> Setup:
     """The vertical scenario's robot without rotors and weight, its tip 2 mm above the floor."""
     scenario, found = read_scenario("aerial-vertical"), factory("aerial-vertical").setup
-    body = replace(found.robot, spec=found.robot.spec.model_copy(update={"propulsion": None}))
+    body = replace(found.robot, spec=replace(found.robot.spec, propulsion=None))
     floor = replace(scenario.surfaces[0], gap=0.002, **vars(law))
     scenario = replace(scenario, surfaces=(floor,), physics=replace(WEIGHTLESS, timestep=timestep), sensors=Sensors())
     return Setup(scenario, body, found.q, build_world(body, scenario, found.q))

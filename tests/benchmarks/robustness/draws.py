@@ -172,7 +172,7 @@ def prepare(chosen: Draw) -> Setup:
 
 def _armature(scenario: Scenario, factor: float) -> dict[str, float]:
     """By joint; those that have none stay without."""
-    model = load_robot(scenario.robot, scenario.load).model
+    model = load_robot(scenario.robot, scenario).model
     own = {str(name): float(model.armature[k]) for name, k in zip(model.names, model.idx_vs, strict=True) if k >= 0}
     return {name: factor * value for name, value in own.items() if value > 0}
 

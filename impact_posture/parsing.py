@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from impact_posture.errors import ContactError, InputError
-from impact_posture.robot.model_variant import Payload
-from impact_posture.robot.spec import Vector3
 
 
-def parse_contact(text: str) -> tuple[str, Vector3, float | None]:
+def parse_contact(text: str) -> tuple[str, tuple[float, float, float], float | None]:
     """Read ``FRAME:NX,NY,NZ[:IMPULSE]``; the frame's name may hold colons itself.
 
     Raises:
@@ -24,10 +22,10 @@ def parse_contact(text: str) -> tuple[str, Vector3, float | None]:
             impulse = float(parts.pop())
         x, y, z = (float(v) for v in parts[-1].split(","))
     except ValueError:
-        raise ContactError(f"'{text}' is no contact", where="--contact", hint=hint) from None
+        raise ContactError(f"'{text}' is no contact", where="contact", hint=hint) from None
     frame = ":".join(parts[:-1])
     if not frame:
-        raise ContactError(f"'{text}' names no frame", where="--contact", hint=hint)
+        raise ContactError(f"'{text}' names no frame", where="contact", hint=hint)
     return frame, (x, y, z), impulse
 
 
@@ -50,24 +48,27 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
             values[joint] = float(value)
         except ValueError:
             raise InputError(
-                f"'{text}' is no JOINT=VALUE", where="--armature", hint="give none, one file, or JOINT=VALUE each"
+                f"'{text}' is no JOINT=VALUE", where="armature", hint="give none, one file, or JOINT=VALUE each"
             ) from None
     return values
 
 
-def parse_payload(text: str) -> Payload:
-    """Read ``FRAME:MASS``; the frame's name may hold colons itself.
+def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Read ``FRAME:MASS`` each; the frame's name may hold colons itself.
 
     Raises:
-        InputError: It does not have this form.
+        InputError: One does not have this form.
     """
-    frame, _, mass = text.rpartition(":")
-    try:
-        value = float(mass)
-    except ValueError:
-        value = float("nan")
-    if not frame or not value > 0:
-        raise InputError(
-            f"'{text}' is no payload", where="--payload", hint="give a frame and kg above zero: FRAME MASS"
-        )
-    return Payload(frame, value)
+    found = []
+    for text in texts:
+        frame, _, mass = text.rpartition(":")
+        try:
+            value = float(mass)
+        except ValueError:
+            value = float("nan")
+        if not frame or not value > 0:
+            raise InputError(
+                f"'{text}' is no payload", where="payload", hint="give a frame and kg above zero: FRAME MASS"
+            )
+        found.append((frame, value))
+    return tuple(found)
