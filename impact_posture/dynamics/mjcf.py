@@ -20,6 +20,7 @@ from impact_posture.errors import InputError, UnsupportedJoint
 from impact_posture.escape import xml_name
 
 Vector = NDArray[np.float64]
+Geom = Literal["sphere", "box", "plane"]
 
 # Joint index that stands for the world.
 WORLD = 0
@@ -65,37 +66,26 @@ class Mjcf:
         """Return the ``MjsBody`` that a Pinocchio joint moves, or the world for :data:`WORLD`."""
         return self.spec.worldbody if joint == WORLD else self.spec.body(self.bodies[joint])
 
-    def add_geom(
-        self, joint: int, name: str, kind: Literal["sphere", "box"], size: Sequence[float], placement: pin.SE3
-    ) -> None:
+    def add_geom(self, joint: int, name: str, kind: Geom, size: Sequence[float], placement: pin.SE3) -> None:
         """Add a massless shape, which only touches what a contact pair names.
 
         Args:
-            joint: Index of the Pinocchio joint that moves it.
+            joint: Index of the Pinocchio joint that moves it, or :data:`WORLD`.
             name: Name of the geom.
-            kind: ``sphere`` or ``box``.
+            kind: ``sphere``, ``box`` or ``plane`` (endless, normal to its z axis).
             size: Radius, or three half extents, m.
             placement: Pose in the frame of the joint.
         """
-        self._add_geom(joint, name, kind.upper(), size, placement)
-
-    def add_plane(self, name: str, point: Vector, normal: Vector) -> None:
-        """Add an endless plane to the world, which only touches what a contact pair names.
-
-        Args:
-            name: Name of the geom.
-            point: A point on the plane, world, m, shape (3,).
-            normal: Unit normal out of the plane, world, shape (3,).
-        """
-        upright = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(normal)).matrix()
-        self._add_geom(WORLD, name, "PLANE", (1.0, 1.0, 1.0), pin.SE3(upright, np.array(point)))
-
-    def _add_geom(self, joint: int, name: str, kind: str, size: Sequence[float], placement: pin.SE3) -> None:
-        type_ = getattr(import_mujoco().mjtGeom, f"mjGEOM_{kind}")
+        type_ = getattr(import_mujoco().mjtGeom, f"mjGEOM_{kind.upper()}")
         size = (*size, 0.0, 0.0)[:3]
         self.body(joint).add_geom(
             name=name, type=type_, size=size, mass=0.0, contype=0, conaffinity=0, **pose(placement)
         )
+
+    def add_plane(self, name: str, point: Vector, normal: Vector) -> None:
+        """Add an endless plane through a point to the world, with a unit normal, each world, shape (3,)."""
+        upright = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(normal)).matrix()
+        self.add_geom(WORLD, name, "plane", (1.0, 1.0, 1.0), pin.SE3(upright, np.array(point)))
 
     def compile(self) -> Any:
         """Build the ``mujoco.MjModel``.

@@ -108,12 +108,9 @@ class MjcfLayout:
             elif family == "spherical":
                 value = _scalar_first(piece)
             elif family == "free-flyer":
-                pose = pin.XYZQUATToSE3(piece)
-                position, quaternion = piece[:3], pin.Quaternion(np.array(piece[3:]))
-                if slot.free:
-                    position = (slot.placement * pose).translation
-                    quaternion = pin.Quaternion(slot.placement.rotation) * quaternion
-                value = np.concatenate([position, _scalar_first(quaternion.coeffs())])
+                if slot.free and slot.moved:
+                    piece = pin.SE3ToXYZQUAT(slot.placement * pin.XYZQUATToSE3(piece))
+                value = np.concatenate([piece[:3], _scalar_first(piece[3:])])
             else:
                 value = piece
             found[slot.qpos] = value

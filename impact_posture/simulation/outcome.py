@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import pinocchio as pin
+from scipy import ndimage
 
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run
@@ -108,9 +109,6 @@ def _contacts(setup: Setup, run: Run) -> list[Event]:
 
 def _longest(flags: Flags) -> tuple[int, int]:
     """Return the begin and the length of the longest sequence of set flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-    begins, lengths = edges[::2], edges[1::2] - edges[::2]
-    if not lengths.size:
-        return 0, 0
-    k = int(np.argmax(lengths))
-    return int(begins[k]), int(lengths[k])
+    sequences = [place for (place,) in ndimage.find_objects(ndimage.label(flags)[0])]
+    longest = max(sequences, key=lambda place: place.stop - place.start, default=slice(0, 0))
+    return longest.start, longest.stop - longest.start

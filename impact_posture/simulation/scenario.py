@@ -305,13 +305,13 @@ class Scenario(ScenarioTable):
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """An experiment ready to run.
+    """An experiment that is ready to run.
 
     Attributes:
-        scenario: What was asked for.
-        robot: Its robot.
+        scenario: The experiment.
+        robot: The loaded robot.
         q: Start posture, shape (nq,).
-        world: Not reset yet.
+        world: The simulated world, before its first reset.
     """
 
     scenario: Scenario
@@ -333,7 +333,7 @@ def set_up(scenario: Scenario) -> Setup:
     """Load the robot, pose it, and build the world around it.
 
     Raises:
-        ImpactPostureError: The first thing that does not fit, in one line.
+        ImpactPostureError: Something does not fit.
     """
     tell(f"loading {scenario.robot}")
     robot = load_robot(scenario.robot, scenario)
