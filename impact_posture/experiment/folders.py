@@ -41,13 +41,7 @@ def write_simulation(
 
 
 def write_comparison(
-    out: Path,
-    found: Reproduction,
-    plan: Plan,
-    store: Store,
-    *,
-    force: bool = False,
-    formats: Sequence[str] = FORMATS,
+    out: Path, found: Reproduction, plan: Plan, store: Store, *, force: bool = False, formats: Sequence[str] = FORMATS
 ) -> None:
     """Write ``comparison.json`` and figures of the first seed, and remove the store.
 
@@ -61,13 +55,7 @@ def write_comparison(
 
 
 def write_reproduction(
-    out: Path,
-    found: Reproduction,
-    plan: Plan,
-    store: Store,
-    *,
-    force: bool = False,
-    formats: Sequence[str] = FORMATS,
+    out: Path, found: Reproduction, plan: Plan, store: Store, *, force: bool = False, formats: Sequence[str] = FORMATS
 ) -> dict[str, Any]:
     """Write ``reproduction.json``, ``SUMMARY.md``, all documents in ``runs/``, and figures, and remove the store.
 

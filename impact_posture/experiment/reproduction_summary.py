@@ -14,15 +14,6 @@ from impact_posture.simulation.controller_factory import MEANING
 
 # Most decimals of a number that is nearly zero.
 _DECIMALS = 4
-_MISSED = {
-    "reduction": "less than the paper's reduction",
-    "recovery": "less than the paper's reduction over the recovery",
-    "peak_jump": "a higher peak jump than nominal",
-    "peak_recovery": "a higher peak than nominal in the recovery",
-    "saturation": "more saturation in the windows than nominal",
-    "stops": "a joint on its stop",
-    "rested": "not at rest before the push",
-}
 # Metrics in the table of a scenario, with their significant digits.
 _COLUMNS = {
     "peak_jump": 3, "peak_recovery": 3, "peak_force": 3, "saturation_inside": 2, "saturation_outside": 2,
@@ -228,7 +219,7 @@ def targets_text(row: Row) -> str:
 def _missed(row: Row) -> str:
     """Return the missed targets in words."""
     targets = targets_of(row)
-    return "" if targets is None else ", ".join(_MISSED[name] for name in targets.missed)
+    return "" if targets is None else targets.words
 
 
 def _total(row: Row | None) -> str:

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
+from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.outcome import Outcome, gravest
 
 Document = dict[str, Any]
-# The metrics that a table shows of each controller.
-QUANTITIES = (
-    "q_total_impact", "q_total_impact_base", "q_total_impact_joints", "q_total_dwell", "q_total_recovery",
-    "peak_jump", "peak_jump_max", "peak_recovery", "peak_force", "saturation_inside", "saturation_outside",
-    "saturation_rotors", "relaxed_ticks", "failed_ticks", "slip",
-)  # fmt: skip
+# The metrics that have a mean and an interval.
+QUANTITIES = tuple(f.name for f in fields(Metrics) if f.name not in ("stops", "contacts", "contacts_asked", "rested"))
 
 
 @dataclass(frozen=True)
