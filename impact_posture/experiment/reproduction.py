@@ -20,8 +20,8 @@ Plan = Mapping[str, Sequence[str]]
 
 
 # Targets of a better controller, for the means over the seeds: whether a row misses them, given the reduction of the
-# paper, and what it then has.  A motion that only comes later, in the recovery, is no reduction.  Numbers of saturated
-# ticks are whole, so a mean that only differs in the last digits is the same.
+# paper, and what it then has.  A motion that only comes later, in the recovery, is no reduction.  Numbers of ticks
+# are whole, so a saturation that only differs in the last digits is the same.
 _TARGETS: dict[str, tuple[Callable[[Row, float], bool], str]] = {
     "reduction": (lambda row, paper: _mean(row.reduction) < paper, "less than the paper's reduction"),
     "recovery": (lambda row, paper: _mean(row.recovery) < paper, "less than the paper's reduction over the recovery"),

@@ -34,11 +34,6 @@ class Event:
     time: float
     what: str
 
-    @property
-    def line(self) -> str:
-        """Description and time."""
-        return f"{self.what} at t = {self.time:.2f} s"
-
 
 def gravest(found: Iterable[Outcome]) -> Outcome:
     """Return the gravest status, or ``completed`` if there is none."""

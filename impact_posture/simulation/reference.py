@@ -18,13 +18,11 @@ class ReferencePoint:
         distance: m.
         speed: m/s.
         acceleration: m/s².
-        contact: Number of the contact, from 0, or −1 while the robot settles.
     """
 
     distance: float
     speed: float
     acceleration: float
-    contact: int
 
 
 class Reference:
@@ -81,19 +79,11 @@ class Reference:
 
     def at(self, t: float) -> ReferencePoint:
         """Return the reference at a time, s."""
-        contact = int(np.floor((t - self.task.settle) / self.cycle))
-        if contact < 0:
-            return ReferencePoint(0.0, 0.0, 0.0, -1)
-        contact = min(contact, self.task.count - 1)
+        contact = min(max(int((t - self.task.settle) // self.cycle), 0), self.task.count - 1)
         since = t - self.start(contact)
         k = int(np.searchsorted(self._ends, since, side="right"))
-        if k == len(self._legs):
-            return ReferencePoint(0.0, 0.0, 0.0, contact)
+        if since < 0 or k == len(self._legs):
+            return ReferencePoint(0.0, 0.0, 0.0)
         duration, acceleration, distance, speed = self._legs[k]
-        s = since - (self._ends[k] - duration)
-        return ReferencePoint(
-            float(distance + speed * s + acceleration * s**2 / 2),
-            float(speed + acceleration * s),
-            acceleration,
-            contact,
-        )
+        s = float(since - (self._ends[k] - duration))
+        return ReferencePoint(distance + speed * s + acceleration * s**2 / 2, speed + acceleration * s, acceleration)

@@ -12,7 +12,6 @@ import numpy as np
 from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.processes import fork_call
 from impact_posture.progress import tell
-from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.recorder import Recorder
@@ -20,7 +19,6 @@ from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush
 from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.simulation.series import RECOVERY, Series, Window
-from impact_posture.tsid.controller import Command
 
 # Time when controllers begin to prepare, after the first reaction of sensors and motors, s.
 _BRACE = 0.1
@@ -109,9 +107,9 @@ class _Loop:
     def tick(self, reference: Reference | None = None) -> bool:
         """Take a tick.  Return whether the state did not run away."""
         point = None if reference is None else reference.at(self.t)
-        command: Command = self.driver.tick(self.world.read(), point)
+        command = self.driver.tick(self.world.read(), point)
         try:
-            self.world.step(ActuatorCommand(command.torque, command.rotor_speed), self.count)
+            self.world.step(command, self.count)
         except SimulationDiverged as error:
             # A figure needs two ticks.
             if self.recorder.ticks < 2:

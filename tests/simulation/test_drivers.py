@@ -179,7 +179,7 @@ def test_a_reference_of_the_hand_does_not_survive_a_reset() -> None:
     driver = made.driver("nominal")
     fresh = driver.reset(made.setup.q)
     made.setup.world.reset(made.setup.q)
-    driver.tick(made.setup.world.read(), ReferencePoint(0.05, 0.5, 1.0, 0))
+    driver.tick(made.setup.world.read(), ReferencePoint(0.05, 0.5, 1.0))
     again = driver.reset(made.setup.q)
     np.testing.assert_array_equal(fresh.u, again.u)
 
@@ -192,7 +192,7 @@ def test_the_hand_follows_its_reference_into_the_surface() -> None:
     (hand,) = [t for t in driver.controller.formulation.tasks if isinstance(t, FramePose)]
     assert hand.target is not None
     home = hand.target.translation.copy()
-    driver.tick(made.setup.world.read(), ReferencePoint(0.1, 0.3, 0.8, 0))
+    driver.tick(made.setup.world.read(), ReferencePoint(0.1, 0.3, 0.8))
     # Against the wall's normal, which is −x.
     np.testing.assert_allclose(hand.target.translation - home, [0.1, 0, 0], atol=1e-15)
     np.testing.assert_allclose(hand.target_velocity, [0.3, 0, 0, 0, 0, 0])
