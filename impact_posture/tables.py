@@ -8,9 +8,9 @@ import tomllib
 from dataclasses import asdict, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, ClassVar, TypeVar, get_type_hints
 
-from impact_posture.errors import SpecError, nearest, not_one_of
+from impact_posture.errors import InputError, SpecError, nearest, not_one_of
 
 _Table = TypeVar("_Table")
 
@@ -74,13 +74,9 @@ def _keys_at(cls: type, location: tuple[int | str, ...]) -> list[str]:
     """The keys of the table at a place inside the table of ``cls``."""
     for part in location:
         hint = get_type_hints(cls).get(str(part))
-        inner = [
-            c for c in (hint, *getattr(hint, "__args__", ())) if isinstance(c, type) and hasattr(c, "__annotations__")
-        ]
+        inner = [c for c in (hint, *getattr(hint, "__args__", ())) if isinstance(c, type) and is_dataclass(c)]
         cls = inner[0] if inner else cls
-    if not is_dataclass(cls):
-        return [name.rstrip("_") for name in cls.model_fields]  # type: ignore[attr-defined]
-    return [field.name for field in fields(cls)]
+    return [field.name for field in fields(cls)]  # type: ignore[arg-type]
 
 
 def read_toml(path: Path) -> dict[str, object]:
@@ -99,3 +95,39 @@ def read_toml(path: Path) -> dict[str, object]:
         raise SpecError("is nested too deeply", where=str(path), hint="correct the syntax") from None
     except tomllib.TOMLDecodeError as error:
         raise SpecError(f"is not valid TOML ({error})", where=str(path), hint="correct the syntax") from None
+
+
+class Checked:
+    """Base of a dataclass whose annotations say which values it takes, in a file and in Python."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+
+    def __post_init__(self) -> None:
+        """Check every value against its annotation.
+
+        Raises:
+            InputError: A value does not fit.
+        """
+        from pydantic import ValidationError
+
+        for name, adapter in _field_adapters(type(self)).items():  # type: ignore[arg-type]
+            try:
+                adapter.validate_python(getattr(self, name))
+            except ValidationError as error:
+                # Of the alternatives of a union, the one that fits best fails deepest.
+                fault = max(error.errors(), key=lambda fault: len(fault["loc"]))
+                missing = fault["type"] == "missing"
+                index = "".join(f"[{part}]" for part in fault["loc"] if isinstance(part, int) and not missing)
+                raise InputError(
+                    f"{name}{index} is {fault['input']!r}",
+                    where=type(self).__name__,
+                    hint=fault["msg"].replace("Input should", "it should"),
+                ) from None
+
+
+@cache
+def _field_adapters(cls: type) -> dict[str, Any]:
+    from pydantic import TypeAdapter
+
+    hints = get_type_hints(cls, include_extras=True)
+    return {field.name: TypeAdapter(hints[field.name]) for field in fields(cls)}

@@ -42,7 +42,7 @@ def reproduce(
     from impact_posture.errors import ScenarioNotFound
     from impact_posture.experiment.folders import FORMATS, store_beside, write_reproduction
     from impact_posture.experiment.paper import PAPER
-    from impact_posture.experiment.reproduction import controllers_of, jobs_of
+    from impact_posture.experiment.reproduction import controllers_of
     from impact_posture.experiment.reproduction import reproduce as reproduce_all
     from impact_posture.experiment.reproduction_summary import advice
     from impact_posture.output_folder import check_output
@@ -57,8 +57,8 @@ def reproduce(
     check_output(folder, force=force, kind="reproduction")
     store = store_beside(folder)
     with progress_line(shown=not (quiet or json)) as progress:
-        found = reproduce_all(scenarios, seeds=seeds, everything=all_, processes=jobs, store=store, progress=progress)
-        plan = [job for name in scenarios for job in jobs_of(name, controllers_of(name, all_), seeds)]
+        plan = {name: controllers_of(name, all_) for name in scenarios}
+        found = reproduce_all(plan, seeds=seeds, processes=jobs, store=store, progress=progress)
         formats = [f.value for f in format or ()] or FORMATS
         document = write_reproduction(folder, found, plan, store, force=force, formats=formats)
     if json:
