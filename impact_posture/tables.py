@@ -76,7 +76,7 @@ def _keys_at(cls: type, location: tuple[int | str, ...]) -> list[str]:
         hint = get_type_hints(cls).get(str(part))
         inner = [c for c in (hint, *getattr(hint, "__args__", ())) if isinstance(c, type) and is_dataclass(c)]
         cls = inner[0] if inner else cls
-    return [field.name for field in fields(cls)]  # type: ignore[arg-type]
+    return [field.name for field in fields(cls)]
 
 
 def read_toml(path: Path) -> dict[str, object]:

@@ -74,7 +74,7 @@ def test_an_aerial_draw_looks_at_its_surface_from_where_it_is_mounted(scenario: 
     place = data.oMi[model.getJointId("shoulder_pitch")].translation - setup.q[:3]
     np.testing.assert_allclose(place, [v["x"], 0.0, v["z"]], atol=1e-9)
     shipped = read_scenario(scenario)
-    own = load_robot(shipped.robot, shipped.load).model.armature[6:]
+    own = load_robot(shipped.robot, shipped).model.armature[6:]
     np.testing.assert_allclose(setup.robot.model.armature[6:], v["armature"] * own)
     assert setup.scenario.control.robust.gain == pytest.approx(v["gain"] * shipped.control.robust.gain)
     assert isinstance(setup.scenario.task, RepeatedContacts)
