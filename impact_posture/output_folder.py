@@ -137,17 +137,35 @@ def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
     """Name more files as ours in a folder that has a record; elsewhere nothing happens.
 
     Raises:
-        OSError: The record cannot be written.
+        OutputError: The record cannot be written.
     """
     content = _read_record(folder)
     if content is None:
         return
     added = {path.absolute().relative_to(folder.absolute()).as_posix() for path in paths}
     content["files"] = sorted(added.union(content["files"]))
-    beside = folder / f"{RECORD}.{os.getpid()}.part"
-    with undone(lambda: beside.unlink(missing_ok=True)):
-        beside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        os.replace(beside, folder / RECORD)
+    write_whole(folder / RECORD, json.dumps(content, indent=1) + "\n")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that appears whole or not at all.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+
+    def remove() -> None:
+        with suppress(OSError):
+            beside.unlink()
+
+    try:
+        with undone(remove):
+            beside.write_text(text, encoding="utf-8", newline="\n")
+            os.replace(beside, path)
+    except OSError as error:
+        hint = "check the disk and permissions"
+        raise OutputError(f"cannot be written ({error.strerror})", where=str(path), hint=hint) from None
 
 
 # ---- what is ours --------------------------------------------------------------------------------------------------

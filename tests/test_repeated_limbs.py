@@ -13,16 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from impact_posture.codegen.build_check import compiled, oracle_difference
-from impact_posture.codegen.code import build_code
-from impact_posture.codegen.emitter import DOUBLE
+from impact_posture.codegen.build_check import largest_difference
 from impact_posture.codegen.export import export
-from impact_posture.codegen.functions import Library, library
-from impact_posture.codegen.graph import ARITHMETIC, COSINE, Graph, graph_of
+from impact_posture.codegen.functions import library, oracle_reference
+from impact_posture.codegen.graph import ARITHMETIC, COSINE, Graph
 from impact_posture.codegen.layout import lay_out
-from impact_posture.codegen.simd_lanes import packed
 from impact_posture.codegen.sums import rebuilt
-from impact_posture.codegen.variants import variants
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.impact_case import ImpactCase
@@ -31,6 +27,7 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.robot.robot_loader import LoadOptions, load_robot
 from impact_posture.toolchain import run_compiler
+from tests.exported import built
 from tests.helpers import assert_close, random_configurations, rng, robot, unit
 from tests.tools import need_compiler
 
@@ -95,10 +92,6 @@ def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarr
     return {name: np.array([float(found[k]) for k in nodes]) for name, nodes in graph.outputs.items()}
 
 
-def packed_of(found: Library) -> Graph:
-    return packed(graph_of(found.function), found.seeds, {"constants": list(found.constants)})
-
-
 def shares(graph: Graph) -> dict[int, int]:
     """Width → operations of that width that some output needs."""
     needed: set[int] = set()
@@ -143,7 +136,7 @@ def test_random_twins_against_pinocchio(
     contact = ImpactContact(f"b0_{len(branch) - 1}", (0.3, -0.4, 0.9), (0.05, 0.1, -0.02))
     objective = ImpactObjective(loaded, contact, Metric(metric, weights), "speed", supports)  # type: ignore[arg-type]
     found = library([objective], ["twins"])
-    graph = packed_of(found)
+    graph = found.vector_graph()
     assert max(shares(graph)) == (4 if count > 3 else 2)
     for q in random_configurations(loaded.model, 2, "twins", seed):
         n = unit(generator)
@@ -169,11 +162,11 @@ def test_random_twins_against_pinocchio(
 def test_robots_with_twins(name: str, frame: str, width: int, most: float) -> None:
     objective = ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))
     found = library([objective], [name])
-    graph = packed_of(found)
+    graph = found.vector_graph()
     counts = shares(graph)
     assert set(counts) == {1, width}
     # The same with numbers alone: vectors change the order of no sum.
-    plain = graph_of(found.function, {"constants": found.constants})
+    plain = found.graph()
     assert sum(counts.values()) < most * shares(plain)[1]
     for q in random_configurations(robot(name).model, 2, name):
         inputs = {"q": q, "n": unit(rng(name))}
@@ -194,7 +187,7 @@ def longest(graph: Graph) -> int:
 def test_sums_in_another_order_have_the_same_value_sooner(name: str) -> None:
     frame = robot(name).spec.contact.frame if robot(name).spec.contact else robot(name).model.frames[-1].name
     found = library([ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))], [name])
-    graph = packed_of(found)
+    graph = found.vector_graph()
     other = rebuilt(graph)
     assert longest(other) < 0.95 * longest(graph)
     assert sum(shares(other).values()) <= 1.01 * sum(shares(graph).values())
@@ -232,19 +225,20 @@ def test_compiled_twins(tmp_path: Path, count: int, flags: tuple[str, ...]) -> N
     objective = ImpactObjective(loaded, ImpactContact("b1_2", (0.3, -0.4, 0.9)), kind="sticking")
     export(objective, tmp_path, prefix="t", check=False)
     strict = ("-Wall", "-Wextra", "-pedantic", "-Werror")
-    with compiled(tmp_path, "t", loaded.nq, loaded.nv, (*strict, *flags)) as built:
-        assert oracle_difference(built, objective, 5) <= 1e-10
+    with built(tmp_path, "t", (*strict, *flags)) as compiled:
+        assert largest_difference(compiled.gradient, objective, oracle_reference, 5) <= 1e-10
 
 
 def test_portable_has_no_vectors_and_the_same_numbers(tmp_path: Path) -> None:
     need_compiler()
     objective = ImpactObjective(robot("solo8"), ImpactContact("base_link", (0.0, 0.6, 0.8)))
-    text = build_code(variants([objective], "s"), "s", DOUBLE, portable=True)
-    assert "vector_size" not in text.vectors and "_r4" not in text.functions
-    assert "vector_size" in build_code(variants([objective], "s"), "s", DOUBLE).vectors
-    export(objective, tmp_path, prefix="s", portable=True, check=False)
-    with compiled(tmp_path, "s", objective.robot.nq, objective.robot.nv) as built:
-        assert oracle_difference(built, objective, 5) <= 1e-10
+    export(objective, tmp_path, prefix="s", check=False)
+    assert "vector_size" in (tmp_path / "s.c").read_text()
+    export(objective, tmp_path, prefix="s", portable=True, check=False, force=True)
+    text = (tmp_path / "s.c").read_text()
+    assert "vector_size" not in text and "__attribute__((unused))" not in text and "V4" not in text.split("#undef")[0]
+    with built(tmp_path, "s") as compiled:
+        assert largest_difference(compiled.gradient, objective, oracle_reference, 5) <= 1e-10
 
 
 @pytest.mark.parametrize("flags", [(), ("-O3", "-march=native")], ids=["plain", "native"])
@@ -256,12 +250,12 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
     objective = ImpactObjective(loaded, ImpactContact("b0_1", (0.3, -0.4, 0.9)))
     export(objective, tmp_path, prefix="t", check=False)
     n = np.array(objective.contact.normal)
-    with compiled(tmp_path, "t", loaded.nq, loaded.nv, flags) as built:
+    with built(tmp_path, "t", flags) as compiled:
         for angle in (0.0, 1e-9, math.pi / 4, math.pi / 2, 3.0, -2.5, 100.0, 1e4, 9.99e5, 1.01e6, 1e15, -1e20):
             q = np.full(loaded.nq, angle)
             reduced = np.full(loaded.nq, math.atan2(math.sin(angle), math.cos(angle)))
             expected = ImpactOracle(ImpactCase(loaded, objective.contact, objective.metric)).quantities(reduced)
-            code, H, _ = built.eval(q, n)
+            code, H, _ = compiled.eval(q, n)
             assert code == 0
             # An angle's own last digit is what is left of it.
             assert pytest.approx(expected.H, rel=1e-11) == H, angle
@@ -271,7 +265,7 @@ def test_blocks_are_shared() -> None:
     """What value needs is a part of what eval needs, computed by blocks that both call."""
     objective = ImpactObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
     found = library([objective], ["t"])
-    layout = lay_out(packed_of(found), [f.outputs for f in found.functions])
+    layout = lay_out(found.vector_graph(), [f.outputs for f in found.functions])
     names = [f.name for f in found.functions]
     calls = {
         name: {b for b, block in enumerate(layout.blocks) if k in block.functions} for k, name in enumerate(names)

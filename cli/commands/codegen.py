@@ -57,7 +57,7 @@ def codegen(
     else:
         options.check_contact(frame[0] if frame else None, normal, contact)
     supports = options.check_supports(support, no_support)
-    from impact_posture.codegen.export_folder import write_export
+    from impact_posture.codegen.export import write_export
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.progress import progress_bar
 
@@ -116,11 +116,11 @@ def codegen(
     page.title(f"{objectives[0].robot.name} at {where}", f"objective {objectives[0].name}")
     page.pairs(
         [
-            ("folder", str(written.out)),
+            ("folder", str(written.folder)),
             ("functions", ", ".join(written.functions)),
             ("posture", "the result's optimum" if posture is not None else "none"),
-            ("numbers", written.export.manifest["real"]),
-            ("stack", f"at most {written.export.manifest['stack_bytes']} bytes"),
+            ("numbers", written.manifest["real"]),
+            ("stack", f"at most {written.manifest['stack_bytes']} bytes"),
         ]
     )
     page.line(written.verdict)

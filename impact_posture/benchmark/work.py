@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from impact_posture.benchmark.count import Operations
 from impact_posture.codegen.functions import library
-from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph, graph_of
-from impact_posture.codegen.simd_lanes import packed
+from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph
 from impact_posture.impact.objective import ImpactObjective
 
 _KINDS = {"+": "add", "-": "add", "*": "mul", "/": "div", "inv": "div", "neg": "neg", SINE: "trig", COSINE: "trig"}
@@ -23,11 +22,10 @@ def eval_operations(objective: ImpactObjective) -> Operations:
     """
     found = library([objective], ["kernel"])
     outputs = next(f.outputs for f in found.functions if f.name == "eval")
-    constants = {"constants": list(found.constants)}
-    single = operations_of(graph_of(found.function, constants), outputs)
+    single = operations_of(found.graph(), outputs)
     if not found.seeds:
         return single
-    graph = packed(graph_of(found.function), found.seeds, constants)
+    graph = found.vector_graph()
     done = sum(graph.nodes[k].op in ARITHMETIC - {"neg"} for k in _reached(graph, outputs))
     return Operations(single.add, single.mul, single.div, single.trig, single.neg, done + single.trig)
 

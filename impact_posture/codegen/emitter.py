@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,6 +75,7 @@ class Real:
 
 DOUBLE = Real("double", 8, 1e-6)
 FLOAT = Real("float", 4, 1e-5)
+REALS = {real.name: real for real in (DOUBLE, FLOAT)}
 
 
 def c_double(value: float) -> str:
@@ -83,30 +84,6 @@ def c_double(value: float) -> str:
         return "NAN"
     text = "INFINITY" if math.isinf(value) else repr(abs(value))
     return f"(-{text})" if math.copysign(1.0, value) < 0 else text
-
-
-def c_vector(values: Sequence[float], indent: str = "  ", real: Real = DOUBLE) -> str:
-    """A brace initializer, four numbers a line."""
-    texts = [real.literal(float(v)).strip("()") for v in values]
-    rows = [", ".join(texts[k : k + 4]) for k in range(0, len(texts), 4)]
-    return "{\n" + ",\n".join(f"{indent}  {row}" for row in rows) + f"\n{indent}}}"
-
-
-@dataclass(frozen=True)
-class Dialect:
-    """What the emitted text is about.
-
-    Attributes:
-        prefix: What C names begin with.
-        real: The type of literals.
-        types: Width → C type of such a number or vector.
-        work: What callers call the structure that holds inputs and work arrays; empty where inputs stand alone.
-    """
-
-    prefix: str
-    real: Real
-    types: dict[int, str]
-    work: str = ""
 
 
 @dataclass(frozen=True)
@@ -147,7 +124,7 @@ class Constants:
         known = self._tables.setdefault(node.width, {})
         return f"{_short(node.width)}[{known.setdefault(node.value, len(known))}]"
 
-    def text(self, types: dict[int, str]) -> str:
+    def text(self, types: Mapping[int, str]) -> str:
         """The tables, of the types for each width, and their short names."""
         lines = []
         for width, known in sorted(self._tables.items()):
@@ -169,14 +146,27 @@ class Emitter:
     """The C of one laid-out graph.
 
     Args:
-        layout: Blocks and what they hand on.
-        dialect: Names and types.
-        size: Bytes of the dialect's type of width one.
-        constants: Where its numbers go.
+        layout: Blocks and the values that they hand on.
+        prefix: Beginning of the names of the blocks.
+        real: The type of literals.
+        types: Width → C type of such a number or vector.
+        constants: Tables that receive the numbers.
+        size: Bytes of the type of width one, if it is not ``real``.
+        work: Name of the structure with inputs and work arrays; empty where inputs are arguments of their own.
     """
 
-    def __init__(self, layout: Layout, dialect: Dialect, size: int, constants: Constants) -> None:
-        self.layout, self.dialect, self._size, self._constants = layout, dialect, size, constants
+    def __init__(
+        self,
+        layout: Layout,
+        prefix: str,
+        real: Real,
+        types: Mapping[int, str],
+        constants: Constants,
+        size: int = 0,
+        work: str = "",
+    ) -> None:
+        self.layout, self._prefix, self._real, self._types = layout, prefix, real, types
+        self._constants, self._size, self._work = constants, size or real.size, work
         self._graph = layout.graph
         at = {k: number for number, block in enumerate(layout.blocks) for k in block.nodes}
         # What its own block uses again, so that it needs a name there.
@@ -196,11 +186,11 @@ class Emitter:
         """An output's value after the blocks have run."""
         node = self._graph.nodes[k]
         if node.op == "const":
-            return self.dialect.real.literal(node.value[0])
+            return self._real.literal(node.value[0])
         if node.op == "lane":
             return f"{self.output(node.args[0], work)}[{node.args[1]}]"
         if node.op == "in":
-            return f"{work if self.dialect.work else ''}{self._graph.inputs[node.args[0]]}[{node.args[1]}]"
+            return f"{work if self._work else ''}{self._graph.inputs[node.args[0]]}[{node.args[1]}]"
         if k in self.layout.trig:
             return f"{work}{'c' if node.op == COSINE else 's'}[{self.layout.trig[k]}]"
         return f"{work}{self._slot(k)}"
@@ -218,26 +208,26 @@ class Emitter:
             if kept and k not in self._reused:
                 lines.append(f"{kept}{text};")
             elif node.op == "gather":
-                lines.append(f"{self.dialect.types[node.width]} {names[k]}={text};")
+                lines.append(f"{self._types[node.width]} {names[k]}={text};")
                 lines += [f"{kept}{names[k]};"] if kept else []
             else:
-                lines.append(f"{self.dialect.types[node.width]} {names[k]}={kept}{text};")
+                lines.append(f"{self._types[node.width]} {names[k]}={kept}{text};")
         body = "\n".join(lines)
         used = set(re.findall(r"\b([a-z]\w*)\[|\((\w) \+", body))
         present = {name for pair in used for name in pair if name}
-        scalar = self.dialect.types[1]
+        scalar = self._types[1]
         parameters, arguments = [], []
         for name in self._graph.inputs:
             if name in present:
                 parameters.append(f"const {scalar} *{name}")
-                arguments.append(f"{self.dialect.work}.{name}" if self.dialect.work else name)
+                arguments.append(f"{self._work}.{name}" if self._work else name)
         for name in _SHARED:
             if name in present:
                 constant = "const " if name in "sc" else ""
-                kind = self.dialect.types[int(name[1:] or 1)]
+                kind = self._types[int(name[1:] or 1)]
                 parameters.append(f"{constant}{kind} *{name}")
-                arguments.append(f"{self.dialect.work or 'm'}.{name}")
-        title = f"{self.dialect.prefix}_block{number}"
+                arguments.append(f"{self._work or 'm'}.{name}")
+        title = f"{self._prefix}_block{number}"
         local = sum(self._graph.nodes[k].width for k in names) * self._size
         return BlockText(
             f"APART static void {title}({', '.join(parameters)})\n{{\n{body}\n}}\n",
@@ -272,9 +262,9 @@ class Emitter:
         elif node.op == "neg":
             text = f"-{operands[0]}"
         elif node.op == "inv":
-            text = self.dialect.real.spelled("1.0") + f"/{operands[0]}"
+            text = self._real.spelled("1.0") + f"/{operands[0]}"
         else:
-            return self.dialect.real.spelled(node.op).format(*operands)
+            return self._real.spelled(node.op).format(*operands)
         return text if top else f"({text})"
 
     def _leaf(self, k: int, node: Node, number: int, names: dict[int, str], lines: list[str]) -> str:
@@ -288,7 +278,7 @@ class Emitter:
         if node.width == 1:
             return f"{array}[{self.layout.trig[k]}]"
         names[k] = f"v{len(names)}"
-        kind = self.dialect.types[node.width]
+        kind = self._types[node.width]
         lines.append(f"const {kind} {names[k]} = *(const {kind}u *)({array} + {self.layout.trig[k]});")
         return names[k]
 

@@ -2,35 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
-from impact_posture.codegen.simd_lanes import Seed
+from impact_posture.codegen.graph import Graph, graph_of
+from impact_posture.codegen.simd_lanes import Seed, packed
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.oracle import ImpactOracle
+
+Vector = NDArray[np.float64]
+Reference = Callable[[Vector, Vector], dict[str, Vector]]
+"""Quantities at a configuration ``q`` (nq,) and a normal ``n`` (3,), by name, each a flat array."""
 
 
-def jump_fun(objective: ImpactObjective) -> ca.Function:
-    """``(q, n) → a, G, H``: ``a = M⁻¹Jᵀn`` (nv), ``G = nᵀJa`` and ``H = aᵀWa``."""
+def casadi_reference(objective: ImpactObjective) -> Reference:
+    """Return the quantities of an export as CasADi interprets them.
+
+    The names are ``H``, ``grad`` (nv,), ``jump`` (nv,), ``G``, ``V = H/G²``, ``ellipsoid`` (9,).  ``objective`` and
+    ``objective_grad`` (nv,) are at the objective's own normal; several contacts at once have these two only.
+    """
     k = objective.kernel
-    names = (["q", "n"], ["a", "G", "H"])
-    return ca.Function("jump", [k.q, k.n], [k.jump.a, k.G, k.H], *names, {"cse": True})
+    value, gradient = objective.gradient_fun().call([k.q, ca.DM(objective.contact.normal)])
+    outputs = {} if objective.others else {"H": k.H, "grad": k.grad_H}
+    outputs |= {"objective": value, "objective_grad": gradient}
+    outputs |= {} if objective.others else {"jump": k.jump.a, "G": k.G, "V": k.V, "ellipsoid": k.ellipsoid}
+    function = ca.Function("reference", [k.q, k.n], [*outputs.values()], ["q", "n"], [*outputs], {"cse": True})
+
+    def evaluate(q: Vector, n: Vector) -> dict[str, Vector]:
+        return {name: np.array(x, dtype=float).ravel() for name, x in zip(outputs, function(q, n), strict=True)}
+
+    return evaluate
 
 
-def ellipsoid_fun(objective: ImpactObjective) -> ca.Function:
-    """``q → Λ_c``, shape (3, 3), world axes."""
-    k = objective.kernel
-    return ca.Function("ellipsoid", [k.q], [k.ellipsoid], ["q"], ["L"], {"cse": True})
+def oracle_reference(objective: ImpactObjective) -> Reference:
+    """Return the same quantities from the numbers of Pinocchio."""
+
+    def evaluate(q: Vector, n: Vector) -> dict[str, Vector]:
+        found = {"objective": objective.value(q), "objective_grad": objective.gradient(q)}
+        if not objective.others:
+            oracle = oracle_along(objective, n)
+            at = oracle.quantities(q)
+            found |= {"H": at.H, "grad": oracle.gradient_H(q), "jump": at.jump, "G": at.G, "V": at.V}
+            found["ellipsoid"] = at.ellipsoid
+        return {name: np.ravel(value) for name, value in found.items()}
+
+    return evaluate
 
 
-def objective_fun(objective: ImpactObjective) -> ca.Function:
-    """``q → value, grad`` of the objective at its own normal."""
-    q, _ = (general := objective.gradient_fun()).sx_in()
-    fixed = general.call([q, ca.DM(objective.contact.normal)])
-    return ca.Function("objective", [q], fixed, ["q"], ["value", "grad"], {"cse": True})
+def oracle_along(objective: ImpactObjective, normal: Vector) -> ImpactOracle:
+    """Return the oracle of the leading contact along another normal, shape (3,), in the axes of its own."""
+    x, y, z = (float(v) for v in normal)
+    return ImpactOracle(replace(objective.case, contact=replace(objective.contact, normal=(x, y, z))))
 
 
 @dataclass(frozen=True)
@@ -63,6 +91,17 @@ class Library:
     constants: tuple[float, ...]
     seeds: Mapping[tuple[str, int], Seed]
     functions: tuple[Exported, ...]
+
+    def graph(self) -> Graph:
+        """Return the operations on single numbers, with the constants as numbers."""
+        *inputs, _ = self.function.sx_in()
+        values = self.function.call([*inputs, ca.DM(self.constants)])
+        names = self.function.name_in()[:-1], self.function.name_out()
+        return graph_of(ca.Function("numbers", inputs, values, *names, {"cse": True}))
+
+    def vector_graph(self) -> Graph:
+        """Return the same operations with one vector operation for those that repeated limbs share."""
+        return packed(graph_of(self.function), self.seeds, {"constants": self.constants})
 
 
 def library(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -85,13 +85,14 @@ class Graph:
     _known: dict[Node, int] = field(default_factory=dict)
 
     def add(self, node: Node) -> int:
-        """Number of the node, simplified where its operands are constants."""
+        """Return the number of the node; arithmetic on constants becomes a constant."""
+        operands = [self.nodes[a] for a in node.operands]
+        if node.op in ARITHMETIC and all(o.op == "const" for o in operands):
+            width = max(o.width for o in operands)
+            lanes = [[o.value[k if o.width > 1 else 0] for o in operands] for k in range(width)]
+            return self.constant(*[_COMPUTE[node.op](*numbers) for numbers in lanes])
         if node.op in _COMMUTE:
             node = Node(node.op, tuple(sorted(node.args)), node.width)
-        simpler = self._simplified(node) if node.op in ARITHMETIC else None
-        if isinstance(simpler, int):
-            return simpler
-        node = node if simpler is None else simpler
         if node not in self._known:
             self._known[node] = len(self.nodes)
             self.nodes.append(node)
@@ -109,29 +110,6 @@ class Graph:
             return self.constant(found.value[lane if found.width > 1 else 0])
         return node if found.width == 1 else self.add(Node("lane", (node, lane)))
 
-    def _simplified(self, node: Node) -> Node | int | None:
-        operands = [self.nodes[a] for a in node.args]
-        if all(o.op == "const" for o in operands):
-            width = max(o.width for o in operands)
-            lanes = [[o.value[k if o.width > 1 else 0] for o in operands] for k in range(width)]
-            return self.constant(*[_COMPUTE[node.op](*numbers) for numbers in lanes])
-        values = [o.value[0] if o.op == "const" and o.width == 1 else None for o in operands]
-        if len(operands) == 1:
-            return operands[0].args[0] if node.op == "neg" and operands[0].op == "neg" else None
-        (a, b), (x, y) = node.args, values
-        fits = {k: self.nodes[k].width == node.width for k in (a, b)}
-        if node.op == "*" and 0.0 in (x, y):
-            return self.constant(0.0)
-        rules: list[tuple[bool, Node | int]] = [
-            (node.op in "+*" and x == (0.0 if node.op == "+" else 1.0) and fits[b], b),
-            (node.op in "+-" and y == 0.0 and fits[a], a),
-            (node.op in "*/" and y == 1.0 and fits[a], a),
-            (node.op == "-" and x == 0.0, Node("neg", (b,), node.width)),
-            (node.op == "*" and x == -1.0, Node("neg", (b,), node.width)),
-            (node.op == "*" and y == -1.0, Node("neg", (a,), node.width)),
-        ]
-        return next((self.add(found) if isinstance(found, Node) else found for holds, found in rules if holds), None)
-
 
 _COMPUTE: dict[str, Callable[..., float]] = {
     "+": lambda a, b: a + b,
@@ -143,42 +121,32 @@ _COMPUTE: dict[str, Callable[..., float]] = {
 }
 
 
-def graph_of(function: ca.Function, parameters: Mapping[str, Sequence[float]] | None = None) -> Graph:
-    """The operations of an SX function, one reciprocal for each number that several are divided by.
+def graph_of(function: ca.Function) -> Graph:
+    """Return the operations of an SX function, with one reciprocal for each number that divides several.
 
-    Args:
-        function: An SX function; its sparse outputs are taken as dense.
-        parameters: Inputs that are constants, by name.
+    Sparse outputs become dense.
 
     Raises:
-        CompilerError: An operation that has no C here.
+        CompilerError: An operation has no C form.
     """
-    function = _dense(function)
-    names, constants = function.name_in(), dict(parameters or {})
-    graph = Graph(tuple(names))
+    inputs = function.sx_in()
+    outputs = [ca.densify(value) for value in function.call(inputs)]
+    function = ca.Function("dense", inputs, outputs, function.name_in(), function.name_out())
+    graph = Graph(tuple(function.name_in()))
+    graph.outputs = {name: [graph.constant(0.0)] * function.numel_out(name) for name in function.name_out()}
     divisors = _divisors(function)
     held: dict[int, int] = {}
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
         source, target = function.instruction_input(k), function.instruction_output(k)
         if operation == ca.OP_OUTPUT:
-            name = function.name_out(target[0])
-            entries = graph.outputs.setdefault(name, [graph.constant(0.0)] * function.numel_out(name))
-            entries[target[1]] = held[source[0]]
-            continue
-        if operation == ca.OP_CONST:
-            found = graph.constant(function.instruction_constant(k))
+            graph.outputs[function.name_out(target[0])][target[1]] = held[source[0]]
+        elif operation == ca.OP_CONST:
+            held[target[0]] = graph.constant(function.instruction_constant(k))
         elif operation == ca.OP_INPUT:
-            name = names[source[0]]
-            known = constants.get(name)
-            found = (
-                graph.add(Node("in", (source[0], source[1]))) if known is None else graph.constant(known[source[1]])
-            )
+            held[target[0]] = graph.add(Node("in", (source[0], source[1])))
         else:
-            found = _operation(graph, operation, [held[s] for s in source], divisors[k])
-        held[target[0]] = found
-    for name in function.name_out():
-        graph.outputs.setdefault(name, [graph.constant(0.0)] * function.numel_out(name))
+            held[target[0]] = _operation(graph, operation, [held[s] for s in source], divisors[k])
     return graph
 
 
@@ -218,9 +186,3 @@ def _divisors(function: ca.Function) -> list[int]:
             made[function.instruction_output(k)[0]] = k
     counts = Counter(by.values())
     return [counts[by[k]] if k in by else 0 for k in range(function.n_instructions())]
-
-
-def _dense(function: ca.Function) -> ca.Function:
-    inputs = function.sx_in()
-    outputs = [ca.densify(value) for value in function.call(inputs)]
-    return ca.Function("dense", inputs, outputs, function.name_in(), function.name_out())

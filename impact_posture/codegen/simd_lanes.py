@@ -6,7 +6,7 @@ place in the branch.  Operations of all the lanes of a group with one key become
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph, Node
@@ -30,7 +30,7 @@ class Seed:
     name: str
 
 
-def packed(graph: Graph, seeds: Mapping[tuple[str, int], Seed], values: Mapping[str, list[float]]) -> Graph:
+def packed(graph: Graph, seeds: Mapping[tuple[str, int], Seed], values: Mapping[str, Sequence[float]]) -> Graph:
     """The same computation with vectors for what twins share.
 
     Args:
@@ -115,7 +115,7 @@ def _of_input(graph: Graph, node: Node) -> bool:
     return node.op in (SINE, COSINE) and graph.nodes[node.args[0]].op == "in"
 
 
-def _merge(graph: Graph, bundles: Mapping[int, tuple[int, ...]], values: Mapping[str, list[float]]) -> Graph:
+def _merge(graph: Graph, bundles: Mapping[int, tuple[int, ...]], values: Mapping[str, Sequence[float]]) -> Graph:
     """A graph with vectors; constants that were inputs get their values."""
     found = Graph(graph.inputs)
     made: dict[int, int] = {}

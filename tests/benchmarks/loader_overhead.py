@@ -18,7 +18,7 @@ from impact_posture.benchmark.timing import Loops, one_core
 from impact_posture.benchmark.workbench import Workbench
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.library import library_path
+from impact_posture.libraries import library_path
 from tests.benchmarks.common import default_problem, machine
 
 CASES = [("tilthex_arm", "ee"), ("solo8", "base_link"), ("panda", "panda_hand_tcp")]

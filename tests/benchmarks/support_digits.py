@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.codegen.build_check import compiled
 from impact_posture.codegen.export import export
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot_loader import load_robot
 from tests.exact import Exact, ExactImpact, digits, distance
 from tests.exact_bounds import Bounded
+from tests.exported import built
 from tests.helpers import random_configurations
 
 PAGE = Path(__file__).parents[2] / "docs" / "generated" / "digits.md"
@@ -72,7 +72,7 @@ def _row(name: str, normal: tuple[float, float, float], share: float) -> str:
     moved, bound, ranks = 0.0, 0.0, set()
     with tempfile.TemporaryDirectory() as folder:
         export(objective, Path(folder), prefix="feet", check=False)
-        with compiled(Path(folder), "feet", robot.nq, robot.nv) as library:
+        with built(Path(folder), "feet") as library:
             for q in [robot.posture(), *random_configurations(robot.model, POSTURES, name, "digits", spread=0.5)]:
                 oracle = objective.oracle
                 own, gradient = oracle.quantities(q), oracle.gradient_H(q)
