@@ -8,7 +8,7 @@ from impact_posture.benchmark.case import Case
 from impact_posture.benchmark.generated import base_rotation, c_source, compiled, function_of
 from impact_posture.benchmark.peer import Peer
 from impact_posture.benchmark.workbench import Workbench
-from impact_posture.dynamics.chart import Chart, integrate
+from impact_posture.dynamics.chart import Chart, tangent_map
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.contact import point_on
 
@@ -21,7 +21,8 @@ def peers(case: Case, bench: Workbench) -> list[Peer]:
     """
     robot = case.robot
     q, n, step = ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3), ca.SX.sym("step", robot.nv)
-    at, direction = integrate(Chart(robot.model), q, step), n
+    # To first order in the step this is q ⊕ step.
+    at, direction = q + tangent_map(Chart(robot.model), q) @ step, n
     if robot.floating:
         # M does not depend on the base's pose: leave it at rest and give the normal in the base's axes.
         at = ca.vertcat(ca.DM([0, 0, 0, 0, 0, 0, 1]), at[7:])

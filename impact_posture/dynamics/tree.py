@@ -26,7 +26,7 @@ from impact_posture.dynamics.spatial import (
     symmetric,
 )
 
-__all__ = ["ByJoint", "Coupling", "PointOnLink", "Product", "Response", "Tree", "Wrench"]
+__all__ = ["ByJoint", "PointOnLink", "Response", "Tree", "Wrench"]
 
 
 @dataclass(frozen=True)
@@ -44,25 +44,6 @@ class Wrench:
     force: ca.SX
     moment: ca.SX
     in_frame: bool = False
-
-
-@dataclass(frozen=True)
-class Coupling:
-    """``scale · wᵀ J v`` of a wrench and a set of link velocities."""
-
-    wrench: Wrench
-    velocities: ByJoint
-    scale: float | ca.SX = 1.0
-
-
-@dataclass(frozen=True)
-class Product:
-    """``scale · leftᵀ M right`` of two sets of link velocities; ``extra``: with the extra inertias."""
-
-    left: ByJoint
-    right: ByJoint
-    scale: float | ca.SX = 1.0
-    extra: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,10 +95,6 @@ class Tree(Kinematics):
             found[i] = moved + own
         return found
 
-    def momenta(self, velocities: ByJoint) -> ByJoint:
-        """Momentum of each link's whole subtree, in link coordinates, for the given link velocities."""
-        return self._accumulate({i: self._inertia[i] @ velocities[i] for i in velocities})
-
     def _accumulate(self, forces: ByJoint) -> ByJoint:
         total = dict(forces)
         for i in sorted(total, reverse=True):
@@ -126,9 +103,18 @@ class Tree(Kinematics):
                 total[parent] = total[parent] + force_to_parent(self._R[i], self._p[i], total[i])
         return total
 
-    def mass_times(self, v: ca.SX) -> ca.SX:
-        """``M(q) v`` in O(n), armature included."""
-        return self._project(self.momenta(self.velocities(v))) + self._armature * v
+    def mass_times(self, v: ca.SX, velocities: ByJoint | None = None, *, extra: bool = True) -> ca.SX:
+        """``M(q) v`` in O(n), armature included, shape (nv,).
+
+        Args:
+            v: Generalized velocity, shape (nv,).
+            velocities: Spatial velocity of every link under ``v``, where it is known already.
+            extra: Include the extra inertias.
+        """
+        velocities = self.velocities(v) if velocities is None else velocities
+        inertia = self._inertia if extra else self._own_inertia
+        momenta = self._accumulate({i: inertia[i] @ velocity for i, velocity in velocities.items()})
+        return self._project(momenta) + self._armature * v
 
     def _project(self, forces: ByJoint) -> ca.SX:
         rows = [self._S[slot.index].T @ forces[slot.index] for slot in self.chart.slots]
@@ -204,11 +190,6 @@ class Tree(Kinematics):
                 articulated[parent] = articulated[parent] + self._inertia_to_parent(i, reduced[i])
         return _Factor(U, D, gain, reduced)
 
-    def solve(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> tuple[ca.SX, ByJoint]:
-        """``a = M⁻¹(τ + Σ Jᵀ w)``, shape (nv,), and the spatial velocity of every link under it."""
-        found = self.respond(tau, wrenches)
-        return found.a, found.velocities
-
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
         """Answer ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization, in O(n) and without forming ``M``.
 
@@ -253,10 +234,10 @@ class Tree(Kinematics):
         part of ``I^a`` is ``v_y⁻ᵀ K v_x⁻``, where ``K`` is how fast ``I^a`` changes as it turns: one product in
         place of two.
         """
-        turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
+        turning: ByJoint = {}
         for one, other in ((x, y), (y, x)):
             for wrench in one.wrenches:
-                self._turn(turning, Coupling(wrench, other.velocities))
+                self._turn(turning, wrench, other.velocities)
         rows: ByJoint = {}
         forces = [dict(x.forces), dict(y.forces)]
         for i in x.forces:
@@ -269,39 +250,15 @@ class Tree(Kinematics):
 
     # ---- tangent gradients by adjoints ------------------------------------------------------------------------
 
-    def bracket_gradient(self, couplings: Sequence[Coupling] = (), products: Sequence[Product] = ()) -> ca.SX:
-        """Tangent gradient of ``Σ scale wᵀJ(q)v + Σ scale bᵀM(q)a`` with ``w, v, a, b`` held fixed, shape (nv,).
+    def energy_gradient(self, velocities: ByJoint) -> ca.SX:
+        """Tangent gradient of ``vᵀM(q)v`` of the robot without extra inertias, ``v`` held fixed, shape (nv,).
 
-        Moving joint j by ``S_j δ`` turns every velocity beyond it by ``−S_j δ ×``.  With ``F_j`` the force that the
-        subtree of j puts against a velocity set ``v``, that is ``−S_jᵀ (v_j⁻ ×* F_j)``, where ``v_j⁻`` is the
-        velocity before joint j's own.  A wrench constant in the world turns back relative to the link; its part is
-        ``−ω_jᵀ (f × u + m × ω)`` on every joint below it.
+        Moving joint j by ``S_j δ`` turns every velocity beyond it by ``−S_j δ ×``.  With ``F_j`` the momentum of the
+        subtree of j, that changes the value by ``−2 S_jᵀ (v_j⁻ ×* F_j)``, where ``v_j⁻`` is the velocity before
+        joint j's own.
         """
-        sets: list[ByJoint] = []
-        forces: list[ByJoint] = []
-
-        def against(velocities: ByJoint) -> ByJoint:
-            for known, force in zip(sets, forces, strict=True):
-                if known is velocities:
-                    return force
-            sets.append(velocities)
-            forces.append({i: ca.SX(6, 1) for i in self._R})
-            return forces[-1]
-
-        turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
-        for coupling in couplings:
-            joint = coupling.wrench.point.joint
-            acting = against(coupling.velocities)
-            acting[joint] = acting[joint] - coupling.scale * self.link_force(coupling.wrench)
-            self._turn(turning, coupling)
-        for product in products:
-            inertia = self._inertia if product.extra else self._own_inertia
-            for one, other in ((product.left, product.right), (product.right, product.left)):
-                acting = against(one)
-                for i in acting:
-                    acting[i] = acting[i] - product.scale * (inertia[i] @ other[i])
-        pairs = [(self._before(v), self._accumulate(f)) for v, f in zip(sets, forces, strict=True)]
-        return self._gather(pairs, turning)
+        forces = {i: -2 * (self._own_inertia[i] @ velocity) for i, velocity in velocities.items()}
+        return self._gather([(self._before(velocities), self._accumulate(forces))], {})
 
     def _before(self, velocities: ByJoint) -> ByJoint:
         """Velocity of every link without its own joint's part; joints with one axis have none along it to lose."""
@@ -313,16 +270,18 @@ class Tree(Kinematics):
             if self._parents[slot.index]
         }
 
-    def _turn(self, turning: ByJoint, coupling: Coupling) -> None:
-        """Add ``f × u + m × ω`` of a wrench that stays in the world while its link turns."""
-        wrench, joint = coupling.wrench, coupling.wrench.point.joint
+    def _turn(self, turning: ByJoint, wrench: Wrench, velocities: ByJoint) -> None:
+        """Add ``f × u + m × ω`` of a wrench that stays in the world while its link moves with ``(u, ω)``.
+
+        The wrench turns back relative to the link, which adds ``−ω_jᵀ (f × u + m × ω)`` on every joint below.
+        """
+        joint = wrench.point.joint
         if wrench.in_frame:
             return
-        force, motion, position = self.link_force(wrench), coupling.velocities[joint], ca.SX(wrench.point.position)
+        force, motion, position = self.link_force(wrench), velocities[joint], ca.SX(wrench.point.position)
         linear = motion[:3] + cross(motion[3:], position)
         moment = force[3:] - cross(position, force[:3])
-        added = cross(force[:3], linear) + cross(moment, motion[3:])
-        turning[joint] = turning[joint] + coupling.scale * added
+        turning[joint] = turning.get(joint, ca.SX(3, 1)) + cross(force[:3], linear) + cross(moment, motion[3:])
 
     def _gather(
         self, pairs: Sequence[tuple[ByJoint, ByJoint]], turning: ByJoint, known: ByJoint | None = None
@@ -331,7 +290,7 @@ class Tree(Kinematics):
 
         ``known`` is added to the joints' rows.
         """
-        turning = dict(turning)
+        turning = {i: turning.get(i, ca.SX(3, 1)) for i in self._R}
         rows: ByJoint = {}
         for slot in reversed(self.chart.slots):
             i, parent = slot.index, self._parents[slot.index]
@@ -346,15 +305,9 @@ class Tree(Kinematics):
 
     def turning_gradient(self, point: PointOnLink, direction: ca.SX, covector: ca.SX) -> ca.SX:
         """Tangent gradient of ``cᵀ d(q)`` where the world direction ``d`` turns with the point's link: (nv,)."""
-        turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
-        turning[point.joint] = -self.to_link(point.joint, cross(direction, covector))
+        turning = {point.joint: -self.to_link(point.joint, cross(direction, covector))}
         return self._gather([], turning)
 
     @cached_property
     def _own_inertia(self) -> ByJoint:
         return {i: self._constant(i, "own inertia", lambda j: self.model.inertias[j].matrix()) for i in self._R}
-
-    def own_mass_times(self, v: ca.SX, velocities: ByJoint) -> ca.SX:
-        """``M v`` of the robot alone, without the extra inertias."""
-        momenta = self._accumulate({i: self._own_inertia[i] @ velocities[i] for i in velocities})
-        return self._project(momenta) + self._armature * v

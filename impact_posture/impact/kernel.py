@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
-from impact_posture.dynamics.tree import ByJoint, PointOnLink, Product, Response, Tree, Wrench
+from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Wrench
 from impact_posture.impact.contact import support_inertia
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.robot.robot import Robot
@@ -189,7 +189,7 @@ class ImpactKernel:
 
     def _weigh(self, a: ca.SX, velocities: ByJoint) -> ca.SX:
         if self.metric.kind == "kinetic":
-            return self.tree.own_mass_times(a, velocities)
+            return self.tree.mass_times(a, velocities, extra=False)
         if self.metric.weights is None:
             return a
         return self.tree.by_joint("weight", self.metric.diagonal(self.tree.nv)) * a
@@ -198,7 +198,7 @@ class ImpactKernel:
         """``∂_q aᵀWa`` with ``a`` held fixed: zero unless W = M."""
         if self.metric.kind != "kinetic":
             return ca.SX.zeros(self.tree.nv)
-        return self.tree.bracket_gradient(products=[Product(velocities, velocities, extra=False)])
+        return self.tree.energy_gradient(velocities)
 
     def _force(self, impulse: ca.SX) -> Wrench:
         return Wrench(self.point, impulse, ca.SX.zeros(3))
