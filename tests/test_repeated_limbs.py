@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from impact_posture.codegen.build_check import largest_difference
 from impact_posture.codegen.export import export
-from impact_posture.codegen.functions import library, oracle_reference
+from impact_posture.codegen.functions import NamedObjective, library, oracle_reference
 from impact_posture.codegen.graph import ARITHMETIC, COSINE, Graph
 from impact_posture.codegen.layout import lay_out
 from impact_posture.codegen.sums import rebuilt
@@ -135,7 +135,7 @@ def test_random_twins_against_pinocchio(
     supports = (Support(f"b1_{len(branch) - 1}"),) if seed % 3 == 0 else ()
     contact = ImpactContact(f"b0_{len(branch) - 1}", (0.3, -0.4, 0.9), (0.05, 0.1, -0.02))
     objective = ImpactObjective(loaded, contact, Metric(metric, weights), "speed", supports)  # type: ignore[arg-type]
-    found = library([objective], ["twins"])
+    found = library([NamedObjective(objective, "limbs")])
     graph = found.vector_graph()
     assert max(shares(graph)) == (4 if count > 3 else 2)
     for q in random_configurations(loaded.model, 2, "twins", seed):
@@ -161,7 +161,7 @@ def test_random_twins_against_pinocchio(
 )
 def test_robots_with_twins(name: str, frame: str, width: int, most: float) -> None:
     objective = ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))
-    found = library([objective], [name])
+    found = library([NamedObjective(objective, name)])
     graph = found.vector_graph()
     counts = shares(graph)
     assert set(counts) == {1, width}
@@ -186,7 +186,7 @@ def longest(graph: Graph) -> int:
 @pytest.mark.parametrize("name", ["solo8", "panda", "talos"])
 def test_sums_in_another_order_have_the_same_value_sooner(name: str) -> None:
     frame = robot(name).spec.contact.frame if robot(name).spec.contact else robot(name).model.frames[-1].name
-    found = library([ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))], [name])
+    found = library([NamedObjective(ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8))), name)])
     graph = found.vector_graph()
     other = rebuilt(graph)
     assert longest(other) < 0.95 * longest(graph)
@@ -264,7 +264,7 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
 def test_blocks_are_shared() -> None:
     """What value needs is a part of what eval needs, computed by blocks that both call."""
     objective = ImpactObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
-    found = library([objective], ["t"])
+    found = library([NamedObjective(objective, "t")])
     layout = lay_out(found.vector_graph(), [f.outputs for f in found.functions])
     names = [f.name for f in found.functions]
     calls = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from impact_posture.benchmark.count import Operations
-from impact_posture.codegen.functions import library
+from impact_posture.codegen.functions import NamedObjective, library
 from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph
 from impact_posture.impact.objective import ImpactObjective
 
@@ -20,7 +20,7 @@ def eval_operations(objective: ImpactObjective) -> Operations:
     numbers of twin branches are one; its sines and cosines are still one each.  The order in which the C
     adds up sums is not looked at: it moves the count by a hundredth at most.
     """
-    found = library([objective], ["kernel"])
+    found = library([NamedObjective(objective, "kernel")])
     outputs = next(f.outputs for f in found.functions if f.name == "eval")
     single = operations_of(found.graph(), outputs)
     if not found.seeds:

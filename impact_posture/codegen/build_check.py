@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.codegen.emitter import REALS, Real
-from impact_posture.codegen.functions import Reference, Vector, casadi_reference, oracle_reference
+from impact_posture.codegen.functions import Reference, Vector, casadi_reference, named_objectives, oracle_reference
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.reader import read_manifest
-from impact_posture.codegen.variants import variants
 from impact_posture.errors import CompilerError
 from impact_posture.impact.contact import heavy_feet_rounding
 from impact_posture.impact.objective import ImpactObjective
@@ -72,7 +71,7 @@ def compile_and_check(
         library = load_library(
             build_library(export_dir, prefix, library_path(export_dir if keep else folder, prefix))
         )
-        for variant in variants(objectives, prefix):
+        for variant in named_objectives(objectives, prefix):
             own = variant.objective
             # Beside an objective of several contacts, each frame has one of its own.
             block = manifest if variant.joint else manifest | {"several": None}

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from impact_posture.codegen.emitter import BlockText, Constants, Emitter, Real
-from impact_posture.codegen.functions import Exported, Library, library
+from impact_posture.codegen.functions import Exported, NamedObjective, library
 from impact_posture.codegen.graph import ARITHMETIC, Graph
 from impact_posture.codegen.layout import Layout, lay_out
 from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.sums import rebuilt
-from impact_posture.codegen.variants import Variant
-from impact_posture.impact.objective import ImpactObjective
 
 LARGEST_VECTOR = 64
 """Bytes of the widest vectors that the source uses, and of the widest group of narrower vectors in a batch."""
@@ -29,70 +28,6 @@ _BATCH_BLOCK = 60
 
 
 @dataclass(frozen=True)
-class Output:
-    """An assignment of a result.
-
-    Attributes:
-        target: The C expression on its left.
-        value: The C expression on its right.
-        constant: Whether the value is the same at every configuration.
-    """
-
-    target: str
-    value: str
-    constant: bool
-
-
-@dataclass(frozen=True)
-class FunctionCode:
-    """One exported function.
-
-    Attributes:
-        stem: Beginning of its C name.
-        name: Rest of its C name.
-        normal: The constant normal, if the function has no parameter for one.
-        calls: Calls of its blocks.
-        outputs: Assignments of its results.
-        finite: Name and length of each result.
-    """
-
-    stem: str
-    name: str
-    normal: tuple[float, float, float] | None
-    calls: tuple[str, ...]
-    outputs: tuple[Output, ...]
-    finite: tuple[tuple[str, int], ...]
-
-
-@dataclass(frozen=True)
-class BatchCode:
-    """Functions of one objective that do not stand on blocks of their own.
-
-    Attributes:
-        stem: Beginning of the C names.
-        normal: Normal of the objective.
-        scale: Literal of the objective over ``H``, if it is a multiple of ``H``; else empty.
-        blocks: Blocks on vectors of configurations; empty for a loop over single calls.
-        angles: Index in ``q`` of each angle.
-        work: Length of the work array.
-        outputs: Assignments of the results.
-    """
-
-    stem: str
-    normal: tuple[float, float, float]
-    scale: str
-    blocks: tuple[BlockText, ...] = ()
-    angles: tuple[int, ...] = ()
-    work: int = 1
-    outputs: tuple[Output, ...] = ()
-
-    @property
-    def room(self) -> int:
-        """Length of the arrays of sines and cosines; C has no arrays of length zero."""
-        return max(1, len(self.angles))
-
-
-@dataclass(frozen=True)
 class Code:
     """Functions of an export.
 
@@ -103,8 +38,12 @@ class Code:
         angles: Index in ``q`` of each angle whose sine and cosine are computed.
         room: Length of the arrays of sines and cosines.
         work: C type, name and length of each work array.
-        functions: Functions of one configuration.
-        batches: Functions of each objective beside those.
+        functions: Each function of one configuration: its ``stem``, ``name``, constant ``normal`` if it has no
+            parameter for one, ``calls`` of blocks, ``outputs`` (target, value, whether it is constant), and
+            ``finite``, the name and length of each result.
+        batches: Each objective: its ``stem``, ``normal``, the literal ``scale`` of its objective over ``H`` (empty if
+            it is no multiple), and the ``blocks``, ``angles``, ``room``, ``work`` and ``outputs`` of its batch on
+            vectors.  Without blocks the batch is a loop.
         stack_bytes: Upper bound on the stack of a call, without that of the C library.
     """
 
@@ -114,12 +53,12 @@ class Code:
     angles: tuple[int, ...]
     room: int
     work: tuple[tuple[str, str, int], ...]
-    functions: tuple[FunctionCode, ...]
-    batches: tuple[BatchCode, ...]
+    functions: tuple[dict[str, Any], ...]
+    batches: tuple[dict[str, Any], ...]
     stack_bytes: int
 
 
-def build_code(exported: Sequence[Variant], prefix: str, real: Real, *, portable: bool = False) -> Code:
+def build_code(exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False) -> Code:
     """Generate the functions of each objective.
 
     Args:
@@ -129,12 +68,13 @@ def build_code(exported: Sequence[Variant], prefix: str, real: Real, *, portable
         portable: Use no vectors, for compilers that have none.
     """
     single = [v for v in exported if not v.joint]
-    joint = next(((v.objective, v.stem) for v in exported if v.joint), None)
-    found = library([v.objective for v in single], [v.stem for v in single], joint)
+    contacts = {v.stem: v.objective.contact for v in single}
+    robot = single[0].objective.robot
+    found = library(exported)
     scalars = found.graph()
-    graph = scalars if portable else found.vector_graph()
     # A single call waits for results more than for arithmetic units.  A batch has other lanes to go on with.
-    layout = lay_out(rebuilt(graph), [f.outputs for f in found.functions])
+    graph = rebuilt(scalars if portable else found.vector_graph())
+    layout = lay_out(graph, [f.outputs for f in found.functions])
     constants = Constants(prefix, real)
     # The names of types stand in thousands of places, so they are short.  The source undefines them at its end.
     types = {1: real.name, 2: "V2", 4: "V4"}
@@ -142,34 +82,58 @@ def build_code(exported: Sequence[Variant], prefix: str, real: Real, *, portable
     angles = _angles(layout)
     whole = 1 if portable else LARGEST_VECTOR // real.size
     room = max(1, -(-len(angles) // whole)) * whole
-    robot = single[0].objective.robot
+    functions = []
+    for number, function in enumerate(found.functions):
+        inputs, results = SIGNATURES[function.name]
+        sizes = [len(graph.outputs[output]) for output in function.outputs]
+        blocks = zip(layout.blocks, emitter.blocks, strict=True)
+        functions.append({
+            "stem": function.stem,
+            "name": function.name,
+            # The objective of several contacts at once takes the normal of the leading contact.
+            "normal": None if "n" in inputs else contacts.get(function.stem, single[0].objective.contact).normal,
+            "calls": [text.call for block, text in blocks if number in block.functions],
+            "outputs": [*_outputs(function, emitter, "m.")],
+            "finite": [*zip(results, sizes, strict=True)],
+        })  # fmt: skip
     numbers = sum(width * count for width, count in layout.sizes.items()) + 3 * room
     frames = [max(_SPILL * b.local_bytes, b.local_bytes + b.wide_bytes) for b in emitter.blocks]
     largest = real.size * numbers + max(frames, default=0)
     batches = []
-    for variant in single:
-        objective = variant.objective
-        scale = real.literal(objective.scale) if objective.is_multiple_of_H else ""
-        batch = BatchCode(variant.stem, objective.contact.normal, scale)
+    for v in single:
+        scale = real.literal(v.objective.scale) if v.objective.is_multiple_of_H else ""
+        batch = {"stem": v.stem, "normal": v.objective.contact.normal, "scale": scale, "blocks": ()}
+        function = next(f for f in found.functions if (f.stem, f.name) == (v.stem, "eval"))
         # A batch of the free robot beside one that stands would be another third of the source, so it is a loop.
-        if not (portable or variant.free):
-            lanes = _batch(batch, scalars, found, real, constants)
-            if lanes is not None:
-                batch, frame = lanes
-                held = 2 * batch.room + batch.work + robot.nq + 3 + 2 * (1 + robot.nv)
-                largest = max(largest, LARGEST_VECTOR * held + frame)
+        if not portable and not v.free and (lanes := _lanes(function, scalars, real, constants)):
+            held = 2 * lanes["room"] + lanes["work"] + robot.nq + 3 + 2 * (1 + robot.nv)
+            frame = max((block.local_bytes for block in lanes["blocks"]), default=0)
+            largest = max(largest, LARGEST_VECTOR * held + frame)
+            batch |= lanes
         batches.append(batch)
+    work = [(types[width], f"w{width if width > 1 else ''}", count) for width, count in sorted(layout.sizes.items())]
+    stack_bytes = -(-(largest + _FRAMES) // 64) * 64
     return Code(
-        portable,
-        constants.text(types),
-        tuple(emitter.blocks),
-        angles,
-        room,
-        tuple((types[width], f"w{width if width > 1 else ''}", size) for width, size in sorted(layout.sizes.items())),
-        tuple(_functions(found, layout, emitter, [v.objective for v in single], [v.stem for v in single])),
-        tuple(batches),
-        -(-(largest + _FRAMES) // 64) * 64,
-    )
+        portable, constants.text(types), tuple(emitter.blocks), angles, room, tuple(work), tuple(functions),
+        tuple(batches), stack_bytes,
+    )  # fmt: skip
+
+
+def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants) -> dict[str, Any]:
+    """The batch on vectors of configurations; empty where C has no vector form of an operation."""
+    layout = lay_out(scalars, [function.outputs], _BATCH_BLOCK)
+    computed = {k for block in layout.blocks for k in block.nodes} | layout.inlined
+    if not all(k in layout.trig or scalars.nodes[k].op in ARITHMETIC for k in computed):
+        return {}
+    emitter = Emitter(layout, f"{function.stem}_lanes", real, {1: "VN"}, constants, LARGEST_VECTOR, "work[g]")
+    return {
+        "blocks": emitter.blocks,
+        "angles": _angles(layout),
+        # C has no arrays of length zero.
+        "room": max(1, len(layout.angles)),
+        "work": layout.sizes.get(1, 1),
+        "outputs": [*_outputs(function, emitter, "m->")],
+    }
 
 
 def _angles(layout: Layout) -> tuple[int, ...]:
@@ -177,62 +141,10 @@ def _angles(layout: Layout) -> tuple[int, ...]:
     return tuple(layout.graph.nodes[k].args[1] for k in layout.angles)
 
 
-def _functions(
-    found: Library, layout: Layout, emitter: Emitter, objectives: Sequence[ImpactObjective], stems: Sequence[str]
-) -> Iterator[FunctionCode]:
-    of = dict(zip(stems, objectives, strict=True))
-    for number, function in enumerate(found.functions):
-        calls = [
-            text.call for block, text in zip(layout.blocks, emitter.blocks, strict=True) if number in block.functions
-        ]
-        inputs, results = SIGNATURES[function.name]
-        # The objective of several contacts at once takes the normal of the leading contact; the others are constants.
-        contact = of.get(function.stem, objectives[0]).contact
-        yield FunctionCode(
-            function.stem,
-            function.name,
-            None if "n" in inputs else contact.normal,
-            tuple(calls),
-            tuple(_outputs(function, layout, emitter, "m.")),
-            tuple(
-                (name, len(layout.graph.outputs[output]))
-                for name, output in zip(results, function.outputs, strict=True)
-            ),
-        )
-
-
-def _outputs(function: Exported, layout: Layout, emitter: Emitter, work: str) -> Iterator[Output]:
-    arrays = lengths(0, 0)
+def _outputs(function: Exported, emitter: Emitter, work: str) -> Iterator[dict[str, Any]]:
+    """The assignments of a function's results, from the work arrays of the structure ``work``."""
+    graph, arrays = emitter.layout.graph, lengths(0, 0)
     for name, output in zip(SIGNATURES[function.name][1], function.outputs, strict=True):
-        for k, node in enumerate(layout.graph.outputs[output]):
-            target = f"{name}[{k}]" if name in arrays else f"*{name}"
-            yield Output(target, emitter.output(node, work), layout.graph.nodes[node].op == "const")
-
-
-def _batch(
-    loop: BatchCode, scalars: Graph, found: Library, real: Real, constants: Constants
-) -> tuple[BatchCode, int] | None:
-    """The batch on vectors with the bytes of its largest block; ``None`` where an operation has no vector form."""
-    function = next(f for f in found.functions if (f.stem, f.name) == (loop.stem, "eval"))
-    layout = lay_out(scalars, [function.outputs], _BATCH_BLOCK)
-    if not _vectorizable(layout):
-        return None
-    emitter = Emitter(layout, f"{loop.stem}_lanes", real, {1: "VN"}, constants, LARGEST_VECTOR, "work[g]")
-    batch = BatchCode(
-        loop.stem,
-        loop.normal,
-        loop.scale,
-        tuple(emitter.blocks),
-        _angles(layout),
-        layout.sizes.get(1, 1),
-        tuple(_outputs(function, layout, emitter, "m->")),
-    )
-    return batch, max((block.local_bytes for block in emitter.blocks), default=0)
-
-
-def _vectorizable(layout: Layout) -> bool:
-    """Whether C has every operation of a layout on vectors."""
-    return all(
-        k in layout.trig or layout.graph.nodes[k].op in ARITHMETIC
-        for k in {k for block in layout.blocks for k in block.nodes} | layout.inlined
-    )
+        for k, node in enumerate(graph.outputs[output]):
+            target, value = f"{name}[{k}]" if name in arrays else f"*{name}", emitter.output(node, work)
+            yield {"target": target, "value": value, "constant": graph.nodes[node].op == "const"}

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from impact_posture.codegen.build_check import compile_and_check
 from impact_posture.codegen.code import build_code
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
+from impact_posture.codegen.functions import named_objectives
 from impact_posture.codegen.manifest import build_manifest
 from impact_posture.codegen.naming import c_identifier, check_prefix, products
 from impact_posture.codegen.render import render
-from impact_posture.codegen.variants import variants
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import library_path
@@ -132,7 +132,7 @@ def export(
         posture = robot.check_posture(given, limits=False)
         # Normalizing a configuration of unit norm changes its last digits.  Keep those that result.json has.
         posture = given if np.allclose(given, posture, rtol=0, atol=1e-9) else posture
-    exported = variants(objectives, prefix)
+    exported = named_objectives(objectives, prefix)
     code = build_code(exported, prefix, real, portable=portable)
     manifest = build_manifest(objectives, prefix, posture, real, code.stack_bytes)
     texts = render(exported, prefix, manifest, code, real)

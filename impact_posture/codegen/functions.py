@@ -1,4 +1,4 @@
-"""The CasADi functions that an export is made of, all of them of an objective's configuration and normal."""
+"""CasADi functions of an export, and the references that its compiled code must reproduce."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.codegen.graph import Graph, graph_of
+from impact_posture.codegen.naming import stems
 from impact_posture.codegen.simd_lanes import Seed, packed
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
+from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 
@@ -62,13 +64,58 @@ def oracle_along(objective: ImpactObjective, normal: Vector) -> ImpactOracle:
 
 
 @dataclass(frozen=True)
+class NamedObjective:
+    """An objective with the beginning of its C names.
+
+    Attributes:
+        objective: The objective.
+        stem: Beginning of its C names.
+        free: Whether it is the free robot beside one that stands.
+        joint: Whether it is of several contacts at once; it has no ``H`` of its own.
+    """
+
+    objective: ImpactObjective
+    stem: str
+    free: bool = False
+    joint: bool = False
+
+
+def named_objectives(objectives: Sequence[ImpactObjective], prefix: str) -> tuple[NamedObjective, ...]:
+    """Return the objective of each contact, followed by ``<stem>_free`` without its supports where it has some.
+
+    A problem of several contacts has these for each contact, and the objective of all contacts last.
+
+    Raises:
+        InputError: A problem of several contacts is not the only objective.
+    """
+    several = [objective for objective in objectives if objective.others]
+    if several and len(objectives) > 1:
+        raise InputError(
+            "is one problem of several contacts beside others", where="codegen", hint="export them one by one"
+        )
+    # A frame with two contacts has one H, of any normal.
+    singles: dict[str, ImpactObjective] = {}
+    for single in (single for objective in several for single in objective.singles):
+        singles.setdefault(single.contact.frame, single)
+    each = [*singles.values()] if several else [*objectives]
+    frames = [o.contact.frame for o in each]
+    names = stems(prefix, frames) if len(frames) > 1 or not several else (f"{prefix}_contact",)
+    found: list[NamedObjective] = []
+    for objective, stem in zip(each, names, strict=True):
+        found.append(NamedObjective(objective, stem))
+        if objective.supports:
+            found.append(NamedObjective(replace(objective, supports=()), f"{stem}_free", free=True))
+    return (*found, *[NamedObjective(objective, prefix, joint=True) for objective in several])
+
+
+@dataclass(frozen=True)
 class Exported:
     """One function of the library.
 
     Attributes:
-        stem: Which objective it belongs to, by what its C name begins with.
-        name: ``eval``, ``objective``, ``value``, ``jump`` or ``ellipsoid``.
-        outputs: The outputs of :attr:`Library.function` that it gives.
+        stem: Beginning of its C name.
+        name: A name of :data:`~impact_posture.codegen.naming.SIGNATURES`.
+        outputs: The outputs of :attr:`Library.function` that it returns.
     """
 
     stem: str
@@ -78,13 +125,13 @@ class Exported:
 
 @dataclass(frozen=True)
 class Library:
-    """Everything that a library computes, as one function, so that what is common is there once.
+    """Everything that a library computes, as one function, so that common expressions exist once.
 
     Attributes:
         function: ``(q, n, constants)`` → all outputs.
-        constants: Values of the input ``constants``: what twin branches differ in.
-        seeds: Input name and index → its place among twins.
-        functions: What is exported.
+        constants: Values of the input ``constants``, in which repeated limbs differ.
+        seeds: Input name and index → its place among repeated limbs.
+        functions: The exported functions.
     """
 
     function: ca.Function
@@ -100,50 +147,43 @@ class Library:
         return graph_of(ca.Function("numbers", inputs, values, *names, {"cse": True}))
 
     def vector_graph(self) -> Graph:
-        """Return the same operations with one vector operation for those that repeated limbs share."""
+        """Return the same operations, with one vector operation for those that repeated limbs share."""
+        if not self.seeds:
+            return self.graph()
         return packed(graph_of(self.function), self.seeds, {"constants": self.constants})
 
 
-def library(
-    objectives: Sequence[ImpactObjective], stems: Sequence[str], joint: tuple[ImpactObjective, str] | None = None
-) -> Library:
-    """The functions of objectives of one robot, and of one that is of several contacts at once, with its stem.
+def library(exported: Sequence[NamedObjective]) -> Library:
+    """Return the functions of objectives of one robot.
 
-    ``objective`` is left out where it is a multiple of H, and so is what only ``V`` needs: C has it from ``H, G``.
+    The C code has ``objective`` from ``H`` where it is a multiple of ``H``, and ``V`` from ``H`` and ``G``.
     """
-    robot = objectives[0].robot
-    q, n, twins = ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3), RepeatedLimbs(robot.model)
-    values: list[ca.SX] = []
-    names: list[str] = []
+    model = exported[0].objective.robot.model
+    q, n, limbs = ca.SX.sym("q", model.nq), ca.SX.sym("n", 3), RepeatedLimbs(model)
+    outputs: dict[str, ca.SX] = {}
     functions: list[Exported] = []
-    for number, (objective, stem) in enumerate(zip(objectives, stems, strict=True)):
-        k = objective.kernel_of(q, n, twins)
-        found = {"H": k.H, "grad": k.grad_H, "a": k.jump.a, "G": k.G, "L": k.ellipsoid}
-        parts = {"eval": ("H", "grad"), "value": ("H",), "jump": ("a", "G", "H"), "ellipsoid": ("L",)}
-        if not objective.is_multiple_of_H:
-            found["value"], found["gradient"] = objective.expressions(k)
-            parts["objective"] = ("value", "gradient")
-        names += [f"o{number}_{name}" for name in found]
-        values += found.values()
-        functions += [
-            Exported(stem, name, tuple(f"o{number}_{output}" for output in outputs))
-            for name, outputs in parts.items()
-        ]
-    if joint is not None:
-        objective, stem = joint
-        values += objective.expressions(objective.kernel_of(q, n, twins))
-        names += ["joint_value", "joint_gradient"]
-        functions.append(Exported(stem, "objective", ("joint_value", "joint_gradient")))
-    constants = ca.vertcat(ca.SX(0, 1), *twins.parameters)
-    inputs = ["q", "n", "constants"]
-    function = ca.Function("library", [q, n, constants], values, inputs, names, {"cse": True})
-    return Library(function, tuple(twins.values), _seeds(robot.model, twins), tuple(functions))
+    for number, v in enumerate(exported):
+        k = v.objective.kernel_of(q, n, limbs)
+        parts: dict[str, dict[str, ca.SX]] = {}
+        if not v.joint:
+            parts["eval"], parts["value"] = {"H": k.H, "grad": k.grad_H}, {"H": k.H}
+            parts["jump"], parts["ellipsoid"] = {"a": k.jump.a, "G": k.G, "H": k.H}, {"L": k.ellipsoid}
+        if not v.objective.is_multiple_of_H:
+            parts["objective"] = dict(zip(("value", "gradient"), v.objective.expressions(k), strict=True))
+        for name, part in parts.items():
+            found = {f"o{number}_{output}": value for output, value in part.items()}
+            functions.append(Exported(v.stem, name, tuple(found)))
+            outputs |= found
+    inputs = [q, n, ca.vertcat(ca.SX(0, 1), *limbs.parameters)]
+    names = ["q", "n", "constants"], [*outputs]
+    function = ca.Function("library", inputs, [*outputs.values()], *names, {"cse": True})
+    return Library(function, tuple(limbs.values), _seeds(model, limbs), tuple(functions))
 
 
-def _seeds(model: object, twins: RepeatedLimbs) -> dict[tuple[str, int], Seed]:
-    found = {("constants", i): Seed(group, lane, name) for i, (group, lane, name) in enumerate(twins.keys)}
+def _seeds(model: object, limbs: RepeatedLimbs) -> dict[tuple[str, int], Seed]:
+    found = {("constants", i): Seed(group, lane, name) for i, (group, lane, name) in enumerate(limbs.keys)}
     for slot in Chart(model).slots:
-        place = twins.places.get(slot.index)
+        place = limbs.places.get(slot.index)
         if place is not None:
             for i in range(slot.q.start, slot.q.stop):
                 found["q", i] = Seed(place.group, place.lane, f"{place.position}.q.{i - slot.q.start}")

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from impact_posture import __version__
 from impact_posture.codegen.emitter import DOUBLE, Real
-from impact_posture.codegen.functions import casadi_reference
+from impact_posture.codegen.functions import casadi_reference, named_objectives
 from impact_posture.codegen.naming import FUNCTIONS
 from impact_posture.codegen.reader import SCHEMA
-from impact_posture.codegen.variants import variants
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import MetricError
 from impact_posture.impact.contact import ImpactContact
@@ -98,7 +97,7 @@ def build_manifest(
     robot, metric = first.robot, first.metric
     frames: list[dict[str, Any]] = []
     joint: dict[str, Any] | None = None
-    for variant in variants(objectives, prefix):
+    for variant in named_objectives(objectives, prefix):
         if variant.joint:
             joint = _joint_block(variant.objective, variant.stem, real)
             continue

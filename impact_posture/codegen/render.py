@@ -17,10 +17,10 @@ from impact_posture import __version__
 from impact_posture.codegen.build_check import self_test_tolerance
 from impact_posture.codegen.code import Code
 from impact_posture.codegen.emitter import DOUBLE, SHORT_NAMES, Real
+from impact_posture.codegen.functions import NamedObjective
 from impact_posture.codegen.manifest import unit_slices
 from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.reader import identity
-from impact_posture.codegen.variants import Variant
 from impact_posture.escape import c_comment, markdown
 from impact_posture.impact.objective import ImpactObjective
 
@@ -34,7 +34,7 @@ class Verbatim(str):
 
 
 def render(
-    exported: Sequence[Variant], prefix: str, manifest: dict[str, Any], code: Code, real: Real
+    exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: Code, real: Real
 ) -> dict[str, str]:
     """Return file name → text of every file but the manifest."""
     names = (f"{prefix}.h", f"{prefix}.c", "example.c", "example.cpp", "Makefile", "CMakeLists.txt", "README.md")
@@ -127,7 +127,7 @@ def _parameters(function: str, sizes: dict[str, int], real: str) -> str:
 
 
 def _context(
-    exported: Sequence[Variant], prefix: str, manifest: dict[str, Any], code: Code, real: Real
+    exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: Code, real: Real
 ) -> dict[str, Any]:
     single = [v for v in exported if not v.joint]
     joint = next((v for v in exported if v.joint), None)
@@ -173,7 +173,7 @@ def _context(
     }
 
 
-def _frame(variant: Variant, test: dict[str, Any], alone: bool) -> dict[str, Any]:
+def _frame(variant: NamedObjective, test: dict[str, Any], alone: bool) -> dict[str, Any]:
     objective, stem = variant.objective, Verbatim(variant.stem)
     contact, cone = objective.contact, objective.normal_cone_deg
     return {
@@ -200,7 +200,7 @@ def _worst_note(objective: ImpactObjective) -> str:
     return note
 
 
-def _several(joint: Variant, test: dict[str, Any]) -> dict[str, Any]:
+def _several(joint: NamedObjective, test: dict[str, Any]) -> dict[str, Any]:
     """The objective of several contacts at once."""
     objective = joint.objective
     names = [f"({scenario.name})" for scenario in objective.scenarios]
