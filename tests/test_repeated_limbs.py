@@ -34,7 +34,7 @@ from tests.tools import need_compiler
 KINDS = ("revolute", "prismatic", "continuous")
 AXES = ("1 0 0", "0 1 0", "0 0 -1", "0.6 0 0.8")
 COMPUTE: dict[str, Callable[..., np.ndarray]] = {
-    "+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide, "neg": np.negative, "inv": np.reciprocal,
+    "+": np.add, "-": np.subtract, "*": np.multiply, "neg": np.negative, "inv": np.reciprocal,
 }  # fmt: skip
 
 

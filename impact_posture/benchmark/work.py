@@ -9,7 +9,7 @@ from impact_posture.codegen.functions import NamedObjective, library
 from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph
 from impact_posture.impact.objective import ImpactObjective
 
-_KINDS = {"+": "add", "-": "add", "*": "mul", "/": "div", "inv": "div", "neg": "neg", SINE: "trig", COSINE: "trig"}
+_KINDS = {"+": "add", "-": "add", "*": "mul", "inv": "div", "neg": "neg", SINE: "trig", COSINE: "trig"}
 
 
 def eval_operations(objective: ImpactObjective) -> Operations:

@@ -71,11 +71,11 @@ def compile_and_check(
         library = load_library(
             build_library(export_dir, prefix, library_path(export_dir if keep else folder, prefix))
         )
-        for variant in named_objectives(objectives, prefix):
-            own = variant.objective
+        for v in named_objectives(objectives, prefix):
+            own = v.objective
             # Beside an objective of several contacts, each frame has one of its own.
-            block = manifest if variant.joint else manifest | {"several": None}
-            gradient = ImpactGradient(library, block, own.contact.frame, free=variant.free)
+            block = manifest if v.joint else manifest | {"several": None}
+            gradient = ImpactGradient(library, block, own.contact.frame, free=v.free)
             tolerance = self_test_tolerance(own, real)
             for reference, allowed, name in (
                 (casadi_reference, tolerance, "CasADi's"),

@@ -1,8 +1,7 @@
-"""C99 from a laid-out graph: straight-line blocks of local variables, and work arrays for what blocks hand on.
+"""C99 from a laid-out graph: straight-line blocks of local variables, and work arrays for values that blocks hand on.
 
-Blocks are not for reading and written tersely: a humanoid has ten thousand operations.
-
-Vectors are the compiler's own (GCC's and Clang's extension): arithmetic is written as for numbers.
+Blocks are terse because a humanoid has ten thousand operations.  Vectors are the extension of GCC and Clang, so their
+arithmetic is written as that of numbers.
 """
 
 from __future__ import annotations
@@ -19,14 +18,15 @@ from numpy.typing import ArrayLike, NDArray
 from impact_posture.codegen.graph import COSINE, Node
 from impact_posture.codegen.layout import Block, Layout, is_leaf
 
-# Characters of a constant's place, about.
+# Approximate number of characters in the place of a constant.
 _PLACE = 7
 SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
-"""Macros of the emitted text, for its end to take back."""
+"""Macros of the emitted text; its end undefines them."""
 
-# What a block may be handed, beside the inputs.
+# Arrays that a block may receive beside the inputs.
 _SHARED = ("s", "c", "w", "w2", "w4")
-# A vector wider than the processor's is made of parts: without optimization they and the whole each have a place.
+# The compiler splits a vector that is wider than the processor's.  Without optimization the parts and the whole have
+# a place each.
 _HALVES = 2
 _MATH = re.compile(r"\b(exp|log|pow|sqrt|a?sin|a?cos|a?tan|atan2|tanh|hypot|fabs|fmin|fmax)\(")
 
@@ -37,8 +37,8 @@ class Real:
 
     Attributes:
         name: ``double`` or ``float``.
-        size: Bytes of one.
-        unit_tolerance: How far the norm of a quaternion may be from one.
+        size: Bytes of a number.
+        unit_tolerance: Largest distance of the norm of a quaternion from one.
     """
 
     name: str
@@ -47,15 +47,15 @@ class Real:
 
     @property
     def dtype(self) -> np.dtype[np.floating[Any]]:
-        """The same type in numpy, whose ``float`` is a double."""
+        """The same type in numpy."""
         return np.dtype(np.float64 if self.name == "double" else np.float32)
 
     def rounded(self, values: ArrayLike) -> NDArray[np.float64]:
-        """The nearest numbers of this type, as doubles."""
+        """Return the nearest numbers of this type, as doubles."""
         return np.array(values, dtype=self.dtype).astype(np.float64)
 
     def literal(self, value: float) -> str:
-        """A literal that reads back as the nearest number of this type; negative ones in parentheses."""
+        """Return a literal that reads back as the nearest number; a negative one is in parentheses."""
         if self.name == "double" or not math.isfinite(value):
             return c_double(value)
         with np.errstate(over="ignore", under="ignore"):
@@ -66,7 +66,7 @@ class Real:
         return f"{text[:-1]}f)" if text.endswith(")") else f"{text}f"
 
     def spelled(self, operation: str) -> str:
-        """An operation's C, written for doubles, in this type: ``sinf`` for ``sin``, ``1.0f`` for ``1.0``."""
+        """Return the C of an operation on doubles in this type: ``sinf`` for ``sin``, ``1.0f`` for ``1.0``."""
         if self.name == "double":
             return operation
         text = _MATH.sub(r"\1f(", operation).replace("(double)", "(float)")
@@ -79,7 +79,7 @@ REALS = {real.name: real for real in (DOUBLE, FLOAT)}
 
 
 def c_double(value: float) -> str:
-    """A double literal that reads back exactly; negative ones in parentheses."""
+    """Return a double literal that reads back exactly; a negative one is in parentheses."""
     if math.isnan(value):
         return "NAN"
     text = "INFINITY" if math.isinf(value) else repr(abs(value))
@@ -88,13 +88,13 @@ def c_double(value: float) -> str:
 
 @dataclass(frozen=True)
 class BlockText:
-    """A block's C.
+    """The C of a block.
 
     Attributes:
         text: The function.
-        call: Its call, with names of the caller's own: inputs, ``m.s``, ``m.w`` and so on.
-        local_bytes: What its variables take at most.
-        wide_bytes: What the parts of vectors that the processor does not have may take beside.
+        call: Its call with the caller's names: inputs, ``m.s``, ``m.w`` and so on.
+        local_bytes: Most bytes of its variables.
+        wide_bytes: Most bytes of the parts of vectors that are wider than the processor's.
     """
 
     text: str
@@ -104,10 +104,10 @@ class BlockText:
 
 
 class Constants:
-    """Tables of the numbers in a library's blocks: a number's place is shorter than its seventeen digits.
+    """Tables of the numbers in the blocks of a library.  The place of a number is shorter than its seventeen digits.
 
     Args:
-        prefix: What the tables' names begin with.
+        prefix: Beginning of the names of the tables.
         real: The type of the numbers.
     """
 
@@ -116,7 +116,7 @@ class Constants:
         self._tables: dict[int, dict[tuple[float, ...], int]] = {}
 
     def place(self, node: Node) -> str:
-        """C of a constant: short numbers as they are, others by their place."""
+        """Return the C of a constant: a short number as it is, another by its place."""
         if node.width == 1:
             text = self._real.literal(node.value[0])
             if len(text) < _PLACE:
@@ -125,7 +125,7 @@ class Constants:
         return f"{_short(node.width)}[{known.setdefault(node.value, len(known))}]"
 
     def text(self, types: Mapping[int, str]) -> str:
-        """The tables, of the types for each width, and their short names."""
+        """Return the C of the tables, with the type of each width, and of their short names."""
         lines = []
         for width, known in sorted(self._tables.items()):
             rows = [", ".join(self._real.literal(v).strip("()") for v in value) for value in known]
@@ -169,7 +169,7 @@ class Emitter:
         self._constants, self._size, self._work = constants, size or real.size, work
         self._graph = layout.graph
         at = {k: number for number, block in enumerate(layout.blocks) for k in block.nodes}
-        # What its own block uses again, so that it needs a name there.
+        # Nodes that their own block uses again, so that they need a name there.
         self._reused: set[int] = set()
         for k, number in at.items():
             waiting = list(self._graph.nodes[k].operands)
@@ -183,7 +183,7 @@ class Emitter:
         self.blocks = [self._block(number, block) for number, block in enumerate(layout.blocks)]
 
     def output(self, k: int, work: str = "m.") -> str:
-        """An output's value after the blocks have run."""
+        """Return the C of an output after the calls of the blocks."""
         node = self._graph.nodes[k]
         if node.op == "const":
             return self._real.literal(node.value[0])
@@ -237,7 +237,7 @@ class Emitter:
         )
 
     def _vector_bytes(self, block: Block) -> int:
-        """Bytes of all results of a block that are vectors, those within statements too."""
+        """Bytes of all vectors that a block computes, also within statements."""
         total, waiting = 0, list(block.nodes)
         while waiting:
             node = self._graph.nodes[waiting.pop()]
@@ -246,7 +246,7 @@ class Emitter:
         return total
 
     def _expression(self, k: int, number: int, names: dict[int, str], lines: list[str], *, top: bool = False) -> str:
-        """C of a node: a name, a place in an array, or the operation itself, in parentheses unless on ``top``."""
+        """Return a name, a place in an array, or the operation itself, in parentheses unless on ``top``."""
         node = self._graph.nodes[k]
         if not top and k in names:
             return names[k]
@@ -257,7 +257,7 @@ class Emitter:
         operands = [self._expression(a, number, names, lines) for a in node.operands]
         if node.op == "gather":
             return "{" + ", ".join(operands) + "}"
-        if node.op in ("+", "-", "*", "/"):
+        if node.op in ("+", "-", "*"):
             text = f"{operands[0]}{node.op}{operands[1]}"
         elif node.op == "neg":
             text = f"-{operands[0]}"

@@ -1,9 +1,8 @@
-"""CasADi's instruction list as a graph of operations that a C compiler can be given in any order and grouping."""
+"""The instructions of a CasADi function as a graph of operations, which C may compute in any order."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -11,11 +10,10 @@ import casadi as ca
 
 from impact_posture.errors import CompilerError
 
-# Operations that vectors have in C.
-ARITHMETIC = frozenset({"+", "-", "*", "/", "neg", "inv"})
+# Operations that C has on vectors.  A division is a product with a reciprocal, which several divisions share.
+ARITHMETIC = frozenset({"+", "-", "*", "neg", "inv"})
 _COMMUTE = frozenset({"+", "*"})
-_BINARY = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
-# The rest, in C's terms: operands are names or stand in parentheses.
+# The C of the other operations.  Operands are names or stand in parentheses.
 CALLS = {
     ca.OP_EXP: "exp({0})",
     ca.OP_LOG: "log({0})",
@@ -52,10 +50,10 @@ class Node:
     """One operation.
 
     Attributes:
-        op: ``const``, ``in``, ``lane``, one of :data:`ARITHMETIC`, or a C expression out of :data:`CALLS`.
-        args: Numbers of the operands; of ``in`` its name's number and index; of ``lane`` the vector and which lane.
-        width: Numbers that it holds: 1, or the lanes of a vector.
-        value: Of ``const``: its numbers.
+        op: ``const``, ``in``, ``lane``, ``gather``, one of :data:`ARITHMETIC`, or a C expression of :data:`CALLS`.
+        args: Numbers of the operands.  ``in`` has the number of its name and an index, ``lane`` a node and an index.
+        width: Count of its numbers: 1, or the lanes of a vector.
+        value: The numbers of ``const``.
     """
 
     op: str
@@ -65,13 +63,13 @@ class Node:
 
     @property
     def operands(self) -> tuple[int, ...]:
-        """The nodes that it needs."""
+        """Numbers of the nodes that it needs."""
         return () if self.op in ("const", "in") else self.args[:1] if self.op == "lane" else self.args
 
 
 @dataclass
 class Graph:
-    """Operations in an order in which every operand comes first; equal ones exist once.
+    """Operations in an order in which every operand comes first.  Equal operations exist once.
 
     Attributes:
         inputs: Names of the inputs.
@@ -99,12 +97,12 @@ class Graph:
         return self._known[node]
 
     def constant(self, *value: float) -> int:
-        """A number, or a vector of them; a vector of equal numbers is the number."""
+        """Return the node of a number or of a vector; a vector of equal numbers is the number."""
         same = len(set(value)) == 1
         return self.add(Node("const", (), 1 if same else len(value), value[:1] if same else value))
 
     def element(self, node: int, lane: int) -> int:
-        """One number of a vector."""
+        """Return the node of one number of a vector."""
         found = self.nodes[node]
         if found.op == "const":
             return self.constant(found.value[lane if found.width > 1 else 0])
@@ -115,16 +113,13 @@ _COMPUTE: dict[str, Callable[..., float]] = {
     "+": lambda a, b: a + b,
     "-": lambda a, b: a - b,
     "*": lambda a, b: a * b,
-    "/": lambda a, b: a / b if b else math.copysign(math.inf, b) * a,
     "neg": lambda a: -a,
     "inv": lambda a: 1.0 / a if a else math.copysign(math.inf, a),
 }
 
 
 def graph_of(function: ca.Function) -> Graph:
-    """Return the operations of an SX function, with one reciprocal for each number that divides several.
-
-    Sparse outputs become dense.
+    """Return the operations of an SX function.  Sparse outputs become dense.
 
     Raises:
         CompilerError: An operation has no C form.
@@ -134,7 +129,6 @@ def graph_of(function: ca.Function) -> Graph:
     function = ca.Function("dense", inputs, outputs, function.name_in(), function.name_out())
     graph = Graph(tuple(function.name_in()))
     graph.outputs = {name: [graph.constant(0.0)] * function.numel_out(name) for name in function.name_out()}
-    divisors = _divisors(function)
     held: dict[int, int] = {}
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
@@ -146,43 +140,26 @@ def graph_of(function: ca.Function) -> Graph:
         elif operation == ca.OP_INPUT:
             held[target[0]] = graph.add(Node("in", (source[0], source[1])))
         else:
-            held[target[0]] = _operation(graph, operation, [held[s] for s in source], divisors[k])
+            held[target[0]] = _operation(graph, operation, [held[s] for s in source])
     return graph
 
 
-def _operation(graph: Graph, operation: int, operands: list[int], divided: int) -> int:
-    first = operands[0]
+def _operation(graph: Graph, operation: int, operands: list[int]) -> int:
+    a, b = operands[0], operands[-1]
     if operation == ca.OP_ASSIGN:
-        return first
-    if operation == ca.OP_DIV and divided > 1:
-        return graph.add(Node("*", (first, graph.add(Node("inv", (operands[1],))))))
-    if operation in _BINARY:
-        return graph.add(Node(_BINARY[operation], (first, operands[1])))
-    unary = {
-        ca.OP_NEG: Node("neg", (first,)),
-        ca.OP_INV: Node("inv", (first,)),
-        ca.OP_SQ: Node("*", (first, first)),
-        ca.OP_TWICE: Node("+", (first, first)),
-    }
-    if operation in unary:
-        return graph.add(unary[operation])
+        return a
+    if operation == ca.OP_DIV:
+        return graph.add(Node("*", (a, graph.add(Node("inv", (b,))))))
+    arithmetic = {
+        ca.OP_ADD: Node("+", (a, b)), ca.OP_SUB: Node("-", (a, b)), ca.OP_MUL: Node("*", (a, b)),
+        ca.OP_NEG: Node("neg", (a,)), ca.OP_INV: Node("inv", (a,)),
+        ca.OP_SQ: Node("*", (a, a)), ca.OP_TWICE: Node("+", (a, a)),
+    }  # fmt: skip
+    if operation in arithmetic:
+        return graph.add(arithmetic[operation])
     if operation in CALLS:
         text = CALLS[operation]
-        return graph.add(Node(text, tuple(operands[: 2 if "{1}" in text else 1])))
+        return graph.add(Node(text, (a, b) if "{1}" in text else (a,)))
     raise CompilerError(
         f"CasADi operation {operation} has no C form", where="codegen", hint="add it to codegen/graph.py"
     )
-
-
-def _divisors(function: ca.Function) -> list[int]:
-    """For each instruction that divides, how many divide by the same number."""
-    made: dict[int, int] = {}
-    by: dict[int, int] = {}
-    for k in range(function.n_instructions()):
-        operation, source = function.instruction_id(k), function.instruction_input(k)
-        if operation in (ca.OP_DIV, ca.OP_INV):
-            by[k] = made[source[1 if operation == ca.OP_DIV else 0]]
-        if operation != ca.OP_OUTPUT:
-            made[function.instruction_output(k)[0]] = k
-    counts = Counter(by.values())
-    return [counts[by[k]] if k in by else 0 for k in range(function.n_instructions())]

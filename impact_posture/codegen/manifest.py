@@ -1,4 +1,4 @@
-"""What an export is of: the manifest beside the C, and the reference vectors that prove it."""
+"""The manifest of an export: robot, frames, metric and objective, and the reference values that prove the code."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
 
-# A unit vector along no axis, exact in binary to the last digit that matters: no entry of a gradient is idle.
+# A unit vector along no axis, so that no entry of a gradient vanishes.  It is exact enough in binary.
 _NORMAL = (0.48, -0.6, 0.64)
 _SCALARS = frozenset({"H", "objective", "G", "V"})
 
 
 def configuration_names(robot: Robot) -> list[str]:
-    """A name with unit for each entry of ``q``, shape (nq,)."""
+    """Return a name with unit for each entry of ``q``."""
     parts = {
         "free-flyer": ("x (m)", "y (m)", "z (m)", "qx", "qy", "qz", "qw"),
         "spherical": ("qx", "qy", "qz", "qw"),
@@ -44,7 +44,7 @@ def configuration_names(robot: Robot) -> list[str]:
 
 
 def unit_slices(robot: Robot) -> list[slice]:
-    """Where ``q`` holds numbers of unit norm: quaternions and cosine-sine pairs."""
+    """Return where ``q`` holds quaternions and cosine-sine pairs, which have unit norm."""
     found = []
     for slot in Chart(robot.model).slots:
         width = {"free-flyer": 4, "spherical": 4, "planar": 2, "continuous": 2}.get(slot.kind.family)
@@ -54,7 +54,7 @@ def unit_slices(robot: Robot) -> list[slice]:
 
 
 def sample_postures(robot: Robot, count: int, seed: int) -> list[Vector]:
-    """Random configurations around the default posture, on the manifold, each of shape (nq,)."""
+    """Return random configurations around the default posture, each of shape (nq,)."""
     rng = np.random.default_rng(seed)
     start = robot.posture()
     return [np.asarray(pin.integrate(robot.model, start, rng.uniform(-0.5, 0.5, robot.nv))) for _ in range(count)]
@@ -87,22 +87,22 @@ def build_manifest(
     real: Real = DOUBLE,
     stack_bytes: int = 0,
 ) -> dict[str, Any]:
-    """Everything that a reader needs to tell whether the export fits the robot in hand.
+    """Return all that a reader needs to know whether the export fits the robot in hand.
 
-    What belongs to one frame stands in ``frames``, an entry each; that of the first frame at the top as well.  An
-    entry's ``free`` has the symbols and the reference of the robot without its supports; null where it has none.
-    ``several`` has those of the objective of several contacts at once.
+    ``frames`` has an entry for each frame, and the top level repeats that of the first.  ``free`` of an entry has the
+    symbols and the reference of the robot without its supports; it is null where the robot has none.  ``several`` has
+    those of the objective of several contacts at once.
     """
     first = objectives[0]
     robot, metric = first.robot, first.metric
     frames: list[dict[str, Any]] = []
     joint: dict[str, Any] | None = None
-    for variant in named_objectives(objectives, prefix):
-        if variant.joint:
-            joint = _joint_block(variant.objective, variant.stem, real)
+    for v in named_objectives(objectives, prefix):
+        if v.joint:
+            joint = _joint_block(v.objective, v.stem, real)
             continue
-        block = _frame_block(variant.objective, variant.stem, real)
-        if variant.free:
+        block = _frame_block(v.objective, v.stem, real)
+        if v.free:
             frames[-1]["free"] = {key: block[key] for key in ("symbols", "self_test")}
         else:
             frames.append(block | {"free": None})

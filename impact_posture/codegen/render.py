@@ -173,16 +173,15 @@ def _context(
     }
 
 
-def _frame(variant: NamedObjective, test: dict[str, Any], alone: bool) -> dict[str, Any]:
-    objective, stem = variant.objective, Verbatim(variant.stem)
+def _frame(v: NamedObjective, test: dict[str, Any], alone: bool) -> dict[str, Any]:
+    objective, stem = v.objective, Verbatim(v.stem)
     contact, cone = objective.contact, objective.normal_cone_deg
     return {
         "stem": stem,
-        "free": variant.free,
+        "free": v.free,
         "test": test,
         "contact": contact,
-        "at": ("" if alone else f" at {contact.frame}")
-        + (", the robot without its supports" if variant.free else ""),
+        "at": ("" if alone else f" at {contact.frame}") + (", the robot without its supports" if v.free else ""),
         "stem_note": "" if alone else f": {stem}_...",
         "cone": f"the worst normal within {cone:g} degrees of" if cone else "the normal",
         "note": _worst_note(objective),
@@ -196,7 +195,7 @@ def _worst_note(objective: ImpactObjective) -> str:
     if objective.scenarios:
         note = "; the worst of " + "; ".join(scenario.name for scenario in objective.scenarios)
     if objective.normal_cone_deg or objective.scenarios:
-        note += "; where several are as bad, grad is a subgradient, that at one of them"
+        note += ".  Where several are as bad, grad is the subgradient at one of them"
     return note
 
 
