@@ -23,7 +23,7 @@ from impact_posture.output_folder import scratch_folder
 from impact_posture.toolchain import find_compiler, no_compiler, run_compiler, words_of
 
 _REBUILD = "delete it: it is built again"
-# ELF's header behind its 16 bytes of identity, and the entries of its program header up to the length in the file.
+# Fields of an ELF header after its 16 bytes of identity, and of a program header up to the length in the file.
 _HEADER = {1: "HHIIIIIHHHHHH", 2: "HHIQQQIHHHHHH"}
 _SEGMENT = {1: "IIIII", 2: "IIQQQQ"}
 
@@ -115,11 +115,11 @@ def _digest(path: Path) -> str:
 
 
 def load_library(library: Path) -> ctypes.CDLL:
-    """Load a library that is whole, which runs its code.
+    """Load a whole library, which runs its code.
 
     Raises:
-        SpecError: It is not what was sealed, has no seal and is shorter than its header says, is for another
-            processor, or cannot be loaded.
+        SpecError: The library differs from what was sealed, or cannot be loaded.  A library without a seal is refused
+            if it is shorter than its header says or is for another processor.
     """
     try:
         sealed = is_sealed(library)
@@ -134,7 +134,7 @@ def load_library(library: Path) -> ctypes.CDLL:
 
 
 def _fault(library: Path) -> str:
-    """What a header says against loading; nothing of formats other than ELF, whose loaders check themselves."""
+    """Return what an ELF header says against loading; empty for other formats, because their loaders check them."""
     size = library.stat().st_size
     with library.open("rb") as file:
         start = file.read(64)
@@ -161,7 +161,7 @@ def _fault(library: Path) -> str:
 
 
 def _machine() -> int | None:
-    """ELF's number of the processor that runs this; ``None`` where the interpreter is no ELF file."""
+    """Return the ELF number of this processor; ``None`` where the interpreter is no ELF file."""
     with suppress(OSError), open(os.path.realpath(sys.executable), "rb") as file:
         start = file.read(20)
         if start[:4] == b"\x7fELF":
@@ -173,11 +173,11 @@ def _machine() -> int | None:
 
 
 def cache_path() -> Path:
-    """Where compiled code is kept: ``$IMPACT_POSTURE_CACHE``, else in the user's cache folder; it need not exist."""
+    """Return the folder of compiled code: ``$IMPACT_POSTURE_CACHE``, else one in the user's cache folder."""
     own = os.environ.get("IMPACT_POSTURE_CACHE")
     if own:
         return Path(own).absolute()
-    # A relative path is to be ignored, says the XDG specification.
+    # The XDG specification says to ignore a relative path.
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
     try:
         return (base if base.is_absolute() else Path.home() / ".cache") / "impact-posture"
@@ -186,10 +186,10 @@ def cache_path() -> Path:
 
 
 def cache_folder(*parts: str) -> Path:
-    """Return a folder of the cache, made where it is missing, for its user alone.
+    """Return a folder of the cache; make it for its user alone where it is missing.
 
     Raises:
-        OutputError: It cannot be made, or is not the user's alone.
+        OutputError: The folder cannot be made, or others may write it.
     """
     folder = cache_path()
     try:
@@ -220,10 +220,10 @@ def source_key(content: Iterable[str], *packages: str) -> str:
 
 
 def check_private(path: Path) -> None:
-    """Refuse what another user could have put there: who owns or may write it chooses the code that runs.
+    """Refuse a path that another user controls, because that user chooses the code that runs.
 
     Raises:
-        OutputError: Another user owns it or may write it.
+        OutputError: Another user owns the path or may write it.
     """
     found = path.stat()
     if found.st_uid not in (os.geteuid(), 0):
@@ -233,10 +233,10 @@ def check_private(path: Path) -> None:
 
 
 def is_cached(library: Path) -> bool:
-    """Whether the cache has a library as it was built; what is damaged goes.
+    """Return whether the cache has a library as it was built; delete a damaged one.
 
     Raises:
-        OutputError: The library, or a folder of the cache on the way to it, is not the user's alone.
+        OutputError: Others may write the library, or a folder of the cache that holds it.
     """
     root = cache_path()
     try:

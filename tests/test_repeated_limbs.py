@@ -1,4 +1,4 @@
-"""Twin branches in vectors: the same numbers as Pinocchio's, on random robots and on those that have twins."""
+"""Repeated limbs in SIMD lanes: the numbers of Pinocchio, on random robots and on known ones."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ COMPUTE: dict[str, Callable[..., np.ndarray]] = {
 }  # fmt: skip
 
 
-def twin_urdf(branch: list[int], branches: int, seed: int, *, odd: bool) -> str:
-    """Branches of the same joints and of other numbers on a body; with ``odd``, one more with other joints."""
+def limbs_urdf(limb: list[int], limbs: int, seed: int, *, odd: bool) -> str:
+    """Limbs with the same joints and other numbers on a body; with ``odd``, one more limb with other joints."""
     generator = np.random.default_rng(seed)
 
     def numbers(low: float, high: float, count: int = 3) -> str:
@@ -55,7 +55,7 @@ def twin_urdf(branch: list[int], branches: int, seed: int, *, odd: bool) -> str:
         )
 
     parts = [link("body")]
-    lists = [(f"b{k}", branch) for k in range(branches)] + ([("odd", [*branch, 5])] if odd else [])
+    lists = [(f"b{k}", limb) for k in range(limbs)] + ([("odd", [*limb, 5])] if odd else [])
     for name, codes in lists:
         parent = "body"
         for depth, code in enumerate(codes):
@@ -67,7 +67,7 @@ def twin_urdf(branch: list[int], branches: int, seed: int, *, odd: bool) -> str:
                 f'<origin xyz="{numbers(-0.3, 0.3)}" rpy="{numbers(-1, 1)}"/><axis xyz="{axis}"/>{limit}</joint>',
             ]
             parent = f"{name}_{depth}"
-    return f'<robot name="twins">{"".join(parts)}</robot>'
+    return f'<robot name="limbs">{"".join(parts)}</robot>'
 
 
 def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -116,29 +116,29 @@ def shares(graph: Graph) -> dict[int, int]:
     st.sampled_from(["fixed", "free-flyer"]),
     st.sampled_from(["euclidean", "kinetic", "weighted"]),
 )
-def test_random_twins_against_pinocchio(
+def test_random_limbs_against_pinocchio(
     tmp_path_factory: pytest.TempPathFactory,
-    branch: list[int],
+    limb: list[int],
     count: int,
     seed: int,
     odd: bool,
     root: str,
     metric: str,
 ) -> None:
-    path = tmp_path_factory.mktemp("twins") / "twins.urdf"
-    path.write_text(twin_urdf(branch, count, seed, odd=odd))
+    path = tmp_path_factory.mktemp("limbs") / "limbs.urdf"
+    path.write_text(limbs_urdf(limb, count, seed, odd=odd))
     loaded = load_robot(str(path), LoadOptions(root=root))  # type: ignore[arg-type]
-    twins = RepeatedLimbs(loaded.model)
-    assert sorted(len(g) for g in twins.groups) == {2: [2], 3: [2], 4: [4], 5: [4]}[count]
-    generator = rng("twins", seed)
+    limbs = RepeatedLimbs(loaded.model)
+    assert sorted(len(g) for g in limbs.groups) == {2: [2], 3: [2], 4: [4], 5: [4]}[count]
+    generator = rng("limbs", seed)
     weights = tuple(generator.uniform(0.5, 2.0, loaded.nv)) if metric == "weighted" else None
-    supports = (Support(f"b1_{len(branch) - 1}"),) if seed % 3 == 0 else ()
-    contact = ImpactContact(f"b0_{len(branch) - 1}", (0.3, -0.4, 0.9), (0.05, 0.1, -0.02))
+    supports = (Support(f"b1_{len(limb) - 1}"),) if seed % 3 == 0 else ()
+    contact = ImpactContact(f"b0_{len(limb) - 1}", (0.3, -0.4, 0.9), (0.05, 0.1, -0.02))
     objective = ImpactObjective(loaded, contact, Metric(metric, weights), "speed", supports)  # type: ignore[arg-type]
     found = library([NamedObjective(objective, "limbs")])
     graph = found.vector_graph()
     assert max(shares(graph)) == (4 if count > 3 else 2)
-    for q in random_configurations(loaded.model, 2, "twins", seed):
+    for q in random_configurations(loaded.model, 2, "limbs", seed):
         n = unit(generator)
         turned = replace(contact, normal=tuple(n))
         oracle = ImpactOracle(ImpactCase(loaded, turned, objective.metric, supports, objective.compliance))
@@ -159,7 +159,7 @@ def test_random_twins_against_pinocchio(
     ("name", "frame", "width", "most"),
     [("talos", "gripper_right_base_link", 2, 0.65), ("solo8", "base_link", 4, 0.45), ("romeo", "r_ankle", 2, 0.75)],
 )
-def test_robots_with_twins(name: str, frame: str, width: int, most: float) -> None:
+def test_robots_with_repeated_limbs(name: str, frame: str, width: int, most: float) -> None:
     objective = ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))
     found = library([NamedObjective(objective, name)])
     graph = found.vector_graph()
@@ -203,14 +203,14 @@ def test_robots_without(name: str) -> None:
     assert RepeatedLimbs(robot(name).model).groups == ()
 
 
-def test_twins_are_outermost_and_disjoint() -> None:
+def test_limbs_are_outermost_and_disjoint() -> None:
     for name in ("talos", "solo12", "hyq", "g1"):
         model = robot(name).model
-        twins = RepeatedLimbs(model)
-        joints = [j for group in twins.groups for branch in group for j in branch]
+        limbs = RepeatedLimbs(model)
+        joints = [j for group in limbs.groups for limb in group for j in limb]
         assert len(joints) == len(set(joints)) > 0
-        for group in twins.groups:
-            roots = {int(model.parents[branch[0]]) for branch in group}
+        for group in limbs.groups:
+            roots = {int(model.parents[limb[0]]) for limb in group}
             assert len(roots) == 1
             for i, j in zip(group[0], group[1], strict=True):
                 assert model.joints[i].shortname() == model.joints[j].shortname()
@@ -218,9 +218,9 @@ def test_twins_are_outermost_and_disjoint() -> None:
 
 @pytest.mark.parametrize("flags", [(), ("-O3", "-march=native")], ids=["plain", "native"])
 @pytest.mark.parametrize("count", [2, 4, 5])
-def test_compiled_twins(tmp_path: Path, count: int, flags: tuple[str, ...]) -> None:
+def test_compiled_limbs(tmp_path: Path, count: int, flags: tuple[str, ...]) -> None:
     need_compiler()
-    (tmp_path / "t.urdf").write_text(twin_urdf([0, 4, 2], count, 7, odd=True))
+    (tmp_path / "t.urdf").write_text(limbs_urdf([0, 4, 2], count, 7, odd=True))
     loaded = load_robot(str(tmp_path / "t.urdf"), LoadOptions(root="free-flyer"))
     objective = ImpactObjective(loaded, ImpactContact("b1_2", (0.3, -0.4, 0.9)), kind="sticking")
     export(objective, tmp_path, prefix="t", check=False)
@@ -245,7 +245,7 @@ def test_portable_has_no_vectors_and_the_same_numbers(tmp_path: Path) -> None:
 def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
     """H of two links depends on the angle between them alone: turned by whole turns it stays, near pi/2 and far."""
     need_compiler()
-    (tmp_path / "t.urdf").write_text(twin_urdf([0, 0], 2, 3, odd=False))
+    (tmp_path / "t.urdf").write_text(limbs_urdf([0, 0], 2, 3, odd=False))
     loaded = load_robot(str(tmp_path / "t.urdf"), LoadOptions(root="fixed"))
     objective = ImpactObjective(loaded, ImpactContact("b0_1", (0.3, -0.4, 0.9)))
     export(objective, tmp_path, prefix="t", check=False)
@@ -277,7 +277,7 @@ def test_blocks_are_shared() -> None:
     assert len(nodes) == len(set(nodes))
 
 
-def test_a_branch_with_another_axis_is_no_twin() -> None:
+def test_a_limb_with_another_axis_is_not_repeated() -> None:
     model = pin.Model()
     inertia = pin.Inertia(1.0, np.array([0.1, 0, 0]), np.eye(3) * 0.1)
     for k, joint in enumerate((pin.JointModelRX(), pin.JointModelRY(), pin.JointModelRX())):

@@ -17,7 +17,7 @@ def eval_operations(objective: ImpactObjective) -> Operations:
 
     A call runs the blocks that its outputs need and no others, so the graph's reach is the count.  It is on single
     numbers, as the peers' sources are counted.  ``packed`` counts operations as the C has them, where those on the
-    numbers of twin branches are one; its sines and cosines are still one each.  The order in which the C
+    numbers of repeated limbs are one; its sines and cosines are still one each.  The order in which the C
     adds up sums is not looked at: it moves the count by a hundredth at most.
     """
     found = library([NamedObjective(objective, "kernel")])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.codegen.graph import Graph, graph_of
 from impact_posture.codegen.naming import stems
@@ -46,13 +46,13 @@ def oracle_reference(objective: ImpactObjective) -> Reference:
     """Return the same quantities from the numbers of Pinocchio."""
 
     def evaluate(q: Vector, n: Vector) -> dict[str, Vector]:
-        found = {"objective": objective.value(q), "objective_grad": objective.gradient(q)}
+        found: dict[str, ArrayLike] = {"objective": objective.value(q), "objective_grad": objective.gradient(q)}
         if not objective.others:
             oracle = oracle_along(objective, n)
             at = oracle.quantities(q)
             found |= {"H": at.H, "grad": oracle.gradient_H(q), "jump": at.jump, "G": at.G, "V": at.V}
             found["ellipsoid"] = at.ellipsoid
-        return {name: np.ravel(value) for name, value in found.items()}
+        return {name: np.array(value, dtype=float).ravel() for name, value in found.items()}
 
     return evaluate
 

@@ -1,4 +1,4 @@
-"""Coordinates that an optimizer can move in, and the manifold's retraction as expressions."""
+"""Coordinates of the configuration space for an optimizer, and the tangent map of the manifold as expressions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ANGLES = ("continuous", "planar")
 
 @dataclass(frozen=True)
 class JointSlot:
-    """Where one joint sits in ``q``, ``v`` and the chart ``x``."""
+    """Place of one joint in ``q``, ``v`` and the chart ``x``."""
 
     index: int
     name: str
@@ -33,10 +33,10 @@ class JointSlot:
 
 
 class Chart:
-    """Chart ``x`` of the configuration space: as ``q``, but every continuous or planar rotation is one angle.
+    """Chart ``x`` of the configuration space, which is ``q`` with one angle for every continuous or planar rotation.
 
-    Quaternions stay four numbers; :meth:`norms` gives the unit-norm equations that go with them.  So ``q(x)`` and all
-    that is built on it is smooth, has no singular chart point, and costs nothing.
+    Quaternions stay four numbers, and :meth:`norms` has the equations of their unit norm.  So ``q(x)`` is smooth, has
+    no singular point, and costs nothing.
     """
 
     def __init__(self, model: pin.Model) -> None:
@@ -54,11 +54,12 @@ class Chart:
         self._model = model
 
     def configuration(self, x: ca.SX) -> ca.SX:
-        """``q(x)``, shape (nq, 1)."""
-        return ca.vertcat(*self._parts(x, ca.cos, ca.sin))
+        """Return ``q(x)``, shape (nq, 1)."""
+        parts: list[ca.SX] = self._parts(x, ca.cos, ca.sin)
+        return ca.vertcat(*parts)
 
     def _parts(self, x: Any, cos: Callable[[Any], Any], sin: Callable[[Any], Any]) -> list[Any]:
-        """The entries of ``q(x)`` in order: every angle as its cosine and sine."""
+        """Return the entries of ``q(x)`` in order, with cosine and sine of every angle."""
         parts: list[Any] = []
         for slot in self.slots:
             angle = slot.kind.family in _ANGLES
@@ -67,15 +68,15 @@ class Chart:
         return parts
 
     def quaternion_slices(self) -> list[slice]:
-        """Where ``x`` holds quaternions (x y z w)."""
+        """Return where ``x`` holds quaternions (x y z w)."""
         return [slice(s.x.stop - 4, s.x.stop) for s in self.slots if s.kind.family in ("free-flyer", "spherical")]
 
     def norms(self, x: ca.SX) -> ca.SX:
-        """``|quaternion|² − 1`` for each quaternion in ``x``."""
+        """Return ``|quaternion|² − 1`` for each quaternion in ``x``."""
         return ca.vertcat(ca.SX(0, 1), *[ca.sumsqr(x[s]) - 1 for s in self.quaternion_slices()])
 
     def to_x(self, q: Vector) -> Vector:
-        """Chart coordinates of a configuration, shape (nx,)."""
+        """Return the chart coordinates of a configuration, shape (nx,)."""
         parts: list[Any] = []
         for slot in self.slots:
             piece = q[slot.q]
@@ -84,11 +85,11 @@ class Chart:
         return np.hstack([np.zeros(0), *parts])
 
     def to_q(self, x: Vector) -> Vector:
-        """Configuration of chart coordinates, shape (nq,), quaternions normalized."""
+        """Return the configuration of chart coordinates, shape (nq,), with normalized quaternions."""
         return np.asarray(pin.normalize(self._model, np.hstack([np.zeros(0), *self._parts(x, np.cos, np.sin)])))
 
     def bounds(self) -> tuple[Vector, Vector]:
-        """Position limits in chart coordinates, infinite where there are none."""
+        """Return the position limits in chart coordinates, infinite where there are none."""
         lower, upper = np.full(self.nx, -np.inf), np.full(self.nx, np.inf)
         for slot in self.slots:
             if slot.kind.family in ("revolute", "prismatic", "translation"):
@@ -101,7 +102,7 @@ class Chart:
 
 
 def tangent_map(chart: Chart, q: ca.SX) -> ca.SX:
-    """``∂(q ⊕ v)/∂v`` at ``v = 0``, shape (nq, nv): turns ``∂/∂q`` into the tangent gradient."""
+    """Return ``∂(q ⊕ v)/∂v`` at ``v = 0``, shape (nq, nv), which turns ``∂/∂q`` into the tangent gradient."""
     blocks = []
     for slot in chart.slots:
         piece, family = q[slot.q], slot.kind.family
@@ -123,6 +124,6 @@ def tangent_map(chart: Chart, q: ca.SX) -> ca.SX:
 
 
 def _quaternion_rate(quaternion: ca.SX) -> ca.SX:
-    """``½ quaternion ⊗ [w; 0]`` as a (4, 3) matrix acting on the body angular velocity ``w``."""
+    """Return ``½ quaternion ⊗ [w; 0]`` as a (4, 3) matrix on the body angular velocity ``w``."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     return 0.5 * ca.blockcat([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]])

@@ -1,4 +1,4 @@
-"""The joints that Pinocchio's URDF parser makes: placement, orientation and motion subspace as expressions."""
+"""Joints that the URDF parser of Pinocchio makes: placement, orientation and motion subspace as expressions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, s
 from impact_posture.errors import UnsupportedJoint
 
 _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
-# Short names after "JointModel": what moves, and by which coordinates.
+# Short names of joint models without "JointModel", with the axis of the joint.
 _REVOLUTE = {"RX": "X", "RY": "Y", "RZ": "Z", "RevoluteUnaligned": None}
 _CONTINUOUS = {"RUBX": "X", "RUBY": "Y", "RUBZ": "Z", "RevoluteUnboundedUnaligned": None}
 _PRISMATIC = {"PX": "X", "PY": "Y", "PZ": "Z", "PrismaticUnaligned": None}
@@ -21,14 +21,14 @@ _PRISMATIC = {"PX": "X", "PY": "Y", "PZ": "Z", "PrismaticUnaligned": None}
 
 @dataclass(frozen=True)
 class JointKind:
-    """What a joint is, read off a ``pin.JointModel``.
+    """Kind of a ``pin.JointModel``.
 
     Attributes:
         family: ``revolute``, ``continuous``, ``prismatic``, ``free-flyer``, ``planar``, ``spherical`` or
             ``translation``.
         axis: Unit axis in the joint frame, shape (3,); zeros where it has none.
-        subspace: Motion subspace ``S`` in the joint frame, shape (6, nv); constant for all of these.
-        nq: Numbers in the configuration.
+        subspace: Motion subspace ``S`` in the joint frame, shape (6, nv); it is constant for all families.
+        nq: Length of the configuration.
     """
 
     family: str
@@ -46,7 +46,7 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
     """Classify a Pinocchio joint.
 
     Raises:
-        UnsupportedJoint: A joint that no URDF makes (composite, universal, helical, ...).
+        UnsupportedJoint: No URDF makes such a joint (composite, universal, helical, ...).
     """
     short = joint.shortname().removeprefix("JointModel")
     for family, table in (("revolute", _REVOLUTE), ("continuous", _CONTINUOUS), ("prismatic", _PRISMATIC)):
@@ -83,7 +83,7 @@ def _axis(joint: pin.JointModel, letter: str | None, *, linear: bool) -> NDArray
 
 
 def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Rotation (3, 3) and translation (3,) of the moved frame in the joint's rest frame."""
+    """Return rotation (3, 3) and translation (3,) of the moved frame in the rest frame of the joint."""
     zero = ca.SX(3, 1)
     if kind.family == "revolute":
         return axis_rotation(kind.axis, ca.cos(q[0]), ca.sin(q[0])), zero
@@ -101,7 +101,7 @@ def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
-    """The joint's rotation as a turn about a coordinate axis; ``None`` where it is none."""
+    """Return the rotation of a joint about a coordinate axis; ``None`` for another joint."""
     axis = int(np.argmax(np.abs(kind.axis)))
     if kind.family not in ("revolute", "continuous") or abs(kind.axis[axis]) < 1 - 1e-15:
         return None
@@ -111,16 +111,16 @@ def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
 
 
 def axis_rotation(axis: NDArray[np.float64], cosine: ca.SX, sine: ca.SX) -> ca.SX:
-    """Rodrigues' rotation ``aaᵀ + cos (I − aaᵀ) + sin [a]×``."""
+    """Return the rotation ``aaᵀ + cos (I − aaᵀ) + sin [a]×`` (Rodrigues)."""
     outer = np.outer(axis, axis)
     return ca.sparsify(constant(outer) + cosine * constant(np.eye(3) - outer) + sine * skew(constant(axis)))
 
 
 def joint_quaternion(kind: JointKind, x: ca.SX) -> ca.SX:
-    """Unit quaternion ``x y z w`` of the joint's rotation, smooth everywhere, from its chart coordinates.
+    """Return the unit quaternion ``x y z w`` of a joint's rotation, smooth everywhere, from its chart coordinates.
 
-    Continuous and planar joints enter by their angle (see :class:`~impact_posture.dynamics.chart.Chart`): a half
-    angle is no smooth function of its cosine and sine.
+    Continuous and planar joints enter by their angle (see :class:`~impact_posture.dynamics.chart.Chart`), because a
+    half angle is no smooth function of its cosine and sine.
     """
     if kind.family in ("revolute", "continuous"):
         return _half(kind.axis, x[0])

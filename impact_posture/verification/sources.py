@@ -1,4 +1,4 @@
-"""The ways of computing an impact: each gives the same numbers at a sample by other means."""
+"""Sources that compute the same quantities of an impact by different means."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """What one way computes at one sample, by quantity: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M``, ``J``.
+    """Quantities of one source at one sample: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M``, ``J``.
 
     Attributes:
-        values: Arrays by quantity; a way need not have all.
-        scales: By quantity, what an error is relative to if that is more than the quantity's largest entry.
+        values: Array of each quantity; a source need not have all.
+        scales: Least scale of the relative error of each quantity; its largest entry replaces a smaller scale.
     """
 
     values: dict[str, Vector]
@@ -37,13 +37,13 @@ class Numbers:
 
 Source = Callable[[Sample], Numbers]
 
-# Where n lies across the ways the contact can move, H, G and ∇H vanish: they count relative to this part of their
-# largest value over all normals.
+# H, G and ∇H vanish where the contact cannot move along n.  Their errors are relative to this share of their largest
+# value over all normals.
 _FLOOR = 1e-3
 
 
 def pinocchio_numbers(objective: ImpactObjective, sample: Sample) -> Numbers:
-    """The reference: Pinocchio's ``M``, ``J`` and derivatives, dense linear algebra."""
+    """Return the reference, from ``M``, ``J`` and derivatives of Pinocchio by dense linear algebra."""
     oracle = oracle_along(objective, sample.normal)
     found = oracle.quantities(sample.q)
     values = {
@@ -59,7 +59,7 @@ def pinocchio_numbers(objective: ImpactObjective, sample: Sample) -> Numbers:
 
 
 def pinocchio_differences(objective: ImpactObjective, sample: Sample) -> Numbers:
-    """``∇H`` from Pinocchio's values of ``H`` alone."""
+    """Return ``∇H`` as finite differences of ``H`` from Pinocchio."""
     oracle = oracle_along(objective, sample.normal)
 
     def value(q: Vector) -> float:
@@ -71,17 +71,17 @@ def pinocchio_differences(objective: ImpactObjective, sample: Sample) -> Numbers
 
 
 def casadi_source(objective: ImpactObjective) -> Source:
-    """CasADi's interpreter of the symbolic kernel."""
+    """Return the source of the symbolic kernel, interpreted by CasADi."""
     reference = casadi_reference(_impulse(objective))
     return lambda sample: _named(reference(sample.q, sample.normal))
 
 
 @contextmanager
 def compiled_source(objective: ImpactObjective) -> Iterator[Source]:
-    """The C export, built by the user's compiler in a temporary folder.
+    """Yield the source of the C export, built by the user's compiler in a temporary folder.
 
     Raises:
-        CompilerError: No compiler, or it failed.
+        CompilerError: There is no compiler, or it failed.
     """
     with scratch_folder() as folder:
         made = export(_impulse(objective), folder, prefix="verified", check=False)
@@ -91,7 +91,7 @@ def compiled_source(objective: ImpactObjective) -> Iterator[Source]:
             values: dict[str, Vector] = {}
             for function, names in _RESULTS.items():
                 code, results = compiled.call(function, sample.q, sample.normal)
-                # Code 3 of jump says that V does not exist, as where G is zero.  G does exist.
+                # Code 3 of jump says that V does not exist, because G is zero.  G does exist.
                 good = code == 0 or (function, code) == ("jump", 3)
                 for name, result in zip(names, results, strict=True):
                     values[name] = result.copy() if good else np.full(result.shape, np.nan)
@@ -104,8 +104,8 @@ _RESULTS = {"eval": ("H", "grad"), "jump": ("jump", "G", "V"), "ellipsoid": ("el
 
 
 def _impulse(objective: ImpactObjective) -> ImpactObjective:
-    """The objective of the leading contact that exists everywhere; it has the same ``H`` and ``∇H``."""
-    return replace(objective.singles[0], kind="impulse")
+    """Return the objective that exists everywhere; it has the same ``H`` and ``∇H``."""
+    return replace(objective, kind="impulse")
 
 
 def _named(values: dict[str, Vector]) -> Numbers:
@@ -115,14 +115,14 @@ def _named(values: dict[str, Vector]) -> Numbers:
 
 
 class MujocoSource:
-    """MuJoCo's ``M`` and ``J``, and what follows from them by one dense solve."""
+    """``M`` and ``J`` from MuJoCo, and what follows from them by one dense solve."""
 
     def __init__(self, objective: ImpactObjective) -> None:
         self._objective = objective
         self._numeric = MujocoNumeric(objective.robot.model)
 
     def __call__(self, sample: Sample) -> Numbers:
-        """Numbers at one sample; ``∇H`` by differences of MuJoCo's own ``H``."""
+        """Return the numbers at one sample; ``∇H`` by finite differences of this ``H``."""
 
         def value(q: Vector) -> float:
             return float(self._values(q, sample.normal)["H"][0])
