@@ -58,7 +58,7 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
         if not force:
             raise OutputError("exists", where=str(out), hint="choose another --out, or --force to replace it")
         _check_ours(out, kind)
-    parent = _first_existing(out.absolute().parent)
+    parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError("cannot be written", where=str(parent), hint="choose another --out")
 
@@ -79,7 +79,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
     check_output(out, force=force, kind=kind)
     out = out.absolute()
     try:
-        with _parents_of(out), _scratch(out.parent, 0o777) as beside:
+        with _parents_of(out), scratch_folder(out.parent, 0o777) as beside:
             try:
                 yield beside
             except OutputError as error:
@@ -95,25 +95,6 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
         raise OutputError(
             f"cannot be written ({words})", where=str(out), hint="free space or choose another --out"
         ) from error
-
-
-@contextmanager
-def scratch_folder(parent: Path | None = None) -> Iterator[Path]:
-    """Yield a temporary folder that only the user can read.  It is removed after the block, also after a signal.
-
-    Args:
-        parent: The folder above it; the system's temporary folder by default.
-
-    Raises:
-        OutputError: The system has no temporary folder.
-        OSError: The folder cannot be made.
-    """
-    try:
-        parent = Path(tempfile.gettempdir()) if parent is None else parent
-    except FileNotFoundError:
-        raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to one") from None
-    with _scratch(parent, 0o700) as folder:
-        yield folder
 
 
 def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None:
@@ -268,17 +249,25 @@ def _parents_of(out: Path) -> Iterator[None]:
         yield
 
 
-def _first_existing(path: Path) -> Path:
-    while not path.exists():
-        path = path.parent
-    return path
-
-
 # ---- temporary folders ---------------------------------------------------------------------------------------------
 
 
 @contextmanager
-def _scratch(parent: Path, mode: int) -> Iterator[Path]:
+def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Path]:
+    """Yield a temporary folder.  It is removed after the block, also after a signal.
+
+    Args:
+        parent: The folder above it; the system's temporary folder by default.
+        mode: Permissions; only the user can read it by default.
+
+    Raises:
+        OutputError: The system has no temporary folder.
+        OSError: The folder cannot be made.
+    """
+    try:
+        parent = Path(tempfile.gettempdir()) if parent is None else parent
+    except FileNotFoundError:
+        raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to one") from None
     _sweep(parent)
     folder = parent / f"{_SCRATCH}{secrets.token_hex(4)}"
     # The folder does not exist yet, so no signal can come between.
@@ -300,7 +289,7 @@ def _sweep(parent: Path) -> None:
     """Remove the temporary folders that processes of this package left when they were killed."""
     with suppress(OSError):
         for folder in parent.glob(f"{_SCRATCH}*"):
-            with suppress(OSError, ValueError, RecursionError):
+            with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
                 _sweep_one(folder)
 
 
@@ -315,8 +304,6 @@ def _sweep_one(folder: Path) -> None:
         # Locks may not reach across machines.  The record of a finished folder names no machine.
         if content["schema"] == SCHEMA and content.get("host", os.uname().nodename) == os.uname().nodename:
             _remove(folder)
-    except (KeyError, TypeError):
-        return
     finally:
         os.close(record)
 

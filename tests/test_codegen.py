@@ -15,12 +15,15 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from jinja2 import UndefinedError
 
 from impact_posture.codegen.build_check import compile_and_check, largest_difference
+from impact_posture.codegen.emitter import DOUBLE
 from impact_posture.codegen.export import Export, export
 from impact_posture.codegen.functions import casadi_reference, oracle_reference
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.naming import c_identifier
+from impact_posture.codegen.render import Verbatim, _environment
 from impact_posture.errors import CompilerError, InputError, MetricError, OutputError, PostureError
 from impact_posture.escape import c_comment
 from impact_posture.impact.contact import ImpactContact, Support
@@ -497,3 +500,18 @@ def test_bad_folder_and_posture(pendulum: str, tmp_path: Path) -> None:
 
 def test_names_cannot_end_a_comment() -> None:
     assert c_comment("a*/ int x; /* \\ ??/ \n ü") == "a_/ int x; /_ _ __/ _ _"
+
+
+def test_templates_escape_every_text_and_refuse_unknown_names() -> None:
+    sizes = {"nq": 2, "nv": 2}
+    environment = _environment(c_comment, DOUBLE, sizes)
+    assert environment.from_string("{{ name }} {{ code }}").render(name="*/", code=Verbatim("*/")) == "_/ */"
+    assert environment.from_string("{{ values | reals }}").render(values=[-1.5]) == "{\n  -1.5\n}"
+    for text in (
+        "{{ nobody }}",
+        "{{ name.nobody }}",
+        "{% if nobody %}{% endif %}",
+        "{% for x in nobody %}{% endfor %}",
+    ):
+        with pytest.raises(UndefinedError):
+            environment.from_string(text).render(name="x")

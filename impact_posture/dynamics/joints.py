@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, skew
 from impact_posture.errors import UnsupportedJoint
 
-_AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
-# Short names of joint models without "JointModel", with the axis of the joint.
-_REVOLUTE = {"RX": "X", "RY": "Y", "RZ": "Z", "RevoluteUnaligned": None}
-_CONTINUOUS = {"RUBX": "X", "RUBY": "Y", "RUBZ": "Z", "RevoluteUnboundedUnaligned": None}
-_PRISMATIC = {"PX": "X", "PY": "Y", "PZ": "Z", "PrismaticUnaligned": None}
+# Short name of a joint model without "JointModel" → its family.
+_FAMILIES = {
+    **dict.fromkeys(("RX", "RY", "RZ", "RevoluteUnaligned"), "revolute"),
+    **dict.fromkeys(("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned"), "continuous"),
+    **dict.fromkeys(("PX", "PY", "PZ", "PrismaticUnaligned"), "prismatic"),
+    **{"FreeFlyer": "free-flyer", "Planar": "planar", "Spherical": "spherical", "Translation": "translation"},
+}
 
 
 @dataclass(frozen=True)
@@ -49,37 +51,20 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
         UnsupportedJoint: No URDF makes such a joint (composite, universal, helical, ...).
     """
     short = joint.shortname().removeprefix("JointModel")
-    for family, table in (("revolute", _REVOLUTE), ("continuous", _CONTINUOUS), ("prismatic", _PRISMATIC)):
-        if short in table:
-            axis = _axis(joint, table[short], linear=family == "prismatic")
-            subspace = np.zeros((6, 1))
-            subspace[0 if family == "prismatic" else 3 :][:3, 0] = axis
-            return JointKind(family, axis, subspace, int(joint.nq))
-    eye, none = np.eye(6), np.zeros(3)
-    others = {
-        "FreeFlyer": JointKind("free-flyer", none, eye, 7),
-        "Planar": JointKind("planar", np.array(_AXES["Z"]), eye[:, [0, 1, 5]], 4),
-        "Spherical": JointKind("spherical", none, eye[:, 3:], 4),
-        "Translation": JointKind("translation", none, eye[:, :3], 3),
-    }
-    if short in others:
-        return others[short]
-    raise UnsupportedJoint(
-        f"joint '{name}' is of type {short}",
-        where="symbolic dynamics",
-        hint="lock it (--lock) or model it by revolute and prismatic joints",
-    )
-
-
-def _axis(joint: pin.JointModel, letter: str | None, *, linear: bool) -> NDArray[np.float64]:
-    if letter is not None:
-        return np.array(_AXES[letter])
-    alone = pin.Model()
-    alone.addJoint(0, joint, pin.SE3.Identity(), "joint")
-    data = alone.createData()
-    pin.computeJointJacobians(alone, data, pin.neutral(alone))
-    column = np.asarray(pin.getJointJacobian(alone, data, 1, pin.LOCAL)).reshape(6)
-    return np.asarray(column[:3] if linear else column[3:])
+    family = _FAMILIES.get(short)
+    if family is None:
+        raise UnsupportedJoint(
+            f"joint '{name}' is of type {short}",
+            where="symbolic dynamics",
+            hint="lock it (--lock) or model it by revolute and prismatic joints",
+        )
+    # S is the same at every configuration.
+    data = joint.createData()
+    joint.calc(data, np.full(joint.idx_q + joint.nq, 0.5))
+    subspace = np.array(data.S, dtype=float).reshape(6, -1)
+    axes = {"revolute": subspace[3:, 0], "prismatic": subspace[:3, 0], "planar": subspace[3:, -1]}
+    axis = axes.get("revolute" if family == "continuous" else family, np.zeros(3))
+    return JointKind(family, axis, subspace, int(joint.nq))
 
 
 def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -125,34 +125,10 @@ def symmetric(matrix: ca.SX) -> ca.SX:
 
 
 def ldl_solve(matrix: ca.SX, rhs: ca.SX) -> ca.SX:
-    """Solve ``matrix x = rhs`` for a small symmetric positive definite matrix by ``LDLᵀ``, without pivots.
-
-    The elimination looks right and writes ``L⁻¹`` out.  In this order an operation waits for the fewest others.
-    """
-    n = matrix.shape[0]
-    rest = [[matrix[i, j] for j in range(i + 1)] for i in range(n)]
-    L = [[ca.SX(0)] * n for _ in range(n)]
-    inverse = [ca.SX(0)] * n
-    for j in range(n):
-        inverse[j] = 1 / rest[j][j]
-        for i in range(j + 1, n):
-            L[i][j] = rest[i][j] * inverse[j]
-        for i in range(j + 1, n):
-            for k in range(j + 1, i + 1):
-                rest[i][k] = rest[i][k] - L[i][j] * rest[k][j]
-    # -L⁻¹ row by row, because each row needs those above it.
-    N = [[ca.SX(0)] * n for _ in range(n)]
-    for i in range(n):
-        for j in range(i):
-            N[i][j] = sum((L[i][k] * N[k][j] for k in range(j + 1, i)), L[i][j])
-            N[i][j] = -N[i][j]
-    columns = []
-    for c in range(rhs.shape[1]):
-        y = [rhs[i, c] + sum((N[i][k] * rhs[k, c] for k in range(i)), ca.SX(0)) for i in range(n)]
-        y = [y[i] * inverse[i] for i in range(n)]
-        x = [y[i] + sum((N[k][i] * y[k] for k in range(i + 1, n)), ca.SX(0)) for i in range(n)]
-        columns.append(ca.vertcat(*x))
-    return ca.horzcat(*columns)
+    """Solve ``matrix x = rhs`` for a small symmetric positive definite matrix by ``LDLᵀ``, without pivots."""
+    D, LT, order = ca.ldl(ca.densify(matrix), False)
+    found: ca.SX = ca.ldl_solve(ca.densify(rhs), D, LT, order)
+    return found
 
 
 def quaternion_product(a: ca.SX, b: ca.SX) -> ca.SX:

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from impact_posture.codegen.build_check import Deviation, deviation
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
@@ -24,7 +25,7 @@ from impact_posture.verification.sources import (
     pinocchio_differences,
     pinocchio_numbers,
 )
-from impact_posture.verification.verification_report import Deviation, Row, VerificationReport, deviation
+from impact_posture.verification.verification_report import Row, VerificationReport
 
 CASADI, COMPILED, DIFFERENCES, MUJOCO = "CasADi", "compiled C", "finite differences", "MuJoCo"
 NO_COMPILER = f"no C compiler: {GET_ONE}"

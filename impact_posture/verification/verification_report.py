@@ -5,12 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from impact_posture.verification.samples import Sample
 
-Vector = NDArray[np.float64]
 Verdict = Literal["pass", "fail", "skipped"]
 
 REFERENCE = "Pinocchio"
@@ -78,25 +74,3 @@ class VerificationReport:
                 for k in named
             ],
         }
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """The largest relative error of one quantity at one sample.
-
-    Attributes:
-        error: Largest ``|found − expected|`` over the scale; infinite where a number is not finite.
-        index: Index of the entry with that error.
-    """
-
-    error: float
-    index: tuple[int, ...]
-
-
-def deviation(found: Vector, expected: Vector, scale: float = 0.0) -> Deviation:
-    """Return the largest deviation over the largest expected entry, or over ``scale`` if that is larger."""
-    difference = np.abs(found - expected)
-    difference[~np.isfinite(difference)] = np.inf
-    index = tuple(int(k) for k in np.unravel_index(int(np.argmax(difference)), difference.shape))
-    largest, size = float(difference[index]), max(float(np.abs(expected).max()), scale)
-    return Deviation(largest / size if size > 0 else (np.inf if largest > 0 else 0.0), index)
