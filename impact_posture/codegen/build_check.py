@@ -147,7 +147,8 @@ class Deviation:
 
 def deviation(found: Vector, expected: Vector, scale: float = 0.0) -> Deviation:
     """Return the largest deviation over the largest expected entry, or over ``scale`` if that is larger."""
-    difference = np.abs(found - expected)
+    with np.errstate(invalid="ignore"):
+        difference = np.abs(found - expected)
     difference[~np.isfinite(difference)] = np.inf
     index = tuple(int(k) for k in np.unravel_index(int(np.argmax(difference)), difference.shape))
     largest, size = float(difference[index]), max(float(np.abs(expected).max()), scale)
