@@ -20,7 +20,7 @@ app = typer.Typer(
 
 def _version(value: bool) -> None:
     if value:
-        from impact_posture import __version__
+        from impact_posture.version import __version__
 
         typer.echo(f"impact-posture {__version__}")
         raise typer.Exit

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from itertools import zip_longest
 
-from impact_posture_cli.options import TRADEOFF_POINTS
+from impact_posture.settings import TRADEOFF_POINTS
 
 
 def put_right(arguments: Sequence[str]) -> list[str]:

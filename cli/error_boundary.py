@@ -19,7 +19,8 @@ import typer
 
 from impact_posture.errors import ImpactPostureError, one_line
 from impact_posture.escape import printable
-from impact_posture_cli.checks import UsageError
+from impact_posture_cli.option_names import as_options, option_of
+from impact_posture_cli.settings_options import UsageError
 
 DEBUG_VARIABLE = "IMPACT_POSTURE_DEBUG"
 _INTERRUPTED = 130
@@ -68,7 +69,8 @@ def _interrupted(wants_json: bool) -> int:
 def _explain(error: Exception, wants_json: bool) -> int:
     kind = type(error).__name__
     if isinstance(error, ImpactPostureError):
-        return _report(error.exit_code, kind, error.what, error.where, error.hint, wants_json=wants_json)
+        what, where, hint = as_options(error.what), option_of(error.where), as_options(error.hint)
+        return _report(error.exit_code, kind, what, where, hint, wants_json=wants_json)
     if isinstance(error, UsageError):
         return _usage(error, wants_json)
     if isinstance(error, OSError):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from impact_posture.errors import one_line
 from impact_posture.escape import printable
+from impact_posture_cli.option_names import as_options
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -46,7 +47,7 @@ class Page:
         """A paragraph, wrapped at words."""
         from rich.text import Text
 
-        self.console.print(Text(printable(text), style=style))
+        self.console.print(Text(printable(as_options(text)), style=style))
 
     def gap(self) -> None:
         """An empty line."""
@@ -97,7 +98,7 @@ class Page:
         """One line each on standard error, unless quiet."""
         if not self.quiet:
             for line in lines:
-                complain(f"warning: {line}")
+                complain(f"warning: {as_options(line)}")
 
 
 def number(value: float | None, unit: str = "", *, missing: str = "undefined") -> str:

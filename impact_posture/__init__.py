@@ -1,7 +1,81 @@
 """Impact-robust posture optimization for kinematically redundant robots.
 
 The velocity jump of a rigid impact is ``Δν = M⁻¹(q) Jᵀ n λ``.  This package measures it, finds the posture that
-keeps it small under the constraints of a task, shows why, and exports what a controller needs.
+keeps it small under the constraints of a task, shows why, and exports what a controller needs::
+
+    import impact_posture as ip
+
+    robot = ip.load_robot("tilthex_arm")
+    objective = ip.ImpactObjective(robot, ip.ImpactContact("ee", normal=(0, 0, 1)))
+    result = ip.optimize(ip.PostureProblem(objective, base="level"))
+    result.save("out")
+
+Names are imported when they are first used, so that the online part (``ip.tsid``) never loads CasADi.
 """
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from impact_posture.version import __version__
+
+if TYPE_CHECKING:
+    from impact_posture import tsid
+    from impact_posture.codegen.export import Export
+    from impact_posture.codegen.impact_gradient import ImpactGradient
+    from impact_posture.errors import ImpactPostureError
+    from impact_posture.front_door import ImpactObjective, PostureProblem, PostureResult, optimize
+    from impact_posture.impact.contact import ImpactContact, Support
+    from impact_posture.impact.metric import Metric
+    from impact_posture.robot.robot import Robot
+    from impact_posture.robot.robot_loader import known_robots, load_robot
+
+
+_HOMES = {
+    "Export": "codegen.export",
+    "ImpactContact": "impact.contact",
+    "ImpactGradient": "codegen.impact_gradient",
+    "ImpactObjective": "front_door",
+    "ImpactPostureError": "errors",
+    "Metric": "impact.metric",
+    "PostureProblem": "front_door",
+    "PostureResult": "front_door",
+    "Robot": "robot.robot",
+    "Support": "impact.contact",
+    "known_robots": "robot.robot_loader",
+    "load_robot": "robot.robot_loader",
+    "optimize": "front_door",
+    "tsid": "",
+}
+
+__all__ = [
+    "Export",
+    "ImpactContact",
+    "ImpactGradient",
+    "ImpactObjective",
+    "ImpactPostureError",
+    "Metric",
+    "PostureProblem",
+    "PostureResult",
+    "Robot",
+    "Support",
+    "__version__",
+    "known_robots",
+    "load_robot",
+    "optimize",
+    "tsid",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'impact_posture' has no attribute '{name}'")
+    home = _HOMES[name]
+    if not home:
+        return import_module(f"impact_posture.{name}")
+    return getattr(import_module(f"impact_posture.{home}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

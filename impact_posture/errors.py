@@ -209,7 +209,7 @@ class Infeasible(ImpactPostureError):
         super().__init__(
             f"the constraints conflict: {named}",
             where=where,
-            hint=hint or "relax one of them, move the target, or start from another --posture",
+            hint=hint or "relax one of them, move the target, or start from another `posture`",
         )
 
 
@@ -225,8 +225,8 @@ class WorkerDied(ImpactPostureError):
     def __init__(self) -> None:
         super().__init__(
             "a worker process was killed",
-            where="--jobs",
-            hint="give it more memory, or work in one process: --jobs 1",
+            where="jobs",
+            hint="give it more memory, or work in one process: `jobs=1`",
         )
 
 

@@ -126,6 +126,12 @@ def _drawings(view: ResultView, folder: Path, formats: Sequence[str]) -> list[Ca
     return [partial(draw_all, view, folder, formats, [name]) for name in drawable(view)]
 
 
+def result_view(prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> ResultView:
+    """What the pictures of a result are drawn from."""
+    path = null_space_path(solution.problem, solution.initial, solution.q)
+    return _view(prepared, solution.initial, solution.q, path, document)
+
+
 def _view(
     prepared: Prepared,
     initial: np.ndarray,

@@ -17,10 +17,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from impact_posture import __version__
 from impact_posture.errors import OutputError, SpecError
 from impact_posture.output_folder import scratch_folder
 from impact_posture.toolchain import find_compiler, no_compiler, run_compiler, words_of
+from impact_posture.version import __version__
 
 _REBUILD = "delete it: it is built again"
 # Fields of an ELF header after its 16 bytes of identity, and of a program header up to the length in the file.

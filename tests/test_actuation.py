@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from impact_posture.robot.actuation import (
     thrust_limits,
 )
 from impact_posture.robot.spec import PropulsionSpec, RotorSpec, read_spec
+from impact_posture.tables import validate
 
 FOLDER = Path(impact_posture_robots.__path__[0]) / "tilthex_arm"
 POSTURES = ["home", "tucked", "brace_down", "brace_forward", "brace_up"]
@@ -59,7 +61,7 @@ def flat(count: int, **changes: object) -> PropulsionSpec:
         "time_constant_down": 0.02,
         "rotors": tuple(rotors),
     }
-    return PropulsionSpec.model_validate(values | changes)
+    return validate(PropulsionSpec, values | changes, "propulsion")
 
 
 def test_allocation_is_full_and_well_conditioned(model: pin.Model, propulsion: PropulsionSpec) -> None:
@@ -205,7 +207,7 @@ def test_more_rotors_than_needed_are_spread_away_from_their_limits(model: pin.Mo
 
 def test_weak_rotors_and_weak_joints_are_named(model: pin.Model, propulsion: PropulsionSpec) -> None:
     q = model.referenceConfigurations["brace_forward"]
-    weak = propulsion.model_copy(update={"speed_max": 70.0})
+    weak = replace(propulsion, speed_max=70.0)
     result = hover(model, weak, q)
     assert result.thrust_margin < 0
     assert any("rotor_1" in v for v in result.violations)

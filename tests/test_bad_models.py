@@ -21,7 +21,8 @@ from impact_posture.errors import (
 )
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import build_metric
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import LoadOptions
 from tests.helpers import NAMES, robot
 
 GOOD = '<mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
@@ -95,7 +96,7 @@ def test_the_good_model_of_these_tests_loads(load: Load) -> None:
         ('<xacro:macro xmlns:xacro="http://x" name="m"><link name="a"/></xacro:macro>', ("not a URDF", "xacro")),
         ('<robot name="r" xmlns:xacro="http://x"><xacro:include filename="a"/></robot>', ("no <link>", "xacro")),
         ("<robot name='r'/>", ("no <link>",)),
-        ("<robot name='r'><link name='a'/></robot>", ("no movable joint", "--root free-flyer")),
+        ("<robot name='r'><link name='a'/></robot>", ("no movable joint", "root='free-flyer'")),
         (f"<robot name='r'>{link('a', GOOD)}{joint('a', 'nowhere')}</robot>", ("makes no robot",)),
         (f"<robot name='r'>{link('a', GOOD)}{link('b', GOOD)}</robot>", ("makes no robot",)),
         (
@@ -191,7 +192,7 @@ def test_a_joint_that_moves_no_mass(load: Load) -> None:
     elements = (link("a", GOOD), link("b", OFF_AXIS), link("c", None), joint("a", "b"), joint("b", "c", "1 0 0"))
     with pytest.raises(InertiaError) as caught:
         load(*elements)
-    one_line(caught.value, "joint 'b_c' moves no mass", "--lock")
+    one_line(caught.value, "joint 'b_c' moves no mass", "`lock_massless=True`")
     # Armature gives it something to turn; locking removes it.
     load(*elements, armature={"b_c": 0.01})
     load(*elements, lock=("b_c",))
@@ -410,7 +411,7 @@ def test_posture_outside_the_limits() -> None:
 def test_normals_without_direction(normal: tuple[float, ...]) -> None:
     with pytest.raises(ContactError) as caught:
         ImpactContact("ee", normal)  # type: ignore[arg-type]
-    one_line(caught.value, "has no direction", "--normal")
+    one_line(caught.value, "has no direction", "normal")
 
 
 def test_normals_are_normalized() -> None:
@@ -422,10 +423,10 @@ def test_normals_are_normalized() -> None:
 def test_impossible_impulses_and_offsets(impulse: float) -> None:
     with pytest.raises(ContactError) as caught:
         ImpactContact("ee", (0, 0, 1), impulse=impulse)
-    one_line(caught.value, "--impulse")
+    one_line(caught.value, "impulse: ")
     with pytest.raises(ContactError) as caught:
         ImpactContact("ee", (0, 0, 1), offset=(0.0, np.nan, 0.0))
-    one_line(caught.value, "--offset")
+    one_line(caught.value, "offset: ")
 
 
 @pytest.mark.parametrize(
@@ -451,7 +452,7 @@ def test_weights_that_do_not_fit_the_metric(tmp_path: Path) -> None:
     one_line(caught.value, "needs weights")
     with pytest.raises(MetricError) as caught:
         build_metric(robot("panda"), "kinetic", "velocity-limits")
-    one_line(caught.value, "--metric weighted")
+    one_line(caught.value, "metric='weighted'")
     path = tmp_path / "weights.toml"
     path.write_text("panda_joint1 = 4.0\n", encoding="utf-8")
     metric = build_metric(robot("panda"), "weighted", str(path))

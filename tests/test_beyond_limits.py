@@ -18,12 +18,13 @@ from impact_posture.codegen.reader import read_manifest
 from impact_posture.errors import CompilerError, ContactError, InputError, PostureError, SpecError, UrdfError
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.evaluation import evaluate
-from impact_posture.impact.request import ImpactRequest
+from impact_posture.impact.resolved_impact import resolve
 from impact_posture.job import load_view
 from impact_posture.posture.problem_settings import read_settings
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.spec import read_spec
 from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM, build_model
+from impact_posture.settings import ImpactSettings
 from impact_posture.toolchain import find_compiler, words_of
 from impact_posture_cli.error_boundary import run
 
@@ -54,7 +55,7 @@ def test_an_impulse_whose_objective_overflows(impulse: float) -> None:
 
 
 def test_a_speed_whose_jump_overflows() -> None:
-    resolved = ImpactRequest("tilthex_arm", normal=(0, 0, 1)).resolve()
+    resolved = resolve(ImpactSettings(robot="tilthex_arm", normal=(0, 0, 1)))
     with pytest.raises(InputError, match="0 to 1e"):
         evaluate(resolved.objective, resolved.q, speed=1e308)
 

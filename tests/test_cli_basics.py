@@ -9,19 +9,15 @@ import resource
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
 
 from impact_posture import __version__
 from impact_posture.errors import Infeasible, SolverFailed
-from impact_posture.impact.contact import NormalFrame
-from impact_posture.impact.metric import MetricKind, ObjectiveKind
 from impact_posture.robot.robot_loader import known_robots
-from impact_posture.robot.spec import ContactPose, Root
 from impact_posture_cli import error_boundary as boundary
-from impact_posture_cli import options
 from tests.command import run as start
 from tests.helpers import frame_jacobian, mass_matrix, relative, robot
 
@@ -319,14 +315,3 @@ def test_a_traceback_comes_only_when_asked_for(
     monkeypatch.setenv(boundary.DEBUG_VARIABLE, "1")
     assert boundary.run(Raises(ValueError("wrong")), []) == 1
     assert "Traceback" in capsys.readouterr().err
-
-
-def test_the_options_know_the_librarys_choices() -> None:
-    for mine, theirs in (
-        (options.NormalFrame, NormalFrame),
-        (options.MetricKind, MetricKind),
-        (options.ObjectiveKind, ObjectiveKind),
-        (options.RootKind, Root),
-        (options.ContactPose, ContactPose),
-    ):
-        assert get_args(mine) == get_args(theirs)

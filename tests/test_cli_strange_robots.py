@@ -10,11 +10,12 @@ import pytest
 import typer.main
 
 from impact_posture.errors import FrameNotFound, InertiaError, JointNotFound, PostureError, not_one_of
-from impact_posture.impact.request import ImpactRequest
+from impact_posture.impact.resolved_impact import resolve
 from impact_posture.posture.notes import percent
 from impact_posture.posture.problem_settings import make_settings, prepare, resolved_settings
 from impact_posture.robot.postures import read_posture, write_posture
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import ImpactSettings, LoadOptions
 from impact_posture_cli.app import app
 from impact_posture_cli.argv import put_right
 from impact_posture_cli.error_boundary import run
@@ -53,8 +54,9 @@ def test_a_floating_robot_without_feet_or_rotors_is_asked(
     for word in (words, "--no-support", "--base", "robot.toml", "--write-robot-toml"):
         assert word in errors
     # A measurement goes ahead, with a word.
-    request = ImpactRequest(DATA + path, LoadOptions(root="free-flyer"), frame, (0, 0, 1))
-    assert any("floating freely" in line and words in line for line in request.resolve().warnings)
+    code, _, errors = call(capsys, "evaluate", DATA + path, *asked)
+    assert code == 0
+    assert any("floating freely" in line and words in line for line in errors.splitlines())
 
 
 @pytest.mark.parametrize("more", [{"support": ()}, {"support": ("FL_foot",)}, {"base": "level"}])
@@ -68,7 +70,9 @@ def test_who_says_what_holds_it_is_not_asked(more: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("name", ["borinot", "hextilt", "tilthex_arm", "solo8", "panda"])
 def test_known_robots_are_not_asked(name: str) -> None:
-    assert not any("floating freely" in line for line in ImpactRequest(name, normal=(0, 0, 1)).resolve().warnings)
+    assert not any(
+        "floating freely" in line for line in resolve(ImpactSettings(robot=name, normal=(0, 0, 1))).warnings
+    )
 
 
 # ---- massless joints, patterns ----------------------------------------------------------------------------------
@@ -77,7 +81,7 @@ def test_known_robots_are_not_asked(name: str) -> None:
 def test_massless_joints_are_listed_and_locked_together(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InertiaError, match="24 joints move no mass") as caught:
         load_robot(ROMEO)
-    assert "--lock-massless" in caught.value.line
+    assert "`lock_massless=True`" in caught.value.line
     found = load_robot(ROMEO, LoadOptions(lock_massless=True))
     assert len(found.locked) == 24
     assert all(f"'{joint}'" in caught.value.line for joint in found.locked)
@@ -131,7 +135,7 @@ def test_an_srdf_in_the_data_package() -> None:
 )
 def test_a_base_that_a_fixed_root_leaves_out_is_said(name: str, options: LoadOptions, posture: str) -> None:
     warned = [line for line in load_robot(name, options).warnings if "the root is fixed" in line]
-    assert len(warned) == 1 and posture in warned[0] and "--root free-flyer" in warned[0]
+    assert len(warned) == 1 and posture in warned[0] and "root='free-flyer'" in warned[0]
 
 
 def test_a_robot_without_a_base_pose_is_not_warned_about_one() -> None:
@@ -144,7 +148,7 @@ def test_a_posture_file_with_a_base_for_a_fixed_root(by_name: bool, tmp_path: Pa
     document = {"base": [0, 0, 0.2, 0, 0, 0, 1]} if by_name else write_posture(floating, floating.posture())
     path = tmp_path / "q.json"
     path.write_text(json.dumps(document))
-    with pytest.raises(PostureError, match=r"base pose, but the root is fixed.*--root free-flyer"):
+    with pytest.raises(PostureError, match=r"base pose, but the root is fixed.*root='free-flyer'"):
         read_posture(bolted, str(path))
 
 
@@ -198,7 +202,7 @@ def test_the_same_words_for_a_key_of_a_file(tmp_path: Path, capsys: pytest.Captu
 @pytest.mark.parametrize(("name", "first"), [("panda", "panda_hand_tcp"), (B1_Z1, "gripperStator")])
 def test_frames_that_are_suggested_are_tips_first(name: str, first: str) -> None:
     with pytest.raises(FrameNotFound) as caught:
-        ImpactRequest(name, frame="§", normal=(0, 0, 1)).resolve()
+        resolve(ImpactSettings(robot=name, frame="§", normal=(0, 0, 1)))
     assert caught.value.nearest[0] == first
 
 

@@ -27,9 +27,10 @@ from impact_posture.codegen.render import Verbatim, _environment
 from impact_posture.errors import CompilerError, InputError, MetricError, OutputError, PostureError
 from impact_posture.escape import c_comment
 from impact_posture.impact.contact import ImpactContact, Support
-from impact_posture.impact.metric import Metric, ObjectiveKind
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import ObjectiveKind
 from impact_posture.toolchain import find_compiler, run_compiler
 from tests import exported
 from tests.exported import Exported

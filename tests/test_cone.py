@@ -19,7 +19,7 @@ from impact_posture.impact.cone import cone_axes, worst_normal
 from impact_posture.impact.cone_symbolic import worst_normal_symbolic
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.evaluation import evaluate
-from impact_posture.impact.metric import Metric, ObjectiveKind
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.normal_cone import NormalCone
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
@@ -28,6 +28,7 @@ from impact_posture.posture.problem import Requirements
 from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.solve import run_start, solve
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import ObjectiveKind
 from tests.command import run
 from tests.helpers import (
     assert_close,

@@ -6,8 +6,9 @@ import importlib
 import inspect
 import json
 import re
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import get_args
+from typing import get_args, get_type_hints
 
 import pytest
 import typer.main
@@ -15,10 +16,11 @@ from pydantic import BaseModel
 
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.pareto import pareto_front
-from impact_posture.posture.problem_settings import ProblemSettings, make_settings, prepare
+from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
-from impact_posture.robot.spec import ContactPose, RobotSpec
+from impact_posture.robot.spec import RobotSpec
+from impact_posture.settings import ContactPose, ProblemSettings
 from impact_posture.simulation.scenario_file import ScenarioFile
 from impact_posture_cli.app import app
 
@@ -38,16 +40,27 @@ def rows(page: Path) -> dict[str, list[str]]:
     return found
 
 
-def nested(annotation: object) -> type[BaseModel] | None:
+def nested(annotation: object) -> type | None:
     """The model inside ``Model``, ``Model | None``, ``tuple[Model, ...]`` or ``dict[str, Model]``."""
-    if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
+    if inspect.isclass(annotation) and (is_dataclass(annotation) or issubclass(annotation, BaseModel)):
         return annotation
     return next((m for a in getattr(annotation, "__args__", ()) if (m := nested(a)) is not None), None)
 
 
-def keys(model: type[BaseModel], prefix: str = "") -> dict[str, object]:
+def keys(model: type, prefix: str = "") -> dict[str, object]:
     """Dotted keys of a model and their defaults; ``...`` where there is none."""
     found: dict[str, object] = {}
+    if is_dataclass(model):
+        hints = get_type_hints(model)
+        for one in fields(model):
+            inner = nested(hints[one.name])
+            default = one.default if one.default_factory is MISSING else one.default_factory()
+            if inner is not None:
+                named = str(hints[one.name]).startswith("dict")
+                found |= keys(inner, f"{prefix}{one.name}.NAME." if named else f"{prefix}{one.name}.")
+            else:
+                found[prefix + one.name] = ... if default is MISSING else default
+        return found
     for name, field in model.model_fields.items():
         key = prefix + (field.alias or name)
         inner = nested(field.annotation)
@@ -81,7 +94,7 @@ def test_every_robot_toml_key_has_its_row() -> None:
     expected = keys(RobotSpec)
     found = {
         key: cells for key, cells in rows(DOCS / "reference" / "robot-toml.md").items()
-        if "." in key or key in RobotSpec.model_fields or key == "schema"
+        if "." in key or key in RobotSpec.__dataclass_fields__ or key == "schema"
     }  # fmt: skip
     assert set(found) == set(expected)
     for key, value in expected.items():
@@ -136,7 +149,7 @@ def test_every_problem_key_is_an_option() -> None:
     names = {o[2:].replace("-", "_") for p in command.params for o in p.opts if o.startswith("--")}
     names |= {"schema", "robot"}
     # Written by the tool itself: the start as numbers, and the compliance in force.
-    assert set(keys(ProblemSettings)) - names == {"q", "support_compliance"}
+    assert set(keys(ProblemSettings)) - names == {"q", "support_compliance", "mounting"}
 
 
 def test_result_keys_have_their_rows() -> None:

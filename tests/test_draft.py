@@ -16,9 +16,10 @@ from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.draft import Draft, write_draft
 from impact_posture.robot.guess import feet, support, tips
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.spec import RobotSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, robots_data
+from impact_posture.settings import LoadOptions
 from tests.helpers import NAMES
 
 B1_Z1 = "example-robot-data:b1_description/urdf/b1-z1.urdf"

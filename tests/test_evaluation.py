@@ -13,10 +13,11 @@ from impact_posture.impact.classical_ellipsoids import classical_ellipsoids, for
 from impact_posture.impact.contact import Support, default_compliance
 from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.parsing import parse_armature, parse_contact
-from impact_posture.impact.request import ImpactRequest
+from impact_posture.impact.resolved_impact import resolve
 from impact_posture.impact.velocity_jump import tangent_units
+from impact_posture.parsing import parse_armature, parse_contact
 from impact_posture.robot.robot import Robot
+from impact_posture.settings import ImpactSettings
 from tests.helpers import (
     assert_close,
     central_gradient,
@@ -88,7 +89,7 @@ CASES = [
 def test_numbers_against_dense_algebra(name: str, frame: str, metric: str) -> None:
     loaded = robot(name)
     n = unit(rng("normal", name))
-    impact = ImpactRequest(name, frame=frame, normal=tuple(n), metric=metric, impulse=3.0).resolve()  # type: ignore[arg-type]
+    impact = resolve(ImpactSettings(robot=name, frame=frame, normal=tuple(n), metric=metric, impulse=3.0))  # type: ignore[arg-type]
     found = evaluate(impact.objective, impact.q, 0.7, 0.3)
     W = mass_matrix(loaded.model, impact.q) if metric == "kinetic" else None
     expected = dense(loaded, frame, impact.q, n, W, impact.supports)
@@ -113,7 +114,7 @@ def test_numbers_against_dense_algebra(name: str, frame: str, metric: str) -> No
 
 def test_free_values_stand_beside_the_supported_ones() -> None:
     loaded, n = robot("talos"), np.array([-1.0, 0.0, 0.0])
-    impact = ImpactRequest("talos", frame="torso_2_link", normal=(-2.0, 0.0, 0.0)).resolve()
+    impact = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-2.0, 0.0, 0.0)))
     found = evaluate(impact.objective, impact.q)
     assert [s.frame for s in impact.supports] == ["left_sole_link", "right_sole_link"]
     expected = dense(loaded, "torso_2_link", impact.q, n, None, ())
@@ -125,7 +126,7 @@ def test_free_values_stand_beside_the_supported_ones() -> None:
     assert found.to_dict()["footing"] == found.footing.to_dict()
     # Two flat feet have full rank: their compliance hardly matters.
     assert found.compliance_effect is not None and 0 < found.compliance_effect < 1e-2
-    without = ImpactRequest("talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0), supports=()).resolve()
+    without = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0), support=()))
     alone = evaluate(without.objective, without.q)
     assert alone.free is None and "free" not in alone.to_dict()
     assert alone.footing is None and "footing" not in alone.to_dict()
@@ -133,7 +134,7 @@ def test_free_values_stand_beside_the_supported_ones() -> None:
 
 
 def test_the_predicted_jumps_obey_the_impact() -> None:
-    impact = ImpactRequest("tilthex_arm", normal=(0.3, -0.2, 1.0)).resolve()
+    impact = resolve(ImpactSettings(robot="tilthex_arm", normal=(0.3, -0.2, 1.0)))
     speed, e = 0.8, 0.4
     found = evaluate(impact.objective, impact.q, speed, e)
     assert found.frictionless is not None and found.sticking is not None and found.energy_loss is not None
@@ -158,7 +159,7 @@ def test_the_predicted_jumps_obey_the_impact() -> None:
 
 @pytest.mark.parametrize("kind", ["impulse", "speed", "sticking", "energy"])
 def test_gradients_against_central_differences(kind: str) -> None:
-    impact = ImpactRequest("tilthex_arm", normal=(0.0, 0.3, 1.0), posture="tucked", objective=kind).resolve()  # type: ignore[arg-type]
+    impact = resolve(ImpactSettings(robot="tilthex_arm", normal=(0.0, 0.3, 1.0), posture="tucked", objective=kind))  # type: ignore[arg-type]
     found = evaluate(impact.objective, impact.q)
     model, oracle = impact.robot.model, impact.objective.oracle
     H = central_gradient(lambda q: oracle.quantities(q).H, model, impact.q, 1e-4)
@@ -175,7 +176,7 @@ def strict(found: Evaluation) -> dict[str, object]:
 
 
 def test_the_block_has_the_keys_of_result_json() -> None:
-    impact = ImpactRequest("panda", normal=(0.0, 0.0, 1.0)).resolve()
+    impact = resolve(ImpactSettings(robot="panda", normal=(0.0, 0.0, 1.0)))
     block = strict(evaluate(impact.objective, impact.q))
     assert set(block["ellipsoid"]) == {"axes", "radii"}  # type: ignore[call-overload]
     assert set(block["pose"]) == {"position", "quaternion_xyzw"}  # type: ignore[call-overload]
@@ -187,7 +188,7 @@ def test_the_block_has_the_keys_of_result_json() -> None:
 
 
 def test_where_S_does_not_exist(planar: str) -> None:
-    impact = ImpactRequest(planar, frame="tip", normal=(1.0, 0.0, 0.5), objective="sticking").resolve()
+    impact = resolve(ImpactSettings(robot=planar, frame="tip", normal=(1.0, 0.0, 0.5), objective="sticking"))
     q = np.array([0.3, 0.9])
     found = evaluate(impact.objective, q)
     block = strict(found)
@@ -197,7 +198,7 @@ def test_where_S_does_not_exist(planar: str) -> None:
 
 
 def test_S_by_the_pseudo_inverse_inside_the_range(planar: str) -> None:
-    impact = ImpactRequest(planar, frame="tip", normal=(1.0, 0.4, 0.0), objective="sticking").resolve()
+    impact = resolve(ImpactSettings(robot=planar, frame="tip", normal=(1.0, 0.4, 0.0), objective="sticking"))
     q = np.array([0.3, 0.9])
     found = evaluate(impact.objective, q)
     n = found.worst_normal
@@ -210,7 +211,7 @@ def test_S_by_the_pseudo_inverse_inside_the_range(planar: str) -> None:
 
 
 def test_where_the_contact_cannot_move_along_the_normal(planar: str) -> None:
-    impact = ImpactRequest(planar, frame="tip", normal=(0.0, 0.0, 1.0), objective="speed").resolve()
+    impact = resolve(ImpactSettings(robot=planar, frame="tip", normal=(0.0, 0.0, 1.0), objective="speed"))
     found = evaluate(impact.objective, np.array([0.3, 0.9]))
     block = strict(found)
     assert [block[key] for key in ("V", "S", "E", "effective_mass", "objective")] == [None] * 5
@@ -228,13 +229,13 @@ def test_one_joint_dominates_or_none_does(planar: str) -> None:
     assert joint.joint == "j2" and joint.dominates
     assert joint.share == pytest.approx(a[1] ** 2 / (a @ a), rel=1e-10)
     assert joint.line.startswith(f"joint 'j2' carries {100 * joint.share:.0f} % of H")
-    even = ImpactRequest("talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0)).resolve()
+    even = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0)))
     verdict = evaluate(even.objective, even.q).dominance
     assert not verdict.dominates and verdict.line.startswith("no single joint dominates H")
 
 
 def _impact(urdf: str, normal: tuple[float, float, float], q: list[float]) -> tuple[ImpactObjective, np.ndarray]:
-    return ImpactRequest(urdf, frame="tip", normal=normal).resolve().objective, np.array(q)
+    return resolve(ImpactSettings(robot=urdf, frame="tip", normal=normal)).objective, np.array(q)
 
 
 def test_units_of_the_tangent_entries() -> None:
@@ -246,13 +247,13 @@ def test_units_of_the_tangent_entries() -> None:
     ("speed", "restitution"), [(-1.0, 0.0), (np.nan, 0.0), (1.0, -0.1), (1.0, 1.1), (1.0, np.nan)]
 )
 def test_an_impossible_approach_is_refused(speed: float, restitution: float) -> None:
-    impact = ImpactRequest("ur5", normal=(0.0, 0.0, 1.0)).resolve()
-    with pytest.raises(InputError, match=r"--speed|--restitution"):
+    impact = resolve(ImpactSettings(robot="ur5", normal=(0.0, 0.0, 1.0)))
+    with pytest.raises(InputError, match=r"^speed: |^restitution: "):
         evaluate(impact.objective, impact.q, speed, restitution)
 
 
 def test_classical_ellipsoids() -> None:
-    impact = ImpactRequest("panda", normal=(0.0, 0.0, 1.0)).resolve()
+    impact = resolve(ImpactSettings(robot="panda", normal=(0.0, 0.0, 1.0)))
     J = frame_jacobian(impact.robot.model, impact.q, impact.robot.frame_id("panda_hand_tcp"))[:3]
     found = classical_ellipsoids(impact.objective, impact.q)
     for name, matrix in (("velocity", J @ J.T), ("force", np.linalg.inv(J @ J.T))):
@@ -282,7 +283,7 @@ def test_contacts_as_text(text: str, expected: object) -> None:
 
 @pytest.mark.parametrize("text", ["ee", "ee:0,0", ":0,0,1", "ee:a,b,c", "0,0,1"])
 def test_contacts_that_are_none(text: str) -> None:
-    with pytest.raises(ContactError, match="--contact"):
+    with pytest.raises(ContactError, match=r"^contact: "):
         parse_contact(text)
 
 
@@ -292,13 +293,13 @@ def test_armature_as_text() -> None:
     assert parse_armature(["motors.toml"]) == "motors.toml"
     assert parse_armature(["a=0.1", "b=2e-3"]) == {"a": 0.1, "b": 2e-3}
     for texts in (["a=0.1", "motors.toml"], ["a=much"], ["none", "a=1"]):
-        with pytest.raises(InputError, match="--armature"):
+        with pytest.raises(InputError, match=r"^armature: "):
             parse_armature(texts)
 
 
 def test_supports_as_text() -> None:
     def supports(*texts: str) -> tuple[Support, ...]:
-        return ImpactRequest("solo8", normal=(1.0, 0.0, 0.0), supports=texts).resolve().supports
+        return resolve(ImpactSettings(robot="solo8", normal=(1.0, 0.0, 0.0), support=texts)).supports
 
     known = {s.frame: Support.from_spec(s) for s in robot("solo8").spec.supports}
     assert supports("FL_FOOT") == (known["FL_FOOT"],)
@@ -312,18 +313,19 @@ def test_supports_as_text() -> None:
 
 
 def test_an_impact_at_a_held_point_is_refused() -> None:
-    request = ImpactRequest("solo8", frame="FL_FOOT", normal=(1.0, 0.0, 0.0))
     with pytest.raises(ContactError, match="held by the support at 'FL_FOOT'"):
-        request.resolve()
+        resolve(ImpactSettings(robot="solo8", frame="FL_FOOT", normal=(1.0, 0.0, 0.0)))
 
 
 def test_a_robot_without_a_default_frame_names_some(planar: str) -> None:
-    with pytest.raises(ContactError, match="--frame: planar has no default contact frame; give one, for example tip"):
-        ImpactRequest(planar, normal=(1.0, 0.0, 0.0)).resolve()
+    with pytest.raises(ContactError, match="frame: planar has no default contact frame; give one, for example tip"):
+        resolve(ImpactSettings(robot=planar, normal=(1.0, 0.0, 0.0)))
 
 
 def test_impulse_of_the_contact_text_and_the_default_offset() -> None:
-    assert ImpactRequest("panda", contacts=("panda_hand_tcp:0,0,2:4",)).resolve().contact.impulse == 4.0
-    assert ImpactRequest("panda", contacts=("panda_hand_tcp:0,0,2",), impulse=5.0).resolve().contact.impulse == 5.0
+    assert resolve(ImpactSettings(robot="panda", contact=("panda_hand_tcp:0,0,2:4",))).contact.impulse == 4.0
+    assert (
+        resolve(ImpactSettings(robot="panda", contact=("panda_hand_tcp:0,0,2",), impulse=5.0)).contact.impulse == 5.0
+    )
     with pytest.raises(ContactError, match="instead of"):
-        ImpactRequest("panda", contacts=("panda_hand_tcp:0,0,2",), normal=(0.0, 0.0, 1.0)).resolve()
+        resolve(ImpactSettings(robot="panda", contact=("panda_hand_tcp:0,0,2",), normal=(0.0, 0.0, 1.0)))

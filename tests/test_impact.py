@@ -14,10 +14,11 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.contact import ImpactContact, Support, default_compliance
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.kernel import ImpactKernel
-from impact_posture.impact.metric import Metric, ObjectiveKind, build_metric
+from impact_posture.impact.metric import Metric, build_metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.robot.robot import Robot
+from impact_posture.settings import ObjectiveKind
 from tests.helpers import (
     NAMES,
     Vector,

@@ -16,7 +16,8 @@ from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import LoadOptions
 from tests.helpers import (
     NAMES,
     Vector,

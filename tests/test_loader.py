@@ -23,8 +23,9 @@ from impact_posture.errors import (
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.urdf import example_robot_data
+from impact_posture.settings import LoadOptions
 from tests.helpers import NAMES, assert_close, mass_matrix, random_configurations, robot
 
 UR5 = "example-robot-data:ur_description/urdf/ur5_robot.urdf"
@@ -222,18 +223,18 @@ def test_wrong_paths_get_the_nearest(arm: Path) -> None:
     assert "ur_description/urdf/ur5_robot.urdf" in caught.value.nearest
     (arm.parent / "meshes").mkdir()
     for wrong in (arm.parent / "meshs", Path("no/such/folder")):
-        with pytest.raises(PackageNotFound, match="--package-dir"):
-            load_robot(str(arm), LoadOptions(package_dirs=(str(wrong),)))
+        with pytest.raises(PackageNotFound, match="package_dir"):
+            load_robot(str(arm), LoadOptions(package_dir=(str(wrong),)))
     with pytest.raises(PackageNotFound) as caught:
-        load_robot(str(arm), LoadOptions(package_dirs=(str(arm.parent / "meshs"),)))
+        load_robot(str(arm), LoadOptions(package_dir=(str(arm.parent / "meshs"),)))
     assert str(arm.parent / "meshes") in caught.value.nearest
-    load_robot("panda", LoadOptions(package_dirs=(str(arm.parent / "meshes"),)))
+    load_robot("panda", LoadOptions(package_dir=(str(arm.parent / "meshes"),)))
 
 
 def test_package_dirs_start_from_where_the_user_stands(arm: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (arm.parent / "meshes").mkdir()
     monkeypatch.chdir(arm.parent)
-    assert load_robot("ur5", LoadOptions(package_dirs=("meshes",))).nv == 6
+    assert load_robot("ur5", LoadOptions(package_dir=("meshes",))).nv == 6
 
 
 def test_wrong_joints_in_options_and_specs(arm: Path) -> None:
@@ -342,14 +343,14 @@ def test_armature_order(arm: Path) -> None:
     assert not warned
     values, source, warned = load(srdf + ours, {"elbow": 0.5})
     np.testing.assert_allclose(values, [0.02, 0.5, 0.02])
-    assert source.startswith("--armature over robot.toml")
+    assert source.startswith("given values over robot.toml")
     values, source, warned = load(srdf + ours, "none")
     assert (values, warned) == ([0.0, 0.0, 0.0], True)
     file = arm.parent / "armature.toml"
     file.write_text("shoulder = 0.7\n", encoding="utf-8")
     values, source, warned = load(srdf + ours, str(file))
     np.testing.assert_allclose(values, [0.7, 0.0, 0.0])
-    assert source == f"--armature {file}"
+    assert source == str(file)
     assert warned
 
 

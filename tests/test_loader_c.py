@@ -29,7 +29,8 @@ from impact_posture.errors import (
 )
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import LoadOptions
 from impact_posture.toolchain import find_compiler
 
 UNIT = np.array([0.6, 0.0, 0.8])

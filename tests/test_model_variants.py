@@ -319,7 +319,7 @@ def test_words_of_every_finding() -> None:
         "the optimum moves by 0.5 rad (m); the worst case is 20.0% lower than at the optimum of the model as it "
         "stands; the model as it stands is 100.0% above its own optimum"
     )
-    assert "25.0% higher than at the optimum" in found(1.0, 3.2) and "more --starts" in found(1.0, 3.2)
+    assert "25.0% higher than at the optimum" in found(1.0, 3.2) and "more `starts`" in found(1.0, 3.2)
     assert "breaks feet that stay (x)" in found(1.0, None, ("feet that stay (x)",))
     assert "no certified optimum of its own" in found(None, None)
     assert "50.0% below its own optimum" in found(4.0, 5.0)

@@ -10,7 +10,8 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import ImpactPostureError, InputError, JointNotFound
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import LoadOptions
 from impact_posture.simulation.scenario_file import read_scenario
 from tests.helpers import frame_placement, mass_matrix, rng
 

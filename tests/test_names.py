@@ -33,14 +33,17 @@ from impact_posture.experiment.reproduction_summary import summary
 from impact_posture.experiment.statistics import Row
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.plot import ResultView, jump_figure, save
-from impact_posture.posture.problem_settings import ProblemSettings, dump_settings, read_settings
+from impact_posture.plot import ResultView, save
+from impact_posture.plot.jump_figure import jump_figure
+from impact_posture.posture.problem_settings import dump_settings, read_settings
 from impact_posture.robot.draft import write_draft
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.spec import RobotSpec, read_spec
+from impact_posture.settings import LoadOptions, ProblemSettings
 from impact_posture.simulation.scene import Scene, Shape, Surface
 from impact_posture.simulation.world_builder import build_scene
+from impact_posture.tables import validate
 from impact_posture_cli.app import app
 from impact_posture_cli.argv import put_right
 from impact_posture_cli.error_boundary import run
@@ -240,7 +243,7 @@ def test_a_drafted_robot_toml_reads_back(many: Robot, tmp_path: Path) -> None:
 
 
 def test_a_path_that_is_not_utf8_is_refused() -> None:
-    settings = ProblemSettings(robot="panda").model_copy(update={"srdf": "caf\udce9.srdf"})
+    settings = ProblemSettings(robot="panda", srdf="caf\udce9.srdf")
     with pytest.raises(errors.SpecError, match=r"srdf: 'caf\\udce9.srdf' is not UTF-8"):
         dump_settings(settings)
 
@@ -392,4 +395,4 @@ def test_optimize_and_codegen_of_a_file(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_a_robot_toml_may_call_it_anything(arm: Robot) -> None:
     for name in NASTY:
-        assert RobotSpec.model_validate({"name": name}).name == name
+        assert validate(RobotSpec, {"name": name}, "test").name == name

@@ -16,7 +16,6 @@ from impact_posture.posture.equalities import equality_jacobian, rank
 from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.problem_settings import (
-    ProblemSettings,
     dump_settings,
     make_settings,
     prepare,
@@ -25,6 +24,7 @@ from impact_posture.posture.problem_settings import (
 )
 from impact_posture.posture.solve import PostureSolution, distinct, solve
 from impact_posture.posture.starts import Projector, feasible_start
+from impact_posture.settings import ProblemSettings
 
 
 def problem_of(robot: str, normal: tuple[float, float, float] = (0, 0, 1), **more: object) -> PostureProblem:
@@ -263,8 +263,8 @@ def test_command_line_wins_over_the_file(tmp_path) -> None:
         ({"contact": ("ee:0,0,1", "ee:1,0,0"), "target_position": (0, 0, 0)}, "several contacts"),
         ({"bilateral": True}, "one contact"),
         ({"armature_range": (2.0, 1.0)}, "range"),
-        ({"payload": (("ee", -1.0),)}, "mass"),
-        ({"normal_cone": 90.0}, "half angle"),
+        ({"payload": (("ee", -1.0),)}, "kg above zero"),
+        ({"normal_cone": 90.0}, "below 90"),
         ({"hold": ("elbwo",)}, "elbow"),
         ({"keep": ("eee",)}, "ee"),
         ({"limit_margin": 5.0}, "no room"),

@@ -17,7 +17,8 @@ from impact_posture.errors import (
 )
 from impact_posture.robot.postures import posture_path, read_posture, write_posture
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import LoadOptions
 from tests.helpers import NAMES, random_configurations, rng, robot
 
 
@@ -61,7 +62,7 @@ def test_a_name_and_the_default() -> None:
     assert np.array_equal(read_posture(loaded, None), loaded.posture("home"))
     with pytest.raises(PostureNotFound, match="did you mean tucked") as caught:
         read_posture(loaded, "tuked")
-    assert caught.value.where == "--posture"
+    assert caught.value.where == "posture"
 
 
 def test_a_file_is_told_from_a_name(tmp_path: Path) -> None:

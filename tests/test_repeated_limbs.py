@@ -25,7 +25,8 @@ from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import LoadOptions
 from impact_posture.toolchain import run_compiler
 from tests.exported import built
 from tests.helpers import assert_close, random_configurations, rng, robot, unit

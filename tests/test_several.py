@@ -18,7 +18,7 @@ from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest import sample_postures
-from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError
+from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError, SpecError
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses, corners
@@ -37,8 +37,9 @@ from impact_posture.posture.problem_settings import (
 from impact_posture.posture.solve import solve
 from impact_posture.posture.starts import feasible_start
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.spec import RobotSpec
+from impact_posture.settings import LoadOptions
 from tests.command import run
 from tests.helpers import (
     assert_close,
@@ -368,13 +369,13 @@ def test_a_resolved_problem_gives_the_same_again(tmp_path: Path) -> None:
         ({"objective": "speed"}, MetricError, "approach speed of one contact"),
         ({"normal_cone": 5.0}, MetricError, "exact for one contact only"),
         ({"offset": (0.0, 0.0, 0.1)}, ContactError, "one offset for several contacts"),
-        ({"frame": "panda_hand_tcp"}, ContactError, "instead of --frame"),
+        ({"frame": "panda_hand_tcp"}, ContactError, "instead of `frame`"),
         ({"contact": ("panda_hand:1,0,0", "panda_hand:2,0,0")}, ContactError, "given twice"),
         ({"contact": tuple(f"panda_link{k}:0,0,1" for k in range(1, 8))}, ContactError, "7 contacts"),
         ({"contact": ("panda_hand_tcp:0,0,1",), "bilateral": True}, ContactError, "one contact"),
         ({"contact": ("panda_hand_tcp:0,0,1", "panda_hnd:0,0,1")}, ImpactPostureError, "panda_hand"),
-        ({"contact": ("panda_hand_tcp:0,0,1", "panda_link4:0,0,0")}, ContactError, "no direction"),
-        ({"contact": ("panda_hand_tcp:0,0,1", "panda_link4:0,0,1:-2")}, ContactError, "bound"),
+        ({"contact": ("panda_hand_tcp:0,0,1", "panda_link4:0,0,0")}, SpecError, "with a direction"),
+        ({"contact": ("panda_hand_tcp:0,0,1", "panda_link4:0,0,1:-2")}, SpecError, "impulse above zero"),
     ],
 )
 def test_refusals(settings_: dict[str, object], kind: type[ImpactPostureError], words: str) -> None:
@@ -469,8 +470,8 @@ def test_evaluate_tells_contacts_of_one_frame_apart(tmp_path: Path) -> None:
     ("arguments", "code", "said"),
     [
         (("--contact", "panda_hand:0,0"), 2, "is no contact"),
-        (("--contact", "panda_hand:0,0,0"), 2, "no direction"),
-        (("--contact", "panda_hand:0,0,1:-1"), 2, "bound"),
+        (("--contact", "panda_hand:0,0,0"), 2, "with a direction"),
+        (("--contact", "panda_hand:0,0,1:-1"), 2, "impulse above zero"),
         ((*BOTH, "--normal", 0, 0, 1), 2, "instead of --frame and --normal"),
         ((*BOTH, "--objective", "speed"), 1, "approach speed of one contact"),
         ((*BOTH, "--contact", "panda_hnd:0,0,1"), 1, "panda_hand"),

@@ -20,8 +20,9 @@ from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support, least_compliance
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.impact.request import ImpactRequest
+from impact_posture.impact.resolved_impact import resolve
 from impact_posture.robot.robot import Robot
+from impact_posture.settings import ImpactSettings
 from impact_posture.verification.verification import verify
 from tests.exact import Exact, ExactImpact, digits, distance, exact, rounded
 from tests.exact_bounds import Bounded
@@ -289,6 +290,6 @@ def test_the_stiffest_feet_pass_every_check(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.99, 0.0, -1.0, np.nan, np.inf])
 def test_stiffer_feet_are_refused(share: float) -> None:
-    asked = ImpactRequest("bolt", normal=(1, 0, 0), compliance=share * least_compliance(robot("bolt")))
+    compliance = share * least_compliance(robot("bolt"))
     with pytest.raises(InputError, match=r"at least 7\.98e-07"):
-        asked.resolve()
+        resolve(ImpactSettings(robot="bolt", normal=(1, 0, 0), support_compliance=compliance))

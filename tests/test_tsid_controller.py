@@ -314,13 +314,13 @@ def more_rotors(r: Robot) -> Robot:
     """The same hexarotor with two more rotors."""
     assert r.spec.propulsion is not None
     rotors = r.spec.propulsion.rotors
-    return with_rotors(r, (*rotors, *(rotors[k].model_copy(update={"name": f"extra_{k}"}) for k in (0, 3))))
+    return with_rotors(r, (*rotors, *(replace(rotors[k], name=f"extra_{k}") for k in (0, 3))))
 
 
 def with_rotors(r: Robot, rotors: tuple[RotorSpec, ...]) -> Robot:
     assert r.spec.propulsion is not None
-    propulsion = r.spec.propulsion.model_copy(update={"rotors": rotors})
-    return replace(r, spec=r.spec.model_copy(update={"propulsion": propulsion}))
+    propulsion = replace(r.spec.propulsion, rotors=rotors)
+    return replace(r, spec=replace(r.spec, propulsion=propulsion))
 
 
 def test_more_rotors_than_needed() -> None:
@@ -339,7 +339,7 @@ def test_rotors_that_cannot_push_sideways() -> None:
     """A hexarotor with parallel propellers has rank 4: the dynamics' other two rows bind the accelerations."""
     r = robot(ARM)
     assert r.spec.propulsion is not None
-    up = (rotor.model_copy(update={"direction": (0.0, 0.0, 1.0)}) for rotor in r.spec.propulsion.rotors)
+    up = (replace(rotor, direction=(0.0, 0.0, 1.0)) for rotor in r.spec.propulsion.rotors)
     r, point = with_rotors(r, tuple(up)), Point("ee")
     controller = Controller(
         r, TaskFormulation((), (FramePosition(point, kp=20.0),), JointPosture(r), force_point=point)

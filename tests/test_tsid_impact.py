@@ -14,8 +14,7 @@ import pytest
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError, MetricError
-from impact_posture.impact.contact import ImpactContact as Impact
-from impact_posture.impact.contact import Support
+from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.problem import PostureProblem, Requirements
@@ -40,7 +39,7 @@ UP = (0.0, 0.0, 1.0)
 @functools.cache
 def problem(objective: str = "impulse") -> PostureProblem:
     r = robot(ARM)
-    value = ImpactObjective(r, Impact.create("ee", UP), kind=objective)  # type: ignore[arg-type]
+    value = ImpactObjective(r, ImpactContact("ee", UP), kind=objective)  # type: ignore[arg-type]
     return build_problem(r, value, r.posture(), Requirements(base="level", limit_margin=0.05))
 
 
@@ -306,7 +305,7 @@ def test_a_standing_robot_braces_on_its_feet() -> None:
     """Contact-consistent H of a push at solo8's base, in the cost beside the other tasks: it falls, the feet stay."""
     r = robot("solo8")
     supports = tuple(Support(s.frame, s.kind, s.offset) for s in r.spec.supports)
-    value = ImpactObjective(r, Impact.create("base_link", (1.0, 0.0, 0.0)), supports=supports)
+    value = ImpactObjective(r, ImpactContact("base_link", (1.0, 0.0, 0.0)), supports=supports)
     function = value.gradient_fun()
 
     def gradient(q: np.ndarray) -> tuple[float, np.ndarray]:

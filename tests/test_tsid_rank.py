@@ -35,7 +35,7 @@ def borinot() -> Robot:
     """With rotors that it does not have: the data of the real ones are not published."""
     found, rotors = robot("borinot"), robot("tilthex_arm").spec.propulsion
     assert rotors is not None
-    spec = found.spec.model_copy(update={"propulsion": rotors.model_copy(update={"frame": "borinot__base_link"})})
+    spec = replace(found.spec, propulsion=replace(rotors, frame="borinot__base_link"))
     return replace(found, spec=spec)
 
 

@@ -12,10 +12,11 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import ImpactContact as Impact
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import LoadOptions
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.frame_tasks import FramePosition
@@ -224,7 +225,7 @@ def test_ticks_leave_no_memory_behind() -> None:
 
 def own_gradient(r: Robot, normal: tuple[float, float, float]) -> Gradient:
     """``H`` at the default contact frame by the library's own interpreted functions."""
-    value = ImpactObjective(r, Impact.create(r.spec.contact.frame or "", normal))
+    value = ImpactObjective(r, ImpactContact(r.spec.contact.frame or "", normal))
     function = value.gradient_fun()
 
     def gradient(q: np.ndarray) -> tuple[float, np.ndarray]:

@@ -19,8 +19,8 @@ from impact_posture.codegen.build_check import deviation
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.request import ImpactRequest
-from impact_posture.robot.robot_loader import LoadOptions
+from impact_posture.impact.resolved_impact import resolve
+from impact_posture.settings import ImpactSettings
 from impact_posture.toolchain import find_compiler
 from impact_posture.verification import verification as module
 from impact_posture.verification.differences import difference_gradient
@@ -37,7 +37,7 @@ HAS_MUJOCO = importlib.util.find_spec("mujoco") is not None
 
 
 def objective(name: str, **more: Any) -> ImpactObjective:
-    return ImpactRequest(name, normal=(0.3, -0.2, 1.0), **more).resolve().objective
+    return resolve(ImpactSettings(robot=name, normal=(0.3, -0.2, 1.0), **more)).objective
 
 
 @functools.cache
@@ -81,7 +81,7 @@ def test_known_robots_pass(name: str) -> None:
         ("solo8", {"metric": "kinetic", "normal_frame": "contact", "offset": (0.1, 0.0, -0.05)}),
         ("bolt", {"metric": "kinetic", "frame": "base_link"}),
         ("tilthex_arm", {"metric": "weighted", "weights": "velocity-limits", "normal_frame": "contact"}),
-        ("ur5", {"load": LoadOptions(armature={"elbow_joint": 0.2}, lock=("wrist_3_joint",))}),
+        ("ur5", {"armature": {"elbow_joint": 0.2}, "lock": ("wrist_3_joint",)}),
     ],
 )
 def test_metrics_normal_frames_and_options_pass(name: str, more: dict[str, Any]) -> None:
@@ -98,7 +98,7 @@ def test_a_urdf_that_a_user_brings(tmp_path: Path, root: Any) -> None:
         ("revolute", "1 0 0"),
     ]
     path = write_urdf(tmp_path / "odd.urdf", joints)
-    found = objective(str(path), frame="l5", load=LoadOptions(root=root))
+    found = objective(str(path), frame="l5", root=root)
     assert_all_there(verify(found, samples=1))
 
 
@@ -118,8 +118,10 @@ def test_a_planar_robot_that_is_hit_across_its_plane(tmp_path: Path, joints: int
     text = "".join(link.format(f"l{k}", inertia) for k in range(joints + 1))
     text += "".join(joint.format(k, k + 1, '<origin xyz="0.5 0 0"/>') for k in range(joints))
     (tmp_path / "planar.urdf").write_text(f'<robot name="planar">{text}</robot>')
-    request = ImpactRequest(str(tmp_path / "planar.urdf"), frame=f"l{joints}", normal=(0, 0, 1), offset=(0.5, 0, 0))
-    found = request.resolve().objective
+    settings = ImpactSettings(
+        robot=str(tmp_path / "planar.urdf"), frame=f"l{joints}", normal=(0, 0, 1), offset=(0.5, 0, 0)
+    )
+    found = resolve(settings).objective
     report = verify(found, samples=1)
     assert found.oracle.quantities(report.samples[0].q).G == 0.0
     assert_all_there(report)
@@ -129,10 +131,10 @@ def test_a_planar_robot_that_is_hit_across_its_plane(tmp_path: Path, joints: int
 
 
 def test_another_armature_fails_in_the_way_that_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong = objective("ur5", load=LoadOptions(armature={"elbow_joint": 1e-5}))
+    wrong = objective("ur5", armature={"elbow_joint": 1e-5})
     monkeypatch.setattr(module, "casadi_source", lambda _: casadi_source(wrong))
     monkeypatch.setattr(module, "find_compiler", lambda: None)
-    report = verify(objective("ur5", load=LoadOptions(armature="none")), samples=1)
+    report = verify(objective("ur5", armature="none"), samples=1)
     assert {row.verdict for row in rows_of(report, CASADI)} == {"fail"}
     assert {row.verdict for row in rows_of(report, DIFFERENCES)} == {"pass"}
     assert not report.passed

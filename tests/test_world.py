@@ -15,11 +15,11 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.actuation import actuation_matrix, hover
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.actuator_command import ActuatorCommand, Push, Truth
-from impact_posture.simulation.restitution import ball
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors, Shape, Surface
 from impact_posture.simulation.world import World, build_world
 from impact_posture.simulation.world_builder import build_scene
 from tests.helpers import NAMES, Vector, assert_close, mass_matrix, random_configurations, rng, robot
+from tests.restitution import ball
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 
@@ -31,7 +31,7 @@ FLOOR = Surface("floor", (0, 0, 1))
 @functools.cache
 def without_rotors(name: str) -> Robot:
     found = robot(name)
-    return replace(found, spec=found.spec.model_copy(update={"propulsion": None}))
+    return replace(found, spec=replace(found.spec, propulsion=None))
 
 
 def idle(found: Robot) -> ActuatorCommand:

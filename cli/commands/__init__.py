@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from impact_posture_cli.commands.bench import bench
 from impact_posture_cli.commands.codegen import codegen
 from impact_posture_cli.commands.compare import compare
 from impact_posture_cli.commands.evaluate import evaluate
@@ -31,6 +30,5 @@ COMMANDS: Final[dict[str, Callable[..., None]]] = {
     "simulate": simulate,
     "compare": compare,
     "reproduce": reproduce,
-    "bench": bench,
 }
 """Name to function, in the order of the help page."""

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Processes, ScenarioName, Seeds, rows_table
 
@@ -20,7 +21,7 @@ Controllers = Annotated[
 Out = Annotated[
     str | None,
     typer.Option(
-        "--out", metavar="DIR", rich_help_panel=options.OUTPUT, show_default="none",
+        "--out", metavar="DIR", rich_help_panel=OUTPUT, show_default="none",
         help="Folder for comparison.json and figures.",
     ),
 ]  # fmt: skip

@@ -4,61 +4,33 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from impact_posture.settings import ImpactSettings
 from impact_posture_cli import options
+from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.impact.classical_ellipsoids import Ellipsoid
     from impact_posture.impact.evaluation import Evaluation
-    from impact_posture.impact.request import ResolvedImpact
+    from impact_posture.impact.resolved_impact import ResolvedImpact
     from impact_posture_cli.output import Page
 
 
+@with_settings(ImpactSettings)
 def evaluate(
+    given: Given,
     robot: options.RobotName,
-    frame: options.Frame = None,
-    normal: options.Normal = None,
-    offset: options.Offset = None,
-    normal_frame: options.NormalAxes = "world",
-    contact: options.ContactList = None,
-    bilateral: options.Bilateral = False,
-    impulse: options.Impulse = 1.0,
-    speed: options.Speed = 1.0,
-    restitution: options.Restitution = 0.0,
-    metric: options.MetricName = "euclidean",
-    weights: options.Weights = None,
-    objective: options.ObjectiveName = "impulse",
-    normal_cone: options.NormalCone = 0.0,
-    armature_range: options.ArmatureRange = None,
-    payload: options.PayloadList = None,
-    posture: options.Posture = None,
-    support: options.SupportList = None,
-    no_support: options.NoSupport = False,
-    lock: options.Lock = None,
-    lock_massless: options.LockMassless = False,
-    root: options.Root = None,
-    armature: options.Armature = None,
-    config: options.Config = None,
-    srdf: options.Srdf = None,
-    package_dir: options.PackageDirs = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Measure an impact at a posture: H, G, V, S, E, ellipsoid, gradient, predicted jump."""
-    from impact_posture_cli.impact_options import impact_request
-
-    request = impact_request(
-        robot, frame=frame, normal=normal, offset=offset, normal_frame=normal_frame, contact=contact,
-        impulse=impulse, posture=posture, support=support, no_support=no_support, metric=metric, weights=weights,
-        objective=objective, normal_cone=normal_cone, speed=speed, restitution=restitution, root=root,
-        package_dir=package_dir, srdf=srdf, config=config, armature=armature, lock=lock, bilateral=bilateral,
-        lock_massless=lock_massless, armature_range=armature_range, payload=payload,
-    )  # fmt: skip
+    given.check_contact()
     from impact_posture.impact.classical_ellipsoids import classical_ellipsoids
     from impact_posture.impact.evaluation import evaluate as evaluate_impact
+    from impact_posture.impact.resolved_impact import resolve
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.tables import alone_line, contact_names, contacts_table, impulses_line, variants_table
 
-    impact = request.resolve()
+    impact = resolve(given.fill(ImpactSettings, robot=robot))
     found = evaluate_impact(impact.objective, impact.q, impact.speed, impact.restitution)
     warnings = (*impact.warnings, *found.warnings)
     classical = classical_ellipsoids(impact.objective, impact.q)

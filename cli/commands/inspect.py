@@ -7,36 +7,30 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from impact_posture.settings import OUTPUT, RobotSettings
 from impact_posture_cli import options
-from impact_posture_cli.checks import UsageError
+from impact_posture_cli.settings_options import Given, UsageError, with_settings
 
 if TYPE_CHECKING:
-    from impact_posture.robot.robot_loader import LoadOptions
+    from impact_posture.settings import LoadOptions
     from impact_posture_cli.output import Page
 
 
 WriteRobotToml = Annotated[
     str | None,
     typer.Option(
-        "--write-robot-toml", metavar="[FILE.toml]", rich_help_panel=options.OUTPUT,
+        "--write-robot-toml", metavar="[FILE.toml]", rich_help_panel=OUTPUT,
         help="Draft the robot.toml of a URDF, every guess marked; without FILE beside the URDF, or here as NAME.toml "
         "where the URDF is in a package.",
     ),
 ]  # fmt: skip
-ForceFile = Annotated[
-    bool, typer.Option("--force", rich_help_panel=options.OUTPUT, help="Replace an existing robot.toml.")
-]
+ForceFile = Annotated[bool, typer.Option("--force", rich_help_panel=OUTPUT, help="Replace an existing robot.toml.")]
 
 
+@with_settings(RobotSettings)
 def inspect(
+    given: Given,
     robot: options.RobotName,
-    root: options.Root = None,
-    package_dir: options.PackageDirs = None,
-    srdf: options.Srdf = None,
-    config: options.Config = None,
-    armature: options.Armature = None,
-    lock: options.Lock = None,
-    lock_massless: options.LockMassless = False,
     write_robot_toml: WriteRobotToml = None,
     force: ForceFile = False,
     json: options.Json = False,
@@ -45,20 +39,11 @@ def inspect(
     """Show a robot: joints, frames, mass, limits, armature, postures, actuation."""
     from impact_posture.robot.robot_loader import load_robot
     from impact_posture.robot.robot_summary import summarize
-    from impact_posture_cli.impact_options import load_options
     from impact_posture_cli.output import Page, print_json
 
-    load = load_options(
-        root=root,
-        package_dir=package_dir,
-        srdf=srdf,
-        config=config,
-        armature=armature,
-        lock=lock,
-        lock_massless=lock_massless,
-    )
+    load = given.fill(RobotSettings, robot=robot)
     if write_robot_toml is not None:
-        if config is not None:
+        if load.config is not None:
             raise UsageError("--config contradicts --write-robot-toml, which drafts one: leave it out.")
         _write(robot, load, write_robot_toml, force=force, json=json, quiet=quiet)
         return

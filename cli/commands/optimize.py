@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from impact_posture.settings import ProblemSettings
 from impact_posture_cli import options
+from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.job import Written
-    from impact_posture.posture.problem_settings import Prepared, ProblemSettings
+    from impact_posture.posture.problem_settings import Prepared
     from impact_posture.posture.solve import PostureSolution
     from impact_posture_cli.output import Page
-
-# Options that say how to solve and where to write, not what the problem is.
-_NOT_SETTINGS = {"robot", "out", "force", "no_codegen", "jobs", "compile", "format", "json", "quiet", "no_support"}
 
 RobotOrProblem = Annotated[
     str,
@@ -26,51 +25,10 @@ RobotOrProblem = Annotated[
 ]
 
 
+@with_settings(ProblemSettings)
 def optimize(
-    context: typer.Context,
+    given: Given,
     robot: RobotOrProblem,
-    frame: options.Frame = None,
-    normal: options.Normal = None,
-    offset: options.Offset = None,
-    normal_frame: options.NormalAxes = "world",
-    contact: options.ContactList = None,
-    bilateral: options.Bilateral = False,
-    impulse: options.Impulse = 1.0,
-    speed: options.Speed = 1.0,
-    restitution: options.Restitution = 0.0,
-    metric: options.MetricName = "euclidean",
-    weights: options.Weights = None,
-    objective: options.ObjectiveName = "impulse",
-    normal_cone: options.NormalCone = 0.0,
-    armature_range: options.ArmatureRange = None,
-    payload: options.PayloadList = None,
-    posture: options.Posture = None,
-    target_position: options.TargetPosition = None,
-    target_quaternion: options.TargetQuaternion = None,
-    contact_pose: options.ContactPoseHeld = None,
-    box: options.Box = None,
-    support: options.SupportList = None,
-    no_support: options.NoSupport = False,
-    keep: options.Keep = None,
-    hold: options.Hold = None,
-    base: options.Base = None,
-    base_box: options.BaseBox = None,
-    com: options.ComOverFeet = None,
-    com_margin: options.ComMargin = None,
-    keep_contacts: options.KeepContacts = False,
-    friction: options.Friction = 0.7,
-    limit_margin: options.LimitMargin = None,
-    regularization: options.Regularization = 0.0,
-    tradeoff: options.Tradeoff = 0,
-    lock: options.Lock = None,
-    lock_massless: options.LockMassless = False,
-    root: options.Root = None,
-    armature: options.Armature = None,
-    config: options.Config = None,
-    srdf: options.Srdf = None,
-    package_dir: options.PackageDirs = None,
-    starts: options.Starts = 16,
-    seed: options.Seed = 0,
     jobs: options.Jobs = 2,
     compile: options.Compile = "auto",
     out: options.Out = None,
@@ -81,15 +39,13 @@ def optimize(
     quiet: options.Quiet = False,
 ) -> None:
     """Find the posture that takes the impact best; write posture, pictures and C code."""
-    given = _given(context)
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
-    from impact_posture.job import FORMATS, default_out, write_result
+    from impact_posture.front_door import PostureProblem
+    from impact_posture.front_door import optimize as solve
+    from impact_posture.job import FORMATS, default_out
     from impact_posture.output_folder import check_output
-    from impact_posture.posture.pareto import pareto_front
     from impact_posture.posture.problem_settings import prepare
-    from impact_posture.posture.result import result_document
-    from impact_posture.posture.robustness import solve_robustly
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.progress import progress_bar
 
@@ -101,31 +57,23 @@ def optimize(
         _announce(page, prepared)
     shown = not (quiet or json)
     with progress_bar("solving", "starts", shown=shown, first="building the expressions") as progress:
-        # With each scenario alone beside it: how far the optimum moves with the model.
-        found = solve_robustly(
-            prepared.problem,
+        result = solve(
+            PostureProblem.of(prepared),
             starts=settings.starts,
             seed=settings.seed,
             jobs=jobs,
             compile=compile,
             progress=progress,
         )
-    solution, robustness = found.solution, found.robustness
-    curve = None
     if settings.tradeoff:
         with progress_bar("solving", "points", shown=shown) as progress:
-            curve = pareto_front(solution, settings.tradeoff, compile=compile, progress=progress)
-    document: dict[str, Any] = result_document(prepared, solution, robustness, curve)
+            result = result.trade_off(settings.tradeoff, compile=compile, progress=progress)
     if not json:
         # Pictures and C code take longer than the answer: nobody waits for it because of them.
-        _summarize(page, prepared, solution, document)
+        _summarize(page, prepared, result.solution, result.document)
     with progress_bar("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as progress:
-        written = write_result(
-            prepared,
-            solution,
-            document,
+        written = result.save(
             folder,
-            tradeoff=curve,
             force=force,
             codegen=not no_codegen,
             formats=[f.value for f in format or ()] or FORMATS,
@@ -135,42 +83,24 @@ def optimize(
     if written.compiler_error:
         page.warnings([f"the C code in c/ is written but could not be built: {written.compiler_error}"])
     if json:
-        print_json(document)
+        print_json(result.document)
     elif not quiet:
         page.gap()
         page.line(f"written to {written.out}: {_contents(written)}")
 
 
-def _given(context: typer.Context) -> dict[str, Any]:
-    """The problem's options that stand on the command line; defaults are not given."""
-    given = {}
-    for name, value in context.params.items():
-        source = context.get_parameter_source(name)
-        if name not in _NOT_SETTINGS and source is not None and source.name == "COMMANDLINE":
-            given[name] = tuple(value) if isinstance(value, list) else value
-    supports = options.check_supports(context.params["support"], context.params["no_support"])
-    return given if supports is None else given | {"support": supports}
-
-
-def _settings(robot: str, given: dict[str, Any]) -> ProblemSettings:
+def _settings(robot: str, given: Given) -> ProblemSettings:
     from_file = robot.endswith(".toml")
-    contacts = given.get("contact")
-    if not from_file or "contact" in given:
-        options.check_contact(given.get("frame"), given.get("normal"), contacts)
-    from impact_posture.impact.parsing import parse_armature, parse_payload
-    from impact_posture.posture.problem_settings import make_settings, read_settings
+    if not from_file or "contact" in given.values:
+        given.check_contact()
+    if not from_file:
+        return given.fill(ProblemSettings, robot=robot)
+    from impact_posture.posture.problem_settings import read_settings
 
-    if "armature" in given:
-        given["armature"] = parse_armature(given["armature"])
-    if "payload" in given:
-        found = [parse_payload(text) for text in given["payload"]]
-        given["payload"] = tuple((payload.frame, payload.mass) for payload in found)
-    if from_file:
-        return read_settings(Path(robot), given)
-    return make_settings({"robot": robot, **given})
+    return read_settings(Path(robot), given.values)
 
 
-def _refuse_idle(given: dict[str, Any], settings: ProblemSettings) -> None:
+def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
     """Refuse options that would do nothing beside the others."""
     for name, used, hint in (
         ("box", settings.contact_pose == "box", "--contact-pose box"),
@@ -178,7 +108,7 @@ def _refuse_idle(given: dict[str, Any], settings: ProblemSettings) -> None:
         ("com_margin", settings.com is not False, "--com"),
         ("friction", settings.keep_contacts, "--keep-contacts"),
     ):
-        if name in given and not used:
+        if name in given.values and not used:
             raise typer.BadParameter(f"does nothing without {hint}", param_hint=f"'--{name.replace('_', '-')}'")
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Processes, Seeds, rows_table
 
@@ -22,7 +23,7 @@ Scenarios = Annotated[
 ]
 Out = Annotated[
     str,
-    typer.Option("--out", metavar="DIR", rich_help_panel=options.OUTPUT, help="Folder of the results."),
+    typer.Option("--out", metavar="DIR", rich_help_panel=OUTPUT, help="Folder of the results."),
 ]
 
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
-from impact_posture_cli.checks import positive
 from impact_posture_cli.experiments import RUN, Mode, ScenarioName
+from impact_posture_cli.settings_options import positive
 
 if TYPE_CHECKING:
     from impact_posture_cli.output import Page
@@ -50,7 +51,7 @@ Sign = Annotated[
 Out = Annotated[
     str | None,
     typer.Option(
-        "--out", metavar="DIR", rich_help_panel=options.OUTPUT, show_default="./SCENARIO-CONTROLLER",
+        "--out", metavar="DIR", rich_help_panel=OUTPUT, show_default="./SCENARIO-CONTROLLER",
         help="Folder for run.json, the time series and the figures.",
     ),
 ]  # fmt: skip

@@ -8,77 +8,53 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from impact_posture.settings import CONTACT, OUTPUT, ImpactSettings, Vector3
 from impact_posture_cli import options
-from impact_posture_cli.checks import Three, direction
+from impact_posture_cli.settings_options import Given, check_direction, with_settings
 
 if TYPE_CHECKING:
-    from impact_posture.impact.request import ResolvedImpact
+    from impact_posture.impact.resolved_impact import ResolvedImpact
     from impact_posture.verification.verification_report import Row, VerificationReport
 
 NormalOfFirst = Annotated[
-    Three | None,
+    Vector3 | None,
     typer.Option(
-        "--normal", metavar="X Y Z", callback=direction, rich_help_panel=options.CONTACT,
+        "--normal", metavar="X Y Z", callback=check_direction, rich_help_panel=CONTACT,
         show_default="0 0 1", help="Normal of the first sample; the others' are random.",
     ),
 ]  # fmt: skip
 Samples = Annotated[
     int,
-    typer.Option("--samples", min=1, rich_help_panel=options.OUTPUT, help="Random postures and normals."),
+    typer.Option("--samples", min=1, rich_help_panel=OUTPUT, help="Random postures and normals."),
 ]
-SampleSeed = Annotated[
-    int, typer.Option("--seed", min=0, rich_help_panel=options.OUTPUT, help="Seed of the random samples.")
-]
+SampleSeed = Annotated[int, typer.Option("--seed", min=0, rich_help_panel=OUTPUT, help="Seed of the random samples.")]
 
 
-# What a result folder leaves to be said.
-_FREE = {"robot", "samples", "seed", "json", "quiet"}
+_WITHOUT = {
+    "bilateral", "impulse", "speed", "restitution", "objective", "normal_cone", "armature_range", "payload", "posture"
+}  # fmt: skip
 
 
+@with_settings(ImpactSettings, without=_WITHOUT, normal=NormalOfFirst)
 def verify(
-    context: typer.Context,
+    given: Given,
     robot: options.RobotOrResult,
-    frame: options.Frame = None,
-    normal: NormalOfFirst = None,
-    offset: options.Offset = None,
-    normal_frame: options.NormalAxes = "world",
-    contact: options.ContactText = None,
-    metric: options.MetricName = "euclidean",
-    weights: options.Weights = None,
-    support: options.SupportList = None,
-    no_support: options.NoSupport = False,
-    lock: options.Lock = None,
-    lock_massless: options.LockMassless = False,
-    root: options.Root = None,
-    armature: options.Armature = None,
-    config: options.Config = None,
-    srdf: options.Srdf = None,
-    package_dir: options.PackageDirs = None,
     samples: Samples = 10,
     seed: SampleSeed = 0,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Compute H, G, Λ_c and ∇H in every way there is and compare: pass or fail."""
-    from_result = options.is_result(robot)
-    if from_result:
-        options.refuse_beside_result(context, _FREE)
-    from impact_posture_cli.impact_options import impact_request
-
-    if contact is None and normal is None:
-        normal = (0.0, 0.0, 1.0)
-    contacts = [contact] if contact else None
-    request = impact_request(
-        robot, frame=frame, normal=normal, offset=offset, normal_frame=normal_frame, contact=contacts, impulse=1.0,
-        posture=None, support=support, no_support=no_support, metric=metric, weights=weights, objective="impulse",
-        normal_cone=0.0, speed=1.0, restitution=0.0, root=root, package_dir=package_dir, srdf=srdf, config=config,
-        armature=armature, lock=lock, lock_massless=lock_massless,
-    )  # fmt: skip
+    from_result = given.is_result(robot, {"samples", "seed"})
+    if "contact" in given.values:
+        given.check_contact()
+    from impact_posture.impact.resolved_impact import resolve
     from impact_posture.verification.verification import verify as verify_objective
     from impact_posture_cli.output import Page, complain, print_json
     from impact_posture_cli.progress import progress_bar
 
-    impact = _of_result(Path(robot)) if from_result else request.resolve()
+    normal = {} if "contact" in given.values else {"normal": given.values.get("normal", (0.0, 0.0, 1.0))}
+    impact = _of_result(Path(robot)) if from_result else resolve(given.fill(ImpactSettings, robot=robot, **normal))
     with progress_bar("comparing", shown=not (quiet or json)) as progress:
         report = verify_objective(impact.objective.singles[0], samples, seed, progress)
     if json:
@@ -107,7 +83,7 @@ def verify(
 
 def _of_result(folder: Path) -> ResolvedImpact:
     """The impact that a result folder is about, at its optimum."""
-    from impact_posture.impact.request import ResolvedImpact
+    from impact_posture.impact.resolved_impact import ResolvedImpact
     from impact_posture.job import load_view
 
     view = load_view(folder)

@@ -15,6 +15,7 @@ from impact_posture.codegen.build_check import compile_and_check
 from impact_posture.codegen.code import build_code
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.functions import named_objectives
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest import build_manifest
 from impact_posture.codegen.naming import c_identifier, check_prefix, products
 from impact_posture.codegen.render import render
@@ -22,6 +23,7 @@ from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import library_path
 from impact_posture.output_folder import whole_folder, write_whole
+from impact_posture.robot.robot import Robot
 from impact_posture.toolchain import GET_ONE, find_compiler
 
 SCHEMA = "impact-posture/codegen-run/1"
@@ -32,7 +34,8 @@ class Export:
     """A written export.
 
     Attributes:
-        folder: The folder of the files.
+        out: The folder of the files.
+        robot: The robot.
         files: The files.
         manifest: The content of ``<prefix>.json``.
         agreement: Largest relative difference of the built code from the numbers of CasADi and Pinocchio; ``None``
@@ -41,7 +44,8 @@ class Export:
         requested: Whether a library was requested.
     """
 
-    folder: Path
+    out: Path
+    robot: Robot
     files: tuple[Path, ...]
     manifest: dict[str, Any]
     agreement: float | None = None
@@ -58,6 +62,10 @@ class Export:
         """Whether a compiler built the code and the numbers agreed."""
         return self.agreement is not None
 
+    def load(self, **options: Any) -> ImpactGradient:
+        """Load the library, which runs its code; the options are those of :meth:`ImpactGradient.load`."""
+        return ImpactGradient.load(self.out, robot=self.robot, **options)
+
     @property
     def functions(self) -> list[str]:
         """Names of the C functions."""
@@ -71,14 +79,14 @@ class Export:
         if self.library is not None:
             return f"{self.library.name}: built, agrees to {self.agreement:.0e}"
         if self.requested:
-            return f"not built, there is no C compiler: {GET_ONE}, then make shared in {self.folder}"
-        return f"build and self-test: make -C {self.folder} check (or codegen --compile)"
+            return f"not built, there is no C compiler: {GET_ONE}, then make shared in {self.out}"
+        return f"build and self-test: make -C {self.out} check (or codegen --compile)"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of ``codegen --json``."""
         return {
             "schema": SCHEMA,
-            "out": str(self.folder),
+            "out": str(self.out),
             "prefix": self.prefix,
             "files": [path.name for path in self.files],
             "functions": self.functions,
@@ -142,7 +150,7 @@ def export(
         raise OutputError(f"holds {there[0]} already", where=str(out), hint="give --force to replace it")
     for name, text in texts.items():
         write_whole(out / name, text)
-    made = Export(out, tuple(out / name for name in texts), manifest)
+    made = Export(out, robot, tuple(out / name for name in texts), manifest)
     if not check or find_compiler() is None:
         return made
     return replace(made, agreement=compile_and_check(out, prefix, objectives))
@@ -189,7 +197,8 @@ def write_export(
                 hint = f"{error.hint}; without --compile the C code is written all the same"
                 raise CompilerError(error.what, where=error.where, hint=hint) from None
     library = None if agreement is None else library_path(out, prefix)
-    return Export(out, tuple(out / path.name for path in made.files), made.manifest, agreement, library, build)
+    files = tuple(out / path.name for path in made.files)
+    return replace(made, out=out, files=files, agreement=agreement, library=library, requested=build)
 
 
 def default_prefix(objectives: Sequence[ImpactObjective]) -> str:

@@ -11,7 +11,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture import __version__
 from impact_posture.codegen.emitter import DOUBLE, Real
 from impact_posture.codegen.functions import casadi_reference, named_objectives
 from impact_posture.codegen.naming import FUNCTIONS
@@ -21,6 +20,7 @@ from impact_posture.errors import MetricError
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
+from impact_posture.version import __version__
 
 Vector = NDArray[np.float64]
 

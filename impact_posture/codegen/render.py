@@ -13,7 +13,6 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from impact_posture import __version__
 from impact_posture.codegen.build_check import self_test_tolerance
 from impact_posture.codegen.code import Code
 from impact_posture.codegen.emitter import DOUBLE, SHORT_NAMES, Real
@@ -23,6 +22,7 @@ from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.reader import identity
 from impact_posture.escape import c_comment, markdown
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.version import __version__
 
 _WIDTH = 112
 

@@ -56,7 +56,7 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
         raise UnsupportedJoint(
             f"joint '{name}' is of type {short}",
             where="symbolic dynamics",
-            hint="lock it (--lock) or model it by revolute and prismatic joints",
+            hint="lock it (`lock`) or model it by revolute and prismatic joints",
         )
     # S is the same at every configuration.
     data = joint.createData()

@@ -13,7 +13,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from impact_posture import __version__
 from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError, SpecError
 from impact_posture.experiment.jobs import SCHEMA, Job, controller_factory, execute
 from impact_posture.libraries import source_key
@@ -23,6 +22,7 @@ from impact_posture.processes import fork_map
 from impact_posture.simulation.controller_factory import CONTROLLERS
 from impact_posture.simulation.scenario_file import scenario_path
 from impact_posture.simulation.series import Series
+from impact_posture.version import __version__
 
 Document = dict[str, Any]
 Progress = Callable[[int, int], None]

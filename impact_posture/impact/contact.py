@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import pinocchio as pin
@@ -12,10 +11,10 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import SupportKind, SupportSpec, Vector3
+from impact_posture.robot.spec import SupportSpec
+from impact_posture.settings import NormalFrame, SupportKind, Vector3
 
 Vector = NDArray[np.float64]
-NormalFrame = Literal["world", "contact"]
 
 # A normal shorter than this is what rounding left of zero.
 _DUST = 1e-9
@@ -54,20 +53,18 @@ class ImpactContact:
         if n.shape != (3,) or not np.isfinite(n).all() or np.abs(n).max() < _DUST:
             raise ContactError(
                 f"the normal {tuple(self.normal)} has no direction",
-                where="--normal",
+                where="normal",
                 hint="give three numbers, not all zero",
             )
         offset = np.array(self.offset, dtype=float)
         if offset.shape != (3,) or not np.isfinite(offset).all():
-            raise ContactError("the offset is not finite", where="--offset", hint="give three numbers")
+            raise ContactError("the offset is not finite", where="offset", hint="give three numbers")
         if not (np.isfinite(self.impulse) and self.impulse > 0):
-            raise ContactError(
-                f"the impulse bound is {self.impulse:g}", where="--impulse", hint="give N·s above zero"
-            )
+            raise ContactError(f"the impulse bound is {self.impulse:g}", where="impulse", hint="give N·s above zero")
         if not 1 / LARGEST <= self.impulse <= LARGEST:
             raise ContactError(
                 f"with an impulse bound of {self.impulse:g} the objective λ̄²H is beyond double precision",
-                where="--impulse",
+                where="impulse",
                 hint=f"give {1 / LARGEST:g} to {LARGEST:g} N·s",
             )
         # The largest entry first, because any length must do and squares overflow.  A unit normal stays as it is, so
@@ -119,7 +116,7 @@ def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> Poi
         raise ContactError(
             f"frame '{frame}' is welded to the world and cannot move",
             where=robot.name,
-            hint="choose a frame on a moving link, or --root free-flyer",
+            hint="choose a frame on a moving link, or `root='free-flyer'`",
         )
     position = found.placement.act(np.array(offset, dtype=float))
     return PointOnLink(int(found.parentJoint), np.array(position), np.array(found.placement.rotation))

@@ -86,6 +86,31 @@ class Evaluation:
     scenarios: tuple[VariantValue, ...]
     warnings: tuple[str, ...]
 
+    @property
+    def H(self) -> float:
+        """Squared jump per squared impulse."""
+        return self.scalars.H
+
+    @property
+    def G(self) -> float:
+        """Inverse effective mass along the normal, 1/kg."""
+        return self.scalars.G
+
+    @property
+    def V(self) -> float | None:
+        """Squared jump per squared approach speed without friction; ``None`` where it does not exist."""
+        return self.scalars.V
+
+    @property
+    def S(self) -> float | None:
+        """Squared jump per squared approach speed of a point that sticks; ``None`` where it does not exist."""
+        return self.scalars.S
+
+    @property
+    def E(self) -> float | None:
+        """Energy lost per squared approach speed, kg; ``None`` where it does not exist."""
+        return self.scalars.E
+
     def to_dict(self) -> dict[str, object]:
         """The ``initial`` or ``optimal`` block of ``result.json``; ``None`` for what does not exist."""
         quaternion = pin.Quaternion(self.pose.rotation)
@@ -150,9 +175,9 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
         InputError: A negative or non-finite speed, or a restitution outside [0, 1].
     """
     if not 0 <= speed <= LARGEST:
-        raise InputError(f"the approach speed is {speed:g}", where="--speed", hint=f"give m/s, 0 to {LARGEST:g}")
+        raise InputError(f"the approach speed is {speed:g}", where="speed", hint=f"give m/s, 0 to {LARGEST:g}")
     if not 0 <= restitution <= 1:
-        raise InputError(f"the restitution is {restitution:g}", where="--restitution", hint="give 0 to 1")
+        raise InputError(f"the restitution is {restitution:g}", where="restitution", hint="give 0 to 1")
     robot, oracle = objective.robot, objective.oracle
     found = oracle.quantities(q)
     scalars = Scalars.of(found)

@@ -76,27 +76,27 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: ImpactKind, *, bilat
     if len(contacts) == 1:
         if bilateral:
             raise ContactError(
-                "there is one contact: pulling is as bad as pushing", where="--bilateral", hint="leave it out"
+                "there is one contact: pulling is as bad as pushing", where="bilateral", hint="leave it out"
             )
         return
     if len(contacts) > MOST_CONTACTS:
-        raise ContactError(f"{len(contacts)} contacts", where="--contact", hint=f"give up to {MOST_CONTACTS}")
+        raise ContactError(f"{len(contacts)} contacts", where="contact", hint=f"give up to {MOST_CONTACTS}")
     for i, one in enumerate(contacts):
         for other in contacts[:i]:
             if (one.frame, one.offset, one.normal) == (other.frame, other.offset, other.normal):
-                raise ContactError(f"'{one.frame}' is given twice", where="--contact", hint="remove one")
+                raise ContactError(f"'{one.frame}' is given twice", where="contact", hint="remove one")
     if not kind.adds_up:
         raise MetricError(
             f"{kind.name} is per approach speed of one contact: of several at once the impulses are not known "
             "from it",
-            where="--objective",
-            hint="choose impulse, whose bounds are given, or one --contact",
+            where="objective",
+            hint="choose impulse, whose bounds are given, or one `contact`",
         )
     if cone:
         raise MetricError(
             "the worst case over a cone of normals is exact for one contact only",
-            where="--normal-cone",
-            hint="give one --contact, or leave the cone out",
+            where="normal_cone",
+            hint="give one `contact`, or leave the cone out",
         )
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from impact_posture.impact.energy_kind import EnergyKind
 from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.impulse_kind import ImpulseKind
-from impact_posture.impact.metric import ObjectiveKind
 from impact_posture.impact.speed_kind import SpeedKind
 from impact_posture.impact.sticking_kind import StickingKind
+from impact_posture.settings import ObjectiveKind
 
 KINDS: dict[ObjectiveKind, ImpactKind] = {
     "impulse": ImpulseKind(),

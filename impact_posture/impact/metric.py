@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from impact_posture.errors import MetricError
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import read_toml
-
-MetricKind = Literal["euclidean", "kinetic", "weighted"]
-ObjectiveKind = Literal["impulse", "speed", "sticking", "energy"]
+from impact_posture.settings import MetricKind
+from impact_posture.tables import read_toml
 
 
 @dataclass(frozen=True)
@@ -35,8 +32,14 @@ class Metric:
         return np.ones(nv) if self.weights is None else np.array(self.weights)
 
 
-def build_metric(robot: Robot, kind: MetricKind, weights: str | None = None) -> Metric:
-    """Build a metric; ``weights`` is a TOML file of joint = weight (``base = [6 numbers]``) or ``velocity-limits``.
+def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...] | None = None) -> Metric:
+    """Build a metric.
+
+    Args:
+        robot: The robot.
+        kind: How the jump is weighed.
+        weights: Of the weighted metric: nv numbers, ``velocity-limits``, or a TOML file of joint = weight
+            (``base = [6 numbers]``).
 
     Raises:
         MetricError: Missing, zero or negative weights.
@@ -44,20 +47,31 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | None = None) -> 
     if kind != "weighted":
         if weights is not None:
             raise MetricError(
-                f"--weights goes with --metric weighted, not {kind}", where="--weights", hint="add --metric weighted"
+                f"are given, but the metric is {kind}", where="weights", hint="remove them or add `metric='weighted'`"
             )
         return Metric(kind)
     if weights is None:
         raise MetricError(
-            "the weighted metric needs weights", where="--metric", hint="add --weights FILE or velocity-limits"
+            "the weighted metric needs weights",
+            where="metric",
+            hint="add `weights=FILE` or `weights='velocity-limits'`",
         )
-    values = _from_limits(robot) if weights == "velocity-limits" else _from_file(robot, Path(weights))
+    source = weights if isinstance(weights, str) else "numbers"
+    if not isinstance(weights, str):
+        values = np.array(weights, dtype=float)
+        if values.shape != (robot.nv,):
+            hint = f"give {robot.nv} numbers above zero"
+            raise MetricError(f"has {values.size} entries", where="weights", hint=hint)
+    elif weights == "velocity-limits":
+        values = _from_limits(robot)
+    else:
+        values = _from_file(robot, Path(weights))
     for name, value in zip(robot.tangent_names, values, strict=True):
         if not (np.isfinite(value) and value > 0):
             raise MetricError(
-                f"the weight of '{name}' is {value:g}", where=weights, hint="every weight must be above zero"
+                f"the weight of '{name}' is {value:g}", where=source, hint="every weight must be above zero"
             )
-    return Metric("weighted", tuple(float(v) for v in values), weights)
+    return Metric("weighted", tuple(float(v) for v in values), source)
 
 
 def _from_limits(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
@@ -69,7 +83,7 @@ def _from_limits(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
         if not (np.isfinite(limit) and 0 < limit < 1e6):
             raise MetricError(
                 f"joint '{name}' has no velocity limit",
-                where="--weights velocity-limits",
+                where="weights",
                 hint="add it to robot.toml [limits.velocity] or give a file",
             )
     return np.asarray(1.0 / limits**2)

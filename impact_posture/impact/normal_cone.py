@@ -38,12 +38,12 @@ def check_cone(kind: ImpactKind, degrees: float) -> None:
         MetricError: A kind that is no quadratic form of the normal.
     """
     if not 0 <= degrees < 90:
-        raise InputError(f"the half angle is {degrees:g}°", where="--normal-cone", hint="give 0 to below 90 degrees")
+        raise InputError(f"the half angle is {degrees:g}°", where="normal_cone", hint="give 0 to below 90 degrees")
     if degrees and not isinstance(kind, QuadraticKind):
         raise MetricError(
             kind.no_cone,
-            where="--normal-cone",
-            hint="choose --objective impulse, sticking or energy, or --normal-cone 0",
+            where="normal_cone",
+            hint="choose `objective='impulse'`, sticking or energy, or `normal_cone=0`",
         )
 
 

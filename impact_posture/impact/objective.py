@@ -25,7 +25,7 @@ from impact_posture.impact.impulse_box import ImpulseBox, check_contacts
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.kinds import KINDS
 from impact_posture.impact.lifted import Guess, Lifted
-from impact_posture.impact.metric import Metric, ObjectiveKind
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.model_set import ModelSet
 from impact_posture.impact.normal_cone import NormalCone, check_cone
 from impact_posture.impact.oracle import ImpactOracle
@@ -33,6 +33,7 @@ from impact_posture.impact.single_impact import SingleImpact
 from impact_posture.impact.worst_case import Subgradients, WorstCase
 from impact_posture.robot.model_variant import ModelVariant
 from impact_posture.robot.robot import Robot
+from impact_posture.settings import ObjectiveKind
 
 Vector = NDArray[np.float64]
 

@@ -276,6 +276,6 @@ def no_sticking() -> MetricError:
     """Build the error for a posture where S does not exist."""
     return MetricError(
         "S does not exist here: the contact point cannot move in every direction and the normal leaves those it can",
-        where="--objective sticking",
-        hint="choose --objective speed, or another frame, normal or posture",
+        where="objective sticking",
+        hint="choose `objective='speed'`, or another frame, normal or posture",
     )

@@ -11,7 +11,7 @@ from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.robot.guess import feet
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import SupportKind
+from impact_posture.settings import SupportKind
 
 
 def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support, ...]:
@@ -30,7 +30,7 @@ def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support
         found = [_support(robot, text, known) for text in texts]
     for support in found:
         if sum(s.frame == support.frame for s in found) > 1:
-            raise InputError(f"frame '{support.frame}' is given twice", where="--support", hint="remove one")
+            raise InputError(f"frame '{support.frame}' is given twice", where="support", hint="remove one")
         point_on(robot, support.frame, support.offset)
     return tuple(found)
 
@@ -42,7 +42,7 @@ def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
             frame, kind = text.removesuffix(f":{candidate}"), candidate
     if frame not in robot.frame_names:
         names = dict.fromkeys((*feet(robot), *robot.frame_names))
-        raise FrameNotFound(frame, names, where="--support", hint="(or FRAME:point, FRAME:surface)")
+        raise FrameNotFound(frame, names, where="support", hint="(or FRAME:point, FRAME:surface)")
     base = known.get(frame, Support(frame))
     return Support(frame, kind or base.kind, base.offset, base.size)
 
@@ -58,6 +58,6 @@ def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support
         if support.kind == "surface" or support.frame == contact.frame or same_point:
             raise ContactError(
                 f"the contact point is held by the support at '{support.frame}'",
-                where=f"--frame {contact.frame}",
-                hint="choose another frame, name the other --support frames, or --no-support",
+                where=f"frame {contact.frame}",
+                hint="choose another frame, name the other `support` frames, or `support=[]`",
             )

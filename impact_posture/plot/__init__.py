@@ -14,18 +14,14 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from impact_posture.errors import NameNotFound
+from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, path_figure, tradeoff_figure
 from impact_posture.plot.bars import Bar, bars_figure, draw_bars
-from impact_posture.plot.classical_figure import classical_figure
 from impact_posture.plot.comparison import comparison_figure, controls_comparison_figure, draw_comparison
-from impact_posture.plot.ellipsoid_figure import ellipsoid_figure
-from impact_posture.plot.jump_figure import jump_figure
-from impact_posture.plot.path_figure import path_figure
 from impact_posture.plot.robot_drawing import postures_figure
 from impact_posture.plot.run_figures import controls_figure, draw_run, joints_figure, metric_figure
 from impact_posture.plot.run_view import RunView, Span
 from impact_posture.plot.snapshots import draw_snapshots, snapshots_figure
 from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save
-from impact_posture.plot.tradeoff_figure import tradeoff_figure
 from impact_posture.plot.view import PathData, ResultView, TradeOffData, sample_path
 
 __all__ = [
@@ -39,7 +35,6 @@ __all__ = [
     "Span",
     "TradeOffData",
     "bars_figure",
-    "classical_figure",
     "comparison_figure",
     "controls_comparison_figure",
     "controls_figure",
@@ -49,25 +44,21 @@ __all__ = [
     "draw_run",
     "draw_snapshots",
     "drawable",
-    "ellipsoid_figure",
     "joints_figure",
-    "jump_figure",
     "metric_figure",
-    "path_figure",
     "postures_figure",
     "sample_path",
     "save",
     "snapshots_figure",
-    "tradeoff_figure",
 ]
 
 FIGURES: dict[str, Callable[[ResultView], Figure]] = {
-    "ellipsoid": ellipsoid_figure,
+    "ellipsoid": ellipsoid_figure.ellipsoid_figure,
     "postures": postures_figure,
-    "jump": jump_figure,
-    "nullspace": path_figure,
-    "classical": classical_figure,
-    "tradeoff": tradeoff_figure,
+    "jump": jump_figure.jump_figure,
+    "nullspace": path_figure.path_figure,
+    "classical": classical_figure.classical_figure,
+    "tradeoff": tradeoff_figure.tradeoff_figure,
 }
 
 

@@ -36,7 +36,7 @@ def tradeoff_figure(view: ResultView) -> Figure:
     data = view.tradeoff
     if data is None:
         raise InputError(
-            "there is no trade-off to draw", where="figure tradeoff", hint="run optimize again with --tradeoff"
+            "there is no trade-off to draw", where="figure tradeoff", hint="run optimize again with `tradeoff`"
         )
     knee = [_KNEE] if data.knee is not None else []
     with style():

@@ -29,7 +29,7 @@ from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.regular import regularize
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import ContactPose
+from impact_posture.settings import ContactPose
 
 Vector = NDArray[np.float64]
 
@@ -84,10 +84,10 @@ def _check(robot: Robot, requirements: Requirements) -> None:
     if not robot.floating and requirements.base != "free":
         raise InputError(
             f"base '{requirements.base}' asked of a robot whose root is fixed",
-            where="--base",
-            hint="leave it out or use --root free-flyer",
+            where="base",
+            hint="leave it out or use `root='free-flyer'`",
         )
-    for name, values in (("--box", requirements.box), ("--base-box", requirements.base_box)):
+    for name, values in (("box", requirements.box), ("base_box", requirements.base_box)):
         if not all(np.isfinite(v) and v > 0 for v in values):
             raise InputError(f"half extents {values}", where=name, hint="give three lengths above zero")
     for name, value in (
@@ -103,15 +103,15 @@ def _check(robot: Robot, requirements: Requirements) -> None:
     if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):
         raise InputError(
             "is one target for several contacts",
-            where="--target-quaternion" if quaternion is not None else "--target-position",
-            hint="leave it out and start from a --posture that has the contacts in place",
+            where="target_quaternion" if quaternion is not None else "target_position",
+            hint="leave it out and start from a `posture` that has the contacts in place",
         )
     if quaternion is not None and not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
         raise InputError(
-            f"has norm {np.linalg.norm(quaternion):.4g}", where="--target-quaternion", hint="give a unit x y z w"
+            f"has norm {np.linalg.norm(quaternion):.4g}", where="target_quaternion", hint="give a unit x y z w"
         )
     if requirements.target_position is not None and not np.isfinite(requirements.target_position).all():
-        raise InputError("is not finite", where="--target-position", hint="give three numbers")
+        raise InputError("is not finite", where="target_position", hint="give three numbers")
     for joint in requirements.hold:
         robot.joint_id(joint)
 
@@ -145,7 +145,7 @@ def _contact_constraints(
         if requirements.target_position is not None or requirements.target_quaternion is not None:
             raise InputError(
                 "a target is given but the contact pose is free",
-                where="--contact-pose",
+                where="contact_pose",
                 hint="use full, position, aligned or box",
             )
         return []
@@ -165,8 +165,8 @@ def _kept_feet(objective: ImpactObjective, numeric: Numeric, friction: float) ->
     if objective.bilateral:
         raise InputError(
             "contacts that pull as well as push would have to leave the feet without any impulse",
-            where="--keep-contacts",
-            hint="leave out --bilateral or --keep-contacts",
+            where="keep_contacts",
+            hint="leave out `bilateral=True` or `keep_contacts=True`",
         )
     return [KeptFeet(single, numeric, friction) for single in objective.singles]
 
@@ -202,7 +202,7 @@ def _com_constraint(
         raise InputError(
             "the feet span no area to keep the center of mass above",
             where="com_over_feet",
-            hint="give three feet or soles with a size, or set com_over_feet = false (--no-com)",
+            hint="give three feet or soles with a size, or set com_over_feet = false, or `com=False`",
         ) from None
     # One row an edge: qhull repeats the equation of an edge that it met in pieces.
     unique = np.unique(np.round(equations, 12), axis=0)

@@ -83,7 +83,7 @@ def _ground_warnings(prepared: Prepared, solution: PostureSolution) -> list[str]
         return []
     return [
         f"the optimal posture has {_named(below)} below the lowest foot: nothing keeps them above the ground; narrow "
-        "their limits (robot.toml [limits.position]) or stay nearer with --regularization"
+        "their limits (robot.toml [limits.position]) or stay nearer with `regularization`"
     ]
 
 

@@ -35,11 +35,11 @@ def notes_on_impacts(objective: Objective, initial: Vector, q: Vector) -> list[s
             notes.append(
                 f"the contact{where} is nearly locked along the normal there: its effective mass is "
                 f"{before / max(after, 1e-300):.3g} times that of the start, and so is the impulse at a given "
-                "approach speed; compare V and S, or minimize them (--objective speed, sticking)"
+                "approach speed; compare V and S, or minimize them (`objective='speed'`, sticking)"
             )
         elif objective.kind == "impulse" and not objective.others and end.V > start.V * (1 + 1e-3):
             notes.append(
                 f"at a given approach speed without friction the jump grows: V {start.V:.4g} to {end.V:.4g}; "
-                "--objective speed minimizes that"
+                "`objective='speed'` minimizes that"
             )
     return notes

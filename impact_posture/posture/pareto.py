@@ -61,7 +61,7 @@ def pareto_front(
         InputError: No points asked for.
     """
     if points < 1:
-        raise InputError(f"{points} points are asked for", where="--tradeoff", hint="give 1 or more")
+        raise InputError(f"{points} points are asked for", where="tradeoff", hint="give 1 or more")
     problem = solution.problem
     chart = Chart(problem.robot.model)
     whole = distance(chart, solution.q, solution.initial)
@@ -226,7 +226,7 @@ class _Curve:
         if lowest < best - _RISE * self._scale and not solution.problem.requirements.regularization:
             notes.append(
                 f"trade-off: it found a better posture ({lowest:.4g}) than the starts did ({best:.4g}); "
-                "more --starts may find it, too"
+                "more `starts` may find it, too"
             )
         knee = find_knee(np.array([p.distance for p in points]), np.array([p.objective for p in points]))
         return TradeOff(tuple(points), knee, self.solves, solve, build, tuple(notes))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +11,9 @@ from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.constraint import Constraint
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import ContactPose, Vector3
+from impact_posture.settings import BaseMode, ContactPose, Vector3
 
 Vector = NDArray[np.float64]
-BaseMode = Literal["free", "level", "fixed", "box"]
 
 
 @dataclass(frozen=True)

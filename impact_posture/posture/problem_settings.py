@@ -2,81 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from impact_posture.errors import InputError, SpecError
 from impact_posture.escape import toml
-from impact_posture.impact.metric import Metric, MetricKind, ObjectiveKind
-from impact_posture.impact.request import FLOATS, ImpactRequest, ResolvedImpact
+from impact_posture.impact.objective import Objective
+from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, resolve
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.constraint import CenterOfMassOverFeet
-from impact_posture.posture.problem import BaseMode, PostureProblem, Requirements
-from impact_posture.robot.model_variant import Payload
-from impact_posture.robot.robot_loader import LoadOptions, from_folder, names_a_path
-from impact_posture.robot.spec import ContactPose, Root, Vector3, read_toml, validate, with_tuples
+from impact_posture.posture.problem import PostureProblem, Requirements
+from impact_posture.robot.model_variant import ModelVariant
+from impact_posture.robot.robot_loader import from_folder, names_a_path
 from impact_posture.robot.urdf import EXAMPLE_PREFIX
-
-SCHEMA = "impact-posture/problem/1"
+from impact_posture.settings import BaseMode, ProblemSettings
+from impact_posture.tables import read_toml, validate
 
 _FILES = ("srdf", "config")
-
-
-class ProblemSettings(BaseModel):
-    """The content of a ``problem.toml``; what is ``None`` comes from the robot or is the option's default."""
-
-    # Strict: a number in quotes or a true for 1 is a slip, not a value.
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-    schema_: Literal["impact-posture/problem/1"] = Field(default="impact-posture/problem/1", alias="schema")
-    robot: str
-    root: Root | None = None
-    package_dir: tuple[str, ...] = ()
-    srdf: str | None = None
-    config: str | None = None
-    armature: str | dict[str, float] | None = None
-    lock: tuple[str, ...] = ()
-    lock_massless: bool = False
-    frame: str | None = None
-    normal: Vector3 | None = None
-    normal_frame: Literal["world", "contact"] = "world"
-    offset: Vector3 | None = None
-    contact: str | tuple[str, ...] | None = None
-    bilateral: bool = False
-    impulse: float = 1.0
-    speed: float = 1.0
-    restitution: float = 0.0
-    posture: str | None = None
-    q: tuple[float, ...] | None = None
-    target_position: Vector3 | None = None
-    target_quaternion: tuple[float, float, float, float] | None = None
-    contact_pose: ContactPose | None = None
-    box: Vector3 = (0.05, 0.05, 0.05)
-    support: tuple[str, ...] | None = None
-    support_compliance: float | None = None
-    keep: tuple[str, ...] = ()
-    hold: tuple[str, ...] | None = None
-    base: BaseMode | None = None
-    base_box: Vector3 = (0.2, 0.2, 0.2)
-    com: bool | None = None
-    com_margin: float | None = None
-    keep_contacts: bool = False
-    friction: float = 0.7
-    limit_margin: float | None = None
-    regularization: float = 0.0
-    metric: MetricKind = "euclidean"
-    weights: str | tuple[float, ...] | None = None
-    objective: ObjectiveKind = "impulse"
-    normal_cone: float = 0.0
-    armature_range: tuple[float, float] | None = None
-    payload: tuple[tuple[str, float], ...] = ()
-    tradeoff: Annotated[int, Field(ge=0)] = 0
-    starts: Annotated[int, Field(ge=1)] = 16
-    seed: Annotated[int, Field(ge=0)] = 0
 
 
 @dataclass(frozen=True)
@@ -108,7 +53,7 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
         data.pop("normal", None)
     if "posture" in over:
         data.pop("q", None)
-    return validate(ProblemSettings, with_tuples(data | over), str(path))
+    return validate(ProblemSettings, data | over, str(path))
 
 
 def make_settings(values: dict[str, object]) -> ProblemSettings:
@@ -116,53 +61,17 @@ def make_settings(values: dict[str, object]) -> ProblemSettings:
     return validate(ProblemSettings, values, "options")
 
 
-def prepare(settings: ProblemSettings) -> Prepared:
-    """Load the robot, resolve defaults, build the problem; nothing is solved yet.
+def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> Prepared:
+    """Resolve all defaults and build the problem; nothing is solved yet.
+
+    Args:
+        settings: The problem.
+        impact: The impact that it is about, where that is built already; else the settings say it.
 
     Raises:
         ImpactPostureError: The first thing that is wrong, in one line.
     """
-    contacts = (settings.contact,) if isinstance(settings.contact, str) else settings.contact or ()
-    if isinstance(settings.weights, tuple) and settings.metric != "weighted":
-        raise InputError(
-            f"weights are listed, but the metric is {settings.metric}",
-            where="weights",
-            hint='remove them or say "weighted"',
-        )
-    weights = settings.weights if isinstance(settings.weights, str) else None
-    request = ImpactRequest(
-        robot=settings.robot,
-        load=LoadOptions(
-            root=settings.root,
-            package_dirs=settings.package_dir,
-            srdf=settings.srdf,
-            config=settings.config,
-            armature=settings.armature,
-            lock=settings.lock,
-            lock_massless=settings.lock_massless,
-        ),
-        frame=settings.frame,
-        normal=settings.normal,
-        offset=settings.offset,
-        normal_frame=settings.normal_frame,
-        contacts=contacts,
-        bilateral=settings.bilateral,
-        impulse=settings.impulse,
-        posture=settings.posture if settings.q is None else None,
-        supports=settings.support,
-        metric="euclidean" if isinstance(settings.weights, tuple) else settings.metric,
-        weights=weights,
-        objective=settings.objective,
-        speed=settings.speed,
-        restitution=settings.restitution,
-        compliance=settings.support_compliance,
-        normal_cone=settings.normal_cone,
-        armature_range=settings.armature_range,
-        payloads=tuple(Payload(frame, mass) for frame, mass in settings.payload),
-    )
-    impact = request.resolve()
-    if isinstance(settings.weights, tuple):
-        impact = replace(impact, objective=replace(impact.objective, metric=_listed_metric(settings, impact)))
+    impact = resolve(settings) if impact is None else impact
     if settings.q is not None:
         impact = replace(impact, q=impact.robot.check_posture(np.array(settings.q), where="q"))
     if impact.missing_support:
@@ -170,33 +79,30 @@ def prepare(settings: ProblemSettings) -> Prepared:
             what = f"nothing says what holds {impact.robot.name} up, {FLOATS}"
             raise InputError(what, where=settings.robot, hint=impact.missing_support)
         impact = replace(impact, missing_support="")
-    problem = build_problem(impact.robot, impact.objective, impact.q, _requirements(settings, impact))
+    problem = build_problem(impact.robot, impact.objective, impact.q, requirements(settings, impact.objective))
     return Prepared(settings, impact, problem)
 
 
-def _listed_metric(settings: ProblemSettings, impact: ResolvedImpact) -> Metric:
-    weights = np.array(settings.weights, dtype=float)
-    if weights.size != impact.robot.nv or not (np.isfinite(weights).all() and (weights > 0).all()):
-        raise SpecError(
-            f"has {weights.size} entries", where="weights", hint=f"give {impact.robot.nv} numbers above zero"
-        )
-    return Metric("weighted", tuple(float(w) for w in weights), "problem.toml")
+def requirements(settings: ProblemSettings, objective: Objective) -> Requirements:
+    """What the task asks of the posture; what the settings leave open comes from the robot.
 
-
-def _requirements(settings: ProblemSettings, impact: ResolvedImpact) -> Requirements:
-    robot, spec = impact.robot, impact.robot.spec.constraints
+    Raises:
+        InputError: A setting about feet, of a robot without feet.
+    """
+    robot, spec = objective.robot, objective.robot.spec.constraints
+    poses = [settings.contact_pose or robot.contact_pose(contact.frame) for contact in objective.contacts]
     free = tuple(j for j in spec.hold if j not in robot.locked)
     base: BaseMode = "level" if spec.level_base and robot.floating else "free"
-    com = spec.com_over_feet and bool(impact.supports) if settings.com is None else settings.com
-    if com and not impact.supports:
+    com = spec.com_over_feet and bool(objective.supports) if settings.com is None else settings.com
+    if com and not objective.supports:
         raise InputError(
-            "there are no feet to keep the center of mass over", where="--com", hint="add --support or --no-com"
+            "there are no feet to keep the center of mass over", where="com", hint="add `support` or `com=False`"
         )
-    if settings.keep_contacts and not impact.supports:
-        raise InputError("there are no feet to keep", where="--keep-contacts", hint="add --support or leave it out")
+    if settings.keep_contacts and not objective.supports:
+        raise InputError("there are no feet to keep", where="keep_contacts", hint="add `support` or leave it out")
     return Requirements(
-        contact_pose=settings.contact_pose or robot.contact_pose(impact.contact.frame),
-        other_poses=tuple(settings.contact_pose or robot.contact_pose(c.frame) for c in impact.objective.others),
+        contact_pose=poses[0] if poses else "free",
+        other_poses=tuple(poses[1:]),
         target_position=settings.target_position,
         target_quaternion=settings.target_quaternion,
         box=settings.box,
@@ -236,7 +142,15 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         "com": any(isinstance(c, CenterOfMassOverFeet) for c in prepared.problem.constraints),
         "com_margin": wanted.com_margin,
         "limit_margin": wanted.limit_margin,
+        "metric": impact.metric.kind,
         "weights": impact.metric.weights,
+        "objective": impact.objective.kind,
+        "normal_cone": impact.objective.normal_cone_deg,
+        "bilateral": impact.objective.bilateral,
+        "normal_frame": impact.contact.normal_frame,
+        "speed": impact.speed,
+        "restitution": impact.restitution,
+        **_resolved_variants(impact.objective.scenarios),
     }
     for key in _FILES:
         value = getattr(settings, key)
@@ -244,7 +158,7 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         changes[key] = value if in_package else str(Path(value).expanduser().resolve())
     if settings.armature is not None:
         changes["armature"] = _armature_by_joint(impact)
-    return settings.model_copy(update=changes)
+    return replace(settings, **changes)  # type: ignore[arg-type]
 
 
 def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
@@ -254,6 +168,19 @@ def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
         return one | {"contact": None, "impulse": contact.impulse}
     texts = tuple(f"{c.frame}:{','.join(map(repr, c.normal))}:{c.impulse!r}" for c in impact.objective.contacts)
     return {"frame": None, "normal": None, "offset": None, "contact": texts}
+
+
+def _resolved_variants(variants: Sequence[ModelVariant]) -> dict[str, object]:
+    """The settings that make these model variants."""
+    # The model as stated is always among them.
+    factors = {variant.armature_factor for variant in variants} - {1.0}
+    if len(factors) == 1:
+        factors.add(1.0)
+    payloads = dict.fromkeys(v.payload for v in variants if v.payload is not None)
+    return {
+        "armature_range": (min(factors), max(factors)) if factors else None,
+        "payload": tuple((payload.frame, payload.mass) for payload in payloads),
+    }
 
 
 def _armature_by_joint(impact: ResolvedImpact) -> str | dict[str, float]:
@@ -269,10 +196,11 @@ def dump_settings(settings: ProblemSettings) -> str:
     Raises:
         SpecError: The path of a file is not UTF-8.
     """
-    lines = [f"schema = {toml(SCHEMA)}"]
-    for key in ProblemSettings.model_fields:
+    lines = [f"schema = {toml(settings.schema)}"]
+    # The robot first: a reader looks for it.
+    for key in sorted((field.name for field in fields(ProblemSettings)), key=lambda name: name != "robot"):
         value = getattr(settings, key)
-        if key != "schema_" and value is not None:
+        if key != "schema" and value is not None and value != {}:
             try:
                 lines.append(f"{key} = {toml(value)}")
             except UnicodeEncodeError:

@@ -10,7 +10,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture import __version__
 from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.posture.caveats import caveats
 from impact_posture.posture.null_space_path import NullSpacePath
@@ -18,6 +17,7 @@ from impact_posture.posture.problem_settings import Prepared
 from impact_posture.posture.robustness import Robustness
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
+from impact_posture.version import __version__
 
 SCHEMA = "impact-posture/result/1"
 

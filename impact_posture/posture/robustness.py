@@ -105,7 +105,7 @@ class Robustness:
             parts.append(f"the optimum of the model as it stands breaks {', '.join(self.broken)}")
         elif self.gain < -_NOISE:
             parts.append(
-                f"the worst case is {percent(-self.gain)} higher than {here}: more --starts will find a better one"
+                f"the worst case is {percent(-self.gain)} higher than {here}: more `starts` will find a better one"
             )
         else:
             parts.append(f"the worst case is {percent(max(self.gain, 0.0))} lower than {here}")

@@ -151,7 +151,7 @@ def solve(
     hits = sum(o.hits for o in optima)
     if len(optima) > 1 and optima[0].hits == 1 and hits >= _MANY:
         notes.append(
-            f"the best of {len(optima)} optima was found once in {hits} starts: more --starts may find a better one"
+            f"the best of {len(optima)} optima was found once in {hits} starts: more `starts` may find a better one"
         )
     return PostureSolution(
         problem=problem,
@@ -187,14 +187,14 @@ def _initial(problem: PostureProblem, seed: int) -> Vector:
     if answer.conflicts:
         limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
         raise Infeasible(
-            answer.conflicts, hint=f"relax one of them, move the target, or start from another --posture{limits}"
+            answer.conflicts, hint=f"relax one of them, move the target, or start from another `posture`{limits}"
         )
     found = Projector(problem).project(answer.q)
     if found.violation > 1e-8:
         raise SolverFailed(
             f"a posture within {found.violation:.1e} of the constraints was found, but none on them",
             where="problem",
-            hint="start from a --posture nearer to the target",
+            hint="start from a `posture` nearer to the target",
         )
     return found.q
 
@@ -212,7 +212,7 @@ def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
         frames = ", ".join(f"'{contact.frame}'" for contact in objective.contacts)
         raise ContactError(
             f"the contact point at {frames} cannot move along the normal",
-            where="--normal",
+            where="normal",
             hint="choose another frame, normal or posture: an impact along it moves nothing",
         )
     return value
@@ -304,12 +304,12 @@ def _failure(runs: list[_Run]) -> SolverFailed:
     words = sorted({r.record.status for r in solved if r.record is not None})
     if not solved:
         return SolverFailed(
-            "the objective does not exist where the starts ended", where="solver", hint="choose another --objective"
+            "the objective does not exist where the starts ended", where="solver", hint="choose another `objective`"
         )
     nearest = min((r.certificate for r in solved if r.certificate), key=lambda c: c.stationarity)
     return SolverFailed(
         f"none of {len(solved)} feasible starts ended at a certified posture (solver: {', '.join(words)}; best "
         f"stationarity {nearest.stationarity:.1e}, violation {nearest.primal:.1e})",
         where="solver",
-        hint="try more --starts, another --seed or --posture, or a small --regularization",
+        hint="try more `starts`, another `seed` or `posture`, or a small `regularization`",
     )

@@ -10,8 +10,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.errors import InputError, SpecError
-from impact_posture.robot.spec import RobotSpec, read_toml
+from impact_posture.robot.spec import RobotSpec
 from impact_posture.robot.urdf import joint_index
+from impact_posture.tables import read_toml
 
 Vector = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
     """
     if option == "none":
         model.armature = np.zeros(model.nv)
-        return "none (--armature none)"
+        return "none (given)"
     armature, source = np.array(model.armature, dtype=float), "none"
     if spec.armature.default is not None or spec.armature.joints:
         armature = _armature_vector(model, spec.armature.default or 0.0, spec.armature.joints, name)
@@ -43,14 +44,14 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
         source = "rotor data in the SRDF"
     if isinstance(option, str):
         armature = _armature_vector(model, 0.0, _armature_file(Path(option)), option)
-        source = f"--armature {option}"
+        source = option
     elif option:
         for joint, value in option.items():
             if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"armature {joint}={value:g}", where="--armature", hint="give a number ≥ 0")
-            index = joint_index(model, joint, "--armature")
+                raise InputError(f"armature {joint}={value:g}", where="armature", hint="give a number ≥ 0")
+            index = joint_index(model, joint, "armature")
             armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]] = value
-        source = f"--armature over {source}"
+        source = f"given values over {source}"
     model.armature = armature
     return source
 
@@ -95,7 +96,7 @@ def armature_warning(model: pin.Model, source: str, held: Sequence[str] = ()) ->
     which = "" if len(bare) == len([j for j in joints if j not in held]) else f" at {_listed(bare)}"
     return (
         f"armature is zero{which} ({source}): geared motors usually have some, and H scales like 1/armature² "
-        "where it dominates; give --armature or robot.toml [armature]",
+        "where it dominates; give `armature` or robot.toml [armature]",
     )
 
 

@@ -17,9 +17,10 @@ from impact_posture.errors import InertiaError, InputError, OutputError, Posture
 from impact_posture.escape import printable, toml
 from impact_posture.robot import guess
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import LoadOptions, Located, build_robot, known_robots, load_robot, locate
-from impact_posture.robot.spec import SCHEMA, ModelSpec, RobotSpec, Root, SupportSpec
+from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
+from impact_posture.robot.spec import SCHEMA, ModelSpec, RobotSpec, SupportSpec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolve_path
+from impact_posture.settings import LoadOptions, Root
 
 _WIDTH = 100
 # Postures to start in, by a part of their name, best first.
@@ -163,7 +164,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
 def _load(located: Located, options: LoadOptions, root: Root, srdf: Path | None) -> tuple[Robot, tuple[str, ...]]:
     """The robot without a robot.toml, and faults of its inertias that had to be accepted."""
     plain = LoadOptions(
-        package_dirs=options.package_dirs, armature=options.armature, lock=options.lock, lock_massless=True
+        package_dir=options.package_dir, armature=options.armature, lock=options.lock, lock_massless=True
     )
 
     def load(accept: bool) -> Robot:
@@ -229,8 +230,8 @@ def _default_posture(robot: Robot) -> str:
 
 
 def _model(draft: Draft, robot: Robot, options: LoadOptions, faults: Sequence[str], folder: Path) -> None:
-    if options.package_dirs:
-        dirs = [_path(Path(name), folder) for name in options.package_dirs]
+    if options.package_dir:
+        dirs = [_path(Path(name), folder) for name in options.package_dir]
         draft.key("package_dirs", dirs, "as --package-dir says")
     wheels = () if robot.floating else guess.wheels(robot)
     if options.lock or wheels:

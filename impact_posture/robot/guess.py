@@ -12,7 +12,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import SupportSpec, Vector3
+from impact_posture.robot.spec import SupportSpec
+from impact_posture.settings import Vector3
 
 Vector = NDArray[np.float64]
 

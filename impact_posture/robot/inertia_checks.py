@@ -78,7 +78,7 @@ def check_moved_mass(model: pin.Model, where: str) -> None:
             f"joint {named} moves no mass" if one else f"{len(found)} joints move no mass: {named}",
             where=where,
             hint=f"give {'its' if one else 'their'} links a mass, or make {'it' if one else 'them'} rigid by "
-            "--lock-massless (robot.toml [model] lock_massless = true)",
+            "`lock_massless=True` (robot.toml [model] lock_massless = true)",
         )
 
 
@@ -116,7 +116,7 @@ def check_mass_matrix(
     raise InertiaError(
         f"the mass matrix is singular at posture '{posture}': {', '.join(named)} {verb}",
         where=where,
-        hint="give the links mass and rotational inertia, or the joints --armature, or --lock one",
+        hint="give the links mass and rotational inertia, or the joints `armature`, or `lock` one",
     )
 
 

@@ -78,22 +78,22 @@ def build_model_variants(
         robot.frame_id(payload.frame)
         if not (np.isfinite(payload.mass) and payload.mass > 0):
             raise InputError(
-                f"the mass at '{payload.frame}' is {payload.mass:g}", where="--payload", hint="give kg above zero"
+                f"the mass at '{payload.frame}' is {payload.mass:g}", where="payload", hint="give kg above zero"
             )
         if robot.model.frames[robot.frame_id(payload.frame)].parentJoint == 0:
             raise InputError(
                 f"frame '{payload.frame}' is welded to the world: a mass there changes nothing",
-                where="--payload",
+                where="payload",
                 hint="choose a frame on a moving link",
             )
         if payloads.count(payload) > 1:
-            raise InputError(f"{payload.mass:g} kg at '{payload.frame}' is given twice", where="--payload",
+            raise InputError(f"{payload.mass:g} kg at '{payload.frame}' is given twice", where="payload",
                              hint="remove one")  # fmt: skip
     found = [_scenario(robot, factor, payload) for payload in (None, *payloads) for factor in factors]
     if len(found) > MOST_SCENARIOS:
         raise InputError(
             f"{len(found)} scenarios, each a model of its own",
-            where="--payload",
+            where="payload",
             hint=f"have at most {MOST_SCENARIOS}",
         )
     return tuple(found) if len(found) > 1 else ()
@@ -106,14 +106,14 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
     if not (np.isfinite([low, high]).all() and 0 < low <= high):
         raise InputError(
             f"the armature's range is {low:g} to {high:g}",
-            where="--armature-range",
+            where="armature_range",
             hint="give two factors above zero on the stated armature, the lower first, such as 0.5 2",
         )
     if not robot.armature.any():
         raise InputError(
             f"{robot.name} has no armature: a factor on zero changes nothing",
-            where="--armature-range",
-            hint="state one with --armature or in robot.toml",
+            where="armature_range",
+            hint="state one with `armature` or in robot.toml",
         )
     return [1.0, *sorted({low, high} - {1.0})]
 

@@ -20,10 +20,10 @@ _BY_NAME_KEYS = ("schema", "robot", "base", "joints")
 _SHAPES = "q with joint_names, joints by name, or a JointState's name and position"
 
 _FIXED = ", but the root is fixed: the root link sits at the world's origin along its axes"
-_NO_BASE = "remove the base and give --normal as it is seen from there, or --root free-flyer"
+_NO_BASE = "remove the base and give `normal` as it is seen from there, or `root='free-flyer'`"
 
 
-def read_posture(robot: Robot, text: str | None, where: str = "--posture") -> Vector:
+def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Vector:
     """Return the configuration that ``text`` names, shape (nq,), checked against length, quaternion and limits.
 
     Args:

@@ -13,7 +13,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.errors import FrameNotFound, JointNotFound, NotWithinLimits, PostureError, PostureNotFound
-from impact_posture.robot.spec import ContactPose, RobotSpec, Root
+from impact_posture.robot.spec import RobotSpec
+from impact_posture.settings import ContactPose, RobotSettings, Root
 
 Vector = NDArray[np.float64]
 
@@ -42,6 +43,7 @@ class Robot:
         locked: Joints made rigid.
         armature_source: Where the armature came from, in words.
         warnings: What a user should know about this model, one line each.
+        settings: What it was loaded by; ``None`` for a robot that was built otherwise.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Robot:
     locked: tuple[str, ...] = ()
     armature_source: str = "none"
     warnings: tuple[str, ...] = ()
+    settings: RobotSettings | None = None
 
     @property
     def nq(self) -> int:

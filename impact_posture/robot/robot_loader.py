@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import fields, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
-from impact_posture.robot.armature import ArmatureOption, armature_warning, set_armature
+from impact_posture.robot.armature import armature_warning, set_armature
 from impact_posture.robot.inertia_checks import check_mass_matrix, check_moved_mass, massless_joints
 from impact_posture.robot.robot import Robot, Vector
-from impact_posture.robot.spec import RobotSpec, Root, Vector3, read_spec
+from impact_posture.robot.spec import RobotSpec, read_spec
 from impact_posture.robot.urdf import (
     EXAMPLE_PREFIX,
     build_model,
@@ -26,32 +26,8 @@ from impact_posture.robot.urdf import (
     resolve_path,
     robots_data,
 )
-
-
-@dataclass(frozen=True)
-class LoadOptions:
-    """What a user may say about a robot when naming it.
-
-    Attributes:
-        root: Put the robot on a free-flyer or weld it to the world; ``None``: as robot.toml says.
-        package_dirs: Where ``package://`` paths lead; dynamics needs none, pictures may.
-        srdf: Another SRDF: a path, or ``example-robot-data:<path below robots/>``.
-        config: Another robot.toml (else one beside the URDF).
-        armature: ``"none"``, a TOML file's path, or values by joint; ``None``: robot.toml's, else the rotor data of
-            the SRDF, else zero.
-        lock: Joints made rigid at the default posture: names, or patterns such as ``gripper_*``.
-        mounting: How far joints sit from where the URDF has them, by joint: meters, in the parent joint's axes.
-        lock_massless: Make those joints rigid, too, that move no mass.
-    """
-
-    root: Root | None = None
-    package_dirs: tuple[str, ...] = ()
-    srdf: str | None = None
-    config: str | None = None
-    armature: ArmatureOption = None
-    lock: tuple[str, ...] = field(default=())
-    mounting: Mapping[str, Vector3] = field(default_factory=dict)
-    lock_massless: bool = False
+from impact_posture.settings import LoadOptions, RobotSettings, Root, Vector3
+from impact_posture.tables import validate
 
 
 def known_robots() -> tuple[str, ...]:
@@ -59,16 +35,22 @@ def known_robots() -> tuple[str, ...]:
     return tuple(sorted(p.parent.name for p in robots_data().glob("*/robot.toml")))
 
 
-def load_robot(robot: str, options: LoadOptions | None = None) -> Robot:
+def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) -> Robot:
     """Load a robot by known name, by path to a ``.urdf``, or by ``example-robot-data:<path below robots/>``.
+
+    Args:
+        robot: The name, path or URI.
+        options: How it is loaded.
+        settings: Fields of :class:`~impact_posture.settings.LoadOptions` instead, such as ``root="fixed"``.
 
     Raises:
         RobotNotFound: With the nearest names.
         UrdfError: The URDF or SRDF cannot be used.
         SpecError: The robot.toml cannot be used.
     """
-    options = options or LoadOptions()
-    return build_robot(locate(robot, options), options)
+    options = options or validate(LoadOptions, settings, "load_robot")
+    given = {field.name: getattr(options, field.name) for field in fields(LoadOptions)}
+    return replace(build_robot(locate(robot, options), options), settings=RobotSettings(robot=robot, **given))
 
 
 def build_robot(located: Located, options: LoadOptions) -> Robot:
@@ -79,7 +61,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     """
     spec, urdf, source, base, name = located
     root: Root = options.root or spec.model.root
-    _check_package_dirs(options.package_dirs, Path(), "--package-dir")
+    _check_package_dirs(options.package_dir, Path(), "package_dir")
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
     model, warnings = build_model(urdf, free_flyer=root == "free-flyer", accept_inertias=spec.model.accept_inertias)
     _remount(model, options.mounting, name)
@@ -93,7 +75,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
             f"default_posture '{default}' does not exist", where=name, hint=f"one of: {', '.join(postures)}"
         )
     armature_source = set_armature(model, spec, srdf, options.armature, name)
-    locked = _named(model, (*spec.model.lock, *options.lock), f"{name} --lock")
+    locked = _named(model, (*spec.model.lock, *options.lock), f"{name} lock")
     if spec.model.lock_massless or options.lock_massless:
         massless = (joint for joint in massless_joints(model) if joint != "root_joint")
         locked = tuple(dict.fromkeys((*locked, *massless)))
@@ -206,7 +188,7 @@ def _srdf(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
         return None
     path = resolve_path(text, Path() if options.srdf else base)
     if not path.is_file():
-        raise UrdfError("no such file", where=str(path), hint="check --srdf or robot.toml [model] srdf")
+        raise UrdfError("no such file", where=str(path), hint="check `srdf` or robot.toml [model] srdf")
     return path
 
 
@@ -268,7 +250,7 @@ def _bases_left_out(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[s
     which = default if default in named else ", ".join(dict.fromkeys(named))
     return (
         f"the root is fixed: the base pose of posture {which} is left out, and the root link sits at the world's "
-        "origin along its axes; --root free-flyer keeps it",
+        "origin along its axes; `root='free-flyer'` keeps it",
     )
 
 
@@ -344,7 +326,7 @@ def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, 
 def _lock(
     model: pin.Model, locked: Sequence[str], postures: dict[str, Vector], default: str, name: str
 ) -> tuple[pin.Model, dict[str, Vector]]:
-    ids = [joint_index(model, joint, f"{name} --lock") for joint in locked]
+    ids = [joint_index(model, joint, f"{name} lock") for joint in locked]
     armature = np.array(model.armature)
     reduced = pin.buildReducedModel(model, ids, postures[default])
     kept_q: list[int] = []
@@ -354,7 +336,7 @@ def _lock(
             kept_q += range(model.idx_qs[i], model.idx_qs[i] + model.nqs[i])
             kept_v += range(model.idx_vs[i], model.idx_vs[i] + model.nvs[i])
     if not kept_v:
-        raise InputError("every joint is locked", where=f"{name} --lock", hint="leave some free")
+        raise InputError("every joint is locked", where=f"{name} lock", hint="leave some free")
     reduced.armature = armature[kept_v]
     return reduced, {key: q[kept_q] for key, q in postures.items()}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -76,7 +77,7 @@ def summarize(robot: Robot) -> dict[str, Any]:
         "supports": [
             {"frame": s.frame, "kind": s.kind, "offset": list(s.offset), "size": list(s.size)} for s in spec.supports
         ],
-        "constraints": spec.constraints.model_dump(mode="json"),
+        "constraints": asdict(spec.constraints),
         "actuation": _actuation(robot, spec.propulsion) if spec.propulsion and robot.floating else None,
         "sources": list(spec.sources),
         "warnings": list(robot.warnings),

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-import re
-import tomllib
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
-from impact_posture.errors import SpecError, nearest, not_one_of
+from impact_posture.errors import SpecError
+from impact_posture.settings import ContactPose, Root, SupportKind, Vector3
+from impact_posture.tables import read_toml, validate
 
 SCHEMA = "impact-posture/robot/1"
 
-Root = Literal["free-flyer", "fixed"]
-ContactPose = Literal["full", "position", "aligned", "free", "box"]
-SupportKind = Literal["point", "surface"]
-Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class _Table:
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
 
-class ModelSpec(_Strict):
+@dataclass(frozen=True)
+class ModelSpec(_Table):
     """Where the model comes from: a path (relative to robot.toml) or ``example-robot-data:<path>``."""
 
     urdf: str | None = None
@@ -38,23 +36,26 @@ class ModelSpec(_Strict):
     accept_inertias: bool = False
 
 
-class PostureSpec(_Strict):
+@dataclass(frozen=True)
+class PostureSpec(_Table):
     """A named posture: joints by name (missing ones neutral), base pose ``[x, y, z, qx, qy, qz, qw]``."""
 
     base: tuple[float, float, float, float, float, float, float] | None = None
-    joints: dict[str, float] = {}
+    joints: dict[str, float] = field(default_factory=dict)
 
 
-class ContactSpec(_Strict):
+@dataclass(frozen=True)
+class ContactSpec(_Table):
     """The frame that touches by default, and what is held of which frame while the posture moves."""
 
     frame: str | None = None
     offset: Vector3 = (0.0, 0.0, 0.0)
     pose: ContactPose = "full"
-    frames: dict[str, ContactPose] = {}
+    frames: dict[str, ContactPose] = field(default_factory=dict)
 
 
-class SupportSpec(_Strict):
+@dataclass(frozen=True)
+class SupportSpec(_Table):
     """A foot that stays on the ground.
 
     ``point``: the contact point (frame origin plus ``offset``, in the frame) does not move.
@@ -68,7 +69,8 @@ class SupportSpec(_Strict):
     size: tuple[NonNegative, NonNegative] = (0.0, 0.0)
 
 
-class ConstraintSpec(_Strict):
+@dataclass(frozen=True)
+class ConstraintSpec(_Table):
     """Constraints that the robot's optimizations carry unless told otherwise."""
 
     hold: tuple[str, ...] = ()
@@ -78,23 +80,26 @@ class ConstraintSpec(_Strict):
     limit_margin: NonNegative = 0.0
 
 
-class LimitSpec(_Strict):
+@dataclass(frozen=True)
+class LimitSpec(_Table):
     """Limits that replace the URDF's: rad or m, rad/s or m/s, N·m or N."""
 
-    position: dict[str, tuple[float, float]] = {}
-    velocity: dict[str, Positive] = {}
-    effort: dict[str, Positive] = {}
+    position: dict[str, tuple[float, float]] = field(default_factory=dict)
+    velocity: dict[str, Positive] = field(default_factory=dict)
+    effort: dict[str, Positive] = field(default_factory=dict)
 
 
-class ArmatureSpec(_Strict):
+@dataclass(frozen=True)
+class ArmatureSpec(_Table):
     """Rotor inertia reflected to the joint (gear ratio² × rotor inertia), kg·m² (kg for a prismatic joint)."""
 
     default: NonNegative | None = None
-    joints: dict[str, NonNegative] = {}
+    joints: dict[str, NonNegative] = field(default_factory=dict)
     source: str = ""
 
 
-class RotorSpec(_Strict):
+@dataclass(frozen=True)
+class RotorSpec(_Table):
     """One propeller: where it sits, which way it pushes, which way it turns (seen against the thrust)."""
 
     name: str
@@ -103,7 +108,8 @@ class RotorSpec(_Strict):
     spin: Literal[-1, 1]
 
 
-class PropulsionSpec(_Strict):
+@dataclass(frozen=True)
+class PropulsionSpec(_Table):
     """The propellers of an aerial robot: thrust ``c_f ω²``, drag moment ``-spin · drag_ratio · thrust``."""
 
     frame: str
@@ -117,16 +123,17 @@ class PropulsionSpec(_Strict):
     source: str = ""
 
 
-class RobotSpec(_Strict):
+@dataclass(frozen=True)
+class RobotSpec(_Table):
     """The whole ``robot.toml``."""
 
-    schema_: str = Field(default=SCHEMA, alias="schema")
+    schema: str = SCHEMA
     name: str | None = None
     kind: Literal["aerial", "arm", "quadruped", "humanoid", "mobile", "other"] = "other"
     description: str = ""
     model: ModelSpec = ModelSpec()
     default_posture: str | None = None
-    postures: dict[str, PostureSpec] = {}
+    postures: dict[str, PostureSpec] = field(default_factory=dict)
     contact: ContactSpec = ContactSpec()
     supports: tuple[SupportSpec, ...] = ()
     constraints: ConstraintSpec = ConstraintSpec()
@@ -134,61 +141,6 @@ class RobotSpec(_Strict):
     armature: ArmatureSpec = ArmatureSpec()
     propulsion: PropulsionSpec | None = None
     sources: tuple[str, ...] = ()
-
-
-_Model = TypeVar("_Model", bound=BaseModel)
-
-
-def validate(cls: type[_Model], data: object, where: str) -> _Model:
-    """Check ``data`` against a pydantic model; the first fault becomes one line with the nearest valid key."""
-    try:
-        return cls.model_validate(data)
-    except ValidationError as error:
-        # A misspelt key that must be there is misspelt first, and missing second.
-        faults = error.errors()
-        fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-        path = ".".join(str(part) for part in fault["loc"])
-        if fault["type"] == "extra_forbidden":
-            known = _keys_at(cls, fault["loc"][:-1])
-            close = ", ".join(nearest(str(fault["loc"][-1]), known))
-            raise SpecError(f"unknown key '{path}'", where=where, hint=f"did you mean {close}?") from None
-        what, hint = str(fault["msg"]), "correct the value"
-        if fault["type"] == "literal_error":
-            what, hint = not_one_of(fault["input"], re.findall(r"'([^']*)'", fault["ctx"]["expected"]))
-        raise SpecError(f"key '{path}': {what}", where=where, hint=hint) from None
-
-
-def _keys_at(cls: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    model: type[BaseModel] = cls
-    for part in location:
-        field = model.model_fields.get(str(part))
-        if field is None:
-            continue
-        annotation = field.annotation
-        candidates = [annotation, *getattr(annotation, "__args__", ())]
-        model = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), model)
-    return [field.alias or name for name, field in model.model_fields.items()]
-
-
-def read_toml(path: Path) -> dict[str, object]:
-    """Read a TOML file; a missing or malformed one becomes one line."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise SpecError("no such file", where=str(path), hint="check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise SpecError(f"cannot be read ({error})", where=str(path), hint="check the file") from None
-    except RecursionError:
-        raise SpecError("is nested too deeply", where=str(path), hint="correct the syntax") from None
-    except tomllib.TOMLDecodeError as error:
-        raise SpecError(f"is not valid TOML ({error})", where=str(path), hint="correct the syntax") from None
-
-
-def with_tuples(value: object) -> object:
-    """The same data with every list a tuple, as strict models want it."""
-    if isinstance(value, dict):
-        return {key: with_tuples(inner) for key, inner in value.items()}
-    return tuple(with_tuples(inner) for inner in value) if isinstance(value, list) else value
 
 
 def read_spec(path: Path, over: Path | None = None) -> RobotSpec:

@@ -96,7 +96,7 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
         said = words[0] or str(error)
         raise UrdfError(f"makes no robot ({said})", where=str(path), hint="correct the URDF") from None
     if model.nv == 0:
-        raise UrdfError("has no movable joint", where=str(path), hint="use --root free-flyer or another URDF")
+        raise UrdfError("has no movable joint", where=str(path), hint="use `root='free-flyer'` or another URDF")
     if model.nv > MOST_DEGREES_OF_FREEDOM:
         raise UrdfError(
             f"has {model.nv} degrees of freedom, more than the {MOST_DEGREES_OF_FREEDOM} that are computed with",

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.robot.spec import Vector3
+from impact_posture.settings import Vector3
 from impact_posture.simulation.contact_forces import ShapeTruth
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import ControllerNotFound, InputError
-from impact_posture.impact.metric import ObjectiveKind
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.baselines import (
     FlowPosture,
     InvariantDriver,

@@ -14,8 +14,8 @@ from impact_posture.progress import tell
 from impact_posture.robot.actuation import allocation
 from impact_posture.robot.postures import read_posture, set_joints
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import LoadOptions, load_robot
-from impact_posture.robot.spec import Vector3
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import LoadOptions, Vector3
 from impact_posture.simulation.actuator_command import Push
 from impact_posture.simulation.scene import Scene, Shape, Surface
 from impact_posture.simulation.world import World, build_world

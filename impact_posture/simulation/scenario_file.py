@@ -9,8 +9,9 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field
 
 from impact_posture.errors import ImpactPostureError, ScenarioNotFound, SpecError
-from impact_posture.robot.robot_loader import LoadOptions, from_folder
-from impact_posture.robot.spec import NonNegative, Positive, Root, Vector3, read_toml, validate, with_tuples
+from impact_posture.robot.robot_loader import from_folder
+from impact_posture.robot.spec import NonNegative, Positive
+from impact_posture.settings import LoadOptions, Root, Vector3
 from impact_posture.simulation.scenario import (
     Bounds,
     Control,
@@ -24,6 +25,7 @@ from impact_posture.simulation.scenario import (
     StanceGains,
 )
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors, Shape, ShapeKind, Surface
+from impact_posture.tables import read_toml, validate
 
 SCHEMA = "impact-posture/scenario/1"
 SHIPPED = Path(__file__).parent / "scenarios"
@@ -219,7 +221,7 @@ def read_scenario(scenario: str | Path) -> Scenario:
     if schema != SCHEMA:
         raise SpecError(f"schema '{schema}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
     data = from_folder(data, path.resolve().parent, ("srdf", "config", "armature", "posture"))
-    return _build(validate(ScenarioFile, with_tuples(data), str(path)), str(path))
+    return _build(validate(ScenarioFile, data, str(path)), str(path))
 
 
 def scenario_path(scenario: str | Path) -> Path:
@@ -247,7 +249,13 @@ def _build(file: ScenarioFile, source: str) -> Scenario:
         description=file.description,
         robot=file.robot,
         load=LoadOptions(
-            file.root, file.package_dir, file.srdf, file.config, file.armature, file.lock, file.mounting
+            root=file.root,
+            package_dir=file.package_dir,
+            srdf=file.srdf,
+            config=file.config,
+            armature=file.armature,
+            lock=file.lock,
+            mounting=file.mounting,
         ),
         posture=file.posture,
         joints=dict(file.joints),

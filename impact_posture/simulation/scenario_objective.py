@@ -17,11 +17,12 @@ from impact_posture.codegen.export import write_export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import CompilerError, MetricError, OutputError
 from impact_posture.impact.contact import ImpactContact
-from impact_posture.impact.metric import Metric, ObjectiveKind
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
 from impact_posture.libraries import cache_folder, is_cached, library_path, source_key
 from impact_posture.progress import tell
+from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
 from impact_posture.toolchain import find_compiler
 

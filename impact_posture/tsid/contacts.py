@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import SupportKind
+from impact_posture.settings import SupportKind
 from impact_posture.tsid.friction import point_cone, surface_cone, to_world
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.state import State
@@ -86,7 +86,7 @@ def support_contacts(robot: Robot, *, friction: float = 0.7) -> tuple[SupportCon
 
 
 @dataclass
-class _Footing:
+class _ContactAnchor:
     """Where a contact was at reset."""
 
     position: Array = field(default_factory=lambda: np.zeros(3))
@@ -114,7 +114,7 @@ class ContactStack:
         self.size = int(ends[-1])
         self.J, self.a = np.zeros((self.size, robot.nv)), np.zeros(self.size)
         self._drift, self._e, self._v = np.zeros(self.size), np.zeros(self.size), np.zeros(self.size)
-        self._home = [_Footing() for _ in contacts]
+        self._home = [_ContactAnchor() for _ in contacts]
         self._kp = np.concatenate([np.zeros(0), *(np.full(c.size, c.kp) for c in contacts)])
         self._kd = np.concatenate([np.zeros(0), *(np.full(c.size, c.kd) for c in contacts)])
         self.weight = np.concatenate([np.zeros(0), *(np.full(c.size, c.weight or 0.0) for c in contacts)])
@@ -128,7 +128,7 @@ class ContactStack:
         row = 0
         for k, (contact, rows) in enumerate(zip(self.contacts, self.rows, strict=True)):
             here = state.at(contact.point)
-            self._home[k] = _Footing(here.position.copy(), here.rotation.copy())
+            self._home[k] = _ContactAnchor(here.position.copy(), here.rotation.copy())
             block = self._cone(k)
             self.cone[row : row + block.shape[0], rows] = block
             # The first row of a cone is the normal force.

@@ -76,7 +76,7 @@ class ImpactRobustPosture(JointPosture):
     def __init__(
         self,
         robot: Robot,
-        gradient: Gradient,
+        gradient: Gradient | ImpactGradient,
         target: ArrayLike | None = None,
         *,
         K: float = 10.0,
@@ -97,7 +97,7 @@ class ImpactRobustPosture(JointPosture):
 
         Args:
             robot: The robot.
-            gradient: ``q → (H, ∇H)``; see :func:`gradient_of`.
+            gradient: ``q → (H, ∇H)``, or a compiled export, whose own objective is then followed.
             target: ``q_des``, shape (nq,); the posture at ``reset`` by default.
             K: Gain, 1/s².
             name: What it is called in reports.
@@ -125,7 +125,8 @@ class ImpactRobustPosture(JointPosture):
         self.spring, self.reach, self.every = spring, float(reach), int(every)
         if kd is None:
             self.kd = 2.0 * np.sqrt(self.kp + self.K)
-        self._function, self._measure, self._follow = gradient, scale is None, float(follow)
+        function = gradient if callable(gradient) else gradient_of(gradient)
+        self._function, self._measure, self._follow = function, scale is None, float(follow)
         ranges = JointRanges(robot)
         width = ranges.upper - ranges.lower
         near, self._farthest = np.minimum(fade[0], width / 16), fade[1]

@@ -10,20 +10,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from impact_posture.errors import InputError
-from impact_posture.plot import (
-    FIGURES,
-    PathData,
-    ResultView,
-    classical_figure,
-    ellipsoid_figure,
-    jump_figure,
-    path_figure,
-    postures_figure,
-    tradeoff_figure,
-)
-from impact_posture.plot.classical_figure import kinds_of
-from impact_posture.plot.jump_figure import groups_of
-from impact_posture.plot.path_figure import normalized
+from impact_posture.plot import FIGURES, PathData, ResultView, postures_figure
+from impact_posture.plot.classical_figure import classical_figure, kinds_of
+from impact_posture.plot.ellipsoid_figure import ellipsoid_figure
+from impact_posture.plot.jump_figure import groups_of, jump_figure
+from impact_posture.plot.path_figure import normalized, path_figure
 from impact_posture.plot.robot_drawing import Surface, side_plane, surfaces_of
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
@@ -32,6 +23,7 @@ from impact_posture.plot.shapes import (
 )
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.style import WIDTH, style, wrap
+from impact_posture.plot.tradeoff_figure import tradeoff_figure
 from impact_posture.plot.view import SEPARATOR, contact_letters, header_lines, number, velocity_units
 from tests.plot.views import PENDULUM, make_view, text_of
 

@@ -39,7 +39,7 @@ def _mujoco() -> None:
 def adrift(law: ContactLaw, timestep: float) -> Setup:
     """The vertical scenario's robot without rotors and weight, its tip 2 mm above the floor."""
     scenario, found = read_scenario("aerial-vertical"), factory("aerial-vertical").setup
-    body = replace(found.robot, spec=found.robot.spec.model_copy(update={"propulsion": None}))
+    body = replace(found.robot, spec=replace(found.robot.spec, propulsion=None))
     floor = replace(scenario.scene.surfaces[0], gap=0.002, law=law)
     scene = Scene((floor,), scenario.scene.shapes, replace(WEIGHTLESS, timestep=timestep))
     return Setup(replace(scenario, scene=scene), body, found.q, build_world(body, scene, found.q))
@@ -149,7 +149,7 @@ def test_a_pushs_prediction_is_the_impulses() -> None:
 
 def free_body(name: str) -> Robot:
     found = robot(name)
-    return replace(found, spec=found.spec.model_copy(update={"propulsion": None}))
+    return replace(found, spec=replace(found.spec, propulsion=None))
 
 
 @pytest.mark.parametrize("name", ["solo8", "go2", "talos"])

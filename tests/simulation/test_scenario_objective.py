@@ -17,9 +17,10 @@ import pytest
 
 from impact_posture.errors import CompilerError, MetricError, OutputError
 from impact_posture.impact.contact import ImpactContact
-from impact_posture.impact.metric import Metric, ObjectiveKind
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
+from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation import scenario_objective as module
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario

@@ -1,0 +1,195 @@
+"""The settings of a problem as options: made from the fields of the settings, and read back into them."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import typer
+
+from impact_posture.errors import ImpactPostureError
+from impact_posture.settings import CONTACT, METRIC, OUTPUT, ROBOT, TASK, ImpactSettings, RobotSettings, Setting
+from impact_posture.tables import validate
+
+_PANELS = (CONTACT, METRIC, ROBOT, TASK, OUTPUT)
+_Settings = TypeVar("_Settings", bound=RobotSettings)
+
+# What every usage error derives from, whichever Click this Typer carries.
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]
+
+NoSupport = Annotated[bool, typer.Option("--no-support", rich_help_panel=ROBOT, help="Nothing stays on the ground.")]
+
+
+@dataclass(frozen=True)
+class Given:
+    """The settings that stand on the command line; a default is not given.
+
+    Attributes:
+        context: Typer's context of the command.
+        values: The settings by name.
+    """
+
+    context: typer.Context
+    values: dict[str, Any]
+
+    def fill(self, settings: type[_Settings], **more: Any) -> _Settings:
+        """Make settings of these values and ``more``; ``more`` wins."""
+        return validate(settings, self.values | more, "options")
+
+    def check_contact(self) -> None:
+        """Ask for ``--normal`` or ``--contact``, and not for both.
+
+        Raises:
+            UsageError: Exit code 2.
+        """
+        if "contact" not in self.values and "normal" not in self.values:
+            raise UsageError("Missing option '--normal X Y Z': the direction out of the surface, towards the robot.")
+        if "contact" in self.values and ("frame" in self.values or "normal" in self.values):
+            raise UsageError("--contact stands instead of --frame and --normal: give one of the two.")
+
+    def is_result(self, robot: str, free: Collection[str]) -> bool:
+        """Whether ROBOT|RESULT_DIR is a folder that optimize wrote; ``free`` are the options that go with it.
+
+        Raises:
+            UsageError: An option beside RESULT_DIR says what the folder says already; exit code 2.
+        """
+        if not (Path(robot) / "result.json").is_file():
+            return False
+        for name in self.context.params:
+            if name not in {"robot", "json", "quiet", *free} and _on_command_line(self.context, name):
+                raise UsageError(
+                    f"{_spelled(name)} contradicts RESULT_DIR, which says what the problem is: leave it out."
+                )
+        return True
+
+
+def with_settings(
+    settings: type[RobotSettings], *, without: Collection[str] = (), **changed: Any
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of all settings; it is called with ``given`` and with its own parameters.
+
+    Args:
+        settings: The dataclass whose annotated fields become options.
+        without: Fields that the command does not take.
+        changed: Annotations of fields whose option differs in this command.
+    """
+    made = _options(settings, without) | {name: (hint, None) for name, hint in changed.items()}
+    if "support" in made:
+        made["no_support"] = (NoSupport, False)
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        hints = get_type_hints(command, include_extras=True)
+        own = {name: p for name, p in inspect.signature(command).parameters.items() if name != "given"}
+
+        def run(context: typer.Context, **values: Any) -> None:
+            command(given=Given(context, _given(context, made, settings)), **{name: values[name] for name in own})
+
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        arguments = [p for p in own.values() if p.default is p.empty]
+        parameters = [
+            inspect.Parameter("context", keyword, annotation=typer.Context),
+            *(p.replace(kind=keyword, annotation=hints[p.name]) for p in arguments),
+            *(inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in made.items()),
+            *(p.replace(kind=keyword, annotation=hints[p.name]) for p in own.values() if p not in arguments),
+        ]
+        # Typer reads the signature and, in some versions, the annotations.
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in parameters}
+        run.__name__, run.__doc__, run.__module__ = command.__name__, command.__doc__, command.__module__
+        return run
+
+    return decorate
+
+
+def _settings_of(settings: type[RobotSettings]) -> dict[str, tuple[Any, Setting]]:
+    """Type and description of each field that has an option."""
+    found = {}
+    for name, hint in get_type_hints(settings, include_extras=True).items():
+        described = [m for m in getattr(hint, "__metadata__", ()) if isinstance(m, Setting)]
+        if described:
+            found[name] = (get_args(hint)[0], described[0])
+    return found
+
+
+def _options(settings: type[RobotSettings], without: Collection[str]) -> dict[str, tuple[Any, Any]]:
+    """Annotation and default of each option, panel by panel."""
+    known, found = _settings_of(settings), {}
+    defaults: dict[str, Any] = {f.name: None if f.default is MISSING else f.default for f in fields(settings)}
+    for name in sorted((n for n in known if n not in without), key=lambda n: _PANELS.index(known[n][1].panel)):
+        kind, setting = known[name]
+        default = None if isinstance(defaults[name], tuple) else defaults[name]
+        words = setting.default
+        if words is None and isinstance(defaults[name], tuple) and defaults[name]:
+            words = " ".join(f"{value:g}" for value in defaults[name])
+        option = typer.Option(
+            setting.option or _spelled(name),
+            metavar=setting.takes,
+            help=setting.help,
+            rich_help_panel=setting.panel,
+            show_default=words if words is not None else True,
+            callback=_callback(setting),
+        )
+        found[name] = (Annotated[_option_type(kind, setting, default is None), option], default)
+    return found
+
+
+def _option_type(kind: Any, setting: Setting, optional: bool) -> Any:
+    """What Typer makes of a field's type."""
+    if setting.repeatable:
+        return list[str] | None
+    inner = [t for t in get_args(kind) if t is not type(None)] if get_origin(kind) in (Union, UnionType) else [kind]
+    return inner[0] | None if optional else inner[0]
+
+
+def _callback(setting: Setting) -> Callable[[Any], Any]:
+    def check(value: Any) -> Any:
+        if value is not None and value != []:
+            try:
+                setting.check(_value(setting, value))
+            except ImpactPostureError as error:
+                raise typer.BadParameter(f"{error.what}; {error.hint}") from None
+            except ValueError as error:
+                raise typer.BadParameter(str(error)) from None
+        return value
+
+    return check
+
+
+positive = _callback(Setting("", holds=lambda value: 0 < value < float("inf"), demand="give a number above zero"))
+"""Refuse what is not above zero."""
+check_direction = _callback(_settings_of(ImpactSettings)["normal"][1])
+"""Refuse what has no direction."""
+
+
+def _value(setting: Setting, value: Any) -> Any:
+    """What the words of an option mean."""
+    if setting.parse is not None:
+        return setting.parse(value)
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _given(
+    context: typer.Context, options: Mapping[str, tuple[Any, Any]], settings: type[RobotSettings]
+) -> dict[str, Any]:
+    known, found = _settings_of(settings), {}
+    for name in options:
+        if name in known and _on_command_line(context, name):
+            found[name] = _value(known[name][1], context.params[name])
+    if context.params.get("no_support"):
+        if "support" in found:
+            raise UsageError("--no-support contradicts --support: give one of the two.")
+        found["support"] = ()
+    return found
+
+
+def _on_command_line(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def _spelled(name: str) -> str:
+    return f"--{name.strip('_').replace('_', '-')}"

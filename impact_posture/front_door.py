@@ -1,0 +1,327 @@
+"""The classes behind ``import impact_posture as ip``: the main job in a few lines of Python.
+
+They take the robot's own defaults, as the command line does, and check what they are given when they are built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from impact_posture.codegen.export import Export, write_export
+from impact_posture.errors import InputError
+from impact_posture.impact import objective as core
+from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.evaluation import Evaluation, evaluate
+from impact_posture.impact.metric import Metric, build_metric
+from impact_posture.impact.resolved_impact import ResolvedImpact, missing_support
+from impact_posture.impact.supports import refuse_held, resolve_supports
+from impact_posture.job import FORMATS, Written, result_view, write_result
+from impact_posture.posture.build_problem import build_problem
+from impact_posture.posture.certificate import Certificate
+from impact_posture.posture.compiled import CompileMode
+from impact_posture.posture.pareto import pareto_front
+from impact_posture.posture.problem import PostureProblem as CoreProblem
+from impact_posture.posture.problem_settings import Prepared, prepare, requirements
+from impact_posture.posture.result import result_document
+from impact_posture.posture.robustness import Robustness, solve_robustly
+from impact_posture.posture.solve import PostureSolution, Progress
+from impact_posture.posture.tradeoff import TradeOff
+from impact_posture.robot.model_variant import ModelVariant, Payload, build_model_variants
+from impact_posture.robot.postures import read_posture
+from impact_posture.robot.robot import Robot
+from impact_posture.settings import (
+    MetricKind,
+    ObjectiveKind,
+    ProblemSettings,
+    RobotSettings,
+)
+from impact_posture.tables import validate
+
+Vector = NDArray[np.float64]
+
+
+class ImpactObjective(core.ImpactObjective):
+    """The objective of one or several impacts, with the robot's own supports unless others are given.
+
+    Args:
+        robot: The robot.
+        contact: Where the impact acts; several act at once.  A contact at the robot's own contact frame without an
+            offset takes that of robot.toml.
+        metric: ``euclidean``, ``kinetic`` or ``weighted``, or a :class:`~impact_posture.impact.metric.Metric`.
+        kind: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S) or ``energy`` (E).
+        supports: Feet that stay, ``FRAME[:point|surface]`` each; ``None`` for those of robot.toml, ``()`` for none.
+        compliance: ε of the supports, 1/kg; 0 for 1e-4 over the robot's mass.
+        normal_cone_deg: Half angle of the cone of normals whose worst counts, degrees.
+        others: More contacts that act at the same time.
+        bilateral: Whether several contacts can pull as well as push.
+        scenarios: Model variants whose worst counts.
+        weights: Of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
+        armature_range: Lowest and highest factor on the armature, whose worst counts.
+        payloads: Frame and mass in kg of what the robot may carry, one at a time; the worst counts.
+
+    Raises:
+        ImpactPostureError: The first thing that does not fit the robot.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        contact: ImpactContact | Sequence[ImpactContact],
+        metric: MetricKind | Metric = "euclidean",
+        kind: ObjectiveKind = "impulse",
+        supports: Sequence[str | Support] | None = None,
+        compliance: float = 0.0,
+        normal_cone_deg: float = 0.0,
+        others: Sequence[ImpactContact] = (),
+        bilateral: bool = False,
+        scenarios: Sequence[ModelVariant] = (),
+        *,
+        weights: str | Sequence[float] | None = None,
+        armature_range: tuple[float, float] | None = None,
+        payloads: Sequence[tuple[str, float]] = (),
+    ) -> None:
+        given = [contact] if isinstance(contact, ImpactContact) else list(contact)
+        if not given:
+            raise InputError("names no contact", where="contact", hint="give an ImpactContact")
+        leading, *more = (_at_own_frame(robot, one) for one in (*given, *others))
+        feet = _supports(robot, supports)
+        for one in (leading, *more):
+            refuse_held(robot, one, feet)
+        if not isinstance(metric, Metric):
+            values = weights if weights is None or isinstance(weights, str) else tuple(weights)
+            metric = build_metric(robot, metric, values)
+        variants = tuple(scenarios) or build_model_variants(robot, armature_range, [Payload(*p) for p in payloads])
+        super().__init__(
+            robot, leading, metric, kind, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
+        )
+        # A hint and no error: to measure an impact needs no support.
+        object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
+
+    def evaluate(self, q: ArrayLike, speed: float = 1.0, restitution: float = 0.0) -> Evaluation:
+        """Compute H, G, V, S, E, the ellipsoid and the predicted jump at ``q``; see :func:`evaluate`."""
+        return evaluate(self, self.robot.check_posture(np.asarray(q, dtype=float), limits=False), speed, restitution)
+
+    def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
+        """Write the C code of H, its gradient and this objective into a folder of its own, and build its library.
+
+        Args:
+            out: The folder.
+            build: Whether to build and check the library, where a C compiler is there.
+            options: ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
+        """
+        return write_export([self], Path(out), build=build, **options)
+
+
+def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
+    own = robot.spec.contact
+    if contact.frame != own.frame or any(contact.offset) or not any(own.offset):
+        return contact
+    return ImpactContact(contact.frame, contact.normal, own.offset, contact.normal_frame, contact.impulse)
+
+
+def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[Support, ...]:
+    if supports is None:
+        return resolve_supports(robot, None)
+    texts = tuple(support for support in supports if isinstance(support, str))
+    return (*resolve_supports(robot, texts), *(support for support in supports if isinstance(support, Support)))
+
+
+class PostureProblem:
+    """``min_q objective(q)`` under the constraints of a task; what is not given comes from the robot.
+
+    Args:
+        objective: What is minimized: an :class:`ImpactObjective`, or anything with the
+            :class:`~impact_posture.impact.objective.Objective` protocol.
+        posture: Where the search starts: a name, a file, or a configuration of shape (nq,); ``None`` for the robot's.
+        speed: Approach speed of the predicted jumps, m/s.
+        restitution: Coefficient of restitution of the predicted jumps.
+        task: Other fields of :class:`~impact_posture.settings.ProblemSettings` about the task, such as
+            ``base="level"``, ``target_position=(x, y, z)``, ``keep_contacts=True`` or ``hold=("joint",)``.
+
+    Attributes:
+        problem: The constraints and bounds, before any solver sees them.
+        prepared: The same with its settings; ``None`` for an objective that is not that of an impact.
+
+    Raises:
+        ImpactPostureError: The first thing that is wrong.
+    """
+
+    def __init__(
+        self,
+        objective: core.Objective,
+        posture: str | ArrayLike | None = None,
+        *,
+        speed: float = 1.0,
+        restitution: float = 0.0,
+        **task: Any,
+    ) -> None:
+        robot = objective.robot
+        if posture is None or isinstance(posture, str):
+            q, name = read_posture(robot, posture), posture or robot.default_posture
+        else:
+            q, name = robot.check_posture(np.asarray(posture, dtype=float), where="posture"), "a configuration"
+        loaded = robot.settings or RobotSettings(robot=robot.source)
+        given = {field.name: getattr(loaded, field.name) for field in fields(RobotSettings)}
+        settings = validate(ProblemSettings, given | task, "PostureProblem")
+        self.prepared: Prepared | None = None
+        if isinstance(objective, core.ImpactObjective):
+            missing = getattr(objective, "_missing", "")
+            impact = ResolvedImpact(objective, q, name, speed, restitution, missing)
+            self.prepared = prepare(settings, impact)
+            self.problem: CoreProblem = self.prepared.problem
+        else:
+            self.problem = build_problem(robot, objective, q, requirements(settings, objective))
+
+    @classmethod
+    def of(cls, prepared: Prepared) -> PostureProblem:
+        """The problem of settings that were read from a file or a command line."""
+        made = cls.__new__(cls)
+        made.prepared, made.problem = prepared, prepared.problem
+        return made
+
+    def describe(self) -> list[str]:
+        """The constraints in words, one line each."""
+        return self.problem.describe()
+
+
+class PostureResult:
+    """An optimized posture that proves itself, and saves, draws and exports itself.
+
+    Attributes:
+        problem: What was solved.
+        solution: All that the search found.
+        robustness: What the model variants cost and bring; ``None`` without any.
+        tradeoff: The best objective within each distance from the start; ``None`` before :meth:`trade_off`.
+    """
+
+    def __init__(
+        self,
+        problem: PostureProblem,
+        solution: PostureSolution,
+        robustness: Robustness | None = None,
+        tradeoff: TradeOff | None = None,
+    ) -> None:
+        self.problem, self.solution = problem, solution
+        self.robustness, self.tradeoff = robustness, tradeoff
+
+    @property
+    def q(self) -> Vector:
+        """The best certified posture, shape (nq,)."""
+        return self.solution.q
+
+    @property
+    def initial(self) -> Vector:
+        """The start, moved to the constraints where it did not satisfy them, shape (nq,)."""
+        return self.solution.initial
+
+    @property
+    def reduction(self) -> float:
+        """``1 − objective(q)/objective(initial)``."""
+        return self.solution.reduction
+
+    @property
+    def certificate(self) -> Certificate:
+        """Stationarity, violation and multipliers, recomputed from Pinocchio's numbers."""
+        return self.solution.certificate
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        """The content of ``result.json``.
+
+        Raises:
+            InputError: The objective is not that of an impact.
+        """
+        return result_document(self._prepared, self.solution, self.robustness, self.tradeoff)
+
+    @property
+    def _prepared(self) -> Prepared:
+        if self.problem.prepared is None:
+            # Raises, and says what to use.
+            _ = self.problem.problem.impact
+            raise AssertionError
+        return self.problem.prepared
+
+    def trade_off(
+        self, points: int = 16, *, compile: CompileMode = "auto", progress: Progress | None = None
+    ) -> PostureResult:
+        """Return the same result with the best objective within each of ``points`` distances from the start."""
+        curve = pareto_front(self.solution, points, compile=compile, progress=progress)
+        return PostureResult(self.problem, self.solution, self.robustness, curve)
+
+    def save(
+        self,
+        out: str | Path,
+        *,
+        force: bool = False,
+        codegen: bool = True,
+        formats: Sequence[str] = FORMATS,
+        jobs: int = 2,
+        progress: Progress | None = None,
+    ) -> Written:
+        """Write the result folder: result.json, problem.toml, posture.json, pictures and C code; whole or not at all.
+
+        Args:
+            out: The folder.
+            force: Replace an earlier result.
+            codegen: Export, build and check the C code, too.
+            formats: Of the pictures: ``png``, ``svg``, ``pdf``.
+            jobs: Processes that draw and compile side by side.
+            progress: Told of each figure and of the C code: done, all.
+
+        Returns:
+            The folder, the export in it, and why its C code could not be built, where it could not.
+
+        Raises:
+            OutputError: It exists without ``force``, or cannot be written.
+        """
+        return write_result(
+            self._prepared, self.solution, self.document, Path(out), tradeoff=self.tradeoff, force=force,
+            codegen=codegen, formats=formats, jobs=jobs, progress=progress,
+        )  # fmt: skip
+
+    def plot(
+        self, out: str | Path, formats: Sequence[str] = FORMATS, only: Sequence[str] | None = None
+    ) -> list[Path]:
+        """Draw the figures into a folder; return their paths."""
+        from impact_posture.plot import draw_all
+
+        return draw_all(result_view(self._prepared, self.solution, self.document), Path(out), formats, only)
+
+    def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
+        """Write the C code with the optimal posture as a constant; as :meth:`ImpactObjective.export`."""
+        objective = self.problem.problem.impact
+        return write_export([objective], Path(out), posture=self.q, build=build, **options)
+
+
+def optimize(
+    problem: PostureProblem,
+    *,
+    starts: int = 16,
+    seed: int = 0,
+    jobs: int = 2,
+    compile: CompileMode = "auto",
+    progress: Progress | None = None,
+) -> PostureResult:
+    """Find the posture with the least objective, from many starts, and certify it.
+
+    Args:
+        problem: The problem.
+        starts: Starting points: the given posture, then random feasible ones.
+        seed: Seed of the random starts.
+        jobs: Processes that search.
+        compile: Whether the program becomes machine code: ``auto`` (where it pays), ``always``, ``never``.
+        progress: Told of each start that ended: done, all.
+
+    Raises:
+        Infeasible: No posture satisfies the constraints; names those that conflict.
+        SolverFailed: No run ended at a posture that certifies.
+    """
+    found = solve_robustly(problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress)
+    return PostureResult(problem, found.solution, found.robustness)

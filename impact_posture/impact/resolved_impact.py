@@ -1,0 +1,224 @@
+"""From settings to robot, contact, supports, metric and objective.
+
+``evaluate``, ``optimize``, ``codegen``, ``verify`` and Python mean the same by the same settings: all come here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.errors import ContactError, FrameNotFound, InputError
+from impact_posture.impact.contact import ImpactContact, Support, least_compliance, point_on
+from impact_posture.impact.metric import Metric, build_metric
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.supports import refuse_held, resolve_supports
+from impact_posture.parsing import parse_contact
+from impact_posture.robot.guess import feet, tips
+from impact_posture.robot.model_variant import Payload, build_model_variants
+from impact_posture.robot.postures import read_posture
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import ImpactSettings, Vector3
+
+Vector = NDArray[np.float64]
+
+FLOATS = "because its data name neither feet nor rotors"
+
+
+def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImpact:
+    """Load the robot and check all settings against it; what is ``None`` there comes from the robot.
+
+    Args:
+        settings: The impact as a user asks for it.
+        robot: The robot, where it is loaded already.
+
+    Raises:
+        ImpactPostureError: The first thing that is wrong, in one line.
+    """
+    robot = load_robot(settings.robot, settings) if robot is None else robot
+    q = read_posture(robot, settings.posture)
+    leading, *others = _contacts(settings, robot)
+    supports = resolve_supports(robot, settings.support)
+    for contact in (leading, *others):
+        refuse_held(robot, contact, supports)
+    least = least_compliance(robot)
+    compliance = settings.support_compliance
+    if compliance is not None and not (np.isfinite(compliance) and compliance >= least):
+        raise InputError(
+            f"the compliance is {compliance:g} 1/kg",
+            where="support_compliance",
+            hint=f"give at least {least:.3g}, 1e-6 over the mass: below it rounding eats what stiffer feet gain",
+        )
+    objective = ImpactObjective(
+        robot,
+        leading,
+        build_metric(robot, settings.metric, settings.weights),
+        settings.objective,
+        supports,
+        compliance or 0.0,
+        settings.normal_cone,
+        tuple(others),
+        settings.bilateral,
+        build_model_variants(robot, settings.armature_range, [Payload(*payload) for payload in settings.payload]),
+    )
+    held_by = missing_support(robot) if settings.support is None and not supports else ""
+    posture = settings.posture or robot.default_posture
+    return ResolvedImpact(objective, q, posture, settings.speed, settings.restitution, held_by)
+
+
+def _contacts(settings: ImpactSettings, robot: Robot) -> list[ImpactContact]:
+    texts = (settings.contact,) if isinstance(settings.contact, str) else settings.contact or ()
+    if not texts:
+        if settings.normal is None:
+            raise ContactError("there is none", where="normal", hint="give the direction out of the surface")
+        return [_contact(settings, robot, settings.frame or _default_frame(robot), settings.normal, None)]
+    if settings.frame is not None or settings.normal is not None:
+        raise ContactError("stands instead of `frame` and `normal`", where="contact", hint="give one of the two")
+    if len(texts) > 1 and settings.offset is not None:
+        raise ContactError(
+            "one offset for several contacts", where="offset", hint="leave it out, or add frames to the URDF"
+        )
+    return [_contact(settings, robot, *parse_contact(text)) for text in texts]
+
+
+def _contact(
+    settings: ImpactSettings, robot: Robot, frame: str, normal: Vector3, impulse: float | None
+) -> ImpactContact:
+    if frame not in robot.frame_names:
+        raise FrameNotFound(frame, tips(robot, feet(robot)), where=robot.name)
+    offset = settings.offset
+    if offset is None:
+        offset = robot.spec.contact.offset if frame == robot.spec.contact.frame else (0.0, 0.0, 0.0)
+    bound = settings.impulse if impulse is None else impulse
+    contact = ImpactContact(frame, normal, offset, settings.normal_frame, bound)
+    point_on(robot, contact.frame, contact.offset)
+    return contact
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvedImpact:
+    """An impact whose settings fit its robot.
+
+    Attributes:
+        objective: Carries robot, contact, metric, kind, supports and compliance.
+        q: The posture asked for, shape (nq,).
+        posture: Its name or file.
+        speed: Approach speed, m/s.
+        restitution: Coefficient of restitution.
+        missing_support: How to say what holds a floating robot up, where nothing does; else empty.
+    """
+
+    objective: ImpactObjective
+    q: Vector
+    posture: str
+    speed: float
+    restitution: float
+    missing_support: str = ""
+
+    @property
+    def robot(self) -> Robot:
+        """The robot as loaded."""
+        return self.objective.robot
+
+    @property
+    def contact(self) -> ImpactContact:
+        """The contact, its normal a unit vector."""
+        return self.objective.contact
+
+    @property
+    def supports(self) -> tuple[Support, ...]:
+        """Feet in force."""
+        return self.objective.supports
+
+    @property
+    def metric(self) -> Metric:
+        """How the jump is weighed."""
+        return self.objective.metric
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to know about the robot and about this objective."""
+        found = (*self.robot.warnings, *self.objective.warnings)
+        if not self.missing_support:
+            return found
+        return (*found, f"{self.robot.name} is taken as floating freely, {FLOATS}; {self.missing_support}")
+
+    def to_dict(self, q: Vector | None = None) -> dict[str, object]:
+        """The blocks of ``result.json`` that say what was asked: robot, contacts, supports, metric.
+
+        Args:
+            q: Where world normals are taken of those that turn with the robot; the posture asked for by default.
+        """
+        q = self.q if q is None else q
+        return {
+            "robot": robot_block(self.robot),
+            "contacts": [_contact_block(single, q) for single in self.objective.singles],
+            "scenarios": [scenario.to_dict() for scenario in self.objective.scenarios],
+            "supports": [{"frame": s.frame, "kind": s.kind} for s in self.supports],
+            "support_compliance": self.objective.compliance if self.supports else None,
+            "metric": {
+                "name": self.metric.kind,
+                "objective": self.objective.kind,
+                "weights": None if self.metric.weights is None else list(self.metric.weights),
+                "normal_cone_deg": self.objective.normal_cone_deg,
+                "bilateral": self.objective.bilateral,
+                "speed": self.speed,
+                "restitution": self.restitution,
+            },
+        }
+
+
+def _contact_block(single: ImpactObjective, q: Vector) -> dict[str, object]:
+    """A contact, its normal in world axes at ``q``."""
+    contact = single.contact
+    return {
+        "frame": contact.frame,
+        "offset": list(contact.offset),
+        "normal": [float(v) for v in single.oracle.at(q).n],
+        "normal_frame": contact.normal_frame,
+        "impulse_bound": contact.impulse,
+    }
+
+
+def robot_block(robot: Robot) -> dict[str, object]:
+    """The ``robot`` block of ``result.json``."""
+    return {
+        "name": robot.name,
+        "source": robot.source,
+        "model_sha256": robot.model_sha256,
+        "nq": robot.nq,
+        "nv": robot.nv,
+        "joint_names": list(robot.joint_names),
+        "root": robot.root,
+        "convention": robot.convention,
+        "armature": [float(v) for v in robot.armature],
+        "armature_source": robot.armature_source,
+        "locked": list(robot.locked),
+    }
+
+
+def missing_support(robot: Robot) -> str:
+    """How to say what holds the robot up, if it floats and its data name neither feet nor rotors; else empty."""
+    spec = robot.spec
+    known = spec.propulsion is not None or spec.kind == "aerial" or spec.constraints.level_base
+    if not robot.floating or known:
+        return ""
+    found = feet(robot)
+    stand = f"`support={list(found)}` (its feet by name or geometry)" if found else "`support=FRAME` for each foot"
+    return (
+        f"give {stand}, `support=[]` if it floats indeed, `base`, or a robot.toml "
+        "(inspect --write-robot-toml drafts one)"
+    )
+
+
+def _default_frame(robot: Robot) -> str:
+    if robot.spec.contact.frame is not None:
+        return robot.spec.contact.frame
+    raise ContactError(
+        f"{robot.name} has no default contact frame",
+        where="frame",
+        hint=f"give one, for example {', '.join(tips(robot, feet(robot))[:3])}",
+    )

@@ -1,0 +1,74 @@
+"""What users write in one word: a contact, an armature, a payload."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from impact_posture.errors import ContactError, InputError
+
+
+def parse_contact(text: str) -> tuple[str, tuple[float, float, float], float | None]:
+    """Read ``FRAME:NX,NY,NZ[:IMPULSE]``; the frame's name may hold colons itself.
+
+    Raises:
+        ContactError: It does not have this form.
+    """
+    hint = "write FRAME:NX,NY,NZ or FRAME:NX,NY,NZ:IMPULSE"
+    parts = text.split(":")
+    impulse: float | None = None
+    try:
+        if len(parts) > 2 and "," not in parts[-1]:
+            impulse = float(parts.pop())
+        x, y, z = (float(v) for v in parts[-1].split(","))
+    except ValueError:
+        raise ContactError(f"'{text}' is no contact", where="contact", hint=hint) from None
+    frame = ":".join(parts[:-1])
+    if not frame:
+        raise ContactError(f"'{text}' names no frame", where="contact", hint=hint)
+    return frame, (x, y, z), impulse
+
+
+def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
+    """Read ``--armature``: ``none``, one file, or any number of ``JOINT=VALUE``.
+
+    Raises:
+        InputError: A mixture, or a value that is no number.
+    """
+    if not texts:
+        return None
+    if len(texts) == 1 and ("=" not in texts[0] or Path(texts[0]).is_file()):
+        return texts[0]
+    values: dict[str, float] = {}
+    for text in texts:
+        joint, equals, value = text.rpartition("=")
+        try:
+            if not equals:
+                raise ValueError
+            values[joint] = float(value)
+        except ValueError:
+            raise InputError(
+                f"'{text}' is no JOINT=VALUE", where="armature", hint="give none, one file, or JOINT=VALUE each"
+            ) from None
+    return values
+
+
+def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Read ``FRAME:MASS`` each; the frame's name may hold colons itself.
+
+    Raises:
+        InputError: One does not have this form.
+    """
+    found = []
+    for text in texts:
+        frame, _, mass = text.rpartition(":")
+        try:
+            value = float(mass)
+        except ValueError:
+            value = float("nan")
+        if not frame or not value > 0:
+            raise InputError(
+                f"'{text}' is no payload", where="payload", hint="give a frame and kg above zero: FRAME MASS"
+            )
+        found.append((frame, value))
+    return tuple(found)

@@ -1,0 +1,355 @@
+"""The settings of a problem: one description for the command line, ``problem.toml`` and Python.
+
+A setting is a field of :class:`RobotSettings`, :class:`ImpactSettings` or :class:`ProblemSettings`.  Its annotation
+carries all that anybody needs to know about it: type, allowed values, meaning, and how it is written as an option.
+The command line makes its options from these fields, ``problem.toml`` its keys, and Python its keyword arguments.
+
+Nothing heavy is imported here, because ``--help`` reads this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Literal
+
+from impact_posture.errors import ImpactPostureError
+from impact_posture.parsing import parse_armature, parse_contact, parse_payloads
+from impact_posture.tables import STRICT
+
+Vector3 = tuple[float, float, float]
+Root = Literal["free-flyer", "fixed"]
+NormalFrame = Literal["world", "contact"]
+MetricKind = Literal["euclidean", "kinetic", "weighted"]
+ObjectiveKind = Literal["impulse", "speed", "sticking", "energy"]
+ContactPose = Literal["full", "position", "aligned", "free", "box"]
+BaseMode = Literal["free", "level", "fixed", "box"]
+SupportKind = Literal["point", "surface"]
+
+CONTACT, METRIC, ROBOT, TASK, OUTPUT = "Contact", "Measure", "Robot", "Task", "Output"
+
+# Distances of --tradeoff without a number.
+TRADEOFF_POINTS = 16
+_LARGEST = float("inf")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What the annotation of a setting says besides its type.
+
+    Attributes:
+        help: Its meaning in one line.
+        panel: The part of ``--help`` where the option stands.
+        takes: What the option takes, as ``--help`` writes it.
+        default: The default in words, where it comes from the robot.
+        demand: What a value must be, as an error says it.
+        holds: Whether a value is that.
+        option: How the option is spelled, if not like the field.
+        parse: Makes the value from all words that the command line gives.
+        repeatable: Whether the option may be given several times.
+    """
+
+    help: str
+    panel: str = TASK
+    takes: str | None = None
+    default: str | None = None
+    demand: str = ""
+    holds: Callable[[Any], bool] | None = None
+    option: str | None = None
+    parse: Callable[[Any], Any] | None = None
+    repeatable: bool = False
+
+    def check(self, value: Any) -> Any:
+        """Return the value.
+
+        Raises:
+            ValueError: It is not what it must be.
+        """
+        if value is not None and self.holds is not None and not self.holds(value):
+            raise ValueError(self.demand)
+        return value
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
+
+
+def _finite(value: Any) -> bool:
+    return all(-_LARGEST < v < _LARGEST for v in (value if isinstance(value, tuple) else (value,)))
+
+
+def _direction(value: Vector3) -> bool:
+    return _finite(value) and max(abs(v) for v in value) >= 1e-9
+
+
+def _positive(value: Any) -> bool:
+    return _finite(value) and min(value if isinstance(value, tuple) else (value,)) > 0
+
+
+def _not_negative(value: float) -> bool:
+    return 0 <= value < _LARGEST
+
+
+def _share(value: float) -> bool:
+    return 0 <= value <= 1
+
+
+def _half_angle(value: float) -> bool:
+    return 0 <= value < 90
+
+
+def _factors(value: tuple[float, float]) -> bool:
+    return 0 < value[0] <= value[1] < _LARGEST
+
+
+def _masses(value: tuple[tuple[str, float], ...]) -> bool:
+    return all(0 < mass < _LARGEST for _, mass in value)
+
+
+def _contacts(value: Any) -> bool:
+    """Whether each is written as a contact and has a direction."""
+    for text in (value,) if isinstance(value, str) else value:
+        try:
+            _, normal, impulse = parse_contact(text)
+        except ImpactPostureError as error:
+            raise ValueError(f"{error.what}; {error.hint}") from None
+        if not _direction(normal) or not _positive(1.0 if impulse is None else impulse):
+            raise ValueError(f"'{text}' needs a normal with a direction and an impulse above zero")
+    return True
+
+
+_NUMBER = {"holds": _finite, "demand": "give finite numbers"}
+_LENGTHS = {"holds": _positive, "demand": "give three numbers above zero"}
+_ZERO_OR_MORE = {"holds": _not_negative, "demand": "give a number, zero or more"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadOptions:
+    """How a robot is loaded; what is ``None`` comes from its ``robot.toml``.
+
+    Attributes:
+        lock: Joints made rigid at the default posture: names, or patterns such as ``gripper_*``.
+        lock_massless: Whether all joints that move no mass are made rigid, too.
+        root: ``free-flyer`` puts the robot on a floating base, ``fixed`` welds it to the world.
+        armature: ``"none"``, a TOML file's path, or values by joint, kg·m² (kg if prismatic).  ``None`` takes
+            the values of robot.toml, else the rotor data of the SRDF, else zero.
+        config: Path of another robot.toml than the one beside the URDF.
+        srdf: Another SRDF: a path, or ``example-robot-data:<path below robots/>``.
+        package_dir: Folders where ``package://`` paths lead.  Dynamics needs none, pictures may.
+        mounting: How far joints sit from where the URDF has them, by joint: meters, in the parent joint's axes.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+
+    lock: Annotated[
+        tuple[str, ...],
+        Setting(
+            "Joint made rigid, or a pattern in quotes such as 'gripper_*'; repeatable.",
+            ROBOT, "JOINT", repeatable=True,
+        ),
+    ] = ()  # fmt: skip
+    lock_massless: Annotated[bool, Setting("Joints that move no mass are made rigid, all of them.", ROBOT)] = False
+    root: Annotated[Root | None, Setting("What the base hangs on.", ROBOT, default="robot.toml's")] = None
+    armature: Annotated[
+        str | Mapping[str, float] | None,
+        Setting(
+            "Rotor inertia at the joint, kg·m²; JOINT=VALUE is repeatable.",
+            ROBOT, "none|FILE|JOINT=VALUE", "robot.toml's, else the SRDF's", parse=parse_armature, repeatable=True,
+        ),
+    ] = None  # fmt: skip
+    config: Annotated[
+        str | None, Setting("What URDF cannot say about the robot.", ROBOT, "ROBOT.TOML", "beside the URDF")
+    ] = None
+    srdf: Annotated[
+        str | None,
+        Setting(
+            "Named postures, rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "robot.toml's"
+        ),
+    ] = None  # fmt: skip
+    package_dir: Annotated[
+        tuple[str, ...], Setting("Where package:// leads; repeatable.", ROBOT, "DIR", repeatable=True)
+    ] = ()
+    mounting: Mapping[str, Vector3] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotSettings(LoadOptions):
+    """Which robot, and how it is loaded.
+
+    Attributes:
+        robot: Known name, path to a ``.urdf``, or ``example-robot-data:<path>``.
+    """
+
+    robot: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImpactSettings(RobotSettings):
+    """One impact of a robot; what is ``None`` comes from the robot."""
+
+    frame: Annotated[str | None, Setting("Contact frame.", CONTACT, "F", "the robot's")] = None
+    normal: Annotated[
+        Vector3 | None,
+        Setting(
+            "Direction out of the surface, towards the robot; any length. Required, or --contact.",
+            CONTACT, "X Y Z", holds=_direction, demand="give three finite numbers, not all zero",
+        ),
+    ] = None  # fmt: skip
+    offset: Annotated[
+        Vector3 | None,
+        Setting("Contact point from the frame's origin, in the frame, m.", CONTACT, "X Y Z", "0 0 0", **_NUMBER),
+    ] = None
+    normal_frame: Annotated[NormalFrame, Setting("Axes that the normal is given in.", CONTACT)] = "world"
+    contact: Annotated[
+        str | tuple[str, ...] | None,
+        Setting(
+            "Instead of --frame and --normal; repeatable: up to 6 contacts at once.",
+            CONTACT, "FRAME:NX,NY,NZ[:IMPULSE]", holds=_contacts, repeatable=True,
+        ),
+    ] = None  # fmt: skip
+    bilateral: Annotated[bool, Setting("Several contacts can pull as well as push (grasps).", CONTACT)] = False
+    impulse: Annotated[
+        float, Setting("Bound on the impulse, N·s.", CONTACT, holds=_positive, demand="give a number above zero")
+    ] = 1.0
+    speed: Annotated[float, Setting("Approach speed, m/s.", CONTACT, **_ZERO_OR_MORE)] = 1.0
+    restitution: Annotated[
+        float,
+        Setting(
+            "0 (plastic) to 1 (elastic).",
+            CONTACT, holds=_share, demand="give a number from 0 to 1",
+        ),
+    ] = 0.0  # fmt: skip
+    metric: Annotated[
+        MetricKind,
+        Setting("How the velocity jump is weighed: euclidean, kinetic or weighted.", METRIC, "KIND"),
+    ] = "euclidean"
+    weights: Annotated[
+        str | tuple[float, ...] | None,
+        Setting(
+            "Diagonal of the weighted metric: TOML of joint = weight, or 1/limit².", METRIC, "FILE|velocity-limits"
+        ),
+    ] = None  # fmt: skip
+    objective: Annotated[
+        ObjectiveKind,
+        Setting(
+            "impulse (jump per impulse, H), speed (jump per approach speed without friction, V), "
+            "sticking (without slip, S) or energy (E).",
+            METRIC, "KIND",
+        ),
+    ] = "impulse"  # fmt: skip
+    normal_cone: Annotated[
+        float,
+        Setting(
+            "Uncertainty of the normal.",
+            METRIC, "DEG", holds=_half_angle, demand="give degrees from 0 to below 90",
+        ),
+    ] = 0.0  # fmt: skip
+    armature_range: Annotated[
+        tuple[float, float] | None,
+        Setting(
+            "Factors on the armature, lowest and highest, whose worst counts.",
+            METRIC, "LOW HIGH", "as stated", holds=_factors,
+            demand="give two factors above zero, the lower first, such as 0.5 2",
+        ),
+    ] = None  # fmt: skip
+    payload: Annotated[
+        tuple[tuple[str, float], ...],
+        Setting(
+            "Mass in kg that the robot may or may not carry there; repeatable; the worst counts.",
+            METRIC, "FRAME MASS", holds=_masses,
+            demand="give a frame and kg above zero each", parse=parse_payloads, repeatable=True,
+        ),
+    ] = ()  # fmt: skip
+    posture: Annotated[
+        str | None,
+        Setting(
+            "Named posture, posture.json, or a JointState as .yaml.", ROBOT, "NAME|FILE", "the robot's"
+        ),
+    ] = None  # fmt: skip
+    support: Annotated[
+        tuple[str, ...] | None,
+        Setting(
+            "Foot that stays on the ground; repeatable.", ROBOT, "FRAME[:point|surface]", "the robot's",
+            repeatable=True,
+        ),
+    ] = None  # fmt: skip
+    support_compliance: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProblemSettings(ImpactSettings):
+    """The content of a ``problem.toml``; what is ``None`` comes from the robot or is the option's default."""
+
+    schema: Literal["impact-posture/problem/1"] = "impact-posture/problem/1"
+    q: tuple[float, ...] | None = None
+    target_position: Annotated[
+        Vector3 | None, Setting("Contact frame's position, world, m.", TASK, "X Y Z", "where it is", **_NUMBER)
+    ] = None
+    target_quaternion: Annotated[
+        tuple[float, float, float, float] | None,
+        Setting("Contact frame's orientation, scalar last.", TASK, "X Y Z W", "as it is", **_NUMBER),
+    ] = None
+    contact_pose: Annotated[
+        ContactPose | None,
+        Setting(
+            "What is held of the contact frame: full, position, aligned, free or box.",
+            TASK, "KIND", "robot.toml's, else full",
+        ),
+    ] = None  # fmt: skip
+    box: Annotated[Vector3, Setting("Half extents of --contact-pose box, m.", TASK, "X Y Z", **_LENGTHS)] = (
+        0.05,
+        0.05,
+        0.05,
+    )
+    keep: Annotated[
+        tuple[str, ...], Setting("Frame whose pose is held; repeatable.", TASK, "FRAME", repeatable=True)
+    ] = ()
+    hold: Annotated[
+        tuple[str, ...] | None,
+        Setting("Joint kept at its value; repeatable.", TASK, "JOINT", "robot.toml's", repeatable=True),
+    ] = None
+    base: Annotated[
+        BaseMode | None,
+        Setting(
+            "What a floating base may do: free, level, fixed or box.", TASK, "KIND", "robot.toml's, else free"
+        ),
+    ] = None  # fmt: skip
+    base_box: Annotated[Vector3, Setting("Half extents of --base box, m.", TASK, "X Y Z", **_LENGTHS)] = (
+        0.2,
+        0.2,
+        0.2,
+    )
+    com: Annotated[
+        bool | None,
+        Setting(
+            "Keep the center of mass above the feet.", TASK, default="robot.toml's", option="--com/--no-com"
+        ),
+    ] = None  # fmt: skip
+    com_margin: Annotated[
+        float | None,
+        Setting(
+            "Its distance from the support polygon's edges, m.", TASK, default="robot.toml's", **_ZERO_OR_MORE
+        ),
+    ] = None  # fmt: skip
+    keep_contacts: Annotated[bool, Setting("The impact must neither lift nor slide a foot.", TASK)] = False
+    friction: Annotated[float, Setting("Friction coefficient for --keep-contacts.", TASK, **_ZERO_OR_MORE)] = 0.7
+    limit_margin: Annotated[
+        float | None,
+        Setting("Distance from the joint limits, rad or m.", TASK, default="robot.toml's", **_ZERO_OR_MORE),
+    ] = None
+    regularization: Annotated[float, Setting("Weight of staying near the start.", TASK, **_ZERO_OR_MORE)] = 0.0
+    tradeoff: Annotated[
+        int,
+        Setting(
+            "What a smaller change would buy: the best objective within each of K distances from the start, "
+            f"{TRADEOFF_POINTS} if K is left out; 0: none.",
+            TASK, "[K]", holds=_not_negative, demand="give a whole number, zero or more",
+        ),
+    ] = 0  # fmt: skip
+    starts: Annotated[
+        int, Setting("Starting points of the search.", OUTPUT, holds=_positive, demand="give 1 or more")
+    ] = 16
+    seed: Annotated[
+        int, Setting("Seed of the random starts.", OUTPUT, holds=_not_negative, demand="give 0 or more")
+    ] = 0
