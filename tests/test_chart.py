@@ -1,4 +1,4 @@
-"""The manifold as expressions: its tangent map, and the chart that the optimizer moves in."""
+"""The chart that the optimizer moves in, and gradients on the tangent space."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.dynamics.chart import Chart, tangent_map
+from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.tree import PointOnLink, Tree, Wrench
 from tests.helpers import NAMES, Vector, assert_close, random_configurations, rng, robot
+from tests.tangent import tangent_map
 
 
 @functools.cache

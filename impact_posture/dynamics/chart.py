@@ -1,4 +1,4 @@
-"""Coordinates of the configuration space for an optimizer, and the tangent map of the manifold as expressions."""
+"""Coordinates of the configuration space for an optimizer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.joints import JointKind, joint_kind
-from impact_posture.dynamics.spatial import quaternion_matrix
 
 Vector = NDArray[np.float64]
 
@@ -99,31 +98,3 @@ class Chart:
                 lower[slot.x] = np.where(low < -1e10, -np.inf, low)
                 upper[slot.x] = np.where(high > 1e10, np.inf, high)
         return lower, upper
-
-
-def tangent_map(chart: Chart, q: ca.SX) -> ca.SX:
-    """Return ``∂(q ⊕ v)/∂v`` at ``v = 0``, shape (nq, nv), which turns ``∂/∂q`` into the tangent gradient."""
-    blocks = []
-    for slot in chart.slots:
-        piece, family = q[slot.q], slot.kind.family
-        if family == "free-flyer":
-            quaternion = piece[3:]
-            R = quaternion_matrix(quaternion)
-            blocks.append(ca.diagcat(R, _quaternion_rate(quaternion)))
-        elif family == "spherical":
-            blocks.append(_quaternion_rate(piece))
-        elif family == "continuous":
-            blocks.append(ca.vertcat(-piece[1], piece[0]))
-        elif family == "planar":
-            c, s = piece[2], piece[3]
-            top = ca.blockcat([[c, -s], [s, c]])
-            blocks.append(ca.diagcat(top, ca.vertcat(-s, c)))
-        else:
-            blocks.append(ca.SX.eye(slot.kind.nv))
-    return ca.diagcat(*blocks)
-
-
-def _quaternion_rate(quaternion: ca.SX) -> ca.SX:
-    """Return ``½ quaternion ⊗ [w; 0]`` as a (4, 3) matrix on the body angular velocity ``w``."""
-    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    return 0.5 * ca.blockcat([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]])

@@ -15,7 +15,7 @@ import numpy as np
 
 from impact_posture.codegen.export import export
 from impact_posture.codegen.functions import NamedObjective, library
-from impact_posture.dynamics.chart import Chart, tangent_map
+from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.contact import point_on
@@ -25,6 +25,7 @@ from tests.benchmarks.build import CONTRACT, Built, build, flag_sets
 from tests.benchmarks.core import say
 from tests.benchmarks.kernel.counts import of_export, of_function
 from tests.benchmarks.kernel.harness import Absent, Kernel, Samples, c_compiler
+from tests.tangent import tangent_map
 
 _WRAPPER = """
 int kernel_eval(const double *q, const double *n, double *H, double *grad)
