@@ -149,7 +149,7 @@ def write_whole(path: Path, text: str) -> None:
         raise OutputError(f"cannot be written ({error.strerror})", where=str(path), hint=hint) from None
 
 
-# ---- what is ours --------------------------------------------------------------------------------------------------
+# ---- ownership -----------------------------------------------------------------------------------------------------
 
 
 def _check_ours(out: Path, kind: Kind) -> None:

@@ -79,13 +79,13 @@ def compile_and_check(
             gradient = ImpactGradient(library, block, own.contact.frame, free=v.free)
             tolerance = self_test_tolerance(own, real)
             for reference, allowed, name in (
-                (casadi_reference, tolerance, "CasADi's"),
-                (oracle_reference, max(_ORACLE_TOLERANCE, tolerance), "Pinocchio's"),
+                (casadi_reference, tolerance, "CasADi"),
+                (oracle_reference, max(_ORACLE_TOLERANCE, tolerance), "Pinocchio"),
             ):
                 found = largest_difference(gradient, own, reference, samples)
                 if found > allowed:
                     raise CompilerError(
-                        f"the compiled code differs from {name} numbers by {found:.3g}, relative",
+                        f"the numbers of the compiled code differ from those of {name} by {found:.3g}, relative",
                         where=f"{prefix}.c",
                         hint="try another compiler (set CC) without -ffast-math, or double instead of float",
                     )

@@ -20,7 +20,7 @@ LARGEST_VECTOR = 64
 # it than the variables of the block.  Where a compiler joins functions, the variables of all of them may get places.
 # This covers return addresses, saved registers, alignment and the variables of the small functions.
 _FRAMES = 2048
-# With -march=native a compiler makes vectors of neighboring numbers, and stores some numbers in several vectors.
+# With -march=native a compiler makes vectors of neighboring numbers, and may store a number in several vectors.
 _SPILL = 2
 
 # So few statements of a block of the batch stay in the first cache of the processor from group to group.

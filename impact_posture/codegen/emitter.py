@@ -149,7 +149,7 @@ class Emitter:
         layout: Blocks and the values that they hand on.
         prefix: Beginning of the names of the blocks.
         real: The type of literals.
-        types: Width → C type of such a number or vector.
+        types: Width → C type of a number or vector of that width.
         constants: Tables that receive the numbers.
         size: Bytes of the type of width one, if it is not ``real``.
         work: Name of the structure with inputs and work arrays; empty where inputs are arguments of their own.

@@ -30,9 +30,9 @@ _SELF_TEST = {"double": 1e-7, "float": 0.1}
 class ImpactGradient:
     """``H``, its tangent gradient and related quantities from a compiled export.
 
-    Every method copies its inputs into buffers that were allocated once.  **Array results are views of such buffers,
-    and the next call of the same method overwrites them**: copy what must last.  One object serves one thread.
-    :meth:`copy` makes another object on the same library for another thread (calls release Python's lock).
+    Every method copies its inputs into buffers that were allocated once.  **Array results are views of buffers, which
+    the next call of the same method overwrites**, so copy a result that must last.  One object serves one thread.
+    :meth:`copy` makes another object on the same library for another thread (calls release the lock of Python).
 
     Attributes:
         manifest: The content of ``<prefix>.json``.
@@ -80,7 +80,7 @@ class ImpactGradient:
     def load(
         cls, path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
     ) -> ImpactGradient:
-        """Load an export.  **This runs its code**: load a foreign export only if you would run its author's programs.
+        """Load an export.  **This runs its code**, so load a foreign export only if you would run a foreign program.
 
         The method uses ``lib<prefix>.so`` beside the manifest.  Where there is none, it **builds the library there**
         with the user's compiler (``$CC``, cc, gcc or clang).  A library that this package built must have the SHA-256
@@ -123,7 +123,7 @@ class ImpactGradient:
     # ---- one configuration ------------------------------------------------------------------------------------
 
     def call(self, name: str, q: ArrayLike, n: ArrayLike | None = None) -> tuple[int, tuple[Array, ...]]:
-        """Call a C function; return its code and views of its results, whatever the code is.
+        """Call a C function and return its code and views of its results, also when the code is not zero.
 
         Args:
             name: A function of :data:`~impact_posture.codegen.naming.SIGNATURES`.

@@ -123,7 +123,7 @@ def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tu
 
 
 def _source(graph: Graph, k: int) -> int:
-    """The node whose statement gives node k: the vector of a lane, else the node itself."""
+    """Return the vector of a lane, and any other node itself."""
     return graph.nodes[k].args[0] if graph.nodes[k].op == "lane" else k
 
 

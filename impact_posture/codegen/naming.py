@@ -60,7 +60,9 @@ def check_prefix(prefix: str) -> str:
     if prefix.lower() == "example":
         raise InputError("the prefix 'example' is taken by example.c", where="--prefix", hint="choose another")
     if prefix.lower() in _C_HEADERS:
-        raise InputError(f"the prefix '{prefix}' is taken by C's {prefix}.h", where="--prefix", hint="choose another")
+        raise InputError(
+            f"the prefix '{prefix}' is the name of the C header {prefix}.h", where="--prefix", hint="choose another"
+        )
     return prefix
 
 

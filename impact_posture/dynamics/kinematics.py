@@ -42,7 +42,7 @@ class Kinematics:
     """A ``pin.Model`` at the configuration ``q`` (``SX``), with optional extra inertias on its links.
 
     Args:
-        model: The model, with every joint type of Pinocchio's URDF parser.
+        model: The model, with joints of every type that the URDF parser of Pinocchio makes.
         q: Configuration, shape (nq, 1).
         chart_x: The chart coordinates of ``q``; only :attr:`quaternions` needs them.
         extra_inertia: Constant 6×6 matrices in link coordinates that ``M`` has beside the inertias of the model.  A
@@ -87,7 +87,7 @@ class Kinematics:
         self._armature = self.by_joint("armature", np.array(model.armature, dtype=float))
 
     def _constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
-        """Return a constant of a joint: numbers, or parameters where the joint's counterparts have others."""
+        """Return a constant of a joint as numbers, or as parameters where its counterparts have others."""
         return constant(of(joint)) if self.limbs is None else self.limbs.constant(joint, tag, of)
 
     def by_joint(self, tag: str, values: NDArray[np.float64]) -> ca.SX:

@@ -1,4 +1,4 @@
-"""Spatial algebra on CasADi expressions, in Pinocchio's order: linear part first.
+"""Spatial algebra on CasADi expressions, with the linear part first as in Pinocchio.
 
 A motion ``[v; w]`` and a force ``[f; m]`` are 6-vectors of ``SX``.  ``R`` and ``p`` place a child frame in its
 parent by ``x_parent = R x_child + p``.  Structural zeros stay, so that CasADi never multiplies by a constant zero.

@@ -1,8 +1,8 @@
 """Dynamics of the kinematic tree at one symbolic configuration: sweeps and an O(n) articulated-body factorization.
 
 Everything is in link coordinates.  ``M`` does not depend on the pose of the base, which only rotates world directions
-into links.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms* (2008), in Pinocchio's order
-(linear part first).
+into links.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms* (2008), with the linear part
+first as in Pinocchio.
 """
 
 from __future__ import annotations

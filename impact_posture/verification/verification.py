@@ -60,8 +60,8 @@ def verify(
     """Compare ``H``, ``G``, ``Λ_c`` and ``∇H`` from every source with the numbers of Pinocchio.
 
     The sources are the interpreter of CasADi, the compiled C export if a compiler is there, ``∇H`` by finite
-    differences of Pinocchio's ``H``, and MuJoCo if it is installed.  MuJoCo gives ``M`` and ``J`` of a model that is
-    written from the same ``pin.Model``, and ``∇H`` is by finite differences of the ``H`` that follows.
+    differences of ``H`` from Pinocchio, and MuJoCo if it is installed.  MuJoCo gives ``M`` and ``J`` of a model from
+    the same ``pin.Model``, and ``∇H`` is by finite differences of the ``H`` that follows.
 
     The error of a quantity is relative to its largest entry.  ``H``, ``G`` and ``∇H`` vanish where the contact cannot
     move along the normal.  So their scale is at least a thousandth of the largest entry of ``Λ_c`` (for ``G`` of
