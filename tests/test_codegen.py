@@ -18,7 +18,6 @@ import pytest
 from jinja2 import UndefinedError
 
 from impact_posture.codegen.build_check import compile_and_check, largest_difference
-from impact_posture.codegen.emitter import DOUBLE
 from impact_posture.codegen.export import Export, export
 from impact_posture.codegen.functions import casadi_reference, oracle_reference
 from impact_posture.codegen.manifest import sample_postures
@@ -504,10 +503,9 @@ def test_names_cannot_end_a_comment() -> None:
 
 
 def test_templates_escape_every_text_and_refuse_unknown_names() -> None:
-    sizes = {"nq": 2, "nv": 2}
-    environment = _environment(c_comment, DOUBLE, sizes)
+    environment = _environment(c_comment)
     assert environment.from_string("{{ name }} {{ code }}").render(name="*/", code=Verbatim("*/")) == "_/ */"
-    assert environment.from_string("{{ values | reals }}").render(values=[-1.5]) == "{\n  -1.5\n}"
+    assert environment.from_string("{{ values | doubles }}").render(values=[-1.5]) == "{\n    -1.5\n  }"
     for text in (
         "{{ nobody }}",
         "{{ name.nobody }}",

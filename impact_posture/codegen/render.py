@@ -7,8 +7,8 @@ fails (``StrictUndefined``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, partial
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -37,20 +37,21 @@ def render(
     exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: Code, real: Real
 ) -> dict[str, str]:
     """Return file name → text of every file but the manifest."""
-    names = (f"{prefix}.h", f"{prefix}.c", "example.c", "example.cpp", "Makefile", "CMakeLists.txt", "README.md")
+    templates = {
+        f"{prefix}.h": "header.h", f"{prefix}.c": "source.c",
+        **{name: name for name in ("example.c", "example.cpp", "Makefile", "CMakeLists.txt", "README.md")},
+    }  # fmt: skip
     context = _context(exported, prefix, manifest, code, real)
-    environments = {escape: _environment(escape, real, manifest) for escape in (c_comment, markdown)}
-    templates = {f"{prefix}.h": "header.h", f"{prefix}.c": "source.c"}
-    return {
-        name: environments[markdown if name.endswith(".md") else c_comment]
-        .get_template(f"{templates.get(name, name)}.jinja")
-        .render(context)
-        for name in names
-    }
+    texts = {}
+    for name, template in templates.items():
+        environment = _environment(markdown if name.endswith(".md") else c_comment)
+        texts[name] = environment.get_template(f"{template}.jinja").render(context)
+    return texts
 
 
-def _environment(escape: Callable[[str], str], real: Real, manifest: dict[str, Any]) -> Environment:
-    """Templates of one language and one export."""
+@cache
+def _environment(escape: Callable[[str], str]) -> Environment:
+    """Templates of one language."""
 
     def insert(value: object) -> str:
         return value if isinstance(value, Verbatim) else escape(str(value))
@@ -67,12 +68,9 @@ def _environment(escape: Callable[[str], str], real: Real, manifest: dict[str, A
         "verbatim": str,
         "c_comment": c_comment,
         "numbers": lambda values: ", ".join(f"{v:.9g}" for v in values),
-        "literals": lambda values: ", ".join(map(real.literal, values)),
-        "reals": partial(_initializer, real=real),
-        "doubles": partial(_initializer, indent="  "),
         "double": lambda value: _plain(DOUBLE, value),
-        "places": _places,
-        "parameters": partial(_parameters, sizes=lengths(manifest["nq"], manifest["nv"]), real=real.name),
+        "doubles": partial(_initializer, DOUBLE, indent="  "),
+        "places": lambda values: _rows([str(v) for v in values], 20, "  "),
         "wrapped": lambda words, indent: wrapped(map(escape, words), indent),
         "lines": lambda parts, between: between.join(map(escape, parts)),
     }
@@ -101,13 +99,9 @@ def _plain(real: Real, value: float) -> str:
     return real.literal(float(value)).strip("()")
 
 
-def _initializer(values: Sequence[float], indent: str = "", real: Real = DOUBLE) -> str:
+def _initializer(real: Real, values: Sequence[float], indent: str = "") -> str:
     """A brace initializer with four numbers a line."""
     return _rows([_plain(real, v) for v in values], 4, indent)
-
-
-def _places(values: Sequence[int]) -> str:
-    return _rows([str(v) for v in values], 20, "  ")
 
 
 def _rows(texts: Sequence[str], count: int, indent: str) -> str:
@@ -115,11 +109,13 @@ def _rows(texts: Sequence[str], count: int, indent: str) -> str:
     return "{\n" + ",\n".join(f"{indent}  {row}" for row in rows) + f"\n{indent}}}"
 
 
-def _parameters(function: str, sizes: dict[str, int], real: str) -> str:
+def _parameters(real: Real, sizes: Mapping[str, int], function: str) -> str:
     """C parameters of an exported function."""
     inputs, results = SIGNATURES[function]
-    parameters = [f"const {real} {name}[{sizes[name]}]" for name in inputs]
-    parameters += [f"{real} {name}[{sizes[name]}]" if name in sizes else f"{real} *{name}" for name in results]
+    parameters = [f"const {real.name} {name}[{sizes[name]}]" for name in inputs]
+    parameters += [
+        f"{real.name} {name}[{sizes[name]}]" if name in sizes else f"{real.name} *{name}" for name in results
+    ]
     return ", ".join(parameters)
 
 
@@ -168,6 +164,9 @@ def _context(
         "units": units,
         "unit_bounds": [real.literal(float(f"{(1 + sign * real.unit_tolerance) ** 2:.12f}")) for sign in (-1, 1)],
         "macros": SHORT_NAMES,
+        "parameters": _verbatim(partial(_parameters, real, lengths(manifest["nq"], manifest["nv"]))),
+        "reals": _verbatim(partial(_initializer, real)),
+        "literals": _verbatim(lambda values: ", ".join(map(real.literal, values))),
         "frames": [_frame(v, test, alone) for v, test in zip(single, tests, strict=True)],
         "several": None if joint is None else _several(joint, manifest["several"]["self_test"]),
     }
