@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.codegen.export_folder import WrittenExport, write_export
-from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.export import Export, write_export
 from impact_posture.errors import InputError
 from impact_posture.impact import objective as core
 from impact_posture.impact.contact import ImpactContact, Support
@@ -46,27 +45,6 @@ from impact_posture.settings import (
 from impact_posture.tables import validate
 
 Vector = NDArray[np.float64]
-
-
-class Export:
-    """C code in a folder, with the library that was built from it.
-
-    Attributes:
-        written: The folder, its files and functions.
-        robot: The robot that it is about.
-    """
-
-    def __init__(self, written: WrittenExport, robot: Robot) -> None:
-        self.written, self.robot = written, robot
-
-    @property
-    def out(self) -> Path:
-        """The folder."""
-        return self.written.out
-
-    def load(self, **options: Any) -> ImpactGradient:
-        """Load the library; this runs its code.  Options are those of :meth:`ImpactGradient.load`."""
-        return ImpactGradient.load(self.out, robot=self.robot, **options)
 
 
 class ImpactObjective(core.ImpactObjective):
@@ -138,7 +116,7 @@ class ImpactObjective(core.ImpactObjective):
             build: Whether to build and check the library, where a C compiler is there.
             options: ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
         """
-        return Export(write_export([self], Path(out), build=build, **options), self.robot)
+        return write_export([self], Path(out), build=build, **options)
 
 
 def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
@@ -319,8 +297,7 @@ class PostureResult:
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
         """Write the C code with the optimal posture as a constant; as :meth:`ImpactObjective.export`."""
         objective = self.problem.problem.impact
-        written = write_export([objective], Path(out), posture=self.q, build=build, **options)
-        return Export(written, objective.robot)
+        return write_export([objective], Path(out), posture=self.q, build=build, **options)
 
 
 def optimize(

@@ -13,7 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from impact_posture.codegen.export import Export, export
-from impact_posture.codegen.library import products
+from impact_posture.codegen.naming import products
 from impact_posture.errors import CompilerError, SpecError
 from impact_posture.escape import file_name
 from impact_posture.output_folder import whole_folder, write_record

@@ -26,7 +26,7 @@ from impact_posture import errors, escape
 from impact_posture.codegen.code import build_code
 from impact_posture.codegen.emitter import DOUBLE
 from impact_posture.codegen.export import default_prefix, export
-from impact_posture.codegen.variants import variants
+from impact_posture.codegen.functions import named_objectives
 from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.experiment.reproduction import Reproduction
 from impact_posture.experiment.reproduction_summary import summary
@@ -120,7 +120,7 @@ def exports(arm: Robot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
     # Names are no part of the functions: they are made once.
     point = (0.3, 0.0, 0.0)
     harmless = ImpactObjective(arm, ImpactContact("tip", (0, 0.6, 0.8), point))
-    code = build_code(variants([harmless], "arm"), "arm", DOUBLE)
+    code = build_code(named_objectives([harmless], "arm"), "arm", DOUBLE)
     folders = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("impact_posture.codegen.export.build_code", lambda *_, **__: code)

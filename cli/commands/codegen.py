@@ -32,7 +32,7 @@ def codegen(
     from_result = given.is_result(robot, {"prefix", "out", "float_", "portable", "compile", "force"})
     if not from_result:
         given.check_contact()
-    from impact_posture.codegen.export_folder import write_export
+    from impact_posture.codegen.export import write_export
     from impact_posture_cli.output import Page, print_json
     from impact_posture_cli.progress import progress_bar
 
@@ -75,8 +75,8 @@ def codegen(
             ("folder", str(written.out)),
             ("functions", ", ".join(written.functions)),
             ("posture", "the result's optimum" if posture is not None else "none"),
-            ("numbers", written.export.manifest["real"]),
-            ("stack", f"at most {written.export.manifest['stack_bytes']} bytes"),
+            ("numbers", written.manifest["real"]),
+            ("stack", f"at most {written.manifest['stack_bytes']} bytes"),
         ]
     )
     page.line(written.verdict)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
-from impact_posture.dynamics.tree import ByJoint, PointOnLink, Product, Response, Tree, Wrench
+from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Wrench
 from impact_posture.impact.contact import support_inertia
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.robot.robot import Robot
@@ -32,14 +32,14 @@ class ImpactKernel:
         case: Robot, contact, metric and supports.
         q: Configuration symbols, shape (nq, 1).
         n: Normal symbols, shape (3, 1), in the axes that the contact's normal is given in.
-        twins: Branches whose expressions are to be alike
+        limbs: Repeated limbs whose expressions shall be alike
             (:class:`~impact_posture.dynamics.repeated_limbs.RepeatedLimbs`).
     """
 
-    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, twins: RepeatedLimbs | None = None) -> None:
+    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:
         self.case, self.metric, self.q, self.n = case, case.metric, q, n
         extra = support_inertia(case.robot, case.supports, case.compliance)
-        self.tree = Tree(case.robot.model, q, extra_inertia=extra, twins=twins)
+        self.tree = Tree(case.robot.model, q, extra_inertia=extra, limbs=limbs)
         self.point = case.point
         self._supported = bool(case.supports)
 
@@ -59,19 +59,19 @@ class ImpactKernel:
         return self.answer([self.impact])
 
     def _alike(self, wrench: Wrench) -> list[Wrench]:
-        """The wrench; where its link has twins, it and none on them, in one form for all."""
-        twins, joint = self.tree.twins, wrench.point.joint
-        if twins is None or joint not in twins.places:
+        """Return the wrench; on a repeated limb, with zero wrenches on its counterparts in the same form."""
+        limbs, joint = self.tree.limbs, wrench.point.joint
+        if limbs is None or joint not in limbs.places:
             return [wrench]
         point = wrench.point
         return [
             Wrench(
-                PointOnLink(twin, point.position, point.rotation),
-                wrench.force * (on := twins.indicator(twin, joint)),
+                PointOnLink(other, point.position, point.rotation),
+                wrench.force * (on := limbs.indicator(other, joint)),
                 wrench.moment * on,
                 wrench.in_frame,
             )
-            for twin in twins.of(joint)
+            for other in limbs.counterparts(joint)
         ]
 
     # ---- H, G and what follows from them ----------------------------------------------------------------------
@@ -189,7 +189,7 @@ class ImpactKernel:
 
     def _weigh(self, a: ca.SX, velocities: ByJoint) -> ca.SX:
         if self.metric.kind == "kinetic":
-            return self.tree.own_mass_times(a, velocities)
+            return self.tree.mass_times(a, velocities, extra=False)
         if self.metric.weights is None:
             return a
         return self.tree.by_joint("weight", self.metric.diagonal(self.tree.nv)) * a
@@ -198,7 +198,7 @@ class ImpactKernel:
         """``∂_q aᵀWa`` with ``a`` held fixed: zero unless W = M."""
         if self.metric.kind != "kinetic":
             return ca.SX.zeros(self.tree.nv)
-        return self.tree.bracket_gradient(products=[Product(velocities, velocities, extra=False)])
+        return self.tree.energy_gradient(velocities)
 
     def _force(self, impulse: ca.SX) -> Wrench:
         return Wrench(self.point, impulse, ca.SX.zeros(3))

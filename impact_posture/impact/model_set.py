@@ -72,7 +72,7 @@ class ModelSet:
         """See :class:`~impact_posture.impact.worst_case.WorstCase`: every model's, and the worst one's gradient."""
         pairs = []
         for member in self.members:
-            # Twin branches are alike in the model as it stands; a payload makes them differ.
+            # Repeated limbs are alike in the model as it stands.  A payload makes them differ.
             case = member.oracle.case
             pairs.append(member.expressions(k if case.robot is k.case.robot else ImpactKernel(case, k.q, k.n)))
         return first_of_largest([value for value, _ in pairs], [gradient for _, gradient in pairs])

@@ -249,9 +249,9 @@ class ImpactObjective:
         """The expressions, on fresh symbols q and n."""
         return self.kernel_of(ca.SX.sym("q", self.robot.nq), ca.SX.sym("n", 3))
 
-    def kernel_of(self, q: ca.SX, n: ca.SX, twins: RepeatedLimbs | None = None) -> ImpactKernel:
-        """The expressions on given symbols; with ``twins``, alike for twin branches."""
-        return ImpactKernel(self.case, q, n, twins)
+    def kernel_of(self, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> ImpactKernel:
+        """Return the expressions on given symbols; with ``limbs``, they are alike for repeated limbs."""
+        return ImpactKernel(self.case, q, n, limbs)
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Value and tangent gradient (nv) in the symbols of a kernel of this contact, metric and supports."""

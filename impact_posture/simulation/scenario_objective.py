@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,21 +12,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.codegen.export_folder import write_export
+from impact_posture.codegen.export import write_export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.library import library_path
 from impact_posture.errors import CompilerError, MetricError, OutputError
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
-from impact_posture.libraries import cache_folder, is_cached
-from impact_posture.posture.compiled import own_source
+from impact_posture.libraries import cache_folder, is_cached, library_path, source_key
 from impact_posture.progress import tell
 from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.scenario import Setup
 from impact_posture.toolchain import find_compiler
-from impact_posture.version import __version__
 
 Array = NDArray[np.float64]
 Gradient = Callable[[Array], tuple[float, Array]]
@@ -85,15 +81,13 @@ def _key(objective: ImpactObjective) -> str:
     point = objective.robot.model.frames[objective.robot.frame_id(objective.contact.frame)]
     held = [objective.robot.model.frames[objective.robot.frame_id(s.frame)] for s in objective.supports]
     content = [
-        __version__,
-        own_source("dynamics", "impact", "codegen"),
         ca.CasadiMeta.version(),
         objective.robot.model_sha256,
         *[f"{f.parentJoint} {f.placement.homogeneous.tolist()}" for f in (point, *held)],
         repr(replace(objective.contact, impulse=1.0)),
         repr((objective.kind, objective.metric, objective.supports, objective.compliance)),
     ]
-    return hashlib.sha256("\n".join(content).encode()).hexdigest()[:32]
+    return source_key(content, "dynamics", "impact", "codegen")
 
 
 @contextmanager
