@@ -83,7 +83,7 @@ class ImpactObjective(core.ImpactObjective):
         normal_cone_deg: Half angle of the cone of normals whose worst counts, degrees.
         others: More contacts that act at the same time.
         bilateral: Whether several contacts can pull as well as push.
-        scenarios: Model variants whose worst counts.
+        model_variants: Model variants whose worst counts.
         weights: Of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
         armature_range: Lowest and highest factor on the armature, whose worst counts.
         payloads: Frame and mass in kg of what the robot may carry, one at a time; the worst counts.
@@ -103,7 +103,7 @@ class ImpactObjective(core.ImpactObjective):
         normal_cone_deg: float = 0.0,
         others: Sequence[ImpactContact] = (),
         bilateral: bool = False,
-        scenarios: Sequence[ModelVariant] = (),
+        model_variants: Sequence[ModelVariant] = (),
         *,
         weights: str | Sequence[float] | None = None,
         armature_range: tuple[float, float] | None = None,
@@ -119,7 +119,8 @@ class ImpactObjective(core.ImpactObjective):
         if not isinstance(metric, Metric):
             values = weights if weights is None or isinstance(weights, str) else tuple(weights)
             metric = build_metric(robot, metric, values)
-        variants = tuple(scenarios) or build_model_variants(robot, armature_range, [Payload(*p) for p in payloads])
+        loads = [Payload(*payload) for payload in payloads]
+        variants = tuple(model_variants) or build_model_variants(robot, armature_range, loads)
         super().__init__(
             robot, leading, metric, kind, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
         )

@@ -135,8 +135,8 @@ def _announce(page: Page, prepared: Prepared) -> None:
             ],
             *([("pull", "as well as push")] if impact.objective.bilateral else []),
             *(
-                [("scenarios", "; ".join(s.name for s in scenarios))]
-                if (scenarios := impact.objective.scenarios)
+                [("model variants", "; ".join(v.name for v in variants))]
+                if (variants := impact.objective.model_variants)
                 else []
             ),
             ("metric", impact.metric.kind),

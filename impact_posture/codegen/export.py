@@ -125,8 +125,8 @@ def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple
 
 def _what(o: ImpactObjective) -> tuple[object, ...]:
     """Everything but the contact."""
-    scenarios = tuple(scenario.robot.model_sha256 for scenario in o.scenarios)
-    return o.robot.model_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg, scenarios
+    models = tuple(variant.robot.model_sha256 for variant in o.model_variants)
+    return o.robot.model_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg, models
 
 
 def _write(texts: dict[str, str], out: Path, force: bool) -> None:

@@ -116,7 +116,7 @@ def _joint_texts(
     contacts = [
         f"{c.frame} ({', '.join(f'{v:.9g}' for v in c.normal)}) {c.impulse:g} N s" for c in objective.contacts
     ]
-    names = [c_comment(f"({scenario.name})") for scenario in objective.scenarios]
+    names = [c_comment(f"({model.name})") for model in objective.model_variants]
     models = wrapped(["The worst of the models", *names], "") if names else ""
     own = _escaped(facts, c_comment) | {
         "stem": joint.stem,
@@ -178,9 +178,9 @@ def _facts(
 def _worst_note(objective: ImpactObjective) -> str:
     """What the objective is the worst of, and what the gradient is where several are as bad."""
     note = ""
-    if objective.scenarios:
-        note = "; the worst of " + "; ".join(scenario.name for scenario in objective.scenarios)
-    if objective.normal_cone_deg or objective.scenarios:
+    if objective.model_variants:
+        note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)
+    if objective.normal_cone_deg or objective.model_variants:
         note += "; where several are as bad, grad is a subgradient, that at one of them"
     return note
 

@@ -47,7 +47,7 @@ class Kinematics:
         chart_x: The chart coordinates that ``q`` was made of; only :attr:`quaternions` needs them.
         extra_inertia: Constant 6×6 matrices in link coordinates added to links in ``M`` (not in ``pin.Model``'s own):
             a foot held with compliance ε is a foot with the point mass 1/ε.
-        twins: Branches whose constants become parameters, so that their expressions are alike.
+        repeated_limbs: Branches whose constants become parameters, so that their expressions are alike.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Kinematics:
         q: ca.SX,
         chart_x: ca.SX | None = None,
         extra_inertia: Mapping[int, NDArray[np.float64]] | None = None,
-        twins: RepeatedLimbs | None = None,
+        repeated_limbs: RepeatedLimbs | None = None,
     ) -> None:
         self.model, self.q = model, q
         self.chart = Chart(model)
@@ -70,7 +70,7 @@ class Kinematics:
         self._spin: dict[int, Spin | None] = {}
         self._S: ByJoint = {}
         self._inertia: ByJoint = {}
-        self.twins = twins
+        self.repeated_limbs = repeated_limbs
         for slot in self.chart.slots:
             i = slot.index
             R, p = joint_transform(slot.kind, q[slot.q])
@@ -88,7 +88,7 @@ class Kinematics:
 
     def _constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
         """What a joint has of a kind of constant: numbers, or parameters where its twins have others."""
-        return constant(of(joint)) if self.twins is None else self.twins.constant(joint, tag, of)
+        return constant(of(joint)) if self.repeated_limbs is None else self.repeated_limbs.constant(joint, tag, of)
 
     def by_joint(self, tag: str, values: NDArray[np.float64]) -> ca.SX:
         """Constants of the degrees of freedom, shape (nv,), as an expression."""

@@ -53,12 +53,12 @@ class Evaluation:
         sticking: Jump of a contact point that does not slip; ``None`` where it does not exist.
         energy_loss: What the frictionless impact dissipates, J; ``None`` where the contact is blocked.
         dominance: Whether one light joint makes up most of H.
-        free: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
+        without_supports: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
         compliance_effect: Relative change of H when the supports' compliance is a tenth; ``None`` without supports.
-        footing: Whether the feet stay under the impact; ``None`` without supports.
+        contact_stability: Whether the feet stay under the impact; ``None`` without supports.
         contacts: Of several contacts each one's own evaluation, as if it were alone, the leading one's first.
         impulses: The worst impulses of several contacts; ``None`` of one.
-        scenarios: The objective and the scalars in each scenario; empty without any.
+        model_variants: The objective and the scalars in each variant; empty without any.
         warnings: What limits these numbers, one line each.
     """
 
@@ -78,12 +78,12 @@ class Evaluation:
     sticking: Jump | None
     energy_loss: float | None
     dominance: Dominance
-    free: Scalars | None
+    without_supports: Scalars | None
     compliance_effect: float | None
-    footing: ContactStability | None
+    contact_stability: ContactStability | None
     contacts: tuple[Evaluation, ...]
     impulses: WorstImpulses | None
-    scenarios: tuple[VariantValue, ...]
+    model_variants: tuple[VariantValue, ...]
     warnings: tuple[str, ...]
 
     @property
@@ -137,16 +137,16 @@ class Evaluation:
         }
         if self.cone is not None:
             block["cone"] = self.cone.to_dict()
-        if self.free is not None:
-            block |= {"free": self.free.to_dict(), "compliance_effect": self.compliance_effect}
-        if self.footing is not None:
-            block["footing"] = self.footing.to_dict()
+        if self.without_supports is not None:
+            block |= {"free": self.without_supports.to_dict(), "compliance_effect": self.compliance_effect}
+        if self.contact_stability is not None:
+            block["footing"] = self.contact_stability.to_dict()
         if self.impulses is not None:
             block["worst_impulses"] = self.impulses.to_dict()
             block["by_contact"] = [_contact_block(one.to_dict()) for one in self.contacts]
-        if self.scenarios:
-            worst = max(self.scenarios, key=lambda s: np.inf if s.objective is None else s.objective)
-            block["by_scenario"] = [scenario.to_dict() for scenario in self.scenarios]
+        if self.model_variants:
+            worst = max(self.model_variants, key=lambda s: np.inf if s.objective is None else s.objective)
+            block["by_scenario"] = [variant.to_dict() for variant in self.model_variants]
             block["worst_scenario"] = worst.name
         return block
 
@@ -182,9 +182,9 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
     found = oracle.quantities(q)
     scalars = Scalars.of(found)
     rebound = (1 + restitution) * speed
-    free, effect = _without_supports(objective, q, found.H)
-    scenarios = variant_values(objective, q)
-    member = worst_member(objective, scenarios)
+    without_supports, effect = _without_supports(objective, q, found.H)
+    model_variants = variant_values(objective, q)
+    member = worst_member(objective, model_variants)
     value = objective_value(member, q)
     cone = _worst(member, q)
     singles = objective.singles if objective.others else ()
@@ -211,12 +211,12 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
         ),
         energy_loss=None if scalars.E is None else scalars.E * speed**2 * (1 - restitution**2),
         dominance=find_dominance(objective, found),
-        free=free,
+        without_supports=without_supports,
         compliance_effect=effect,
-        footing=contact_stability(oracle, objective.supports, q) if objective.supports else None,
+        contact_stability=contact_stability(oracle, objective.supports, q) if objective.supports else None,
         contacts=tuple(evaluate(single, q, speed, restitution) for single in singles),
         impulses=member.worst_case.worst(q) if isinstance(member.worst_case, ImpulseBox) else None,
-        scenarios=scenarios,
+        model_variants=model_variants,
         warnings=_warnings(scalars, effect),
     )  # fmt: skip
 

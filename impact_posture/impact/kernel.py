@@ -32,14 +32,14 @@ class ImpactKernel:
         case: Robot, contact, metric and supports.
         q: Configuration symbols, shape (nq, 1).
         n: Normal symbols, shape (3, 1), in the axes that the contact's normal is given in.
-        twins: Branches whose expressions are to be alike
+        repeated_limbs: Branches whose expressions are to be alike
             (:class:`~impact_posture.dynamics.repeated_limbs.RepeatedLimbs`).
     """
 
-    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, twins: RepeatedLimbs | None = None) -> None:
+    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, repeated_limbs: RepeatedLimbs | None = None) -> None:
         self.case, self.metric, self.q, self.n = case, case.metric, q, n
         extra = support_inertia(case.robot, case.supports, case.compliance)
-        self.tree = Tree(case.robot.model, q, extra_inertia=extra, twins=twins)
+        self.tree = Tree(case.robot.model, q, extra_inertia=extra, repeated_limbs=repeated_limbs)
         self.point = case.point
         self._supported = bool(case.supports)
 
@@ -59,19 +59,19 @@ class ImpactKernel:
         return self.answer([self.impact])
 
     def _alike(self, wrench: Wrench) -> list[Wrench]:
-        """The wrench; where its link has twins, it and none on them, in one form for all."""
-        twins, joint = self.tree.twins, wrench.point.joint
-        if twins is None or joint not in twins.places:
+        """Return the wrench, or for a repeated limb a wrench on each limb of the group, zero on all but its own."""
+        limbs, joint = self.tree.repeated_limbs, wrench.point.joint
+        if limbs is None or joint not in limbs.places:
             return [wrench]
         point = wrench.point
         return [
             Wrench(
-                PointOnLink(twin, point.position, point.rotation),
-                wrench.force * (on := twins.indicator(twin, joint)),
+                PointOnLink(link, point.position, point.rotation),
+                wrench.force * (on := limbs.indicator(link, joint)),
                 wrench.moment * on,
                 wrench.in_frame,
             )
-            for twin in twins.of(joint)
+            for link in limbs.of(joint)
         ]
 
     # ---- H, G and what follows from them ----------------------------------------------------------------------

@@ -114,7 +114,7 @@ class NormalCone:
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """The single impact's along the worst normal, which the gradient holds fixed (Danskin)."""
-        worst = ImpactKernel(k.case, k.q, self.worst_normal_expression(k), k.tree.twins)
+        worst = ImpactKernel(k.case, k.q, self.worst_normal_expression(k), k.tree.repeated_limbs)
         return self.kind.expressions(worst)
 
     def worst_normal_expression(self, k: ImpactKernel) -> ca.SX:

@@ -125,7 +125,7 @@ class ImpactObjective:
         normal_cone_deg: Half angle of the cone of normals that the worst is taken of, degrees; 0: the one normal.
         others: More contacts at the same time, each with its own bound on its impulse.
         bilateral: Whether several contacts can pull as well as push.
-        scenarios: Models that the worst is taken of, the robot's own first; empty: that one alone.
+        model_variants: Models that the worst is taken of, the robot's own first; empty: that one alone.
     """
 
     robot: Robot
@@ -137,7 +137,7 @@ class ImpactObjective:
     normal_cone_deg: float = 0.0
     others: tuple[ImpactContact, ...] = ()
     bilateral: bool = False
-    scenarios: tuple[ModelVariant, ...] = ()
+    model_variants: tuple[ModelVariant, ...] = ()
 
     def __post_init__(self) -> None:
         check_cone(self.impact_kind, self.normal_cone_deg)
@@ -173,7 +173,7 @@ class ImpactObjective:
             (
                 (self.kind, self.metric, self.supports, self.compliance),
                 (self.normal_cone_deg, self.others, self.bilateral),
-                [scenario.robot.model_sha256 for scenario in self.scenarios],
+                [variant.robot.model_sha256 for variant in self.model_variants],
                 (contact.frame, contact.offset, contact.normal_frame),
                 self.scale,
             )
@@ -207,23 +207,23 @@ class ImpactObjective:
     def singles(self) -> tuple[ImpactObjective, ...]:
         """The objective of each contact alone, on the robot as modeled."""
         if not self.others:
-            return (replace(self, scenarios=()) if self.scenarios else self,)
+            return (replace(self, model_variants=()) if self.model_variants else self,)
         return tuple(
-            replace(self, contact=contact, others=(), bilateral=False, scenarios=()) for contact in self.contacts
+            replace(self, contact=contact, others=(), bilateral=False, model_variants=()) for contact in self.contacts
         )
 
     @cached_property
-    def by_scenario(self) -> tuple[ImpactObjective, ...]:
-        """The objective on each scenario's robot; itself alone without scenarios."""
-        if not self.scenarios:
+    def by_variant(self) -> tuple[ImpactObjective, ...]:
+        """The objective on each variant's robot; itself alone without model_variants."""
+        if not self.model_variants:
             return (self,)
-        return tuple(replace(self, robot=scenario.robot, scenarios=()) for scenario in self.scenarios)
+        return tuple(replace(self, robot=variant.robot, model_variants=()) for variant in self.model_variants)
 
     @cached_property
     def worst_case(self) -> WorstCase:
         """What the worst is taken over."""
-        if self.scenarios:
-            return ModelSet(tuple(member.worst_case for member in self.by_scenario))
+        if self.model_variants:
+            return ModelSet(tuple(member.worst_case for member in self.by_variant))
         if self.others:
             return ImpulseBox(tuple(single.oracle for single in self.singles), self.bilateral)
         cone = self.normal_cone
@@ -249,9 +249,9 @@ class ImpactObjective:
         """The expressions, on fresh symbols q and n."""
         return self.kernel_of(ca.SX.sym("q", self.robot.nq), ca.SX.sym("n", 3))
 
-    def kernel_of(self, q: ca.SX, n: ca.SX, twins: RepeatedLimbs | None = None) -> ImpactKernel:
-        """The expressions on given symbols; with ``twins``, alike for twin branches."""
-        return ImpactKernel(self.case, q, n, twins)
+    def kernel_of(self, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> ImpactKernel:
+        """Return the expressions on given symbols, of one form for ``limbs`` that repeat."""
+        return ImpactKernel(self.case, q, n, limbs)
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Value and tangent gradient (nv) in the symbols of a kernel of this contact, metric and supports."""

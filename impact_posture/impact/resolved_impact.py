@@ -156,7 +156,7 @@ class ResolvedImpact:
         return {
             "robot": robot_block(self.robot),
             "contacts": [_contact_block(single, q) for single in self.objective.singles],
-            "scenarios": [scenario.to_dict() for scenario in self.objective.scenarios],
+            "scenarios": [variant.to_dict() for variant in self.objective.model_variants],
             "supports": [{"frame": s.frame, "kind": s.kind} for s in self.supports],
             "support_compliance": self.objective.compliance if self.supports else None,
             "metric": {

@@ -59,7 +59,7 @@ class VariantValue:
     """What an impact means should the robot be another than it was modeled.
 
     Attributes:
-        name: The scenario's.
+        name: The variant's.
         objective: The objective there; ``None`` where it does not exist.
         scalars: H, G, V, S, E of the leading contact there.
     """
@@ -78,26 +78,26 @@ def _blocked(found: ImpactQuantities) -> bool:
 
 
 def variant_values(objective: ImpactObjective, q: Vector) -> tuple[VariantValue, ...]:
-    """The objective and its parts in each scenario."""
-    pairs = zip(objective.scenarios, objective.by_scenario, strict=True) if objective.scenarios else ()
+    """The objective and its parts in each variant."""
+    pairs = zip(objective.model_variants, objective.by_variant, strict=True) if objective.model_variants else ()
     return tuple(
-        VariantValue(scenario.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
-        for scenario, member in pairs
+        VariantValue(variant.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
+        for variant, member in pairs
     )
 
 
-def worst_member(objective: ImpactObjective, scenarios: tuple[VariantValue, ...]) -> ImpactObjective:
-    """The objective in the worst of its scenarios as evaluated, one where it does not exist before all others."""
-    if not scenarios:
+def worst_member(objective: ImpactObjective, model_variants: tuple[VariantValue, ...]) -> ImpactObjective:
+    """The objective in the worst of its model_variants as evaluated, one where it does not exist before all others."""
+    if not model_variants:
         return objective
-    values = [np.inf if scenario.objective is None else scenario.objective for scenario in scenarios]
-    return objective.by_scenario[int(np.argmax(values))]
+    values = [np.inf if variant.objective is None else variant.objective for variant in model_variants]
+    return objective.by_variant[int(np.argmax(values))]
 
 
 def objective_value(objective: ImpactObjective, q: Vector) -> float | None:
-    """The objective; ``None`` where it does not exist: in any of its scenarios, of any normal of its cone."""
-    if objective.scenarios:
-        values = [objective_value(member, q) for member in objective.by_scenario]
+    """The objective; ``None`` where it does not exist: in any of its model_variants, of any normal of its cone."""
+    if objective.model_variants:
+        values = [objective_value(member, q) for member in objective.by_variant]
         return None if None in values else max(v for v in values if v is not None)
     if isinstance(objective.worst_case, SingleImpact):
         scalars = Scalars.of(objective.oracle.quantities(q))

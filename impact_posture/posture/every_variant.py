@@ -17,10 +17,10 @@ from impact_posture.posture.kept_feet import KeptFeet
 def in_every_variant(
     objective: ImpactObjective, numeric: Numeric, friction: float, constraints: Sequence[Constraint]
 ) -> list[Constraint]:
-    """The constraints of the other scenarios that a problem's own do not imply; none without scenarios.
+    """The constraints of the other model_variants that a problem's own do not imply; none without model_variants.
 
     Args:
-        objective: With its scenarios, the robot as modeled first.
+        objective: With its model_variants, the robot as modeled first.
         numeric: At the given posture.
         friction: Of the feet that stay.
         constraints: Of the robot as modeled.
@@ -28,11 +28,11 @@ def in_every_variant(
     found: list[Constraint] = []
     kept = any(isinstance(constraint, KeptFeet) for constraint in constraints)
     centers = [constraint for constraint in constraints if isinstance(constraint, CenterOfMassOverFeet)]
-    for scenario, member in zip(objective.scenarios[1:], objective.by_scenario[1:], strict=True):
+    for variant, member in zip(objective.model_variants[1:], objective.by_variant[1:], strict=True):
         # The armature moves no center of mass.
-        if scenario.payload is not None and scenario.armature_factor == 1:
-            loaded = scenario.robot.model, scenario.name
+        if variant.payload is not None and variant.armature_factor == 1:
+            loaded = variant.robot.model, variant.name
             found += [CenterOfMassOverFeet(c.normals, c.offsets, c.margin, loaded) for c in centers]
         if kept:
-            found += [KeptFeet(single, numeric, friction, scenario.name) for single in member.singles]
+            found += [KeptFeet(single, numeric, friction, variant.name) for single in member.singles]
     return found

@@ -30,11 +30,11 @@ class KeptFeet(Constraint):
         objective: Whose impact, one along the contact's normal, and whose feet.
         numeric: At the given posture: soles keep their axes, for the feet are held.
         friction: Coefficient.
-        scenario: Name of the model that it is, where there are several.
+        variant: Name of the model that it is, where there are several.
     """
 
-    def __init__(self, objective: ImpactObjective, numeric: Numeric, friction: float, scenario: str = "") -> None:
-        self._where = f" ({scenario})" if scenario else ""
+    def __init__(self, objective: ImpactObjective, numeric: Numeric, friction: float, variant: str = "") -> None:
+        self._where = f" ({variant})" if variant else ""
         self.name = f"feet that stay{self._where}"
         self._robot, self._supports = objective.robot, objective.supports
         self._objective = replace(objective, normal_cone_deg=0.0)

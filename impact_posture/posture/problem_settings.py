@@ -150,7 +150,7 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         "normal_frame": impact.contact.normal_frame,
         "speed": impact.speed,
         "restitution": impact.restitution,
-        **_resolved_variants(impact.objective.scenarios),
+        **_resolved_variants(impact.objective.model_variants),
     }
     for key in _FILES:
         value = getattr(settings, key)

@@ -1,4 +1,4 @@
-"""How far the optimum moves with the model: what robustness against a few scenarios costs and what it buys."""
+"""How far the optimum moves with the model: what robustness against a few model_variants costs and what it buys."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from impact_posture.robot.model_variant import between
 
 Vector = NDArray[np.float64]
 
-# Models drawn between the scenarios, to see whether something there is worse than all of them.
+# Models drawn between the model_variants, to see whether something there is worse than all of them.
 _BETWEEN = 60
 # Shares below this are what the solver leaves, and constraints within this (m, rad) are kept.
 _NOISE = 1e-6
@@ -30,10 +30,10 @@ _KEPT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class VariantOptimum:
-    """One scenario, and the posture that would be best if it were known to hold.
+    """One variant, and the posture that would be best if it were known to hold.
 
     Attributes:
-        name: The scenario's.
+        name: The variant's.
         at_robust: Its objective at the robust optimum.
         own: Its objective at its own optimum; ``None`` where no start certified.
         q: That optimum, shape (nq,), or ``None``.
@@ -62,16 +62,16 @@ class Robustness:
     """The robust optimum beside that of the model as it stands.
 
     Attributes:
-        scenarios: The first is the model as it stands.
-        worst_robust: The worst over the scenarios at the robust optimum.
+        model_variants: The first is the model as it stands.
+        worst_robust: The worst over the model_variants at the robust optimum.
         worst_nominal: The same at the optimum of the model as it stands; ``None`` where that has none, or where it
-            breaks a constraint in another scenario.
+            breaks a constraint in another variant.
         broken: The constraints that it breaks.
-        between: The largest objective at the robust optimum among models drawn between the scenarios.
+        between: The largest objective at the robust optimum among models drawn between the model_variants.
         drawn: How many were drawn.
     """
 
-    scenarios: tuple[VariantOptimum, ...]
+    model_variants: tuple[VariantOptimum, ...]
     worst_robust: float
     worst_nominal: float | None
     broken: tuple[str, ...]
@@ -81,13 +81,13 @@ class Robustness:
     @property
     def moved(self) -> float | None:
         """How far the optimum moved from that of the model as it stands, tangent norm."""
-        return self.scenarios[0].moved
+        return self.model_variants[0].moved
 
     @property
     def price(self) -> float | None:
         """Share by which the objective of the model as it stands is above its own optimum."""
-        own = self.scenarios[0].own
-        return None if own is None else self.scenarios[0].at_robust / own - 1
+        own = self.model_variants[0].own
+        return None if own is None else self.model_variants[0].at_robust / own - 1
 
     @property
     def gain(self) -> float | None:
@@ -114,7 +114,7 @@ class Robustness:
             f"the model as it stands is {percent(abs(self.price))} {'below' if lower else 'above'} its own optimum"
         )
         if self.between > self.worst_robust * (1 + _NOISE):
-            parts.append(f"between the scenarios it reaches {self.between:.4g}, above the worst of them")
+            parts.append(f"between the model variants it reaches {self.between:.4g}, above the worst of them")
         return "; ".join(parts)
 
     def to_dict(self) -> dict[str, object]:
@@ -127,7 +127,7 @@ class Robustness:
             "worst_nominal": self.worst_nominal,
             "broken": list(self.broken),
             "between": {"drawn": self.drawn, "largest": self.between},
-            "scenarios": [scenario.to_dict() for scenario in self.scenarios],
+            "scenarios": [variant.to_dict() for variant in self.model_variants],
             "line": self.line,
         }
 
@@ -149,20 +149,20 @@ def solve_robustly(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
 ) -> RobustSolution:
-    """Solve; with scenarios each alone first, then all from the optima of these besides ``starts`` others.
+    """Solve; with model_variants each alone first, then all from the optima of these besides ``starts`` others.
 
     Raises:
         Infeasible, SolverFailed: See :func:`~impact_posture.posture.solve.solve`.
     """
     given, wanted = problem.given, problem.requirements
-    if not (isinstance(problem.objective, ImpactObjective) and problem.objective.scenarios):
+    if not (isinstance(problem.objective, ImpactObjective) and problem.objective.model_variants):
         return RobustSolution(
             solve(problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress), None
         )
     # Each built anew: what the feet bear and where the center of mass is hangs on the model.
     alone = [
-        build_problem(scenario.robot, member, given, wanted)
-        for scenario, member in zip(problem.impact.scenarios, problem.impact.by_scenario, strict=True)
+        build_problem(variant.robot, member, given, wanted)
+        for variant, member in zip(problem.impact.model_variants, problem.impact.by_variant, strict=True)
     ]
     total = starts * (len(alone) + 1)
 
@@ -186,20 +186,20 @@ def solve_robustly(
 
 
 def compare_variants(solution: PostureSolution, optima: Sequence[Vector | None], seed: int = 0) -> Robustness:
-    """The robust optimum beside the optimum of each scenario alone, and among models drawn between the scenarios."""
+    """The robust optimum beside the optimum of each variant alone, and among models drawn between the model_variants."""
     problem, objective = solution.problem, solution.problem.impact
     found: list[VariantOptimum] = []
-    for scenario, q in zip(objective.scenarios, optima, strict=True):
-        member = replace(objective, robot=scenario.robot, scenarios=())
+    for variant, q in zip(objective.model_variants, optima, strict=True):
+        member = replace(objective, robot=variant.robot, model_variants=())
         own = None if q is None else member.value(q)
         step = None if q is None else float(np.linalg.norm(wrapped_difference(problem, solution.q, q)))
-        found.append(VariantOptimum(scenario.name, member.value(solution.q), own, q, step))
+        found.append(VariantOptimum(variant.name, member.value(solution.q), own, q, step))
     nominal = optima[0]
     broken = () if nominal is None else tuple(_broken(problem, nominal))
-    drawn = between(objective.scenarios, _BETWEEN, seed)
-    values = [replace(objective, robot=robot, scenarios=()).value(solution.q) for robot in drawn]
+    drawn = between(objective.model_variants, _BETWEEN, seed)
+    values = [replace(objective, robot=robot, model_variants=()).value(solution.q) for robot in drawn]
     return Robustness(
-        scenarios=tuple(found),
+        model_variants=tuple(found),
         worst_robust=objective.value(solution.q),
         worst_nominal=None if nominal is None or broken else objective.value(nominal),
         broken=broken,
