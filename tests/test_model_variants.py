@@ -21,8 +21,8 @@ from impact_posture.errors import FrameNotFound, ImpactPostureError, InputError,
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.metric import Metric
-from impact_posture.impact.model_set import ModelSet
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.worst_case import ModelSet
 from impact_posture.posture.constraint import CenterOfMassOverFeet
 from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem

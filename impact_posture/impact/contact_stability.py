@@ -1,8 +1,8 @@
-"""Whether the feet stay where they are: does any support impulse that the impact allows lie in the friction cones?
+"""Check whether support impulses within the friction cones can hold the feet during an impact.
 
-The metric holds the feet by force, pulling if need be.  At rank-deficient postures the impulses that hold them are
-not unique, so the question is about a set: ``f + N z`` with ``N`` a basis of ``{f: J_sᵀ f = 0}``, forces that feet
-press against each other with.  Weight does not count: within an impact it is nothing.
+The metric holds the feet by any impulse, even a pull.  The impulses are not unique where ``J_s`` lacks rank.  They
+form the set ``f + N z``, where ``N`` is a basis of ``{f: J_sᵀ f = 0}``, impulses by which feet press against each
+other.  Weight has no effect within an impact.
 """
 
 from __future__ import annotations
@@ -16,27 +16,28 @@ from numpy.typing import NDArray
 
 from impact_posture.impact.contact import Support
 from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
 
-# Singular values of J_s below this part of the largest are rounding.
+# A singular value of J_s below this share of the largest one is rounding.
 _RANK = 1e-9
-# An impulse of this part of the largest is none.
+# An impulse below this share of the largest one is zero.
 _NONE = 1e-6
-# Sides of the pyramid that stands for a friction cone, inside it.
+# Sides of the pyramid that stands for a friction cone.  It lies inside the cone.
 _SIDES = 16
 _MOST_FRICTION = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class FootImpulse:
-    """What one foot gets per unit impulse of the impact.
+    """Support impulse on one foot per unit impulse of the impact.
 
     Attributes:
-        frame: The foot.
+        frame: Frame of the foot.
         impulse: World axes, shape (3,); positive z pushes the robot up.
-        moment: About its contact point, world axes, shape (3,); zeros for a point.
-        lifts: Whether it would have to pull.
+        moment: Moment about its contact point, world axes, shape (3,); zero for a point.
+        lifts: Whether the ground would have to pull.
     """
 
     frame: str
@@ -45,13 +46,8 @@ class FootImpulse:
     lifts: bool
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        return {
-            "frame": self.frame,
-            "impulse": [float(v) for v in self.impulse],
-            "moment": [float(v) for v in self.moment],
-            "lifts": self.lifts,
-        }
+        """Return JSON content."""
+        return json_block(self)
 
 
 @dataclass(frozen=True)
@@ -59,10 +55,10 @@ class ContactStability:
     """Whether the feet can stay.
 
     Attributes:
-        friction: The least friction coefficient with which all feet stay; ``None`` where one lifts (or its sole tips)
-            whatever the friction, infinite above ten.
-        feet: An impulse for each foot: one within the cones where there is one, else the one that pulls least.
-        freedom: Dimension of the set of impulses; zero where they are unique.
+        friction: Least friction coefficient with which all feet stay; infinite above ten; ``None`` if a foot lifts or
+            a sole tips at any friction.
+        feet: Impulse on each foot: within the cones if possible, else with the least pull.
+        freedom: Dimension of the set of impulses; zero if they are unique.
     """
 
     friction: float | None
@@ -82,7 +78,7 @@ class ContactStability:
         return f"the feet stay with a friction coefficient of {self.friction:.2f} or more"
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
+        """Return JSON content."""
         finite = self.friction is not None and np.isfinite(self.friction)
         return {
             "friction": self.friction if finite else None,
@@ -94,13 +90,13 @@ class ContactStability:
 
 
 def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Vector) -> ContactStability:
-    """Find impulses within the friction cones, or those that pull least.
+    """Find impulses within the friction cones, or impulses with the least pull.
 
-    The ground is level: cones stand along world z.  A sole with a ``size`` bears moments only as far as its edges.
+    The ground is level, so the axis of the cones is world z.  A sole with a ``size`` bears moments up to its edges.
 
     Args:
-        oracle: The impact, with these supports.
-        supports: The feet.
+        oracle: Numbers of the impact with these supports.
+        supports: Feet that the impact must not move.
         q: Configuration, shape (nq,).
     """
     particular = oracle.quantities(q).support_impulse
@@ -113,7 +109,7 @@ def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Ve
         return ContactStability(None, rows.feet(lifting.impulse, _NONE * scale), basis.shape[1])
     found = rows.within(particular, basis, _MOST_FRICTION)
     if found is None:
-        # No friction that exists, or a sole that tips: without the sliding rows it is the sole.
+        # At this friction no row limits sliding, so only a sole that tips is left as a reason.
         tips = rows.within(particular, basis, 1e6) is None
         return ContactStability(
             None if tips else float("inf"), rows.feet(lifting.impulse, _NONE * scale), basis.shape[1]
@@ -133,11 +129,11 @@ class _Pull:
 
 
 class FrictionCones:
-    """The cones as inequalities ``A f ≤ 0`` on the stacked impulses.
+    """The friction cones as inequalities ``A f ≤ 0`` on the stacked impulses.
 
     Args:
-        supports: The feet.
-        axes: World axes of each foot's frame, shape (3, 3); what a sole's size is along.
+        supports: Feet that stay on the ground.
+        axes: World axes of the frame of each foot, along which its sole has a size, shape (3, 3).
     """
 
     def __init__(self, supports: tuple[Support, ...], axes: Sequence[Vector]) -> None:
@@ -147,7 +143,7 @@ class FrictionCones:
         self._axes = [np.asarray(a) for a in axes]
 
     def matrix(self, friction: float) -> tuple[Vector, list[str]]:
-        """``A``, shape (rows, impulses), for a friction coefficient, and what each row says."""
+        """Return ``A``, shape (rows, impulses), for a friction coefficient, and the name of each row."""
         soles, slopes = self._soles(), self._slopes(friction)
         frames = [s.frame for s in self._supports]
         wide = [s.frame for s in self._supports if s.kind == "surface" and min(s.size) > 0]
@@ -162,7 +158,7 @@ class FrictionCones:
         return rows
 
     def _soles(self) -> list[Vector]:
-        """``|τ_x| ≤ Y f_z`` and ``|τ_y| ≤ X f_z`` of soles whose size is known, in the foot's axes."""
+        """``|τ_x| ≤ Y f_z`` and ``|τ_y| ≤ X f_z`` for soles with a known size, in the axes of the foot."""
         found = []
         for start, support, R in zip(self._starts, self._supports, self._axes, strict=False):
             if support.kind != "surface" or min(support.size) <= 0:
@@ -192,7 +188,7 @@ class FrictionCones:
         return found
 
     def least_pull(self, particular: Vector, basis: Vector) -> _Pull:
-        """Impulses whose largest pull is least."""
+        """Return the impulses whose largest pull is least."""
         up = self._up()
         count = basis.shape[1]
         # min t: -f_z ≤ t, t ≥ 0.
@@ -205,7 +201,7 @@ class FrictionCones:
         return _Pull(float(found.x[-1]), particular + basis @ found.x[:-1])
 
     def within(self, particular: Vector, basis: Vector, friction: float) -> Vector | None:
-        """Impulses within the cones, the smallest by their largest entry, or ``None``."""
+        """Return the impulses within the cones whose largest entry is least, or ``None``."""
         A, _ = self.matrix(friction)
         slack = 1e-9 * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
         if not basis.shape[1]:
@@ -219,7 +215,7 @@ class FrictionCones:
         return particular + basis @ found.x[:-1] if found.status == 0 else None
 
     def feet(self, impulse: Vector, none: float) -> tuple[FootImpulse, ...]:
-        """Each foot's share."""
+        """Return the impulse on each foot; a pull above ``none`` lifts it."""
         found = []
         for start, support in zip(self._starts, self._supports, strict=False):
             own = impulse[start : start + support.rows]

@@ -1,4 +1,4 @@
-"""The numbers of an impact that have a name each, and the objective made of them, where they exist."""
+"""The numbers H, G, V, S, E of an impact and the objective made of them, where they exist."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from impact_posture.errors import MetricError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactQuantities
-from impact_posture.impact.single_impact import SingleImpact
+from impact_posture.impact.worst_case import SingleImpact
+from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
 
-# Below this share of the largest mobility the contact counts as blocked along n, and JM⁻¹Jᵀ as singular.
-_BLOCKED = 1e-12
+# JM⁻¹Jᵀ is singular if an eigenvalue is below this share of the largest one.
 _SINGULAR = 1e-9
 
 
@@ -27,8 +27,8 @@ class Scalars:
         H: Squared jump per squared impulse.
         G: Inverse effective mass along the normal, 1/kg.
         V: Squared jump per squared approach speed, frictionless, e = 0.
-        S: The same when the contact point sticks.
-        E: Energy dissipated per squared approach speed, e = 0: half the effective mass, kg.
+        S: The same if the contact point sticks.
+        E: Energy dissipated per squared approach speed, e = 0, which is half the effective mass, kg.
     """
 
     H: float
@@ -39,8 +39,8 @@ class Scalars:
 
     @staticmethod
     def of(found: ImpactQuantities) -> Scalars:
-        """Read them off; ``V`` and ``E`` do not exist where the contact cannot move along the normal."""
-        if _blocked(found):
+        """Return the numbers; ``V`` and ``E`` do not exist if the contact cannot move along the normal."""
+        if found.blocked:
             return Scalars(found.H, found.G, None, found.S, None)
         return Scalars(found.H, found.G, found.V, found.S, found.E)
 
@@ -49,19 +49,19 @@ class Scalars:
         """``1/G``, kg; ``None`` where unbounded."""
         return None if self.E is None else 1 / self.G
 
-    def to_dict(self) -> dict[str, float | None]:
-        """JSON content."""
-        return {"H": self.H, "G": self.G, "V": self.V, "S": self.S, "E": self.E}
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return json_block(self)
 
 
 @dataclass(frozen=True)
 class VariantValue:
-    """What an impact means should the robot be another than it was modeled.
+    """The impact on one model variant.
 
     Attributes:
-        name: The variant's.
-        objective: The objective there; ``None`` where it does not exist.
-        scalars: H, G, V, S, E of the leading contact there.
+        name: Name of the model variant.
+        objective: The objective on it; ``None`` where it does not exist.
+        scalars: H, G, V, S, E of the leading contact on it.
     """
 
     name: str
@@ -69,16 +69,12 @@ class VariantValue:
     scalars: Scalars
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
+        """Return JSON content."""
         return {"name": self.name, "objective": self.objective, **self.scalars.to_dict()}
 
 
-def _blocked(found: ImpactQuantities) -> bool:
-    return found.G <= _BLOCKED * float(np.linalg.eigvalsh(found.mobility)[-1])
-
-
 def variant_values(objective: ImpactObjective, q: Vector) -> tuple[VariantValue, ...]:
-    """The objective and its parts in each variant."""
+    """Return the objective and its parts on each model variant; empty if there is none."""
     pairs = zip(objective.model_variants, objective.by_variant, strict=True) if objective.model_variants else ()
     return tuple(
         VariantValue(variant.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
@@ -86,16 +82,13 @@ def variant_values(objective: ImpactObjective, q: Vector) -> tuple[VariantValue,
     )
 
 
-def worst_member(objective: ImpactObjective, model_variants: tuple[VariantValue, ...]) -> ImpactObjective:
-    """The objective in the worst of its model_variants as evaluated, one where it does not exist before all others."""
-    if not model_variants:
-        return objective
-    values = [np.inf if variant.objective is None else variant.objective for variant in model_variants]
-    return objective.by_variant[int(np.argmax(values))]
+def worst_variant(variants: tuple[VariantValue, ...]) -> int:
+    """Return the index of the worst model variant; one without a value comes before all others."""
+    return int(np.argmax([np.inf if variant.objective is None else variant.objective for variant in variants]))
 
 
 def objective_value(objective: ImpactObjective, q: Vector) -> float | None:
-    """The objective; ``None`` where it does not exist: in any of its model_variants, of any normal of its cone."""
+    """Return the objective; ``None`` if it does not exist for a model variant or a normal of the cone."""
     if objective.model_variants:
         values = [objective_value(member, q) for member in objective.by_variant]
         return None if None in values else max(v for v in values if v is not None)
@@ -111,9 +104,9 @@ def objective_value(objective: ImpactObjective, q: Vector) -> float | None:
 
 
 def objective_gradient(objective: ImpactObjective, q: Vector, value: float | None) -> Vector | None:
-    """Tangent gradient, shape (nv,), where the objective has ``value``; a subgradient where tied.
+    """Return the tangent gradient where the objective has ``value``, shape (nv,); a subgradient at a tie.
 
-    ``None`` where it does not exist.
+    It is ``None`` where it does not exist.
     """
     values = np.linalg.eigvalsh(objective.oracle.quantities(q).mobility)
     singular = objective.kind == "sticking" and values[0] <= _SINGULAR * values[-1]

@@ -18,7 +18,7 @@ from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
 from impact_posture.impact.scalars import objective_value
-from impact_posture.impact.single_impact import SingleImpact
+from impact_posture.impact.worst_case import SingleImpact
 from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
