@@ -126,8 +126,9 @@ def default_compliance(robot: Robot) -> float:
     """Return the default support compliance ε in 1/kg: a foot is held as if it weighed 10⁴ robots.
 
     ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  Its effect on the jump
-    differs from that of rigid feet by a share of at most ``ε/(σ + ε)``, where σ is the least eigenvalue of ``J_sM⁻¹J_sᵀ`` above zero.
-    The share is 1e-4 where the feet bear the mass of the robot, and more where the rank of ``J_s`` nearly drops.
+    differs from that of rigid feet by a share of at most ``ε/(σ + ε)``.  σ is the least eigenvalue of ``J_sM⁻¹J_sᵀ``
+    above zero.  The share is 1e-4 where the feet bear the mass of the robot.  It is larger where ``J_s`` nearly loses
+    rank.
     """
     return _DEFAULT_COMPLIANCE / robot.mass
 

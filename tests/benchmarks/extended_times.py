@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.benchmark.measure import machine
-from impact_posture.posture.blas import one_blas_thread
-from impact_posture.posture.nlp import PostureNLP, build_nlp
+from impact_posture.posture.nlp import PostureNLP, build_nlp, one_blas_thread
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.solve import run_start
 from impact_posture.posture.starts import feasible_start
