@@ -103,6 +103,11 @@ class Support:
         """Number of velocities that it holds."""
         return 3 if self.kind == "point" else 6
 
+    @property
+    def has_sole(self) -> bool:
+        """Whether it is a surface of known size."""
+        return self.kind == "surface" and min(self.size) > 0
+
 
 def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> PointOnLink:
     """Resolve a frame and an offset in it to a point on a link.

@@ -37,7 +37,7 @@ Vector = NDArray[np.float64]
 
 
 class Objective(Minimized, Protocol):
-    """What a posture problem minimizes, under constraints at its contacts and supports."""
+    """The function that a posture problem minimizes, with the contacts and supports that the problem holds."""
 
     @property
     def robot(self) -> Robot:

@@ -11,7 +11,6 @@ from impact_posture.errors import MetricError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.impact.worst_case import SingleImpact
-from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
 
@@ -49,9 +48,9 @@ class Scalars:
         """``1/G``, kg; ``None`` where unbounded."""
         return None if self.E is None else 1 / self.G
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, float | None]:
         """Return JSON content."""
-        return json_block(self)
+        return {"H": self.H, "G": self.G, "V": self.V, "S": self.S, "E": self.E}
 
 
 @dataclass(frozen=True)

@@ -81,18 +81,15 @@ def build_problem(robot: Robot, objective: Objective, given: Vector, requirement
 def _check(robot: Robot, requirements: Requirements) -> None:
     if not robot.floating and requirements.base != "free":
         raise InputError(
-            f"base '{requirements.base}' asked of a robot whose root is fixed",
+            f"base '{requirements.base}' does not fit a robot whose root is fixed",
             where="base",
             hint="leave it out or use `root='free-flyer'`",
         )
     for name, values in (("box", requirements.box), ("base_box", requirements.base_box)):
         if not all(np.isfinite(v) and v > 0 for v in values):
             raise InputError(f"half extents {values}", where=name, hint="give three lengths above zero")
-    for name, value in (
-        ("com_margin", requirements.com_margin),
-        ("limit_margin", requirements.limit_margin),
-        ("regularization", requirements.regularization),
-    ):
+    for name in ("com_margin", "limit_margin", "regularization"):
+        value = getattr(requirements, name)
         if not (np.isfinite(value) and value >= 0):
             raise InputError(f"is {value:g}", where=name, hint="give a number ≥ 0")
     if not (np.isfinite(requirements.friction) and requirements.friction > 0):

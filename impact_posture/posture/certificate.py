@@ -139,45 +139,40 @@ class _Near:
     slack: float
 
 
+def _near_bounds(name: str, value: float, low: float, high: float, gradient: Vector) -> list[_Near]:
+    """The bounds of a scalar that are near, given its tangent gradient."""
+    sides = _Near(name, "lower", -gradient, float(value - low)), _Near(name, "upper", gradient, float(high - value))
+    return [side for side in sides if side.slack < _ACTIVE]
+
+
 def _inequalities(problem: PostureProblem, numeric: Numeric) -> tuple[list[_Near], float]:
     """Inequality rows near their bound, and the largest violation of all constraints."""
     near: list[_Near] = []
     violation = 0.0
-    for constraint in problem.constraints:
-        value, jacobian = constraint.evaluate(numeric)
-        violation = max(violation, float(np.abs(constraint.excess(value)).max()))
-        if constraint.equality:
-            continue
-        for k in range(constraint.rows):
-            for side, slack, sign in (
-                ("lower", value[k] - constraint.lower[k], -1.0),
-                ("upper", constraint.upper[k] - value[k], 1.0),
-            ):
-                if slack < _ACTIVE:
-                    near.append(_Near(constraint.row_name(k), side, sign * jacobian[k], float(slack)))
+    for c in problem.constraints:
+        value, jacobian = c.evaluate(numeric)
+        violation = max(violation, float(np.abs(c.excess(value)).max()))
+        if not c.equality:
+            for k in range(c.rows):
+                near += _near_bounds(c.row_name(k), value[k], c.lower[k], c.upper[k], jacobian[k])
     return near, violation
 
 
 def _limits(problem: PostureProblem, q: Vector) -> tuple[list[_Near], float]:
     """Joint limits that are near, and the largest violation of all limits."""
     chart = Chart(problem.robot.model)
-    x = chart.to_x(q)
+    x, unit = chart.to_x(q), np.eye(problem.robot.nv)
     near: list[_Near] = []
     worst = 0.0
     for slot in chart.slots:
         if slot.kind.family not in ("revolute", "prismatic", "translation"):
             continue
-        for k in range(slot.kind.nv):
-            low, high = problem.lower[slot.x.start + k], problem.upper[slot.x.start + k]
-            value, unit = x[slot.x.start + k], np.eye(problem.robot.nv)[slot.v.start + k]
-            worst = max(worst, low - value, value - high)
-            if low == high:
-                continue  # A held joint is an equality.
-            name = f"joint '{slot.name}'"
-            if value - low < _ACTIVE:
-                near.append(_Near(name, "lower", -unit, float(value - low)))
-            if high - value < _ACTIVE:
-                near.append(_Near(name, "upper", unit, float(high - value)))
+        for k, v in zip(range(slot.x.start, slot.x.stop), range(slot.v.start, slot.v.stop), strict=True):
+            low, high = problem.lower[k], problem.upper[k]
+            worst = max(worst, low - x[k], x[k] - high)
+            # A held joint is an equality.
+            if low != high:
+                near += _near_bounds(f"joint '{slot.name}'", x[k], low, high, unit[v])
     return near, float(worst)
 
 

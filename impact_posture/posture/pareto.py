@@ -61,7 +61,7 @@ def pareto_front(
         InputError: The number of points is below 1.
     """
     if points < 1:
-        raise InputError(f"{points} points are asked for", where="tradeoff", hint="give 1 or more")
+        raise InputError(f"the number of points is {points}", where="tradeoff", hint="give 1 or more")
     problem = solution.problem
     chart = Chart(problem.robot.model)
     whole = distance(chart, solution.q, solution.initial)

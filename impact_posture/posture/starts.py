@@ -103,8 +103,8 @@ class Projector:
 def feasible_start(problem: PostureProblem, index: int, seed: int, tolerance: float = 1e-8) -> Vector | None:
     """Return the ``index``-th feasible start of a seed; ``None`` if no attempt reached the constraints.
 
-    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near it, even starts anywhere within the
-    limits.  Near starts reach the constraints more often, far starts find other optima.
+    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near it, even starts anywhere within
+    the limits.  Near starts reach the constraints more often, far starts find other optima.
     """
     projector = Projector(problem)
     if index == 0:
