@@ -1,4 +1,4 @@
-"""What the inner maximum was over: lines on several contacts and on scenarios, alike for every command."""
+"""What the inner maximum was over: lines on several contacts and on model variants, alike for every command."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def contacts_table(page: Page, frames: Sequence[str], blocks: Sequence[Mapping[s
 
 
 def variants_table(page: Page, blocks: Sequence[Mapping[str, Any]], titles: Sequence[str]) -> None:
-    """The objective in each scenario; one column for each evaluation."""
+    """The objective for each model variant, with one column for each evaluation."""
     from impact_posture_cli.output import number
 
     rows = []
-    for k, scenario in enumerate(blocks[0]["by_scenario"]):
-        worst = [block["worst_scenario"] == scenario["name"] for block in blocks]
+    for k, variant in enumerate(blocks[0]["by_scenario"]):
+        worst = [block["worst_scenario"] == variant["name"] for block in blocks]
         values = [number(block["by_scenario"][k]["objective"]) + (" ←" if bad else "  ")
                   for block, bad in zip(blocks, worst, strict=True)]  # fmt: skip
-        rows.append((f"  {scenario['name']}", *values))
+        rows.append((f"  {variant['name']}", *values))
     page.gap()
-    page.table(("  objective by scenario (← worst)", *titles), rows, right=tuple(range(1, 1 + len(titles))))
+    page.table(("  objective by model variant (← worst)", *titles), rows, right=tuple(range(1, 1 + len(titles))))

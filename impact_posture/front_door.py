@@ -1,6 +1,6 @@
 """The classes behind ``import impact_posture as ip``: the main job in a few lines of Python.
 
-They take the robot's own defaults, as the command line does, and check what they are given when they are built.
+They use the defaults of the robot, as the command line does, and check their arguments when they are built.
 """
 
 from __future__ import annotations
@@ -48,26 +48,26 @@ Vector = NDArray[np.float64]
 
 
 class ImpactObjective(core.ImpactObjective):
-    """The objective of one or several impacts, with the robot's own supports unless others are given.
+    """The objective of one or several impacts, by default with the supports of the robot.
 
     Args:
         robot: The robot.
-        contact: Where the impact acts; several act at once.  A contact at the robot's own contact frame without an
-            offset takes that of robot.toml.
+        contact: Contact of the impact, or several contacts that act at once.  A contact without an offset at the
+            contact frame of robot.toml takes the offset from there.
         metric: ``euclidean``, ``kinetic`` or ``weighted``, or a :class:`~impact_posture.impact.metric.Metric`.
         kind: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S) or ``energy`` (E).
-        supports: Feet that stay, ``FRAME[:point|surface]`` each; ``None`` for those of robot.toml, ``()`` for none.
+        supports: Feet that stay, as ``FRAME[:point|surface]``; ``None`` for those of robot.toml, ``()`` for none.
         compliance: ε of the supports, 1/kg; 0 for 1e-4 over the robot's mass.
         normal_cone_deg: Half angle of the cone of normals whose worst counts, degrees.
         others: More contacts that act at the same time.
         bilateral: Whether several contacts can pull as well as push.
-        scenarios: Model variants whose worst counts.
-        weights: Of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
-        armature_range: Lowest and highest factor on the armature, whose worst counts.
-        payloads: Frame and mass in kg of what the robot may carry, one at a time; the worst counts.
+        model_variants: Robot models whose worst counts, the robot as modeled first.
+        weights: Weights of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
+        armature_range: Lowest and highest factor on the armature; the worst counts.
+        payloads: Frame and mass in kg of payloads that the robot may carry, one at a time; the worst counts.
 
     Raises:
-        ImpactPostureError: The first thing that does not fit the robot.
+        ImpactPostureError: An argument does not fit the robot.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class ImpactObjective(core.ImpactObjective):
         normal_cone_deg: float = 0.0,
         others: Sequence[ImpactContact] = (),
         bilateral: bool = False,
-        scenarios: Sequence[ModelVariant] = (),
+        model_variants: Sequence[ModelVariant] = (),
         *,
         weights: str | Sequence[float] | None = None,
         armature_range: tuple[float, float] | None = None,
@@ -97,11 +97,12 @@ class ImpactObjective(core.ImpactObjective):
         if not isinstance(metric, Metric):
             values = weights if weights is None or isinstance(weights, str) else tuple(weights)
             metric = build_metric(robot, metric, values)
-        variants = tuple(scenarios) or build_model_variants(robot, armature_range, [Payload(*p) for p in payloads])
+        loads = [Payload(*payload) for payload in payloads]
+        variants = tuple(model_variants) or build_model_variants(robot, armature_range, loads)
         super().__init__(
             robot, leading, metric, kind, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
         )
-        # A hint and no error: to measure an impact needs no support.
+        # This is a hint and no error, because evaluating an impact needs no support.
         object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
 
     def evaluate(self, q: ArrayLike, speed: float = 1.0, restitution: float = 0.0) -> Evaluation:
@@ -109,12 +110,12 @@ class ImpactObjective(core.ImpactObjective):
         return evaluate(self, self.robot.check_posture(np.asarray(q, dtype=float), limits=False), speed, restitution)
 
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
-        """Write the C code of H, its gradient and this objective into a folder of its own, and build its library.
+        """Write the C code of H, its gradient and this objective into a folder, and build its library.
 
         Args:
             out: The folder.
-            build: Whether to build and check the library, where a C compiler is there.
-            options: ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
+            build: Whether to build and check the library, if a C compiler is installed.
+            options: Options ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
         """
         return write_export([self], Path(out), build=build, **options)
 
@@ -134,23 +135,23 @@ def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[S
 
 
 class PostureProblem:
-    """``min_q objective(q)`` under the constraints of a task; what is not given comes from the robot.
+    """``min_q objective(q)`` under the constraints of a task; a missing argument comes from the robot.
 
     Args:
-        objective: What is minimized: an :class:`ImpactObjective`, or anything with the
-            :class:`~impact_posture.impact.objective.Objective` protocol.
-        posture: Where the search starts: a name, a file, or a configuration of shape (nq,); ``None`` for the robot's.
+        objective: An :class:`ImpactObjective`, or another implementation of
+            :class:`~impact_posture.impact.objective.Objective`.
+        posture: Start of the search: a name, a file, or a configuration (nq,); ``None`` for the default posture.
         speed: Approach speed of the predicted jumps, m/s.
         restitution: Coefficient of restitution of the predicted jumps.
         task: Other fields of :class:`~impact_posture.settings.ProblemSettings` about the task, such as
             ``base="level"``, ``target_position=(x, y, z)``, ``keep_contacts=True`` or ``hold=("joint",)``.
 
     Attributes:
-        problem: The constraints and bounds, before any solver sees them.
-        prepared: The same with its settings; ``None`` for an objective that is not that of an impact.
+        problem: Constraints and bounds, before any solver sees them.
+        prepared: The problem with its settings; ``None`` for an objective that is not that of an impact.
 
     Raises:
-        ImpactPostureError: The first thing that is wrong.
+        ImpactPostureError: An argument is wrong.
     """
 
     def __init__(
@@ -181,23 +182,23 @@ class PostureProblem:
 
     @classmethod
     def of(cls, prepared: Prepared) -> PostureProblem:
-        """The problem of settings that were read from a file or a command line."""
+        """Return the problem of settings from a file or a command line."""
         made = cls.__new__(cls)
         made.prepared, made.problem = prepared, prepared.problem
         return made
 
     def describe(self) -> list[str]:
-        """The constraints in words, one line each."""
+        """Describe the constraints, one line each."""
         return self.problem.describe()
 
 
 class PostureResult:
-    """An optimized posture that proves itself, and saves, draws and exports itself.
+    """An optimized posture with its certificate, which can be saved, drawn and exported.
 
     Attributes:
-        problem: What was solved.
-        solution: All that the search found.
-        robustness: What the model variants cost and bring; ``None`` without any.
+        problem: The solved problem.
+        solution: Result of the search.
+        robustness: Cost and gain of the model variants; ``None`` without model variants.
         tradeoff: The best objective within each distance from the start; ``None`` before :meth:`trade_off`.
     """
 
@@ -218,7 +219,7 @@ class PostureResult:
 
     @property
     def initial(self) -> Vector:
-        """The start, moved to the constraints where it did not satisfy them, shape (nq,)."""
+        """The start, moved to the constraints if it did not satisfy them, shape (nq,)."""
         return self.solution.initial
 
     @property
@@ -243,7 +244,7 @@ class PostureResult:
     @property
     def _prepared(self) -> Prepared:
         if self.problem.prepared is None:
-            # Raises, and says what to use.
+            # This raises an error that names the remedy.
             _ = self.problem.problem.impact
             raise AssertionError
         return self.problem.prepared
@@ -270,16 +271,16 @@ class PostureResult:
         Args:
             out: The folder.
             force: Replace an earlier result.
-            codegen: Export, build and check the C code, too.
-            formats: Of the pictures: ``png``, ``svg``, ``pdf``.
+            codegen: Whether to export, build and check the C code as well.
+            formats: Formats of the pictures: ``png``, ``svg``, ``pdf``.
             jobs: Processes that draw and compile side by side.
-            progress: Told of each figure and of the C code: done, all.
+            progress: Called after each figure and after the C code with the numbers done and in all.
 
         Returns:
-            The folder, the export in it, and why its C code could not be built, where it could not.
+            The folder, the export in it, and the reason if its C code could not be built.
 
         Raises:
-            OutputError: It exists without ``force``, or cannot be written.
+            OutputError: The folder exists without ``force``, or cannot be written.
         """
         return write_result(
             self._prepared, self.solution, self.document, Path(out), tradeoff=self.tradeoff, force=force,
@@ -295,7 +296,7 @@ class PostureResult:
         return draw_all(result_view(self._prepared, self.solution, self.document), Path(out), formats, only)
 
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
-        """Write the C code with the optimal posture as a constant; as :meth:`ImpactObjective.export`."""
+        """Write the C code as :meth:`ImpactObjective.export` does, with the optimal posture as a constant."""
         objective = self.problem.problem.impact
         return write_export([objective], Path(out), posture=self.q, build=build, **options)
 
@@ -313,15 +314,15 @@ def optimize(
 
     Args:
         problem: The problem.
-        starts: Starting points: the given posture, then random feasible ones.
+        starts: Number of starts: the given posture, then random feasible postures.
         seed: Seed of the random starts.
-        jobs: Processes that search.
-        compile: Whether the program becomes machine code: ``auto`` (where it pays), ``always``, ``never``.
-        progress: Told of each start that ended: done, all.
+        jobs: Processes that search side by side.
+        compile: Whether the program is compiled: ``auto`` (if it pays), ``always`` or ``never``.
+        progress: Called after each start with the numbers done and in all.
 
     Raises:
-        Infeasible: No posture satisfies the constraints; names those that conflict.
-        SolverFailed: No run ended at a posture that certifies.
+        Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
+        SolverFailed: No run ended at a certified posture.
     """
     found = solve_robustly(problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress)
     return PostureResult(problem, found.solution, found.robustness)

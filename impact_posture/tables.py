@@ -56,6 +56,12 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
         raise SpecError(f"key '{path}': {what}", where=where, hint=hint) from None
 
 
+def json_block(value: Any) -> dict[str, object]:
+    """Return the fields of a dataclass as JSON content, with arrays as lists."""
+    found = {field.name: getattr(value, field.name) for field in fields(value)}
+    return {name: entry.tolist() if hasattr(entry, "tolist") else entry for name, entry in found.items()}
+
+
 def _plain(value: Any) -> Any:
     return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
 

@@ -11,7 +11,7 @@ import typer.main
 
 from impact_posture.errors import FrameNotFound, InertiaError, JointNotFound, PostureError, not_one_of
 from impact_posture.impact.resolved_impact import resolve
-from impact_posture.posture.notes import percent
+from impact_posture.posture.caveats import percent
 from impact_posture.posture.problem_settings import make_settings, prepare, resolved_settings
 from impact_posture.robot.postures import read_posture, write_posture
 from impact_posture.robot.robot_loader import load_robot

@@ -14,8 +14,7 @@ import threadpoolctl
 from impact_posture import libraries
 from impact_posture.errors import CompilerError, OutputError
 from impact_posture.posture import compiled
-from impact_posture.posture.blas import one_blas_thread
-from impact_posture.posture.nlp import build_nlp
+from impact_posture.posture.nlp import build_nlp, one_blas_thread
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.problem_settings import Prepared, make_settings, prepare
 from impact_posture.posture.result import result_document

@@ -118,19 +118,19 @@ def test_free_values_stand_beside_the_supported_ones() -> None:
     found = evaluate(impact.objective, impact.q)
     assert [s.frame for s in impact.supports] == ["left_sole_link", "right_sole_link"]
     expected = dense(loaded, "torso_2_link", impact.q, n, None, ())
-    assert found.free is not None
+    assert found.without_supports is not None
     for key in ("H", "G", "V", "S", "E"):
-        assert_close(found.free.to_dict()[key], expected[key], 1e-10, key)  # type: ignore[arg-type]
-    assert found.to_dict()["free"] == found.free.to_dict()
-    assert found.footing is not None
-    assert found.to_dict()["footing"] == found.footing.to_dict()
+        assert_close(found.without_supports.to_dict()[key], expected[key], 1e-10, key)  # type: ignore[arg-type]
+    assert found.to_dict()["free"] == found.without_supports.to_dict()
+    assert found.contact_stability is not None
+    assert found.to_dict()["footing"] == found.contact_stability.to_dict()
     # Two flat feet have full rank: their compliance hardly matters.
     assert found.compliance_effect is not None and 0 < found.compliance_effect < 1e-2
     without = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0), support=()))
     alone = evaluate(without.objective, without.q)
-    assert alone.free is None and "free" not in alone.to_dict()
-    assert alone.footing is None and "footing" not in alone.to_dict()
-    assert alone.scalars.H == pytest.approx(found.free.H, rel=1e-14)
+    assert alone.without_supports is None and "free" not in alone.to_dict()
+    assert alone.contact_stability is None and "footing" not in alone.to_dict()
+    assert alone.scalars.H == pytest.approx(found.without_supports.H, rel=1e-14)
 
 
 def test_the_predicted_jumps_obey_the_impact() -> None:

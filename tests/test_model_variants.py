@@ -1,4 +1,4 @@
-"""Uncertain models: what a scenario is, the worst of several, how far the optimum moves, the export, the command."""
+"""Uncertain models: model variants, the worst of several, how far the optimum moves, the export, the command."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from impact_posture.errors import FrameNotFound, ImpactPostureError, InputError,
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.metric import Metric
-from impact_posture.impact.model_set import ModelSet
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.worst_case import ModelSet
 from impact_posture.libraries import build_library, library_path
 from impact_posture.posture.constraint import CenterOfMassOverFeet
 from impact_posture.posture.kept_feet import KeptFeet
@@ -35,7 +35,7 @@ from impact_posture.posture.problem_settings import (
 )
 from impact_posture.posture.robustness import Robustness, VariantOptimum, solve_robustly
 from impact_posture.posture.solve import solve
-from impact_posture.robot.model_variant import MOST_SCENARIOS, Payload, between, build_model_variants
+from impact_posture.robot.model_variant import MOST_VARIANTS, Payload, between, build_model_variants
 from impact_posture.robot.robot import Robot
 from tests.command import run
 from tests.helpers import (
@@ -58,7 +58,7 @@ def feet_of(found: Robot) -> tuple[Support, ...]:
     return tuple(Support.from_spec(s) for s in found.spec.supports)
 
 
-# ---- what a scenario is -------------------------------------------------------------------------------------------
+# ---- what a model variant is ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", FRAMES)
@@ -67,31 +67,31 @@ def test_a_payload_adds_its_mass_and_a_factor_scales_the_armature(name: str) -> 
     before, armature = found.model_sha256, found.armature.copy()
     frame = FRAMES[name]
     payload = Payload(frame, 0.7)
-    scenarios = build_model_variants(found, (0.5, 3.0), [payload])
-    assert [s.name for s in scenarios] == [
+    variants = build_model_variants(found, (0.5, 3.0), [payload])
+    assert [s.name for s in variants] == [
         "as modeled", "armature × 0.5", "armature × 3", f"0.7 kg at {frame}",
         f"armature × 0.5, 0.7 kg at {frame}", f"armature × 3, 0.7 kg at {frame}",
     ]  # fmt: skip
-    assert scenarios[0].robot is found and len({s.robot.model_sha256 for s in scenarios}) == len(scenarios)
+    assert variants[0].robot is found and len({s.robot.model_sha256 for s in variants}) == len(variants)
     for q in random_configurations(found.model, 3, name, "payload"):
         M, J = mass_matrix(found.model, q), frame_jacobian(found.model, q, found.frame_id(frame))[:3]
-        for scenario in scenarios:
-            expected = M + (scenario.armature_factor - 1) * np.diag(armature)
-            if scenario.payload is not None:
+        for variant in variants:
+            expected = M + (variant.armature_factor - 1) * np.diag(armature)
+            if variant.payload is not None:
                 expected = expected + payload.mass * J.T @ J
-            assert_close(mass_matrix(scenario.robot.model, q), expected, 1e-12, scenario.name)
-            np.testing.assert_allclose(scenario.robot.armature, scenario.armature_factor * armature, rtol=1e-15)
+            assert_close(mass_matrix(variant.robot.model, q), expected, 1e-12, variant.name)
+            np.testing.assert_allclose(variant.robot.armature, variant.armature_factor * armature, rtol=1e-15)
     del found.__dict__["model_sha256"]
     assert found.model_sha256 == before, "the robot itself is as it was"
-    assert scenarios[4].to_dict() == {
+    assert variants[4].to_dict() == {
         "name": f"armature × 0.5, 0.7 kg at {frame}",
         "armature_factor": 0.5,
         "payload": {"frame": frame, "mass": 0.7},
-        "model_sha256": scenarios[4].robot.model_sha256,
+        "model_sha256": variants[4].robot.model_sha256,
     }
 
 
-def test_which_scenarios_there_are() -> None:
+def test_which_model_variants_there_are() -> None:
     arm = robot("tilthex_arm")
     assert build_model_variants(arm, None, []) == () == build_model_variants(arm, (1.0, 1.0), [])
     assert [s.armature_factor for s in build_model_variants(arm, (2.0, 2.0), [])] == [1.0, 2.0]
@@ -113,7 +113,7 @@ def test_which_scenarios_there_are() -> None:
         ("panda", (0.0, 2.0), [], InputError, "above zero"),
         ("panda", (0.5, float("inf")), [], InputError, "range"),
         ("anymal_c", (0.5, 2.0), [], InputError, "no armature"),
-        ("panda", (0.5, 2.0), [("panda_hand", m) for m in (1.0, 2.0, 3.0, 4.0)], InputError, "15 scenarios"),
+        ("panda", (0.5, 2.0), [("panda_hand", m) for m in (1.0, 2.0, 3.0, 4.0)], InputError, "15 model variants"),
     ],
 )
 def test_refusals(
@@ -126,15 +126,15 @@ def test_refusals(
     with pytest.raises(kind) as caught:
         build_model_variants(robot(name), factors, [Payload(*payload) for payload in payloads])
     assert words in caught.value.line and "\n" not in caught.value.line
-    assert MOST_SCENARIOS == 12
+    assert MOST_VARIANTS == 12
 
 
-def test_robots_between_the_scenarios() -> None:
+def test_robots_between_the_model_variants() -> None:
     found = robot("talos")
-    scenarios = build_model_variants(
+    variants = build_model_variants(
         found, (0.5, 4.0), [Payload("gripper_right_base_link", 2.0), Payload("base_link", 9.0)]
     )
-    drawn = between(scenarios, 200, seed=1)
+    drawn = between(variants, 200, seed=1)
     factors = np.array([(one.armature.sum() / found.armature.sum()) for one in drawn])
     assert 0.5 <= factors.min() < 0.6 and 3.5 < factors.max() <= 4.0
     assert 0.3 < (factors < np.sqrt(0.5 * 4)).mean() < 0.7, "evenly in the logarithm"
@@ -143,7 +143,7 @@ def test_robots_between_the_scenarios() -> None:
     hand = found.model.frames[found.frame_id("gripper_right_base_link")].parentJoint
     at_hand = np.array([one.model.inertias[hand].mass - found.model.inertias[hand].mass for one in drawn])
     assert at_hand.max() <= 2.0 and (at_hand > 0).any() and (at_hand == 0).any(), "one payload at a time"
-    assert [one.model_sha256 for one in between(scenarios, 3, seed=1)] == [one.model_sha256 for one in drawn[:3]]
+    assert [one.model_sha256 for one in between(variants, 3, seed=1)] == [one.model_sha256 for one in drawn[:3]]
 
 
 # ---- the worst of them --------------------------------------------------------------------------------------------
@@ -170,7 +170,7 @@ def objective_of(name: str, more: dict[str, object], *, feet: bool = False) -> I
         ImpactContact(FRAMES[name], (0.2, -0.4, 1.0), (0.02, 0.0, 0.01)),
         supports=feet_of(found) if feet else (),
         compliance=1e-3,
-        scenarios=build_model_variants(found, (0.4, 2.0), [Payload(FRAMES[name], 0.8)]),
+        model_variants=build_model_variants(found, (0.4, 2.0), [Payload(FRAMES[name], 0.8)]),
         **several,
         **rest,  # type: ignore[arg-type]
     )
@@ -193,7 +193,7 @@ def test_the_largest_of_separate_objectives(name: str, feet: bool, kind: str) ->
     gradient_fun = objective.gradient_fun()
     seen = set()
     for q in random_configurations(objective.robot.model, 2, name, kind, spread=0.4):
-        alone = [replace(objective, robot=s.robot, scenarios=()) for s in objective.scenarios]
+        alone = [replace(objective, robot=s.robot, model_variants=()) for s in objective.model_variants]
         values = np.array([one.value(q) for one in alone])
         value, worst = objective.value(q), int(values.argmax())
         assert value == values.max() and few(objective).worst(q) == worst
@@ -208,10 +208,10 @@ def test_the_largest_of_separate_objectives(name: str, feet: bool, kind: str) ->
         points = objective.subgradients(q)
         np.testing.assert_array_equal(points.first, gradient)
         found = evaluate(objective, q)
-        assert [s.objective for s in found.scenarios] == values.tolist() and found.objective == value
+        assert [s.objective for s in found.model_variants] == values.tolist() and found.objective == value
         block = found.to_dict()
-        assert block["worst_scenario"] == objective.scenarios[worst].name
-    assert seen <= set(range(len(objective.scenarios)))
+        assert block["worst_scenario"] == objective.model_variants[worst].name
+    assert seen <= set(range(len(objective.model_variants)))
 
 
 def test_subgradients_where_two_payloads_are_as_bad() -> None:
@@ -223,7 +223,7 @@ def test_subgradients_where_two_payloads_are_as_bad() -> None:
     def objective(mass: float) -> ImpactObjective:
         payloads = [Payload("FL_SHOULDER", 1.0), Payload("FR_SHOULDER", mass)]
         return ImpactObjective(
-            found, contact, Metric("kinetic"), "energy", scenarios=build_model_variants(found, None, payloads)
+            found, contact, Metric("kinetic"), "energy", model_variants=build_model_variants(found, None, payloads)
         )
 
     def gap(mass: float) -> float:
@@ -263,7 +263,7 @@ def problem_of(task: dict[str, object], **more: object) -> PostureProblem:
 @pytest.mark.parametrize("name", TASKS)
 def test_optima_certify(name: str) -> None:
     problem = problem_of(TASKS[name])
-    nominal = solve(replace(problem, objective=problem.impact.by_scenario[0]), starts=2, jobs=1, compile="never")
+    nominal = solve(replace(problem, objective=problem.impact.by_variant[0]), starts=2, jobs=1, compile="never")
     solution = solve(problem, starts=2, jobs=1, compile="never", guesses=(nominal.q,))
     assert solution.certificate.holds() and solution.certified_starts == solution.feasible_starts
     assert problem.objective.value(solution.q) <= problem.objective.value(nominal.q) * (1 + 1e-9)
@@ -276,27 +276,27 @@ def test_how_far_the_optimum_moves() -> None:
     both = solve_robustly(problem, starts=3, seed=4, jobs=1, compile="never")
     found, q = both.robustness, both.solution.q
     assert found is not None and both.solution.certificate.holds()
-    members = problem.impact.by_scenario
+    members = problem.impact.by_variant
     at_robust = [member.value(q) for member in members]
-    assert [s.name for s in found.scenarios] == [s.name for s in problem.impact.scenarios]
-    assert [s.at_robust for s in found.scenarios] == at_robust and found.worst_robust == max(at_robust)
-    for one, member in zip(found.scenarios, members, strict=True):
+    assert [s.name for s in found.model_variants] == [s.name for s in problem.impact.model_variants]
+    assert [s.at_robust for s in found.model_variants] == at_robust and found.worst_robust == max(at_robust)
+    for one, member in zip(found.model_variants, members, strict=True):
         assert one.q is not None and one.own is not None and one.own == member.value(one.q)
         assert one.own <= one.at_robust * (1 + 1e-7), "its own optimum is best for it"
         assert one.moved == pytest.approx(np.linalg.norm(pin.difference(problem.robot.model, q, one.q)), rel=1e-9)
-    first = found.scenarios[0]
+    first = found.model_variants[0]
     assert first.own is not None and first.q is not None
     assert found.worst_nominal == problem.objective.value(first.q) and found.worst_nominal >= found.worst_robust
     assert found.price == pytest.approx(at_robust[0] / first.own - 1) and found.moved == first.moved
     assert found.gain == pytest.approx(1 - found.worst_robust / found.worst_nominal)
     drawn = [
-        replace(problem.objective, robot=one, scenarios=()).value(q)
-        for one in between(problem.impact.scenarios, found.drawn, 4)
+        replace(problem.objective, robot=one, model_variants=()).value(q)
+        for one in between(problem.impact.model_variants, found.drawn, 4)
     ]
     assert found.between == max(drawn)
     words = found.line
     assert f"moves by {found.moved:.3g} rad" in words and f"{found.gain:.1%} lower" in words
-    assert ("between the scenarios" in words) == (found.between > found.worst_robust)
+    assert ("between the model variants" in words) == (found.between > found.worst_robust)
     assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["worst_nominal"] == found.worst_nominal
 
 
@@ -310,10 +310,10 @@ def test_where_nothing_is_uncertain_nothing_is_compared() -> None:
 
 def test_words_of_every_finding() -> None:
     def found(own: float | None, worst_nominal: float | None, broken: tuple[str, ...] = ()) -> str:
-        scenario = VariantOptimum(
+        variant = VariantOptimum(
             "as modeled", 2.0, own, None if own is None else np.zeros(1), None if own is None else 0.5
         )
-        return Robustness((scenario,), 4.0, worst_nominal, broken, 3.0, 60).line
+        return Robustness((variant,), 4.0, worst_nominal, broken, 3.0, 60).line
 
     assert found(1.0, 5.0) == (
         "the optimum moves by 0.5 rad (m); the worst case is 20.0% lower than at the optimum of the model as it "
@@ -325,7 +325,7 @@ def test_words_of_every_finding() -> None:
     assert "50.0% below its own optimum" in found(4.0, 5.0)
 
 
-def test_balance_and_feet_hold_in_every_scenario() -> None:
+def test_balance_and_feet_hold_in_every_model_variant() -> None:
     """A weight in the hand moves the center of mass: a posture found for it must not tip over with it."""
     frame = FRAMES["talos"]
     task = {"robot": "talos", "frame": frame, "normal": (-1, 0, 0), "contact_pose": "position"}
@@ -335,8 +335,8 @@ def test_balance_and_feet_hold_in_every_scenario() -> None:
         "center of mass over the feet", f"center of mass over the feet with 16 kg at {frame}"
     ]  # fmt: skip
     solution = solve(problem, starts=2, jobs=1, compile="never")
-    for scenario in problem.impact.scenarios:
-        model = scenario.robot.model
+    for variant in problem.impact.model_variants:
+        model = variant.robot.model
         center = pin.centerOfMass(model, model.createData(), solution.q)[:2]
         assert (centers[0].normals @ center - centers[0].offsets).max() <= -centers[0].margin + 1e-8
         rows, jacobian = centers[1].evaluate(Numeric(problem.robot.model).at(solution.q))
@@ -361,7 +361,7 @@ def test_a_resolved_problem_gives_the_same_again(tmp_path: Path) -> None:
     assert 'payload = [["ee", 0.3]]' in text and "armature_range = [0.25, 1.0]" in text
     (tmp_path / "problem.toml").write_text(text)
     again = prepare(read_settings(tmp_path / "problem.toml"))
-    names = [[s.name for s in p.problem.impact.scenarios] for p in (prepared, again)]
+    names = [[s.name for s in p.problem.impact.model_variants] for p in (prepared, again)]
     assert names[0] == names[1] and len(names[0]) == 4
     one, two = (solve(p.problem, starts=2, jobs=1, compile="never") for p in (prepared, again))
     np.testing.assert_array_equal(one.q, two.q)
@@ -382,12 +382,12 @@ def test_bad_keys(tmp_path: Path, line: str) -> None:
 
 
 @pytest.mark.parametrize(("kind", "real"), [("cone", DOUBLE), ("contacts", FLOAT)])
-def test_export_has_the_worst_scenario(tmp_path: Path, kind: str, real: Real) -> None:
+def test_export_has_the_worst_model_variant(tmp_path: Path, kind: str, real: Real) -> None:
     need_compiler()
     objective = objective_of("tilthex_arm", MORE[kind])
-    objective = replace(objective, scenarios=objective.scenarios[::4])
+    objective = replace(objective, model_variants=objective.model_variants[::4])
     written = export(objective, tmp_path, prefix="arm", real=real, check=False)
-    assert [s["name"] for s in written.manifest["scenarios"]] == [s.name for s in objective.scenarios]
+    assert [s["name"] for s in written.manifest["scenarios"]] == [s.name for s in objective.model_variants]
     assert written.manifest["model_sha256"] == objective.robot.model_sha256
     header = (tmp_path / "arm.h").read_text()
     assert "armature x 0.4, 0.8 kg at ee" in " ".join(header.replace("*", " ").split())
@@ -425,7 +425,7 @@ def test_optimize(tmp_path: Path) -> None:
     assert robustness["between"]["drawn"] == 60
     assert [c["impulse_bound"] for c in document["contacts"]] == [1.0, 2.0] and "up to 2 N·s" in done.stdout
     worst = optimal["worst_impulses"]
-    assert worst["jump_norm"] ** 2 == pytest.approx(optimal["objective"], rel=1e-9), "of the worst scenario"
+    assert worst["jump_norm"] ** 2 == pytest.approx(optimal["objective"], rel=1e-9), "of the worst model variant"
     assert "worst impulses after: 1 N·s at ee" in done.stdout
     assert robustness["line"] in " ".join(done.stdout.split())
 

@@ -12,9 +12,8 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.contact import point_on
 from impact_posture.posture.certificate import certify, objective_gradients
-from impact_posture.posture.equalities import equality_jacobian, rank
 from impact_posture.posture.null_space_path import null_space_path
-from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
 from impact_posture.posture.problem_settings import (
     dump_settings,
     make_settings,

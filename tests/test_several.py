@@ -345,7 +345,8 @@ def test_kept_feet_of_each_impact() -> None:
     assert [tuple(c.parameters) for c in kept] == [c.normal for c in problem.objective.contacts]
     solution = solve(problem, starts=1, jobs=1, compile="never")
     for one in evaluate(problem.objective, solution.q).contacts:
-        assert one.footing is not None and one.footing.friction is not None and one.footing.friction <= 2.02
+        found = one.contact_stability
+        assert found is not None and found.friction is not None and found.friction <= 2.02
     with pytest.raises(InputError, match="pull as well as push"):
         problem_of(task, bilateral=True)
 

@@ -27,8 +27,8 @@ from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.posture.starts import Projector
 from impact_posture.posture.tradeoff import TradeOff, find_knee
+from impact_posture.settings import TRADEOFF_POINTS
 from impact_posture_cli.argv import fill_optional
-from impact_posture_cli.options import TRADEOFF_POINTS
 from tests.command import run
 from tests.helpers import central_gradient, relative, rng
 from tests.test_posture import walk

@@ -53,15 +53,15 @@ def evaluate(
     block = found.to_dict()
     if found.contacts:
         contacts_table(page, frames, block["by_contact"])  # type: ignore[arg-type]
-    if found.scenarios:
+    if found.model_variants:
         variants_table(page, [block], ["value"])
     page.gap()
     page.line(found.dominance.line)
     if found.impulses is not None:
         page.line(f"worst impulses: {impulses_line(frames, found.impulses.to_dict())}")
     for name, one in zip(frames, found.contacts or (found,), strict=True):
-        if one.footing is not None:
-            page.line(f"feet{f' (impact at {name})' if found.contacts else ''}: {one.footing.line}")
+        if one.contact_stability is not None:
+            page.line(f"feet{f' (impact at {name})' if found.contacts else ''}: {one.contact_stability.line}")
     page.warnings(warnings)
 
 
@@ -111,8 +111,9 @@ def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
         ("S", per_speed, "the same when the contact sticks"),
         ("E", "kg", "energy lost per approach speed², e = 0"),
     )
-    mine, free = found.scalars.to_dict(), found.free.to_dict() if found.free is not None else None
-    mass = (found.scalars.effective_mass, None if found.free is None else found.free.effective_mass)
+    mine, other = found.scalars.to_dict(), found.without_supports
+    free = None if other is None else other.to_dict()
+    mass = (found.scalars.effective_mass, None if other is None else other.effective_mass)
     rows = [
         (f"  {key}", number(mine[key]), *(() if free is None else (number(free[key]),)), unit, words)
         for key, unit, words in meaning
@@ -127,8 +128,8 @@ def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     if impact.objective.others:
         letters["impulse"] = "the largest ‖Δν‖² within the bounds on the impulses"
     worst = f", worst within {cone:g}° of n" if (cone := impact.objective.normal_cone_deg) else ""
-    if count := len(found.scenarios):
-        worst += f", worst of {count} scenarios"
+    if count := len(found.model_variants):
+        worst += f", worst of {count} model variants"
     page.line(f"  objective {kind} ({letters[kind]}{worst}): {number(found.objective)}")
     if not kinetic:
         weighed = "weighted" if impact.metric.kind == "weighted" else "alike"

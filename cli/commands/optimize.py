@@ -135,8 +135,8 @@ def _announce(page: Page, prepared: Prepared) -> None:
             ],
             *([("pull", "as well as push")] if impact.objective.bilateral else []),
             *(
-                [("scenarios", "; ".join(s.name for s in scenarios))]
-                if (scenarios := impact.objective.scenarios)
+                [("model variants", "; ".join(v.name for v in variants))]
+                if (variants := impact.objective.model_variants)
                 else []
             ),
             ("metric", impact.metric.kind),
@@ -155,7 +155,7 @@ def _announce(page: Page, prepared: Prepared) -> None:
 
 
 def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
-    from impact_posture.posture.notes import percent
+    from impact_posture.posture.caveats import percent
     from impact_posture_cli.output import number, worst_normal
     from impact_posture_cli.tables import contact_names, contacts_table, impulses_line, variants_table
 
@@ -222,7 +222,7 @@ def _footings(frames: list[str], block: dict[str, Any]) -> list[tuple[str, dict[
 
 def _tradeoff(page: Page, points: list[dict[str, Any]], notes: list[str]) -> None:
     """What a smaller change would buy."""
-    from impact_posture.posture.notes import percent
+    from impact_posture.posture.caveats import percent
     from impact_posture_cli.output import number
 
     page.gap()

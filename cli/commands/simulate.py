@@ -77,7 +77,7 @@ def simulate(
     from impact_posture.experiment.jobs import Job, execute
     from impact_posture.experiment.statistics import fate
     from impact_posture.output_folder import check_output
-    from impact_posture.posture.blas import one_blas_thread
+    from impact_posture.posture.nlp import one_blas_thread
     from impact_posture.simulation.scenario_file import read_scenario
     from impact_posture_cli.output import Page, complain, print_json
     from impact_posture_cli.progress import progress_line

@@ -225,5 +225,5 @@ def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple
 
 
 def _without_contact(o: ImpactObjective) -> tuple[object, ...]:
-    scenarios = tuple(scenario.robot.model_sha256 for scenario in o.scenarios)
-    return o.robot.model_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg, scenarios
+    models = tuple(variant.robot.model_sha256 for variant in o.model_variants)
+    return o.robot.model_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg, models

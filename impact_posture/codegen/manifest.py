@@ -131,7 +131,7 @@ def build_manifest(
         "objective": first.name,
         "objective_units": first.units,
         "normal_cone_deg": first.normal_cone_deg,
-        "scenarios": [scenario.to_dict() for scenario in first.scenarios],
+        "scenarios": [variant.to_dict() for variant in first.model_variants],
         "several": joint,
         "supports": [{"frame": s.frame, "kind": s.kind, "offset": list(s.offset)} for s in first.supports],
         "support_compliance": first.compliance if first.supports else None,

@@ -191,9 +191,9 @@ def _frame(v: NamedObjective, test: dict[str, Any], alone: bool) -> dict[str, An
 def _worst_note(objective: ImpactObjective) -> str:
     """Say what the objective is the worst of, and which gradient it has where several are as bad."""
     note = ""
-    if objective.scenarios:
-        note = "; the worst of " + "; ".join(scenario.name for scenario in objective.scenarios)
-    if objective.normal_cone_deg or objective.scenarios:
+    if objective.model_variants:
+        note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)
+    if objective.normal_cone_deg or objective.model_variants:
         note += ".  Where several are as bad, grad is the subgradient at one of them"
     return note
 
@@ -201,7 +201,7 @@ def _worst_note(objective: ImpactObjective) -> str:
 def _several(joint: NamedObjective, test: dict[str, Any]) -> dict[str, Any]:
     """The objective of several contacts at once."""
     objective = joint.objective
-    names = [f"({scenario.name})" for scenario in objective.scenarios]
+    names = [f"({model.name})" for model in objective.model_variants]
     return {
         "stem": Verbatim(joint.stem),
         "test": test,

@@ -17,7 +17,7 @@ from impact_posture.errors import ImpactPostureError, InputError, MetricError, O
 from impact_posture.experiment.jobs import SCHEMA, Job, controller_factory, execute
 from impact_posture.libraries import source_key
 from impact_posture.output_folder import is_ours, write_record
-from impact_posture.posture.blas import one_blas_thread
+from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.processes import fork_map
 from impact_posture.simulation.controller_factory import CONTROLLERS
 from impact_posture.simulation.scenario_file import scenario_path

@@ -1,4 +1,4 @@
-"""Ellipsoids by axes and radii, and the classical ones of velocity and force beside the impact ellipsoid."""
+"""Ellipsoids by axes and radii, and the classical velocity and force ellipsoids."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from impact_posture.impact.objective import ImpactObjective
 
 Vector = NDArray[np.float64]
 
-# An eigenvalue below this share of the largest one is zero: no motion that way, and no bound on the force.
+# An eigenvalue below this share of the largest one is zero: no motion along it, and no bound on the force.
 _RANK = 1e-12
 
 
@@ -29,22 +29,25 @@ class Ellipsoid:
 
     @property
     def finite_radii(self) -> list[float | None]:
-        """The radii, ``None`` for one without end."""
+        """The radii, with ``None`` for an infinite radius."""
         return [float(r) if np.isfinite(r) else None for r in self.radii]
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content; an infinite radius is ``None``."""
-        return {"axes": [[float(v) for v in row] for row in self.axes], "radii": self.finite_radii}
+        """Return JSON content; an infinite radius is ``None``."""
+        return {"axes": self.axes.tolist(), "radii": self.finite_radii}
 
 
 def ellipsoid_of(matrix: Vector) -> Ellipsoid:
-    """The ellipsoid ``{A^{1/2} u : |u| ≤ 1}`` of a symmetric PSD ``A``, shape (3, 3): radii are ``√eigenvalues``."""
+    """Return the ellipsoid ``{A^{1/2} u : |u| ≤ 1}`` of a symmetric PSD ``A``, shape (3, 3).
+
+    Its radii are ``√eigenvalues``.
+    """
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return Ellipsoid(_oriented(vectors[:, ::-1]), np.sqrt(np.clip(values[::-1], 0.0, None)))
 
 
 def velocity_ellipsoid(J: Vector) -> Ellipsoid:
-    """Contact velocities of joint velocities ``|ν| ≤ 1``: the ellipsoid of ``JJᵀ`` (Yoshikawa 1985).
+    """Return the ellipsoid of ``JJᵀ``: contact velocities for joint velocities ``|ν| ≤ 1`` (Yoshikawa 1985).
 
     Args:
         J: Linear contact Jacobian in world axes, shape (3, nv).
@@ -53,7 +56,9 @@ def velocity_ellipsoid(J: Vector) -> Ellipsoid:
 
 
 def force_ellipsoid(J: Vector) -> Ellipsoid:
-    """Contact forces of joint torques ``|Jᵀf| ≤ 1``: the ellipsoid of ``(JJᵀ)⁻¹``, endless where J loses rank.
+    """Return the ellipsoid of ``(JJᵀ)⁻¹``: contact forces for joint torques ``|Jᵀf| ≤ 1``.
+
+    It is infinite along directions in which J loses rank.
 
     Args:
         J: Linear contact Jacobian in world axes, shape (3, nv).
@@ -65,16 +70,16 @@ def force_ellipsoid(J: Vector) -> Ellipsoid:
 
 
 def classical_ellipsoids(objective: ImpactObjective, q: Vector) -> dict[str, Ellipsoid]:
-    """``{"velocity", "force"}`` of the objective's contact at ``q``.
+    """Return ``{"velocity", "force"}`` of the contact at ``q``.
 
-    Both know nothing of inertia or of supports, and mix m/s with rad/s as ``|ν|`` does.
+    Both ignore inertia and supports, and mix m/s with rad/s as ``|ν|`` does.
     """
     J = objective.oracle.at(q).J
     return {"velocity": velocity_ellipsoid(J), "force": force_ellipsoid(J)}
 
 
 def _oriented(vectors: Vector) -> Vector:
-    """Fix the signs that an eigensolver leaves open: largest entry positive, third axis by the right hand."""
+    """Fix the signs of eigenvectors: the largest entry is positive, and the axes are right-handed."""
     axes = np.array(vectors, dtype=float)
     for k in range(2):
         axes[:, k] *= np.sign(axes[np.argmax(np.abs(axes[:, k])), k])

@@ -1,8 +1,8 @@
-"""The worst normal of a cone: ``max nᵀAn`` over ``∠(n, n₀) ≤ α``, exactly, with the multiplier that proves it.
+"""The worst normal of a cone, exactly: ``max nᵀAn`` over ``∠(n, n₀) ≤ α``, with the multiplier that proves it.
 
 A quadratic on a cap of the sphere has its maximum at an eigenvector inside the cap or on the cap's edge, where it is
 a trigonometric polynomial of degree two.  ``bound = λ_max(A + μ(n₀n₀ᵀ − cos²α I)) ≥ nᵀAn`` for every normal of the
-cone and any ``μ ≥ 0``; at the right ``μ`` it is attained (S-lemma).
+cone and any ``μ ≥ 0``.  It is attained at the optimal ``μ`` (S-lemma).
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
-# Values closer than this are tied: relative to the size of A and to sin α, by which they can differ in the cone.
+# Values that differ by less, relative to the size of A times sin α (their possible range), are tied.
 TIED = 1e-6
-# Worst normals closer than this share of sin α are one.
+# Worst normals closer than this share of sin α count as the same normal.
 _APART = 1e-2
-# Values that differ by less, relative to the size of A, are in no order.
+# Values that differ by less, relative to the size of A, are equal up to rounding.
 _EQUAL = 1e-14
 _SMALL = float(np.finfo(float).tiny)
 _POLISH = 20
@@ -31,11 +31,11 @@ class WorstNormal:
 
     Attributes:
         value: The maximum.
-        normal: Where it is attained, shape (3,); one of ``normals``.
-        normals: All of the tied ones that stand apart, shape (k, 3); of a whole arc or circle a few.
+        normal: Normal that attains the maximum, shape (3,); the first of ``normals``.
+        normals: All tied normals that stand apart, shape (k, 3); a few of an arc or a circle.
         angle_deg: Angle of ``normal`` from the cone's axis, degrees.
-        multiplier: ``μ ≥ 0`` of the dual; zero where the cone's edge does not matter.
-        bound: ``λ_max(A + μ(n₀n₀ᵀ − cos²α I))``: no normal of the cone has more.
+        multiplier: ``μ ≥ 0`` of the dual; zero if the edge of the cone is inactive.
+        bound: ``λ_max(A + μ(n₀n₀ᵀ − cos²α I))``, an upper bound over the cone.
     """
 
     value: float
@@ -47,25 +47,25 @@ class WorstNormal:
 
     @property
     def tied(self) -> bool:
-        """Whether another normal is as bad: the value then has a kink here, and no gradient."""
+        """Whether another normal has the same value; the value then has a kink here and no gradient."""
         return len(self.normals) > 1
 
     def turned(self, R: Vector) -> WorstNormal:
-        """The same with its normals in other axes."""
+        """Return the same maximum with its normals in other axes."""
         return replace(self, normal=R @ self.normal, normals=self.normals @ R.T)
 
     def to_dict(self) -> dict[str, object]:
-        """The ``cone`` block of an evaluation."""
+        """Return the ``cone`` block of an evaluation."""
         return {
             "angle_deg": self.angle_deg,
             "tied": self.tied,
-            "normals": [[float(v) for v in n] for n in self.normals],
+            "normals": self.normals.tolist(),
             "multiplier": self.multiplier,
         }
 
 
 def cone_axes(n: Vector) -> Vector:
-    """Orthonormal axes with ``n`` as first column, shape (3, 3), without a branch near any ``n``."""
+    """Return orthonormal axes with ``n`` as first column, shape (3, 3); accurate for every ``n``."""
     x, y, z = (float(v) for v in n)
     side = 1.0 if z >= 0 else -1.0
     # Duff et al., "Building an orthonormal basis, revisited", JCGT 6 (2017).
@@ -90,7 +90,7 @@ def worst_normal(A: Vector, axis: Vector, cone_deg: float) -> WorstNormal:
     found = np.vstack([_inside(P, c, s * size), _on_edge(P, c, s, size)])
     values = np.einsum("ki,ij,kj->k", found, P, found)
     best = float(values.max())
-    # The named one must not hang on rounding: ties go by the coordinates.
+    # The leading normal must not depend on rounding, so its coordinates decide a tie.
     near = [k for k in range(len(found)) if values[k] >= best - TIED * s * size]
     near.sort(key=lambda k: (round((best - values[k]) / (_EQUAL * size)), *(-found[k])))
     apart: list[Vector] = []
@@ -111,9 +111,9 @@ def worst_normal(A: Vector, axis: Vector, cone_deg: float) -> WorstNormal:
 
 
 def tied_normals(A: Vector, axis: Vector, cone_deg: float, worst: WorstNormal, tolerance: float) -> Vector:
-    """Normals of the cone whose value is within ``tolerance · |A|`` of the worst, that one first, shape (k, 3).
+    """Return the normals whose value is within ``tolerance · |A|`` of the worst normal, it first, shape (k, 3).
 
-    Finitely many for finitely many; of an arc, a circle or a cap of tied ones a sample dense enough for its hull.
+    An arc, a circle or a cap of tied normals gives a sample that is dense enough for its convex hull.
     """
     alpha = np.deg2rad(cone_deg)
     size = float(np.abs(A).max())
@@ -121,7 +121,7 @@ def tied_normals(A: Vector, axis: Vector, cone_deg: float, worst: WorstNormal, t
     circle = np.stack([np.cos(_GRID), np.sin(_GRID)])
     values, vectors = np.linalg.eigh(A)
     top = vectors[:, values >= values[-1] - tolerance * size]
-    # A plane of top eigenvectors cuts the cap in an arc; where all are, every normal of the cap is as bad.
+    # A plane of top eigenvectors cuts the cap in an arc.  If all eigenvectors are, every normal of the cap is tied.
     tilts = alpha * (np.linspace(0, 1, 9) if top.shape[1] == 3 else np.ones(1))
     rings = [np.vstack([np.full_like(_GRID, np.cos(tilt)), np.sin(tilt) * circle]) for tilt in tilts]
     planes = [top[:, [i, j]] @ circle for i in range(top.shape[1]) for j in range(i)]
@@ -132,7 +132,7 @@ def tied_normals(A: Vector, axis: Vector, cone_deg: float, worst: WorstNormal, t
 
 
 def _multiplier(P: Vector, n: Vector, c: float, s: float) -> float:
-    """``μ`` of ``(P + μ diag(s², −c², −c²)) n = t n``, whose first row is free of cancellation in this form."""
+    """``μ`` of ``(P + μ diag(s², −c², −c²)) n = t n``, from its first row, in a form without cancellation."""
     if n[0] > c * (1 + 1e-12):
         return 0.0
     w = n[1:] / np.linalg.norm(n[1:])
@@ -140,7 +140,7 @@ def _multiplier(P: Vector, n: Vector, c: float, s: float) -> float:
 
 
 def _inside(P: Vector, c: float, size: float) -> Vector:
-    """Top eigenvectors within the cap, in the cone's axes; of a multiple eigenvalue also the one nearest the axis."""
+    """Top eigenvectors within the cap, in its axes; for a multiple eigenvalue also the nearest to the axis."""
     values, vectors = np.linalg.eigh(P)
     top = vectors[:, values >= values[-1] - TIED * size]
     candidates = [*top.T]
@@ -152,7 +152,7 @@ def _inside(P: Vector, c: float, size: float) -> Vector:
 
 
 def _on_edge(P: Vector, c: float, s: float, size: float) -> Vector:
-    """Maxima on the cap's edge ``n = (c, s cos φ, s sin φ)``; where it is flat, three of its points."""
+    """Maxima on the edge of the cap ``n = (c, s cos φ, s sin φ)``; three of its points if the value is constant."""
     b1, b2 = float(P[0, 1]), float(P[0, 2])
     h, k = float(P[1, 1] - P[2, 2]) / 2, float(P[1, 2])
 
@@ -165,7 +165,7 @@ def _on_edge(P: Vector, c: float, s: float, size: float) -> Vector:
     def height(x: Vector) -> Vector:
         return np.asarray(2 * c * (b1 * np.cos(x) + b2 * np.sin(x)) + s * (h * np.cos(2 * x) + k * np.sin(2 * x)))
 
-    # The slope's zeros as roots z = exp(iφ); on the unit circle or not, their angles are where to look.
+    # The zeros of the slope are roots z = exp(iφ).  The angles of all roots are candidates.
     roots = np.roots([s * complex(k, h), c * complex(b2, b1), 0, c * complex(b2, -b1), s * complex(k, -h)])
     phi = np.concatenate([np.angle(roots), _GRID[[int(height(_GRID).argmax())]]])
     swing = max(c * np.hypot(b1, b2) + s * np.hypot(h, k), _SMALL)
@@ -176,7 +176,7 @@ def _on_edge(P: Vector, c: float, s: float, size: float) -> Vector:
         if np.abs(step).max() < 1e-15:
             break
     kept = (bend(phi) < 0) & (np.abs(slope(phi)) <= 1e-10 * swing)
-    # A maximum that is flat to third order is no simple root: then what is highest is near enough.
+    # A maximum that is flat to third order is no simple root, so the highest candidate is kept as well.
     highest = int(height(phi).argmax())
     kept[highest] |= not (height(phi)[kept] >= height(phi)[highest] - _EQUAL * swing).any()
     phi = phi[kept]

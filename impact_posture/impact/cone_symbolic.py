@@ -1,7 +1,7 @@
-"""The worst normal of a cone in closed form, as an expression: what the C export evaluates.
+"""The worst normal of a cone in closed form, as the expression that the C export evaluates.
 
 With ``A`` in the cone's axes as ``[a, bᵀ; b, diag(d₁, d₂)]`` (the last two turned to the principal axes, ``d₁ ≥ d₂``)
-both cases are roots of a function that Newton's method climbs from the left without ever passing them:
+the normal follows from the root of a function.  Newton's method climbs to it from the left without passing it:
 
 - on the edge ``n = (c, s w)``, ``|w| = 1``: ``w_i = p_i/(ν − d_i)`` with ``p = b c/s`` (a trust-region problem in the
   plane; Moré and Sorensen 1983), solved for ``1/|w| = 1``;
@@ -14,14 +14,14 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-# Newton's steps: enough for full precision over 16 decades of p, gap and a up to 89.9°.
+# These steps of Newton's method give full precision over 16 decades of p, gap and a, and up to 89.9°.
 _EDGE_STEPS, _INSIDE_STEPS = 8, 14
-# Below every number that matters, in float as well.
+# Smaller than every number that matters, in single precision as well.
 _TINY = 1e-30
 
 
 def cone_axes_symbolic(n: ca.SX) -> ca.SX:
-    """As :func:`~impact_posture.impact.cone.cone_axes`, of an expression."""
+    """Return :func:`~impact_posture.impact.cone.cone_axes` of an expression."""
     x, y, z = n[0], n[1], n[2]
     side = ca.if_else(z >= 0, 1.0, -1.0)
     a = -1 / (side + z)
@@ -30,10 +30,10 @@ def cone_axes_symbolic(n: ca.SX) -> ca.SX:
 
 
 def worst_normal_symbolic(A: ca.SX, axis: ca.SX, cone_deg: float) -> ca.SX:
-    """The normal, shape (3,), that maximizes ``nᵀAn`` within ``cone_deg`` of ``axis``; one of them where tied.
+    """Return the normal, shape (3,), that maximizes ``nᵀAn`` within ``cone_deg`` of ``axis``; one normal at a tie.
 
-    The maximum's gradient is that of ``nᵀA(q)n`` with this ``n`` held fixed (Danskin); the expression is not to be
-    differentiated itself.
+    The gradient of the maximum is that of ``nᵀA(q)n`` with this ``n`` held fixed (Danskin).  Do not differentiate the
+    expression itself.
     """
     alpha = np.deg2rad(cone_deg)
     c, s = float(np.cos(alpha)), float(np.sin(alpha))
@@ -62,7 +62,7 @@ def worst_normal_symbolic(A: ca.SX, axis: ca.SX, cone_deg: float) -> ca.SX:
 
 def _edge_root(p: ca.SX, gap: ca.SX) -> ca.SX:
     """``η = ν − d₁ ≥ 0`` with ``p₁²/η² + p₂²/(η + gap)² = 1``; zero in the hard case."""
-    # Bounds from below; the last one for the corner where p₁ vanishes and |p₂| nears the gap (η ~ p₁^⅔ there).
+    # Bounds from below; the last bound is for the corner where p₁ vanishes and |p₂| nears the gap (η ~ p₁^⅔ there).
     x, y = ca.fabs(p[0]), ca.fabs(p[1])
     corner = ca.fmin((x * x * gap / 4) ** (1 / 3), x * ca.sqrt(gap / (4 * ca.fmax(gap - y, 0) + _TINY)))
     eta = ca.fmax(ca.fmax(ca.fmax(x, y - gap), corner), _TINY)
@@ -77,10 +77,10 @@ def _edge_root(p: ca.SX, gap: ca.SX) -> ca.SX:
 
 
 def _on_circle(p: ca.SX, eta: ca.SX, gap: ca.SX) -> ca.SX:
-    """``w`` of length one; in the hard case ``p₁ = 0`` either sign is right and plus is taken."""
+    """``w`` of length one; in the hard case ``p₁ = 0`` both signs are right and plus is chosen."""
     y = ca.fmin(ca.fmax(p[1] / ca.fmax(eta + gap, _TINY), -1), 1)
     rest = 1 - y * y
-    # By the sine where it is large, by the quotient where a root would lose its digits.
+    # Use the sine where it is large, and the quotient where a root would lose its digits.
     x = ca.if_else(rest > 1e-6, ca.if_else(p[0] >= 0, 1.0, -1.0) * ca.sqrt(rest), p[0] / eta)
     return ca.vertcat(x, y) / ca.hypot(x, y)
 

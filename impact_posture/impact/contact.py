@@ -1,4 +1,4 @@
-"""Where the impact comes from, and which feet stay on the ground."""
+"""Contacts of an impact, and supports that stay on the ground."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from impact_posture.settings import NormalFrame, SupportKind, Vector3
 
 Vector = NDArray[np.float64]
 
-# A normal shorter than this is what rounding left of zero.
+# A normal shorter than this is zero up to rounding.
 _DUST = 1e-9
-# A normal whose length is this near to 1 is a unit vector up to rounding.
+# A normal whose length differs from 1 by less is a unit vector up to rounding.
 _UNIT = 1e-15
-# Of impulses and speeds: their squares, times whatever a robot has, must stay within the range of doubles.
+# Largest impulse and speed.  Their squares, times the numbers of a robot, must stay within the range of doubles.
 LARGEST = 1e100
-# Compliance times the robot's mass: what is taken unless told, and the least that leaves digits enough.
+# Compliance times the mass of the robot: the default, and the least value that leaves enough digits.
 _DEFAULT_COMPLIANCE, _LEAST_COMPLIANCE = 1e-4, 1e-6
 
 
@@ -32,14 +32,14 @@ class ImpactContact:
 
     Attributes:
         frame: The frame that carries the contact point.
-        normal: Direction out of the surface, towards the robot, shape (3,).  It may be given with any length; the
+        normal: Direction out of the surface, towards the robot, shape (3,).  Any length is accepted, and the
             attribute is a unit vector.
         offset: Contact point from the frame's origin, in the frame, meters.
-        normal_frame: Axes of ``normal``: the world, or the contact frame (the normal then turns with the robot).
+        normal_frame: Axes of ``normal``: the world, or the contact frame, with which the normal turns.
         impulse: Largest impulse λ̄ along the normal, N·s.
 
     Raises:
-        ContactError: Zero or non-finite normal, offset or impulse.
+        ContactError: The normal is zero, or the normal, offset or impulse is not finite.
     """
 
     frame: str
@@ -67,8 +67,8 @@ class ImpactContact:
                 where="impulse",
                 hint=f"give {1 / LARGEST:g} to {LARGEST:g} N·s",
             )
-        # The largest entry first, because any length must do and squares overflow.  A unit normal stays as it is, so
-        # that a copy of a contact equals it to the last digit.
+        # Divide by the largest entry first, because squares of long vectors overflow.  A unit normal stays as it is,
+        # so that a copy of a contact equals it to the last digit.
         if abs(np.linalg.norm(n / np.abs(n).max()) * np.abs(n).max() - 1) > _UNIT:
             n = n / np.abs(n).max()
             n = n / np.linalg.norm(n)
@@ -79,11 +79,11 @@ class ImpactContact:
 
 @dataclass(frozen=True)
 class Support:
-    """A foot that stays: ``point`` holds three, ``surface`` six velocities at zero up to the compliance.
+    """A foot that stays on the ground; its velocities are zero up to the compliance.
 
     Attributes:
         frame: The foot's frame.
-        kind: ``point`` or ``surface``.
+        kind: ``point`` holds three velocities, ``surface`` holds six.
         offset: Contact point from the frame's origin, in the frame, meters.
         size: Half extents (x, y) of the sole in its frame, meters.
     """
@@ -95,20 +95,25 @@ class Support:
 
     @staticmethod
     def from_spec(spec: SupportSpec) -> Support:
-        """The support that a ``robot.toml`` names."""
+        """Return a support of ``robot.toml``."""
         return Support(spec.frame, spec.kind, spec.offset, spec.size)
 
     @property
     def rows(self) -> int:
-        """Velocities that it holds."""
+        """Number of velocities that it holds."""
         return 3 if self.kind == "point" else 6
+
+    @property
+    def has_sole(self) -> bool:
+        """Whether it is a surface of known size."""
+        return self.kind == "surface" and min(self.size) > 0
 
 
 def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> PointOnLink:
     """Resolve a frame and an offset in it to a point on a link.
 
     Raises:
-        FrameNotFound: No such frame.
+        FrameNotFound: There is no such frame.
         ContactError: The frame is welded to the world.
     """
     found = robot.model.frames[robot.frame_id(frame)]
@@ -123,31 +128,32 @@ def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> Poi
 
 
 def default_compliance(robot: Robot) -> float:
-    """Support compliance ε in 1/kg: a foot held as if it weighed 10⁴ robots.
+    """Return the default support compliance ε in 1/kg: a foot is held as if it weighed 10⁴ robots.
 
-    ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  Of what exactly held feet do to the
-    jump it leaves out at most ``ε/(σ + ε)``, with σ the least eigenvalue of ``J_sM⁻¹J_sᵀ`` above zero: 1e-4 where the
-    feet bear on the robot's mass, more near a posture where the rank of ``J_s`` drops.
+    ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  Its effect on the jump
+    differs from that of rigid feet by a share of at most ``ε/(σ + ε)``.  σ is the least eigenvalue of ``J_sM⁻¹J_sᵀ``
+    above zero.  The share is 1e-4 where the feet bear the mass of the robot.  It is larger where ``J_s`` nearly loses
+    rank.
     """
     return _DEFAULT_COMPLIANCE / robot.mass
 
 
 def least_compliance(robot: Robot) -> float:
-    """The stiffest feet that the symbolic kernel and the C export are good for, ε in 1/kg.
+    """Return the least compliance ε that the symbolic kernel and the C export allow, 1/kg.
 
-    Both add ``1/ε`` to the feet's inertia and take it away again on the way to the base, which costs as many digits
-    as ``ε`` has zeros; here some eight are left.
+    Both add ``1/ε`` to the inertia of the feet and subtract it again on the way to the base.  This costs as many
+    digits as ``ε`` has zeros; about eight digits are left at this limit.
     """
     return _LEAST_COMPLIANCE / robot.mass
 
 
 def heavy_feet_rounding(robot: Robot, compliance: float) -> float:
-    """How many times more ``M + J_sᵀJ_s/ε`` rounds than at the default compliance: its condition goes as ``1/ε``."""
+    """Return the rounding error of ``M + J_sᵀJ_s/ε`` relative to the default compliance; it grows with ``1/ε``."""
     return max(1.0, default_compliance(robot) / compliance)
 
 
 def support_inertia(robot: Robot, supports: tuple[Support, ...], compliance: float) -> dict[int, Vector]:
-    """``J_sᵀJ_s/ε`` as 6×6 inertias on the feet's links: point masses ``1/ε``, for a surface also moments ``1/ε``."""
+    """Return ``J_sᵀJ_s/ε`` by link, as 6×6 inertias: point masses ``1/ε``, and moments ``1/ε`` for a surface."""
     extra: dict[int, Vector] = {}
     for support in supports:
         point = point_on(robot, support.frame, support.offset)

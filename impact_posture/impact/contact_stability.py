@@ -1,8 +1,8 @@
-"""Whether the feet stay where they are: does any support impulse that the impact allows lie in the friction cones?
+"""Check whether support impulses within the friction cones can hold the feet during an impact.
 
-The metric holds the feet by force, pulling if need be.  At rank-deficient postures the impulses that hold them are
-not unique, so the question is about a set: ``f + N z`` with ``N`` a basis of ``{f: J_sᵀ f = 0}``, forces that feet
-press against each other with.  Weight does not count: within an impact it is nothing.
+The metric holds the feet by any impulse, even a pull.  The impulses are not unique where ``J_s`` lacks rank.  They
+form the set ``f + N z``, where ``N`` is a basis of ``{f: J_sᵀ f = 0}``, impulses by which feet press against each
+other.  Weight has no effect within an impact.
 """
 
 from __future__ import annotations
@@ -16,27 +16,28 @@ from numpy.typing import NDArray
 
 from impact_posture.impact.contact import Support
 from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
 
-# Singular values of J_s below this part of the largest are rounding.
+# A singular value of J_s below this share of the largest one is rounding.
 _RANK = 1e-9
-# An impulse of this part of the largest is none.
+# An impulse below this share of the largest one is zero.
 _NONE = 1e-6
-# Sides of the pyramid that stands for a friction cone, inside it.
+# Sides of the pyramid that stands for a friction cone.  It lies inside the cone.
 _SIDES = 16
 _MOST_FRICTION = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class FootImpulse:
-    """What one foot gets per unit impulse of the impact.
+    """Support impulse on one foot per unit impulse of the impact.
 
     Attributes:
-        frame: The foot.
+        frame: Frame of the foot.
         impulse: World axes, shape (3,); positive z pushes the robot up.
-        moment: About its contact point, world axes, shape (3,); zeros for a point.
-        lifts: Whether it would have to pull.
+        moment: Moment about its contact point, world axes, shape (3,); zero for a point.
+        lifts: Whether the ground would have to pull.
     """
 
     frame: str
@@ -45,13 +46,8 @@ class FootImpulse:
     lifts: bool
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        return {
-            "frame": self.frame,
-            "impulse": [float(v) for v in self.impulse],
-            "moment": [float(v) for v in self.moment],
-            "lifts": self.lifts,
-        }
+        """Return JSON content."""
+        return json_block(self)
 
 
 @dataclass(frozen=True)
@@ -59,10 +55,10 @@ class ContactStability:
     """Whether the feet can stay.
 
     Attributes:
-        friction: The least friction coefficient with which all feet stay; ``None`` where one lifts (or its sole tips)
-            whatever the friction, infinite above ten.
-        feet: An impulse for each foot: one within the cones where there is one, else the one that pulls least.
-        freedom: Dimension of the set of impulses; zero where they are unique.
+        friction: Least friction coefficient with which all feet stay; infinite above ten; ``None`` if a foot lifts or
+            a sole tips at any friction.
+        feet: Impulse on each foot: within the cones if possible, else with the least pull.
+        freedom: Dimension of the set of impulses; zero if they are unique.
     """
 
     friction: float | None
@@ -82,7 +78,7 @@ class ContactStability:
         return f"the feet stay with a friction coefficient of {self.friction:.2f} or more"
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
+        """Return JSON content."""
         finite = self.friction is not None and np.isfinite(self.friction)
         return {
             "friction": self.friction if finite else None,
@@ -94,118 +90,102 @@ class ContactStability:
 
 
 def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Vector) -> ContactStability:
-    """Find impulses within the friction cones, or those that pull least.
+    """Find impulses within the friction cones, or impulses with the least pull.
 
-    The ground is level: cones stand along world z.  A sole with a ``size`` bears moments only as far as its edges.
+    The ground is level, so the axis of the cones is world z.  A sole with a ``size`` bears moments up to its edges.
 
     Args:
-        oracle: The impact, with these supports.
-        supports: The feet.
+        oracle: Numbers of the impact with these supports.
+        supports: Feet that the impact must not move.
         q: Configuration, shape (nq,).
     """
     particular = oracle.quantities(q).support_impulse
     values, vectors = np.linalg.eigh(oracle.Js @ oracle.Js.T)
     basis = vectors[:, values <= _RANK**2 * max(float(values[-1]), 1e-300)]
-    rows = FrictionCones(supports, [oracle.numeric.placement(p).rotation for p, _ in oracle.feet])
-    lifting = rows.least_pull(particular, basis)
-    scale = max(float(np.abs(particular).max(initial=0.0)), 1e-300)
-    if lifting.pull > _NONE * scale:
-        return ContactStability(None, rows.feet(lifting.impulse, _NONE * scale), basis.shape[1])
-    found = rows.within(particular, basis, _MOST_FRICTION)
+    cones = FrictionCones(supports, [oracle.numeric.placement(p).rotation for p, _ in oracle.feet])
+    none = _NONE * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
+
+    def verdict(friction: float | None, impulse: Vector) -> ContactStability:
+        return ContactStability(friction, cones.feet(impulse, none), basis.shape[1])
+
+    lifting = cones.least_pull(particular, basis)
+    if cones.pull(lifting) > none:
+        return verdict(None, lifting)
+    found = cones.within(particular, basis, _MOST_FRICTION)
     if found is None:
-        # No friction that exists, or a sole that tips: without the sliding rows it is the sole.
-        tips = rows.within(particular, basis, 1e6) is None
-        return ContactStability(
-            None if tips else float("inf"), rows.feet(lifting.impulse, _NONE * scale), basis.shape[1]
-        )
+        # At this friction no row limits sliding, so only a sole that tips is left as a reason.
+        tips = cones.within(particular, basis, 1e6) is None
+        return verdict(None if tips else float("inf"), lifting)
     low, high = 0.0, _MOST_FRICTION
     while high - low > 1e-4:
         middle = (low + high) / 2
-        tried = rows.within(particular, basis, middle)
+        tried = cones.within(particular, basis, middle)
         low, high, found = (middle, high, found) if tried is None else (low, middle, tried)
-    return ContactStability(high, rows.feet(found, _NONE * scale), basis.shape[1])
-
-
-@dataclass(frozen=True)
-class _Pull:
-    pull: float
-    impulse: Vector
+    return verdict(high, found)
 
 
 class FrictionCones:
-    """The cones as inequalities ``A f ≤ 0`` on the stacked impulses.
+    """The friction cones as inequalities ``A f ≤ 0`` on the stacked impulses.
 
     Args:
-        supports: The feet.
-        axes: World axes of each foot's frame, shape (3, 3); what a sole's size is along.
+        supports: Feet that stay on the ground.
+        axes: World axes of the frame of each foot, along which its sole has a size, shape (3, 3).
     """
 
     def __init__(self, supports: tuple[Support, ...], axes: Sequence[Vector]) -> None:
-        self._supports = supports
-        self._starts = np.concatenate([[0], np.cumsum([s.rows for s in supports])]).astype(int)
-        self._size = int(self._starts[-1])
-        self._axes = [np.asarray(a) for a in axes]
+        starts = np.cumsum([0, *[s.rows for s in supports]])
+        self._size = int(starts[-1])
+        self._feet = [(int(k), s, np.asarray(R)) for k, s, R in zip(starts, supports, axes, strict=False)]
 
     def matrix(self, friction: float) -> tuple[Vector, list[str]]:
-        """``A``, shape (rows, impulses), for a friction coefficient, and what each row says."""
-        soles, slopes = self._soles(), self._slopes(friction)
-        frames = [s.frame for s in self._supports]
-        wide = [s.frame for s in self._supports if s.kind == "surface" and min(s.size) > 0]
-        names = [f"{frame} lifts" for frame in frames] + [f"{frame} tips" for frame in wide for _ in range(4)]
-        for frame in frames:
-            names += [f"{frame} slides"] * _SIDES + [f"{frame} turns"] * (2 if frame in wide else 0)
-        return np.vstack([self._up(), *soles, *slopes]), names
+        """Return ``A``, shape (rows, impulses), for a friction coefficient, and the name of each row.
 
-    def _up(self) -> Vector:
-        rows = np.zeros((len(self._supports), self._size))
-        rows[np.arange(len(self._supports)), self._starts[:-1] + 2] = -1.0
-        return rows
+        The rows are ``−f_z ≤ 0``, for soles ``|τ_x| ≤ Y f_z`` and ``|τ_y| ≤ X f_z`` in the axes of the foot, then
+        ``|f_t| ≤ μ f_z``, and for soles ``|τ_z| ≤ μ (X+Y)/2 f_z``.
+        """
+        names, rows = [f"{s.frame} lifts" for _, s, _ in self._feet], [*self._lifts()]
 
-    def _soles(self) -> list[Vector]:
-        """``|τ_x| ≤ Y f_z`` and ``|τ_y| ≤ X f_z`` of soles whose size is known, in the foot's axes."""
-        found = []
-        for start, support, R in zip(self._starts, self._supports, self._axes, strict=False):
-            if support.kind != "surface" or min(support.size) <= 0:
-                continue
+        def add(name: str, start: int, entries: Vector) -> None:
+            names.append(name)
+            rows.append(np.zeros(self._size))
+            rows[-1][start : start + len(entries)] = entries
+
+        for start, support, R in (foot for foot in self._feet if foot[1].has_sole):
             for axis, reach in ((0, support.size[1]), (1, support.size[0])):
                 for sign in (1.0, -1.0):
-                    row = np.zeros(self._size)
-                    row[start + 3 : start + 6] = sign * R[:, axis]
-                    row[start + 2] = -reach
-                    found.append(row)
-        return found
-
-    def _slopes(self, friction: float) -> list[Vector]:
-        """``|f_t| ≤ μ f_z``, and for soles ``|τ_z| ≤ μ (X+Y)/2 f_z``."""
-        found = []
+                    add(f"{support.frame} tips", start, np.array([0.0, 0.0, -reach, *(sign * R[:, axis])]))
         inner = friction * np.cos(np.pi / _SIDES)
-        for start, support in zip(self._starts, self._supports, strict=False):
+        for start, support, _ in self._feet:
             for angle in 2 * np.pi * np.arange(_SIDES) / _SIDES:
-                row = np.zeros(self._size)
-                row[start : start + 3] = np.cos(angle), np.sin(angle), -inner
-                found.append(row)
-            if support.kind == "surface" and min(support.size) > 0:
+                add(f"{support.frame} slides", start, np.array([np.cos(angle), np.sin(angle), -inner]))
+            if support.has_sole:
+                twist = friction * sum(support.size) / 2
                 for sign in (1.0, -1.0):
-                    row = np.zeros(self._size)
-                    row[start + 5], row[start + 2] = sign, -friction * sum(support.size) / 2
-                    found.append(row)
-        return found
+                    add(f"{support.frame} turns", start, np.array([0.0, 0.0, -twist, 0.0, 0.0, sign]))
+        return np.array(rows), names
 
-    def least_pull(self, particular: Vector, basis: Vector) -> _Pull:
-        """Impulses whose largest pull is least."""
-        up = self._up()
-        count = basis.shape[1]
+    def _lifts(self) -> Vector:
+        rows = np.zeros((len(self._feet), self._size))
+        for row, (start, _, _) in zip(rows, self._feet, strict=True):
+            row[start + 2] = -1.0
+        return rows
+
+    def pull(self, impulse: Vector) -> float:
+        """Return the largest pull of the ground on a foot; zero if it pushes all feet."""
+        return float(np.max(self._lifts() @ impulse, initial=0.0))
+
+    def least_pull(self, particular: Vector, basis: Vector) -> Vector:
+        """Return the impulses whose largest pull is least."""
+        up, count = self._lifts(), basis.shape[1]
         # min t: -f_z ≤ t, t ≥ 0.
         cost = np.concatenate([np.zeros(count), [1.0]])
         A = np.hstack([up @ basis, -np.ones((len(up), 1))])
         bounds = [(None, None)] * count + [(0.0, None)]
         found = scipy.optimize.linprog(cost, A_ub=A, b_ub=-up @ particular, bounds=bounds)
-        if found.status != 0:
-            return _Pull(float(np.max(up @ particular, initial=0.0)), particular)
-        return _Pull(float(found.x[-1]), particular + basis @ found.x[:-1])
+        return particular if found.status != 0 else particular + basis @ found.x[:-1]
 
     def within(self, particular: Vector, basis: Vector, friction: float) -> Vector | None:
-        """Impulses within the cones, the smallest by their largest entry, or ``None``."""
+        """Return the impulses within the cones whose largest entry is least, or ``None``."""
         A, _ = self.matrix(friction)
         slack = 1e-9 * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
         if not basis.shape[1]:
@@ -219,9 +199,9 @@ class FrictionCones:
         return particular + basis @ found.x[:-1] if found.status == 0 else None
 
     def feet(self, impulse: Vector, none: float) -> tuple[FootImpulse, ...]:
-        """Each foot's share."""
+        """Return the impulse on each foot; a pull above ``none`` lifts it."""
         found = []
-        for start, support in zip(self._starts, self._supports, strict=False):
+        for start, support, _ in self._feet:
             own = impulse[start : start + support.rows]
             moment = own[3:] if support.rows == 6 else np.zeros(3)
             found.append(FootImpulse(support.frame, own[:3].copy(), moment.copy(), bool(own[2] < -none)))

@@ -1,8 +1,9 @@
-"""Everything that one impact means at one posture, by name: what ``evaluate`` and ``result.json`` show."""
+"""All quantities of one impact at one posture, as ``evaluate`` and ``result.json`` show them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 import pinocchio as pin
@@ -22,13 +23,13 @@ from impact_posture.impact.scalars import (
     objective_gradient,
     objective_value,
     variant_values,
-    worst_member,
+    worst_variant,
 )
 from impact_posture.impact.velocity_jump import Dominance, Jump, find_dominance, weighed_jump
 
 Vector = NDArray[np.float64]
 
-# A relative change of H above this, when the supports are made ten times stiffer, is worth a warning.
+# A relative change of H above this share, with supports ten times as stiff, gets a warning.
 _SOFT = 0.01
 
 
@@ -38,28 +39,28 @@ class Evaluation:
 
     Attributes:
         q: Configuration, shape (nq,).
-        scalars: H, G, V, S, E, contact-consistent where there are supports.
+        scalars: H, G, V, S, E, contact-consistent if there are supports; also attributes of the evaluation itself.
         objective: The objective's value, λ̄² included; ``None`` where it does not exist.
         gradient: Tangent gradient of H, shape (nv,).
         objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` where it does not exist.
-        normal: World unit normal that H, G, V, S, E and the jumps hold for, shape (3,).
-        worst_normal: World unit normal that the objective holds for: ``normal``, or the worst of the cone around it.
-        cone: More about the worst normal, world; ``None`` without a cone, or where the objective does not exist.
+        normal: World unit normal of H, G, V, S, E and the jumps, shape (3,).
+        worst_normal: World unit normal of the objective, which is ``normal`` or the worst in the cone around it.
+        cone: The worst normal of the cone, world; ``None`` without a cone, or where the objective does not exist.
         ellipsoid: Dynamic impact ellipsoid ``Λ_c``.
         pose: World placement of the contact frame.
         speed: Approach speed of the predicted jumps, m/s.
-        restitution: Their coefficient of restitution.
-        frictionless: Jump without friction; ``None`` where the contact is blocked along the normal.
-        sticking: Jump of a contact point that does not slip; ``None`` where it does not exist.
-        energy_loss: What the frictionless impact dissipates, J; ``None`` where the contact is blocked.
+        restitution: Coefficient of restitution of the predicted jumps.
+        frictionless: Jump without friction; ``None`` if the contact is blocked along the normal.
+        sticking: Jump of a contact point that sticks; ``None`` where it does not exist.
+        energy_loss: Energy that the frictionless impact dissipates, J; ``None`` if the contact is blocked.
         dominance: Whether one light joint makes up most of H.
-        free: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
-        compliance_effect: Relative change of H when the supports' compliance is a tenth; ``None`` without supports.
-        footing: Whether the feet stay under the impact; ``None`` without supports.
-        contacts: Of several contacts each one's own evaluation, as if it were alone, the leading one's first.
-        impulses: The worst impulses of several contacts; ``None`` of one.
-        scenarios: The objective and the scalars in each scenario; empty without any.
-        warnings: What limits these numbers, one line each.
+        without_supports: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
+        compliance_effect: Relative change of H with a tenth of the compliance; ``None`` without supports.
+        contact_stability: Whether the feet stay under the impact; ``None`` without supports.
+        contacts: Evaluation of each of several contacts alone, the leading contact first; empty for one contact.
+        impulses: The worst impulses of several contacts; ``None`` for one contact.
+        model_variants: Objective and scalars for each model variant; empty if there is none.
+        warnings: Limits of these numbers, one line each.
     """
 
     q: Vector
@@ -78,54 +79,35 @@ class Evaluation:
     sticking: Jump | None
     energy_loss: float | None
     dominance: Dominance
-    free: Scalars | None
+    without_supports: Scalars | None
     compliance_effect: float | None
-    footing: ContactStability | None
+    contact_stability: ContactStability | None
     contacts: tuple[Evaluation, ...]
     impulses: WorstImpulses | None
-    scenarios: tuple[VariantValue, ...]
+    model_variants: tuple[VariantValue, ...]
     warnings: tuple[str, ...]
 
-    @property
-    def H(self) -> float:
-        """Squared jump per squared impulse."""
-        return self.scalars.H
-
-    @property
-    def G(self) -> float:
-        """Inverse effective mass along the normal, 1/kg."""
-        return self.scalars.G
-
-    @property
-    def V(self) -> float | None:
-        """Squared jump per squared approach speed without friction; ``None`` where it does not exist."""
-        return self.scalars.V
-
-    @property
-    def S(self) -> float | None:
-        """Squared jump per squared approach speed of a point that sticks; ``None`` where it does not exist."""
-        return self.scalars.S
-
-    @property
-    def E(self) -> float | None:
-        """Energy lost per squared approach speed, kg; ``None`` where it does not exist."""
-        return self.scalars.E
+    H = property(attrgetter("scalars.H"), doc="Squared jump per squared impulse.")
+    G = property(attrgetter("scalars.G"), doc="Inverse effective mass along the normal, 1/kg.")
+    V = property(
+        attrgetter("scalars.V"), doc="Squared jump per squared approach speed without friction, or ``None``."
+    )
+    S = property(attrgetter("scalars.S"), doc="Squared jump per squared approach speed if sticking, or ``None``.")
+    E = property(attrgetter("scalars.E"), doc="Energy lost per squared approach speed, kg, or ``None``.")
 
     def to_dict(self) -> dict[str, object]:
-        """The ``initial`` or ``optimal`` block of ``result.json``; ``None`` for what does not exist."""
+        """Return the ``initial`` or ``optimal`` block of ``result.json``; a value that does not exist is ``None``."""
         quaternion = pin.Quaternion(self.pose.rotation)
-        block: dict[str, object] = {"q": _listed(self.q), "objective": self.objective}
-        block |= self.scalars.to_dict()
-        block |= {
+        block: dict[str, object] = {
+            "q": self.q.tolist(),
+            "objective": self.objective,
+            **self.scalars.to_dict(),
             "effective_mass": self.scalars.effective_mass,
-            "gradient": _listed(self.gradient),
-            "objective_gradient": None if self.objective_gradient is None else _listed(self.objective_gradient),
-            "worst_normal": _listed(self.worst_normal),
+            "gradient": self.gradient.tolist(),
+            "objective_gradient": None if self.objective_gradient is None else self.objective_gradient.tolist(),
+            "worst_normal": self.worst_normal.tolist(),
             "ellipsoid": self.ellipsoid.to_dict(),
-            "pose": {
-                "position": _listed(self.pose.translation),
-                "quaternion_xyzw": _listed(quaternion.coeffs()),
-            },
+            "pose": {"position": self.pose.translation.tolist(), "quaternion_xyzw": quaternion.coeffs().tolist()},
             "jump": {
                 "speed": self.speed,
                 "restitution": self.restitution,
@@ -137,33 +119,29 @@ class Evaluation:
         }
         if self.cone is not None:
             block["cone"] = self.cone.to_dict()
-        if self.free is not None:
-            block |= {"free": self.free.to_dict(), "compliance_effect": self.compliance_effect}
-        if self.footing is not None:
-            block["footing"] = self.footing.to_dict()
+        if self.without_supports is not None:
+            block |= {"free": self.without_supports.to_dict(), "compliance_effect": self.compliance_effect}
+        if self.contact_stability is not None:
+            block["footing"] = self.contact_stability.to_dict()
         if self.impulses is not None:
             block["worst_impulses"] = self.impulses.to_dict()
-            block["by_contact"] = [_contact_block(one.to_dict()) for one in self.contacts]
-        if self.scenarios:
-            worst = max(self.scenarios, key=lambda s: np.inf if s.objective is None else s.objective)
-            block["by_scenario"] = [scenario.to_dict() for scenario in self.scenarios]
-            block["worst_scenario"] = worst.name
+            blocks = [contact.to_dict() for contact in self.contacts]
+            block["by_contact"] = [{key: one[key] for key in _OWN if key in one} for one in blocks]
+        if self.model_variants:
+            block["by_scenario"] = [variant.to_dict() for variant in self.model_variants]
+            block["worst_scenario"] = self.model_variants[worst_variant(self.model_variants)].name
         return block
 
 
-# Of a contact among several: what is its own, and not the posture's or the objective's.
+# Keys of one contact among several, without those of the posture and of the objective.
 _OWN = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pose", "free", "footing")
-
-
-def _contact_block(block: dict[str, object]) -> dict[str, object]:
-    return {key: block[key] for key in _OWN if key in block}
 
 
 def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitution: float = 0.0) -> Evaluation:
     """Compute all impact quantities at ``q`` from Pinocchio's numbers, and predict the jump of one impact.
 
-    Frictionless: ``Δν = a (1+e) v_n / G``, impulse ``(1+e) v_n / G`` along n.  Sticking:
-    ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``.
+    The frictionless jump is ``Δν = a (1+e) v_n / G``, with the impulse ``(1+e) v_n / G`` along n.  The jump of a
+    contact that sticks is ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``.
 
     Args:
         objective: Robot, contact, metric, kind and supports.
@@ -172,7 +150,7 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
         restitution: Coefficient of restitution ``e``.
 
     Raises:
-        InputError: A negative or non-finite speed, or a restitution outside [0, 1].
+        InputError: The speed is negative or not finite, or the restitution lies outside [0, 1].
     """
     if not 0 <= speed <= LARGEST:
         raise InputError(f"the approach speed is {speed:g}", where="speed", hint=f"give m/s, 0 to {LARGEST:g}")
@@ -182,9 +160,9 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
     found = oracle.quantities(q)
     scalars = Scalars.of(found)
     rebound = (1 + restitution) * speed
-    free, effect = _without_supports(objective, q, found.H)
-    scenarios = variant_values(objective, q)
-    member = worst_member(objective, scenarios)
+    without_supports, effect = _without_supports(objective, q, found.H)
+    model_variants = variant_values(objective, q)
+    member = objective.by_variant[worst_variant(model_variants)] if model_variants else objective
     value = objective_value(member, q)
     cone = _worst(member, q)
     singles = objective.singles if objective.others else ()
@@ -211,12 +189,12 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
         ),
         energy_loss=None if scalars.E is None else scalars.E * speed**2 * (1 - restitution**2),
         dominance=find_dominance(objective, found),
-        free=free,
+        without_supports=without_supports,
         compliance_effect=effect,
-        footing=contact_stability(oracle, objective.supports, q) if objective.supports else None,
+        contact_stability=contact_stability(oracle, objective.supports, q) if objective.supports else None,
         contacts=tuple(evaluate(single, q, speed, restitution) for single in singles),
         impulses=member.worst_case.worst(q) if isinstance(member.worst_case, ImpulseBox) else None,
-        scenarios=scenarios,
+        model_variants=model_variants,
         warnings=_warnings(scalars, effect),
     )  # fmt: skip
 
@@ -234,9 +212,9 @@ def _without_supports(objective: ImpactObjective, q: Vector, H: float) -> tuple[
     if not objective.supports:
         return None, None
     case = objective.case
-    free = Scalars.of(ImpactOracle(replace(case, supports=())).quantities(q))
+    alone = Scalars.of(ImpactOracle(replace(case, supports=())).quantities(q))
     stiffer = ImpactOracle(replace(case, compliance=case.compliance / 10)).quantities(q).H
-    return free, abs(stiffer - H) / H if H > 0 else 0.0
+    return alone, abs(stiffer - H) / H if H > 0 else 0.0
 
 
 def _warnings(scalars: Scalars, effect: float | None) -> tuple[str, ...]:
@@ -256,7 +234,3 @@ def _warnings(scalars: Scalars, effect: float | None) -> tuple[str, ...]:
             "supports hold by their compliance"
         )
     return tuple(lines)
-
-
-def _listed(values: Vector) -> list[float]:
-    return [float(v) for v in np.asarray(values).reshape(-1)]

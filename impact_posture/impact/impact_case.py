@@ -1,4 +1,4 @@
-"""One impact on one robot: which contact, how the jump is weighed, which feet stay."""
+"""One impact on one robot: contact, metric and supports."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from impact_posture.robot.robot import Robot
 
 @dataclass(frozen=True)
 class ImpactCase:
-    """What the velocity jump of a single impact depends on, apart from the posture.
+    """Everything except the posture that the velocity jump of a single impact depends on.
 
     Attributes:
         robot: The robot.
-        contact: Where the impact acts, and along which normal.
-        metric: Weight ``W`` of the jump's squared norm.
+        contact: Point and normal of the impact.
+        metric: Weight ``W`` of the squared norm of the jump.
         supports: Feet that stay on the ground; empty for a robot that flies or is bolted down.
         compliance: ε of the supports, 1/kg; zero for :func:`~impact_posture.impact.contact.default_compliance`.
     """
@@ -40,5 +40,5 @@ class ImpactCase:
 
     @property
     def in_contact_frame(self) -> bool:
-        """Whether the normal is given in the contact frame and so turns with the robot."""
+        """Whether the normal is given in the contact frame, and so turns with the robot."""
         return self.contact.normal_frame == "contact"

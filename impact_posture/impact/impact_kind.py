@@ -1,4 +1,4 @@
-"""What of an impact is minimized: the abstract base of the kinds of objective."""
+"""The abstract base of the kinds of objective: which scalar of an impact is minimized."""
 
 from __future__ import annotations
 
@@ -9,24 +9,27 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.kernel import ImpactKernel
-from impact_posture.impact.lifted import Lifted, UnknownJump, unknown_jump, weighed
-from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.impact.lifted import Lifted, UnknownJump, impact_at, unknown_jump, weighed
+from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities, no_sticking
 
 Vector = NDArray[np.float64]
 
 
 class ImpactKind(ABC):
-    """A scalar of one impact along one normal, with its gradient, its expressions and its lifted form.
+    """A multiple of H, G, V, S or E of one impact along one normal.
+
+    Value, gradient and expressions follow from :attr:`symbol`: the oracle and the kernel have an attribute of that
+    name and its gradient.  A kind adds the equations of its lifted form.
 
     Attributes:
-        name: Its name in options, files and outputs.
-        symbol: Which of H, G, V, S, E it is a multiple of.
+        name: Name in options, files and outputs.
+        symbol: Scalar that it is a multiple of: H, G, V, S or E.
         units: Units in words.
         adds_up: Whether the impulses of several contacts at once are known, so that their jumps add up.
-        no_cone: Why it has no exact worst case over a cone of normals.
+        no_cone: Reason why no exact worst case over a cone of normals exists.
     """
 
     name: ClassVar[str]
@@ -36,42 +39,60 @@ class ImpactKind(ABC):
     no_cone: ClassVar[str] = "it is no quadratic form of the normal"
 
     def factor(self, case: ImpactCase) -> float:
-        """The value over the scalar that :attr:`symbol` names."""
+        """Return the value divided by the scalar that :attr:`symbol` names."""
         return 1.0
 
-    @abstractmethod
     def value(self, oracle: ImpactOracle, q: Vector) -> float:
-        """The value from Pinocchio's numbers.
+        """Return the value from Pinocchio's numbers.
 
         Raises:
-            MetricError: It does not exist at ``q``.
+            MetricError: The value does not exist at ``q``.
         """
+        found = getattr(oracle.quantities(q), self.symbol)
+        if found is None:
+            raise no_sticking()
+        return self.factor(oracle.case) * float(found)
 
-    @abstractmethod
     def gradient(self, oracle: ImpactOracle, q: Vector) -> Vector:
-        """Tangent gradient from Pinocchio's numbers, shape (nv,)."""
+        """Return the tangent gradient from Pinocchio's numbers, shape (nv,)."""
+        return np.asarray(self.factor(oracle.case) * getattr(oracle, f"gradient_{self.symbol}")(q))
 
-    @abstractmethod
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Value and tangent gradient (nv) in the symbols of a kernel."""
+        """Return value and tangent gradient (nv) in the symbols of a kernel."""
+        factor = self.factor(k.case)
+        return factor * getattr(k, self.symbol), factor * getattr(k, f"grad_{self.symbol}")
 
     @abstractmethod
+    def unknowns(self, case: ImpactCase, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
+        """Return the unknown jump at ``tree.q`` along the normal ``n``, with the equations that fix it."""
+
+    @abstractmethod
+    def jump(self, found: ImpactQuantities) -> tuple[Vector, Vector]:
+        """Return the jump (nv,) and the unknown impulse that solve the equations of :meth:`unknowns`."""
+
+    def lifted_value(self, case: ImpactCase, jump: UnknownJump) -> ca.SX:
+        """Return the value in terms of the unknown jump: ``aᵀWa`` times the factor."""
+        return self.factor(case) * weighed(case.metric, jump, jump)
+
     def lift(self, case: ImpactCase, tree: Tree, n: ca.SX) -> Lifted:
-        """The value with the linear solve left to the program, at ``tree.q`` and the normal ``n``."""
+        """Return the value with the linear solve left to the program, at ``tree.q`` and the normal ``n``."""
+        jump = self.unknowns(case, tree, n)
+        return Lifted(jump.variables, jump.residual, self.lifted_value(case, jump))
 
-    @abstractmethod
     def guess(self, oracle: ImpactOracle, q: Vector) -> Vector:
-        """The unknowns of :meth:`lift` that solve its equations at ``q``."""
+        """Return the unknowns of :meth:`lift` that solve its equations at ``q``."""
+        a, impulse = self.jump(oracle.quantities(q))
+        return np.concatenate([oracle.with_support_impulses(a), impulse])
 
 
 class QuadraticKind(ImpactKind):
     """A kind whose value rises with one quadratic form ``nᵀK(q)n`` of the normal.
 
-    Such a kind has an exact worst case over a cone of normals.  The defaults are those of ``K = Λ_c``.
+    A quadratic form has an exact worst case over a cone of normals.  The defaults are those of ``K = Λ_c``.
     """
 
     def directions(self, mobility: Vector, world: Vector) -> Vector:
-        """Impulses whose jumps make up the form along world directions (columns), world axes, shape (3, 3).
+        """Return impulses whose jumps make up the form along world directions (columns), shape (3, 3).
 
         Raises:
             MetricError: They do not exist with this ``JM⁻¹Jᵀ``, shape (3, 3).
@@ -79,52 +100,48 @@ class QuadraticKind(ImpactKind):
         return world
 
     def form(self, oracle: ImpactOracle, mobility: Vector, world: Vector, jumps: Vector) -> Vector:
-        """``K`` along world directions (columns) whose impulses cause ``jumps`` (columns), shape (3, 3)."""
+        """Return ``K`` along world directions (columns) whose impulses cause ``jumps`` (columns), shape (3, 3)."""
         return np.asarray(jumps.T @ oracle.weigh(jumps))
 
     @abstractmethod
     def form_gradient(self, oracle: ImpactOracle, q: Vector, n: Vector) -> Vector:
-        """Tangent gradient of ``nᵀK(q)n`` with ``n`` held fixed, of any length, shape (nv,)."""
+        """Return the tangent gradient of ``nᵀK(q)n``, shape (nv,), for a fixed ``n`` of any length."""
 
     @abstractmethod
     def form_expression(self, k: ImpactKernel) -> ca.SX:
-        """``K`` in world axes, shape (3, 3)."""
+        """Return ``K`` in world axes, shape (3, 3)."""
 
     def of_form(self, case: ImpactCase, form: Vector) -> Vector:
-        """The values where the form has these."""
+        """Return the values of the objective for values of the form."""
         return self.factor(case) * form
 
     def of_form_slope(self, case: ImpactCase, form: Vector) -> Vector:
-        """Derivative of :meth:`of_form`."""
+        """Return the derivative of :meth:`of_form`."""
         return np.full_like(form, self.factor(case))
 
     def of_form_expression(self, case: ImpactCase, form: ca.SX) -> ca.SX:
-        """:meth:`of_form` as an expression."""
+        """Return :meth:`of_form` as an expression."""
         return self.factor(case) * form
 
-    def lift_direction(
-        self, case: ImpactCase, tree: Tree, impact: Wrench, world: ca.SX, label: str
-    ) -> tuple[UnknownJump, ca.SX, ca.SX]:
-        """Jump, unknowns and equations of one direction of the form.
+    def lift_direction(self, case: ImpactCase, tree: Tree, n: ca.SX, label: str) -> UnknownJump:
+        """Return the unknown jump of one direction of the form.
 
         Args:
             case: The impact.
             tree: The tree at the program's configuration.
-            impact: The unit impulse along the direction.
-            world: The direction in world axes, shape (3,).
-            label: Suffix of the unknowns' names.
+            n: The direction in the axes of the contact's normal, shape (3,).
+            label: Suffix of the names of the unknowns.
         """
-        jump = unknown_jump(case, tree, impact, label)
-        return jump, jump.variables, jump.residual
+        return unknown_jump(case, tree, impact_at(case, n), label)
 
     def guess_direction(self, jump: Vector, support_impulse: Vector, impulse: Vector) -> list[Vector]:
-        """The unknowns of :meth:`lift_direction`, given the direction's jump and impulses."""
+        """Return the unknowns of :meth:`lift_direction`, given the jump and the impulses of the direction."""
         return [jump, support_impulse]
 
     def lift_entry(self, case: ImpactCase, world: ca.SX, one: UnknownJump, other: UnknownJump) -> ca.SX:
-        """An entry of ``K``, from two directions' jumps; ``world`` is the first direction."""
+        """Return an entry of ``K`` from the jumps of two directions; ``world`` is the first direction."""
         return weighed(case.metric, one, other)
 
     def form_unit(self, case: ImpactCase, value: Any) -> Any:
-        """Size of the form where the objective has ``value``, a number or an expression."""
+        """Return the size of the form where the objective has ``value``, a number or an expression."""
         return value / self.factor(case)

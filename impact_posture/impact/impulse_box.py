@@ -1,8 +1,8 @@
-"""Several contacts at once: the largest jump that impulses within a box can give.
+"""Several contacts at once: the largest jump under impulses within a box.
 
 ``‖Σ λ_i a_i‖²_W`` with ``a_i = M⁻¹J_iᵀn_i`` is a convex quadratic ``λᵀKλ`` of the impulses, ``K_ij = a_iᵀWa_j``, so
-its maximum over ``0 ≤ λ_i ≤ λ̄_i`` (``|λ_i| ≤ λ̄_i`` where contacts can pull) is at a corner of the box: one of
-``2^m − 1`` (``2^(m−1)``, up to sign).  In the program: ``min t`` with ``t ≥ λᵀKλ`` at every corner.
+its maximum over ``0 ≤ λ_i ≤ λ̄_i`` (``|λ_i| ≤ λ̄_i`` where contacts can pull) is at one of the ``2^m − 1`` corners of
+the box (``2^(m−1)``, up to sign).  The program is ``min t`` with ``t ≥ λᵀKλ`` at every corner.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from impact_posture.impact.worst_case import Subgradients, finite_maximum, first
 
 Vector = NDArray[np.float64]
 
-# 63 corners; each one more doubles the rows of the program.
+# Six contacts have 63 corners.  Each additional contact doubles the rows of the program.
 MOST_CONTACTS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class WorstImpulses:
-    """The corner of the box of impulses that jolts the robot most.
+    """The corner of the box of impulses with the largest jump.
 
     Attributes:
-        value: ``λᵀKλ`` there: the objective.
+        value: ``λᵀKλ`` at the corner, which is the objective.
         impulses: λ of each contact, N·s, shape (m,).
-        tied: All corners as bad as this one, it first, shape (k, m).
-        jump: ``Δν`` of it, shape (nv,).
+        tied: All corners with the same value, this corner first, shape (k, m).
+        jump: ``Δν`` at the corner, shape (nv,).
     """
 
     value: float
@@ -57,21 +57,21 @@ class WorstImpulses:
     jump: Vector
 
     def to_dict(self) -> dict[str, object]:
-        """The ``worst_impulses`` block of an evaluation."""
+        """Return the ``worst_impulses`` block of an evaluation."""
         return {
-            "impulses": [float(v) for v in self.impulses],
+            "impulses": self.impulses.tolist(),
             "tied": len(self.tied) > 1,
-            "corners": [[float(v) for v in corner] for corner in self.tied],
+            "corners": self.tied.tolist(),
             "jump_norm": float(np.sqrt(max(self.value, 0.0))),
         }
 
 
 def check_contacts(contacts: Sequence[ImpactContact], kind: ImpactKind, *, bilateral: bool, cone: bool) -> None:
-    """Refuse contacts that have no box of impulses to take the worst of.
+    """Refuse contacts that have no worst case over a box of impulses.
 
     Raises:
-        ContactError: Too many contacts, or one point along one normal twice.
-        MetricError: A kind per approach speed, or a cone of normals.
+        ContactError: There are too many contacts, or two have the same point and normal.
+        MetricError: The kind is per approach speed, or there is a cone of normals.
     """
     if len(contacts) == 1:
         if bilateral:
@@ -101,10 +101,13 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: ImpactKind, *, bilat
 
 
 def corners(count: int, bilateral: bool) -> Vector:
-    """Corners of the unit box as rows: of 0 and 1 without the origin, or of ±1 up to sign, shape (k, count)."""
+    """Return the corners of the unit box as rows, shape (k, count).
+
+    The entries are 0 and 1, without the origin.  They are ±1 (up to sign) if the contacts are bilateral.
+    """
     if bilateral:
         return np.array([[1.0, *rest] for rest in product((1.0, -1.0), repeat=count - 1)])
-    # From all contacts at once down: of equally bad ones the first is the one that a user expects.
+    # The corner of all contacts comes first, because a user expects it where corners tie.
     found = sorted(product((1.0, 0.0), repeat=count), key=lambda corner: -sum(corner))
     return np.array(found[:-1])
 
@@ -114,7 +117,7 @@ class ImpulseBox:
     """The worst corner of ``0 ≤ λ_i ≤ λ̄_i``, or of ``|λ_i| ≤ λ̄_i``.
 
     Attributes:
-        oracles: Pinocchio's numbers for each contact, the leading one first.
+        oracles: Pinocchio's numbers for each contact, the leading contact first.
         bilateral: Whether the contacts can pull as well as push.
         attempts: Guesses of the lifted form.
     """
@@ -135,7 +138,7 @@ class ImpulseBox:
         return np.asarray(corners(len(bounds), self.bilateral) * bounds)
 
     def worst(self, q: Vector) -> WorstImpulses:
-        """The worst corner at ``q``, from Pinocchio's numbers."""
+        """Return the worst corner at ``q``, from Pinocchio's numbers."""
         jumps, values = self._jumps_and_values(q)
         leading, tied, _ = finite_maximum(values)
         impulses = self.corners[leading]
@@ -150,7 +153,7 @@ class ImpulseBox:
         return self._gradient(q, self.worst(q).impulses)
 
     def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
-        """See :class:`~impact_posture.impact.worst_case.WorstCase`; of all corners that tie."""
+        """See :class:`~impact_posture.impact.worst_case.Minimized`; all corners that tie contribute."""
         _, tied, gaps = finite_maximum(self._jumps_and_values(q)[1], within)
         return Subgradients(np.array([self._gradient(q, self.corners[k]) for k in tied]), gaps)
 
@@ -174,7 +177,7 @@ class ImpulseBox:
         return np.asarray(2 * gradient + first.metric_gradient(x.a))
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """See :class:`~impact_posture.impact.worst_case.WorstCase`: ``K``, its worst corner, one gradient there."""
+        """See :class:`~impact_posture.impact.worst_case.WorstCase`; the gradient is that of the worst corner."""
         impacts = self._impacts(k.n)
         jumps = [k.answer([impact]) for impact in impacts]
         K = _gram(len(jumps), lambda i, j: k.product(jumps[i], jumps[j]))
@@ -185,10 +188,10 @@ class ImpulseBox:
         ])  # fmt: skip
         return k.product(worst, worst), k.size_gradient(worst)
 
-    def lift(self, tree: Tree, n: ca.SX, scale: ca.SX) -> Lifted:
-        """See :class:`~impact_posture.impact.worst_case.WorstCase`: a jump a contact, ``t`` above each corner."""
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
+        """See :class:`~impact_posture.impact.worst_case.Minimized`; ``t`` bounds the value at each corner."""
         case = self.oracle.case
-        jumps = [unknown_jump(case, tree, impact, f"{i}_") for i, impact in enumerate(self._impacts(n))]
+        jumps = [unknown_jump(case, tree, impact, f"{i}_") for i, impact in enumerate(self._impacts(parameters))]
         K = _gram(len(jumps), lambda i, j: weighed(case.metric, jumps[i], jumps[j]))
         parts = [Lifted(jump.variables, jump.residual, ca.SX(0)) for jump in jumps]
         return worst_of(parts, [_form(K, ca.DM(corner)) for corner in self.corners], scale)
@@ -196,12 +199,11 @@ class ImpulseBox:
     def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
         """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
         found = [oracle.quantities(q) for oracle in self.oracles]
-        parts = [np.concatenate([one.jump, one.support_impulse]) for one in found]
-        guesses = [Guess(p, np.full(p.size, -np.inf)) for p in parts]
-        return worst_of_guesses(guesses, self.value(q) / scale, attempt)
+        parts = [Guess.unbounded(np.concatenate([one.jump, one.support_impulse])) for one in found]
+        return worst_of_guesses(parts, self.value(q) / scale, attempt)
 
     def _impacts(self, n: ca.SX) -> list[Wrench]:
-        """Unit impulses of all contacts; the leading one's normal is an input, the others' are constants."""
+        """Unit impulses of all contacts; the leading normal is an input, the other normals are constants."""
         leading, *others = [oracle.case for oracle in self.oracles]
         return [impact_at(leading, n), *[impact_at(c, ca.SX(np.array(c.contact.normal))) for c in others]]
 

@@ -1,7 +1,7 @@
 """The impact quantities and their tangent gradients as expressions, by the adjoints of the theory page.
 
-With feet held at compliance ε every formula below stands as it is, with ``M + J_sᵀJ_s/ε`` for ``M``: the robot whose
-feet carry the point mass 1/ε.  So there is one code path, free or standing.
+With feet held at compliance ε every formula below holds with ``M + J_sᵀJ_s/ε`` for ``M``, the mass matrix of a robot
+whose feet carry the point mass 1/ε.  So there is one code path with and without supports.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class ImpactKernel:
     Args:
         case: Robot, contact, metric and supports.
         q: Configuration symbols, shape (nq, 1).
-        n: Normal symbols, shape (3, 1), in the axes that the contact's normal is given in.
-        limbs: Repeated limbs whose expressions shall be alike
+        n: Normal symbols, shape (3, 1), in the axes of the contact's normal.
+        limbs: Repeated limbs whose expressions get one form
             (:class:`~impact_posture.dynamics.repeated_limbs.RepeatedLimbs`).
     """
 
@@ -55,23 +55,23 @@ class ImpactKernel:
 
     @cached_property
     def jump(self) -> Response:
-        """The robot's answer to the impact; its ``a`` is ``M⁻¹Jᵀn``."""
+        """Response of the robot to the impact; its ``a`` is ``M⁻¹Jᵀn``."""
         return self.answer([self.impact])
 
     def _alike(self, wrench: Wrench) -> list[Wrench]:
-        """Return the wrench; on a repeated limb, with zero wrenches on its counterparts in the same form."""
+        """Return the wrench, or for a repeated limb a wrench on each limb of the group, zero on all but its own."""
         limbs, joint = self.tree.limbs, wrench.point.joint
         if limbs is None or joint not in limbs.places:
             return [wrench]
         point = wrench.point
         return [
             Wrench(
-                PointOnLink(other, point.position, point.rotation),
-                wrench.force * (on := limbs.indicator(other, joint)),
+                PointOnLink(link, point.position, point.rotation),
+                wrench.force * (on := limbs.indicator(link, joint)),
                 wrench.moment * on,
                 wrench.in_frame,
             )
-            for other in limbs.counterparts(joint)
+            for link in limbs.counterparts(joint)
         ]
 
     # ---- H, G and what follows from them ----------------------------------------------------------------------
@@ -92,15 +92,15 @@ class ImpactKernel:
         return self.grad_G if self.metric.kind == "kinetic" and not self._supported else self.size_gradient(self.jump)
 
     def answer(self, impacts: Sequence[Wrench]) -> Response:
-        """The robot's answer to several impulses at once, wherever they act."""
+        """Return the response of the robot to several impulses at once, at any points."""
         return self.tree.respond(wrenches=[part for impact in impacts for part in self._alike(impact)])
 
     def product(self, one: Response, other: Response) -> ca.SX:
-        """``a₁ᵀWa₂`` of two answers."""
+        """Return ``a₁ᵀWa₂`` of two responses."""
         return ca.dot(one.a, self._weigh(other.a, other.velocities))
 
     def size_gradient(self, jump: Response) -> ca.SX:
-        """Tangent gradient of ``aᵀWa`` of an answer, what acts held fixed, shape (nv,)."""
+        """Return the tangent gradient of ``aᵀWa`` of a response for fixed impulses, shape (nv,)."""
         if self.metric.kind == "kinetic" and not self._supported:
             return self.tree.pair_gradient(jump, jump)
         adjoint = self.tree.respond(tau=self._weigh(jump.a, jump.velocities))
@@ -135,7 +135,7 @@ class ImpactKernel:
 
     @cached_property
     def _axes(self) -> list[Response]:
-        """``M⁻¹Jᵀe_k`` of the three world directions."""
+        """``M⁻¹Jᵀe_k`` for the three world directions."""
         eye = np.eye(3)
         return [self.tree.respond(wrenches=self._alike(self._force(ca.SX(eye[k])))) for k in range(3)]
 
@@ -152,7 +152,7 @@ class ImpactKernel:
 
     @cached_property
     def _mobility_inverse(self) -> ca.SX:
-        """``(JM⁻¹Jᵀ)⁻¹``; the pseudo-inverse of a planar robot's."""
+        """``(JM⁻¹Jᵀ)⁻¹``, or the pseudo-inverse for a planar robot."""
         frozen = frozen_directions(self.case.robot, self.point)
         return _inverse3(self.mobility + frozen if frozen.any() else self.mobility)
 
@@ -163,12 +163,12 @@ class ImpactKernel:
 
     @cached_property
     def _sticking(self) -> Response:
-        """The answer to the impulse ``s = (JM⁻¹Jᵀ)⁻¹n`` per unit approach speed."""
+        """Response to the impulse ``s = (JM⁻¹Jᵀ)⁻¹n`` per unit approach speed."""
         return self.tree.respond(wrenches=self._alike(self._force(self._mobility_inverse @ self.world_normal)))
 
     @cached_property
     def S(self) -> ca.SX:
-        """``‖M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹n‖²_W``: as V when the contact point sticks."""
+        """``‖M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹n‖²_W``: as V if the contact point sticks."""
         x = self._sticking
         return ca.dot(x.a, self._weigh(x.a, x.velocities))
 
@@ -208,9 +208,9 @@ class ImpactKernel:
 
 
 def frozen_directions(robot: Robot, point: PointOnLink) -> NDArray[np.float64]:
-    """Projector, shape (3, 3), on the world directions that a point can move in nowhere; zero but for planar robots.
+    """Return the projector on the world directions in which a point can never move, shape (3, 3).
 
-    Added to ``JM⁻¹Jᵀ`` it makes the inverse act as the pseudo-inverse on the directions that remain.
+    It is zero except for planar robots.  Added to ``JM⁻¹Jᵀ``, it makes the inverse act as the pseudo-inverse.
     """
     numeric, generator = Numeric(robot.model), np.random.default_rng(0)
     rest = pin.neutral(robot.model)

@@ -1,9 +1,9 @@
-"""Objectives with their linear solves left to the program: the unknowns, their equations and where they start."""
+"""The lifted form of an objective, which leaves linear solves to the program as unknowns and equations."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -16,7 +16,7 @@ from impact_posture.impact.metric import Metric
 
 Vector = NDArray[np.float64]
 
-# Where t starts above what bounds it, by attempt, in units of the scale: inside, where a barrier is finite.
+# Start of t above its bounds by attempt, in units of the scale.  A barrier is finite inside only.
 ABOVE = (0.01, 1.0, 0.1)
 
 
@@ -39,25 +39,30 @@ class Lifted:
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """Where a lifted form's auxiliaries start.
+    """Initial auxiliaries of a lifted form.
 
     Attributes:
-        values: Shape (k,).
+        values: Values, shape (k,).
         lower: Lower bounds, shape (k,); minus infinity where there is none.
     """
 
     values: Vector
     lower: Vector
 
+    @staticmethod
+    def unbounded(values: Vector) -> Guess:
+        """Return a guess without lower bounds."""
+        return Guess(values, np.full(values.size, -np.inf))
+
 
 @dataclass(frozen=True, eq=False)
 class UnknownJump:
-    """A jump ``a`` and the supports' impulses as unknowns.
+    """A jump ``a`` and the support impulses as unknowns.
 
     Attributes:
-        a: Unknown, shape (nv,).
-        variables: ``a`` and the supports' impulses.
-        residual: ``M a − J_sᵀf − (the impact)`` and ``J_s a + εf``.
+        a: Unknown jump, shape (nv,).
+        variables: ``a``, the support impulses, and an unknown impulse of the impact if there is one.
+        residual: ``M a − J_sᵀf − (the impact)`` and ``J_s a + εf``, and equations that fix the unknown impulse.
         mass_a: ``M a``.
         contact_velocity: ``J a``, world, shape (3,).
     """
@@ -68,9 +73,15 @@ class UnknownJump:
     mass_a: ca.SX
     contact_velocity: ca.SX
 
+    def with_impulse(self, impulse: ca.SX, fixing: ca.SX) -> UnknownJump:
+        """Return the same jump with the impulse of the impact as an unknown, and the equations that fix it."""
+        return replace(
+            self, variables=ca.vertcat(self.variables, impulse), residual=ca.vertcat(self.residual, fixing)
+        )
+
 
 def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") -> UnknownJump:
-    """Unknowns and equations of the velocity jump under one impulse."""
+    """Return unknowns and equations of the velocity jump under one impulse."""
     a = ca.SX.sym(f"a{label}", tree.nv)
     velocities = tree.velocities(a)
     wrenches, held, f = [impact], [], ca.SX(0, 1)
@@ -93,25 +104,25 @@ def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") 
 
 
 def impact_at(case: ImpactCase, impulse: ca.SX) -> Wrench:
-    """An impulse at the contact point, in the axes that the normal is given in."""
+    """Return an impulse at the contact point, in the axes of the contact's normal."""
     return Wrench(case.point, impulse, ca.SX.zeros(3), in_frame=case.in_contact_frame)
 
 
 def in_world(case: ImpactCase, tree: Tree, directions: ca.SX) -> ca.SX:
-    """Directions (columns) from the axes that the normal is given in to world axes."""
+    """Turn directions (columns) from the axes of the contact's normal to world axes."""
     return tree.rotation(case.point) @ directions if case.in_contact_frame else directions
 
 
 def weighed(metric: Metric, one: UnknownJump, other: UnknownJump) -> ca.SX:
-    """``a₁ᵀWa₂``."""
+    """Return ``a₁ᵀWa₂``."""
     if metric.kind == "kinetic":
-        # Not sᵀJa − ε|f|², equal on the equations: stiff feet make that a small difference of large numbers.
+        # sᵀJa − ε|f|² is equal on the equations, but a small difference of large numbers if the feet are stiff.
         return ca.dot(one.a, other.mass_a)
     return ca.dot(one.a, ca.SX(metric.diagonal(one.a.numel())) * other.a)
 
 
 def worst_of(parts: Sequence[Lifted], values: Sequence[ca.SX], scale: ca.SX) -> Lifted:
-    """``t`` with ``values[k] ≤ t · scale``, over the unknowns and equations of all parts."""
+    """Return ``t`` with ``values[k] ≤ t · scale``, over the unknowns and equations of all parts."""
     t = ca.SX.sym("t")
     return Lifted(
         variables=ca.vertcat(*[p.variables for p in parts], t),
@@ -122,7 +133,7 @@ def worst_of(parts: Sequence[Lifted], values: Sequence[ca.SX], scale: ca.SX) -> 
 
 
 def worst_of_guesses(parts: Sequence[Guess], largest: float, attempt: int) -> Guess:
-    """Where :func:`worst_of` starts: ``t`` above the largest value, in units of the scale, by :data:`ABOVE`."""
+    """Return the start of :func:`worst_of`, with ``t`` above the largest value (in units of the scale)."""
     return Guess(
         np.concatenate([*[p.values for p in parts], [largest + ABOVE[attempt]]]),
         np.concatenate([*[p.lower for p in parts], [-np.inf]]),

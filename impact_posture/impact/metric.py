@@ -1,4 +1,4 @@
-"""How a velocity jump is measured: ``‖Δν‖²_W``."""
+"""The metric ``‖Δν‖²_W`` of a velocity jump."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Metric:
 
     Attributes:
         kind: ``euclidean`` (W = I), ``kinetic`` (W = M) or ``weighted`` (diagonal).
-        weights: The diagonal of ``weighted``, shape (nv,), else ``None``.
-        source: Where the weights came from.
+        weights: Diagonal of the weighted metric, shape (nv,); else ``None``.
+        source: Origin of the weights.
     """
 
     kind: MetricKind = "euclidean"
@@ -28,7 +28,7 @@ class Metric:
     source: str = ""
 
     def diagonal(self, nv: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        """The diagonal of ``W`` for a constant metric, shape (nv,)."""
+        """Return the diagonal of ``W`` of a constant metric, shape (nv,)."""
         return np.ones(nv) if self.weights is None else np.array(self.weights)
 
 
@@ -37,12 +37,12 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
 
     Args:
         robot: The robot.
-        kind: How the jump is weighed.
-        weights: Of the weighted metric: nv numbers, ``velocity-limits``, or a TOML file of joint = weight
+        kind: Kind of the metric.
+        weights: Weights of the weighted metric: nv numbers, ``velocity-limits``, or a TOML file of joint = weight
             (``base = [6 numbers]``).
 
     Raises:
-        MetricError: Missing, zero or negative weights.
+        MetricError: Weights are missing, zero or negative.
     """
     if kind != "weighted":
         if weights is not None:
@@ -77,7 +77,7 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
 def _from_limits(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     limits = np.array(robot.model.upperVelocityLimit, dtype=float)
     base = 6 if robot.floating else 0
-    # A base has no velocity limits; 1 m/s and 1 rad/s keep it in the sum.
+    # A base has no velocity limits.  1 m/s and 1 rad/s keep it in the sum.
     limits[:base] = 1.0
     for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
         if not (np.isfinite(limit) and 0 < limit < 1e6):

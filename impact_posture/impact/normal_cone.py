@@ -1,8 +1,17 @@
 """The worst normal within a cone: value, gradients, expressions and lifted form.
 
 ``impulse``, ``sticking`` and ``energy`` depend on the normal through one quadratic form ``nᵀK(q)n``
-(:class:`~impact_posture.impact.impact_kind.QuadraticKind`), whose largest value over a cone is known exactly
-(:mod:`impact_posture.impact.cone`).  ``speed`` is no such form and has no such dual.
+(:class:`~impact_posture.impact.impact_kind.QuadraticKind`).  Its largest value over a cone is known exactly
+(:mod:`impact_posture.impact.cone`).  ``speed`` is no quadratic form and has no such dual.
+
+In the program the dual replaces the inner maximum.  In the axes of the cone (half angle α), with the quadratic form
+``P(q) = [a, bᵀ; b, C]``, ``c = cos α``, ``s = sin α`` and everything divided by the first value of the form::
+
+    min t,   t = a + sτ,   Z = [τ − ρ, −bᵀ; −b, (st + ρc²) I − sC] = L²,   ρ ≥ 0
+
+``Z`` is ``tI − P − μ(n₀n₀ᵀ − c²I)`` between two factors ``diag(s^-½, s^½, s^½)`` with ``μ = ρ/s``, which stays
+bounded as α goes to zero.  The symmetric root ``L`` keeps its gradient where eigenvalues of ``Z`` vanish together, as
+they do at mirror-symmetric postures.  ``det Z`` has no gradient there.
 """
 
 from __future__ import annotations
@@ -15,27 +24,30 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError, MetricError
-from impact_posture.impact.cone import WorstNormal, tied_normals, worst_normal
-from impact_posture.impact.cone_symbolic import worst_normal_symbolic
+from impact_posture.impact.cone import WorstNormal, cone_axes, tied_normals, worst_normal
+from impact_posture.impact.cone_symbolic import cone_axes_symbolic, worst_normal_symbolic
 from impact_posture.impact.impact_kind import ImpactKind, QuadraticKind
 from impact_posture.impact.kernel import ImpactKernel
-from impact_posture.impact.lifted import Guess, Lifted
-from impact_posture.impact.lifted_normal_cone import INSIDE, FormAlongAxes, guess_cone, lift_cone
+from impact_posture.impact.lifted import Guess, Lifted, in_world
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.impact.worst_case import Subgradients
 
 Vector = NDArray[np.float64]
 
-# Normals whose value is within this share of the largest count as worst ones in a subdifferential.
+# Normals whose value is within this share of the largest value are worst normals in a subdifferential.
 _ACTIVE = 1e-7
+# Start of τ and ρ above their solution at the first posture, by attempt.  A root with a zero eigenvalue, on the
+# boundary, is a saddle point for Newton's method.
+_INSIDE = ((0.03, 0.01), (0.3, 0.1), (0.003, 0.001))
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def check_cone(kind: ImpactKind, degrees: float) -> None:
-    """Refuse what is no cone, and what has no exact worst case over one.
+    """Refuse an angle that is no cone, and a kind without an exact worst case over a cone.
 
     Raises:
-        InputError: No half angle of a cone.
-        MetricError: A kind that is no quadratic form of the normal.
+        InputError: The angle is no half angle of a cone.
+        MetricError: The kind is no quadratic form of the normal.
     """
     if not 0 <= degrees < 90:
         raise InputError(f"the half angle is {degrees:g}°", where="normal_cone", hint="give 0 to below 90 degrees")
@@ -49,11 +61,11 @@ def check_cone(kind: ImpactKind, degrees: float) -> None:
 
 @dataclass(frozen=True)
 class NormalCone:
-    """The worst normal within ``degrees`` of the contact's own.
+    """The worst normal within ``degrees`` of the contact's own normal.
 
     Attributes:
         oracle: Pinocchio's numbers.
-        kind: What is minimized.
+        kind: The scalar that is minimized.
         degrees: Half angle of the cone.
         attempts: Guesses of the lifted form.
     """
@@ -61,7 +73,7 @@ class NormalCone:
     oracle: ImpactOracle
     kind: QuadraticKind
     degrees: float
-    attempts: int = len(INSIDE)
+    attempts: int = len(_INSIDE)
 
     @property
     def axis(self) -> Vector:
@@ -69,37 +81,38 @@ class NormalCone:
         return np.array(self.oracle.contact.normal)
 
     def worst(self, q: Vector) -> WorstNormal:
-        """The worst normal at ``q``, in the axes that the contact's normal is given in.
+        """Return the worst normal at ``q``, in the axes of the contact's normal.
 
-        Its ``value`` is that of the form ``nᵀKn``; :meth:`value` is the objective's.
+        Its ``value`` is that of the form ``nᵀKn``.  :meth:`value` is that of the objective.
 
         Raises:
-            MetricError: ``sticking`` where the contact point cannot move in every direction.
+            MetricError: The kind is ``sticking`` and the contact point cannot move in every direction.
         """
-        return worst_normal(self._form(q), self.axis, self.degrees)
+        return worst_normal(self._form(q)[0], self.axis, self.degrees)
 
     def worst_in_world(self, q: Vector) -> WorstNormal:
-        """:meth:`worst` with its normals in world axes."""
+        """Return :meth:`worst` with its normals in world axes."""
         found = self.worst(q)
-        return found.turned(self._axes_in_world(q)) if self.oracle.case.in_contact_frame else found
+        return found.turned(self._axes_in_world(q))
 
     def value(self, q: Vector) -> float:
-        """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
+        """See :class:`~impact_posture.impact.worst_case.Minimized`."""
         return float(self.kind.of_form(self.oracle.case, np.array(self.worst(q).value)))
 
     def gradient(self, q: Vector) -> Vector:
-        """Tangent gradient at the worst normal, held fixed (Danskin); where tied, the named one's: a subgradient."""
+        """Return the tangent gradient at the worst normal, held fixed (Danskin); at a tie, a subgradient."""
         found = self.worst(q)
         slope = float(self.kind.of_form_slope(self.oracle.case, np.array(found.value)))
         return slope * self.kind.form_gradient(self.oracle, q, found.normal)
 
     def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
-        """Gradients at all worst normals, the named one first; of an arc or a circle of them a dense sample.
+        """Return the gradients at all worst normals, the leading normal first.
 
-        Those whose objective is at most ``within`` below count as well.
+        An arc or a circle of worst normals gives a dense sample.  A normal counts if its objective is at most
+        ``within`` below the maximum.
         """
         case, kind, axis = self.oracle.case, self.kind, self.axis
-        form = self._form(q)
+        form = self._form(q)[0]
         found = worst_normal(form, axis, self.degrees)
         size = max(float(np.abs(form).max() * kind.of_form_slope(case, np.array(found.value))), 1e-300)
         normals = tied_normals(form, axis, self.degrees, found, max(_ACTIVE, within / size))
@@ -113,39 +126,102 @@ class NormalCone:
         return Subgradients(slopes[:, None] * gradients, gaps)
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """The single impact's along the worst normal, which the gradient holds fixed (Danskin)."""
+        """Return the expressions of a single impact along the worst normal, which is held fixed (Danskin)."""
         worst = ImpactKernel(k.case, k.q, self.worst_normal_expression(k), k.tree.limbs)
         return self.kind.expressions(worst)
 
     def worst_normal_expression(self, k: ImpactKernel) -> ca.SX:
-        """The worst normal of a kernel's ``q`` and ``n`` in closed form, in the axes of ``n``, shape (3,)."""
+        """Return the worst normal for the symbols of a kernel in closed form, in the axes of ``n``, shape (3,)."""
         K = self.kind.form_expression(k)
         if k.case.in_contact_frame:
             R = k.tree.rotation(k.point)
             K = R.T @ K @ R
         return worst_normal_symbolic((K + K.T) / 2, k.n, self.degrees)
 
-    def lift(self, tree: Tree, n: ca.SX, scale: ca.SX) -> Lifted:
-        """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
-        return lift_cone(self.oracle.case, self.kind, self.degrees, tree, n, scale)
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
+        """Return the dual over the cone: the unknowns are three jumps, ``τ``, ``ρ`` and the six entries of ``L``."""
+        case, kind, local = self.oracle.case, self.kind, cone_axes_symbolic(parameters)
+        world = in_world(case, tree, local)
+        jumps = [kind.lift_direction(case, tree, local[:, k], str(k)) for k in range(3)]
+        unit = kind.form_unit(case, scale)
+        form = ca.SX.zeros(3, 3)
+        for i, j in _UPPER:
+            form[i, j] = form[j, i] = kind.lift_entry(case, world[:, i], jumps[i], jumps[j]) / unit
+        tau, rho, root = ca.SX.sym("tau"), ca.SX.sym("rho"), ca.SX.sym("root", 6)
+        c, s = self._cosine_sine
+        t = form[0, 0] + s * tau
+        block = (s * t + rho * c * c) * ca.SX.eye(2) - s * form[1:, 1:]
+        L = ca.SX.zeros(3, 3)
+        for k, (i, j) in enumerate(_UPPER):
+            L[i, j] = L[j, i] = root[k]
+        gap = ca.blockcat([[tau - rho, -form[0, 1:]], [-form[1:, 0], block]]) - L @ L
+        return Lifted(
+            variables=ca.vertcat(*[jump.variables for jump in jumps], tau, rho, root),
+            residual=ca.vertcat(*[jump.residual for jump in jumps], *[gap[i, j] for i, j in _UPPER]),
+            value=kind.of_form_expression(case, unit * t),
+        )
 
     def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
-        """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
-        return guess_cone(self.oracle, self.kind, self.degrees, q, scale, attempt)
+        """Return the auxiliaries of :meth:`lift` at ``q``, with ``Z`` inside the cone that it must stay in."""
+        oracle = self.oracle
+        form, jumps, impulses = self._form(q, cone_axes(self.axis))
+        form = form / self.kind.form_unit(oracle.case, scale)
+        parts: list[Vector] = []
+        for k in range(3):
+            feet = -oracle.Js @ jumps[:, k] / oracle.compliance
+            parts += self.kind.guess_direction(jumps[:, k], feet, impulses[:, k])
+        c, s = self._cosine_sine
+        worst = worst_normal(form, np.eye(3)[0], self.degrees)
+        above, beyond = _INSIDE[attempt]
+        tau, rho = (worst.value - form[0, 0]) / s + above + beyond, worst.multiplier * s + beyond
+        Z = -s * form
+        Z[0, :] = Z[:, 0] = Z[:, 0] / s
+        Z[0, 0] = tau - rho
+        Z[1:, 1:] += (s * (form[0, 0] + s * tau) + rho * c * c) * np.eye(2)
+        values, vectors = np.linalg.eigh(Z)
+        root = (vectors * np.sqrt(np.maximum(values, 1e-6))) @ vectors.T
+        guess = Guess.unbounded(np.concatenate([*parts, [tau, rho], [root[i, j] for i, j in _UPPER]]))
+        guess.lower[-1 - len(_UPPER)] = 0.0
+        return guess
+
+    @property
+    def _cosine_sine(self) -> tuple[float, float]:
+        alpha = np.deg2rad(self.degrees)
+        return float(np.cos(alpha)), float(np.sin(alpha))
 
     def _axes_in_world(self, q: Vector) -> Vector:
-        return np.array(self.oracle.at(q).numeric.placement(self.oracle.point).rotation)
+        """World axes of the contact's normal at ``q``, as columns."""
+        oracle = self.oracle.at(q)
+        return (
+            np.array(oracle.numeric.placement(oracle.point).rotation) if oracle.case.in_contact_frame else np.eye(3)
+        )
 
-    def _form(self, q: Vector) -> Vector:
-        return FormAlongAxes.at(self.oracle, self.kind, q, np.eye(3)).form
+    def _form(self, q: Vector, directions: Vector | None = None) -> tuple[Vector, Vector, Vector]:
+        """``K`` along three directions (columns in the axes of the normal, those axes by default), shape (3, 3).
+
+        Returns:
+            The form, the velocity jumps along the directions (columns, shape (nv, 3)), and the impulses that cause
+            them (columns, world axes, shape (3, 3)).
+
+        Raises:
+            MetricError: The form does not exist at ``q``.
+        """
+        world = self._axes_in_world(q)
+        if directions is not None:
+            world = world @ directions
+        responses = self.oracle.solve(self.oracle.J.T)
+        mobility = self.oracle.J @ responses
+        impulses = self.kind.directions(mobility, world)
+        jumps = responses @ impulses
+        K = self.kind.form(self.oracle, mobility, world, jumps)
+        return (K + K.T) / 2, jumps, impulses
 
     def _form_tensor(self, q: Vector) -> Vector:
         """``∂K``, shape (3, 3, nv), from the gradients along six directions."""
         axes = np.eye(3)
         tensor = np.zeros((3, 3, self.oracle.robot.nv))
-        for i in range(3):
-            tensor[i, i] = self.kind.form_gradient(self.oracle, q, axes[i])
-        for i, j in ((0, 1), (0, 2), (1, 2)):
-            both = self.kind.form_gradient(self.oracle, q, axes[i] + axes[j])
-            tensor[i, j] = tensor[j, i] = (both - tensor[i, i] - tensor[j, j]) / 2
+        # The diagonal comes first in the order of i, because the other entries need it.
+        for i, j in sorted(_UPPER, key=lambda entry: entry[0] != entry[1]):
+            both = self.kind.form_gradient(self.oracle, q, axes[i] if i == j else axes[i] + axes[j])
+            tensor[i, j] = tensor[j, i] = both if i == j else (both - tensor[i, i] - tensor[j, j]) / 2
         return tensor

@@ -1,8 +1,7 @@
-"""The impact quantities from Pinocchio's numbers, by dense linear algebra: an independent second opinion.
+"""The impact quantities from Pinocchio's numbers by dense linear algebra, independent of the symbolic kernel.
 
-Feet enter by the KKT system ``[M, −J_sᵀ; J_s, εI]`` and not by the heavy-foot shortcut of the symbolic kernel.  Their
-impulses ``f`` are its unknowns and stay so: ``−J_s a/ε`` is a small difference over a small number and loses as many
-digits as ε has zeros.
+Feet enter through the KKT system ``[M, −J_sᵀ; J_s, εI]``, not through the heavy feet of the symbolic kernel.  The
+support impulses ``f`` remain unknowns, because ``−J_s a/ε`` loses as many digits as ε has zeros.
 """
 
 from __future__ import annotations
@@ -22,21 +21,23 @@ Vector = NDArray[np.float64]
 
 # Relative size of a singular value of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
 _RANK = 1e-9
+# A contact whose 1/m_eff along the normal is below this share of the largest mobility cannot move along it.
+_BLOCKED = 1e-12
 
 
 @dataclass(frozen=True)
 class ImpactQuantities:
-    """Everything that one contact means at one posture.
+    """The impact quantities of one contact at one posture.
 
     Attributes:
         H: ``nᵀΛ_c n``, squared jump per squared impulse.
         G: ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg.
         V: ``H/G²``, squared jump per squared approach speed (frictionless, e = 0).
-        S: The same when the contact sticks; ``None`` where it does not exist.
+        S: The same if the contact sticks; ``None`` where it does not exist.
         E: ``1/(2G)``, energy dissipated per squared approach speed, kg.
         jump: ``a = M⁻¹Jᵀn``, shape (nv,).
-        sticking_jump: Jump per unit approach speed when sticking, shape (nv,), or ``None``.
-        sticking_impulse: Impulse per unit approach speed when sticking, world, shape (3,), or ``None``.
+        sticking_jump: Jump per unit approach speed of a contact that sticks, shape (nv,), or ``None``.
+        sticking_impulse: Impulse per unit approach speed of a contact that sticks, world, shape (3,), or ``None``.
         ellipsoid: ``Λ_c``, shape (3, 3).
         mobility: ``JM⁻¹Jᵀ``, shape (3, 3), 1/kg.
         normal: World unit normal, shape (3,).
@@ -56,14 +57,19 @@ class ImpactQuantities:
     normal: Vector
     support_impulse: Vector
 
+    @property
+    def blocked(self) -> bool:
+        """Whether the contact cannot move along the normal."""
+        return self.G <= _BLOCKED * float(np.linalg.eigvalsh(self.mobility)[-1])
+
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What the robot does under a generalized impulse, or under several.
+    """Jump of the robot under a generalized impulse, or under several.
 
     Attributes:
         a: ``(M + J_sᵀJ_s/ε)⁻¹ τ``, shape (nv,) or (nv, k).
-        f: The supports' impulses ``−J_s a/ε``, shape (rows,) or (rows, k).
+        f: Support impulses ``−J_s a/ε``, shape (rows,) or (rows, k).
     """
 
     a: Vector
@@ -71,7 +77,11 @@ class Answer:
 
 
 class ImpactOracle:
-    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact."""
+    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact.
+
+    Args:
+        case: Robot, contact, metric and supports.
+    """
 
     def __init__(self, case: ImpactCase) -> None:
         self.case, self.robot, self.contact, self.metric = case, case.robot, case.contact, case.metric
@@ -99,24 +109,24 @@ class ImpactOracle:
         return self
 
     def answer(self, tau: Vector, slip: Vector | None = None) -> Answer:
-        """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for vectors or columns; no slip unless given."""
+        """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for vectors or columns; the slip is zero by default."""
         shape = (len(self.Js), *tau.shape[1:])
         rhs = np.concatenate([tau, np.zeros(shape) if slip is None else slip])
         found = np.asarray(scipy.linalg.lu_solve(self._lu, rhs))
         return Answer(found[: self._nv], found[self._nv :])
 
     def solve(self, tau: Vector) -> Vector:
-        """``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector or columns."""
+        """Return ``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector or columns."""
         return self.answer(tau).a
 
     def weigh(self, a: Vector) -> Vector:
-        """``W a``."""
+        """Return ``W a``."""
         if self.metric.kind == "kinetic":
             return np.asarray(self.M @ a)
         return np.asarray((self.metric.diagonal(self._nv) * a.T).T)
 
     def quantities(self, q: Vector) -> ImpactQuantities:
-        """All quantities at ``q``."""
+        """Return all quantities at ``q``."""
         self.at(q)
         answers = self.answer(self.J.T)
         A = answers.a
@@ -146,13 +156,18 @@ class ImpactOracle:
         )
 
     def with_support_impulses(self, a: Vector) -> Vector:
-        """``a`` and the impulses ``−J_s a/ε`` that it means at the supports, at the last posture, one vector."""
+        """Return ``a`` and its support impulses ``−J_s a/ε`` at the last posture, as one vector."""
         return np.concatenate([a, -self.Js @ a / self.compliance])
 
     # ---- gradients --------------------------------------------------------------------------------------------
 
     def gradient_H(self, q: Vector, normal: Vector | None = None) -> Vector:
-        """Tangent gradient of H, shape (nv,); along another ``normal`` than the contact's if given, in its axes."""
+        """Return the tangent gradient of H, shape (nv,).
+
+        Args:
+            q: Configuration, shape (nq,).
+            normal: Another normal than that of the contact, in the same axes, shape (3,).
+        """
         self.at(q)
         own, n = self._normals(normal)
         x = self.answer(self.J.T @ n)
@@ -161,17 +176,17 @@ class ImpactOracle:
         return gradient + self.metric_gradient(x.a)
 
     def gradient_G(self, q: Vector, normal: Vector | None = None) -> Vector:
-        """Tangent gradient of G, shape (nv,); ``normal`` as for H."""
+        """Return the tangent gradient of G, shape (nv,), with ``normal`` as in :meth:`gradient_H`."""
         self.at(q)
         own, n = self._normals(normal)
         x = self.answer(self.J.T @ n)
         return 2 * self.coupling(own, x.a, self.case.in_contact_frame) - self.inertial(x, x)
 
     def gradient_S(self, q: Vector, normal: Vector | None = None) -> Vector:
-        """Tangent gradient of S, shape (nv,); ``normal`` as for H.
+        """Return the tangent gradient of S, shape (nv,), with ``normal`` as in :meth:`gradient_H`.
 
-        Where ``JM⁻¹Jᵀ`` is singular the point is held in its range: right where the directions that the contact can
-        move in stay the same, as in a planar robot.
+        Where ``JM⁻¹Jᵀ`` is singular, the point is held in its range.  That is right if the directions in which the
+        contact can move stay the same, as in a planar robot.
 
         Raises:
             MetricError: S does not exist here.
@@ -188,15 +203,24 @@ class ImpactOracle:
             gradient = gradient - 2 * self.numeric.turning_gradient(self.point, n, r)
         return gradient + self.metric_gradient(x.a)
 
+    def gradient_V(self, q: Vector) -> Vector:
+        """Return the tangent gradient of V, ``∇H/G² − 2H/G³ ∇G``, shape (nv,)."""
+        found = self.quantities(q)
+        return self.gradient_H(q) / found.G**2 - 2 * found.H / found.G**3 * self.gradient_G(q)
+
+    def gradient_E(self, q: Vector) -> Vector:
+        """Return the tangent gradient of E, ``−∇G/(2G²)``, shape (nv,)."""
+        return -self.gradient_G(q) / (2 * self.quantities(q).G ** 2)
+
     def _normals(self, given: Vector | None) -> tuple[Vector, Vector]:
-        """A normal (the contact's own if none is given) in the axes that it is given in, and in world axes."""
+        """A normal (by default that of the contact) in the axes of the contact's normal, and in world axes."""
         own = np.array(self.contact.normal) if given is None else given
         return own, self.numeric.placement(self.point).rotation @ own if self.case.in_contact_frame else own
 
     def support_gradient(self, q: Vector) -> Vector:
-        """Tangent Jacobian of the supports' impulses ``f``, shape (rows, nv).
+        """Return the tangent Jacobian of the support impulses ``f``, shape (rows, nv).
 
-        Row k by the adjoint ``M p − J_sᵀr = 0, J_s p + εr = −e_k``: ``∂f_k = pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)``.
+        Row k uses the adjoint ``M p − J_sᵀr = 0, J_s p + εr = −e_k``: ``∂f_k = pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)``.
         """
         self.at(q)
         x = self.answer(self.J.T @ self.n)
@@ -210,12 +234,12 @@ class ImpactOracle:
         return np.array(found).reshape(rows, self._nv)
 
     def coupling(self, direction: Vector, v: Vector, in_frame: bool) -> Vector:
-        """``∂_q directionᵀJ v``, the direction in world axes or turning with the frame, shape (nv,)."""
+        """Return ``∂_q directionᵀJ v``, shape (nv,), for a direction in world axes or fixed in the frame."""
         wrench = np.concatenate([direction, np.zeros(3)])
         return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)
 
     def inertial(self, left: Answer, right: Answer) -> Vector:
-        """``∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]``, all four letters held: ``∂_q lᵀ(M + J_sᵀJ_s/ε)r``."""
+        """Return ``∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]`` with all four letters held: ``∂_q lᵀ(M + J_sᵀJ_s/ε)r``."""
         gradient = self.numeric.inertial_gradient(left.a, right.a)
         first = 0
         for point, rows in self.feet:
@@ -227,16 +251,16 @@ class ImpactOracle:
         return gradient
 
     def metric_gradient(self, a: Vector) -> Vector:
-        """``∂_q aᵀWa`` with ``a`` held fixed: zero unless W = M, shape (nv,)."""
+        """Return ``∂_q aᵀWa`` with ``a`` held fixed, shape (nv,); zero unless W = M."""
         return self.numeric.inertial_gradient(a, a) if self.metric.kind == "kinetic" else np.zeros(self._nv)
 
 
 @dataclass(frozen=True, eq=False)
 class _HeldPoint:
-    """The contact point held beside the feet, in the directions that it can move in.
+    """The contact point held beside the feet, in the directions in which it can move.
 
-    ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is factorized as it stands.  By way of ``(JM⁻¹Jᵀ)⁻¹`` the
-    second answer of ∇S would be a small difference of large ones, and lose by the square of that matrix's condition.
+    ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is factorized as it stands.  Through ``(JM⁻¹Jᵀ)⁻¹`` the adjoint
+    of ∇S would be a small difference of large numbers, with an error of the square of that matrix's condition.
     """
 
     lu: tuple[Vector, Vector]
@@ -257,11 +281,11 @@ class _HeldPoint:
         return _HeldPoint(scipy.linalg.lu_factor(system), axes, vectors[:, ~kept], nv)
 
     def can_move(self, n: Vector) -> bool:
-        """Whether the point can move along ``n``."""
+        """Return whether the point can move along ``n``."""
         return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(_RANK))
 
     def answer(self, *, tau: Vector | None = None, velocity: Vector | None = None) -> tuple[Answer, Vector]:
-        """The robot's answer to ``τ`` where the point is to move at ``v``, and the point's impulse ``s``."""
+        """Return the jump under ``τ`` with the point moving at ``v``, and the impulse ``s`` of the point."""
         right = np.zeros(len(self.lu[1]))
         size = len(right) - self.axes.shape[1]
         if tau is not None:

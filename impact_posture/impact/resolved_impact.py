@@ -1,6 +1,7 @@
-"""From settings to robot, contact, supports, metric and objective.
+"""Resolve settings to robot, contact, supports, metric and objective.
 
-``evaluate``, ``optimize``, ``codegen``, ``verify`` and Python mean the same by the same settings: all come here.
+``evaluate``, ``optimize``, ``codegen``, ``verify`` and Python all resolve their settings here, so that the same
+settings mean the same impact.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ FLOATS = "because its data name neither feet nor rotors"
 
 
 def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImpact:
-    """Load the robot and check all settings against it; what is ``None`` there comes from the robot.
+    """Load the robot and check all settings against it; a setting that is ``None`` comes from the robot.
 
     Args:
-        settings: The impact as a user asks for it.
-        robot: The robot, where it is loaded already.
+        settings: The impact as the user states it.
+        robot: The robot, if it is loaded already.
 
     Raises:
-        ImpactPostureError: The first thing that is wrong, in one line.
+        ImpactPostureError: A setting is wrong; the first fault, in one line.
     """
     robot = load_robot(settings.robot, settings) if robot is None else robot
     q = read_posture(robot, settings.posture)
@@ -50,7 +51,7 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
         raise InputError(
             f"the compliance is {compliance:g} 1/kg",
             where="support_compliance",
-            hint=f"give at least {least:.3g}, 1e-6 over the mass: below it rounding eats what stiffer feet gain",
+            hint=f"give at least {least:.3g}, 1e-6 over the mass, because rounding outweighs stiffer feet below it",
         )
     objective = ImpactObjective(
         robot,
@@ -73,7 +74,7 @@ def _contacts(settings: ImpactSettings, robot: Robot) -> list[ImpactContact]:
     texts = (settings.contact,) if isinstance(settings.contact, str) else settings.contact or ()
     if not texts:
         if settings.normal is None:
-            raise ContactError("there is none", where="normal", hint="give the direction out of the surface")
+            raise ContactError("is missing", where="normal", hint="give the direction out of the surface")
         return [_contact(settings, robot, settings.frame or _default_frame(robot), settings.normal, None)]
     if settings.frame is not None or settings.normal is not None:
         raise ContactError("stands instead of `frame` and `normal`", where="contact", hint="give one of the two")
@@ -103,12 +104,12 @@ class ResolvedImpact:
     """An impact whose settings fit its robot.
 
     Attributes:
-        objective: Carries robot, contact, metric, kind, supports and compliance.
-        q: The posture asked for, shape (nq,).
-        posture: Its name or file.
+        objective: Robot, contact, metric, kind, supports and compliance.
+        q: The given posture, shape (nq,).
+        posture: Name or file of the given posture.
         speed: Approach speed, m/s.
         restitution: Coefficient of restitution.
-        missing_support: How to say what holds a floating robot up, where nothing does; else empty.
+        missing_support: Hint how to state what holds a floating robot up, if nothing does; else empty.
     """
 
     objective: ImpactObjective
@@ -125,38 +126,38 @@ class ResolvedImpact:
 
     @property
     def contact(self) -> ImpactContact:
-        """The contact, its normal a unit vector."""
+        """The leading contact."""
         return self.objective.contact
 
     @property
     def supports(self) -> tuple[Support, ...]:
-        """Feet in force."""
+        """Feet that stay on the ground."""
         return self.objective.supports
 
     @property
     def metric(self) -> Metric:
-        """How the jump is weighed."""
+        """Weight of the jump."""
         return self.objective.metric
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to know about the robot and about this objective."""
+        """Warnings about the robot and about this objective."""
         found = (*self.robot.warnings, *self.objective.warnings)
         if not self.missing_support:
             return found
         return (*found, f"{self.robot.name} is taken as floating freely, {FLOATS}; {self.missing_support}")
 
     def to_dict(self, q: Vector | None = None) -> dict[str, object]:
-        """The blocks of ``result.json`` that say what was asked: robot, contacts, supports, metric.
+        """Return the blocks of ``result.json`` that state the impact: robot, contacts, supports, metric.
 
         Args:
-            q: Where world normals are taken of those that turn with the robot; the posture asked for by default.
+            q: Posture for the world axes of normals that turn with the robot; by default the given posture.
         """
         q = self.q if q is None else q
         return {
             "robot": robot_block(self.robot),
             "contacts": [_contact_block(single, q) for single in self.objective.singles],
-            "scenarios": [scenario.to_dict() for scenario in self.objective.scenarios],
+            "scenarios": [variant.to_dict() for variant in self.objective.model_variants],
             "supports": [{"frame": s.frame, "kind": s.kind} for s in self.supports],
             "support_compliance": self.objective.compliance if self.supports else None,
             "metric": {
@@ -172,36 +173,30 @@ class ResolvedImpact:
 
 
 def _contact_block(single: ImpactObjective, q: Vector) -> dict[str, object]:
-    """A contact, its normal in world axes at ``q``."""
+    """The block of a contact, with its normal in world axes at ``q``."""
     contact = single.contact
     return {
         "frame": contact.frame,
         "offset": list(contact.offset),
-        "normal": [float(v) for v in single.oracle.at(q).n],
+        "normal": single.oracle.at(q).n.tolist(),
         "normal_frame": contact.normal_frame,
         "impulse_bound": contact.impulse,
     }
 
 
 def robot_block(robot: Robot) -> dict[str, object]:
-    """The ``robot`` block of ``result.json``."""
-    return {
-        "name": robot.name,
-        "source": robot.source,
-        "model_sha256": robot.model_sha256,
-        "nq": robot.nq,
-        "nv": robot.nv,
+    """Return the ``robot`` block of ``result.json``."""
+    keys = ("name", "source", "model_sha256", "nq", "nv", "joint_names", "root", "convention", "armature")
+    found = {key: getattr(robot, key) for key in (*keys, "armature_source", "locked")}
+    return found | {
         "joint_names": list(robot.joint_names),
-        "root": robot.root,
-        "convention": robot.convention,
-        "armature": [float(v) for v in robot.armature],
-        "armature_source": robot.armature_source,
+        "armature": robot.armature.tolist(),
         "locked": list(robot.locked),
     }
 
 
 def missing_support(robot: Robot) -> str:
-    """How to say what holds the robot up, if it floats and its data name neither feet nor rotors; else empty."""
+    """Return a hint how to state what holds the robot up, if it floats and its data name no feet and no rotors."""
     spec = robot.spec
     known = spec.propulsion is not None or spec.kind == "aerial" or spec.constraints.level_base
     if not robot.floating or known:

@@ -1,4 +1,4 @@
-"""The numbers of an impact that have a name each, and the objective made of them, where they exist."""
+"""The numbers H, G, V, S, E of an impact and the objective made of them, where they exist."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from impact_posture.errors import MetricError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactQuantities
-from impact_posture.impact.single_impact import SingleImpact
+from impact_posture.impact.worst_case import SingleImpact
 
 Vector = NDArray[np.float64]
 
-# Below this share of the largest mobility the contact counts as blocked along n, and JM⁻¹Jᵀ as singular.
-_BLOCKED = 1e-12
+# JM⁻¹Jᵀ is singular if an eigenvalue is below this share of the largest one.
 _SINGULAR = 1e-9
 
 
@@ -27,8 +26,8 @@ class Scalars:
         H: Squared jump per squared impulse.
         G: Inverse effective mass along the normal, 1/kg.
         V: Squared jump per squared approach speed, frictionless, e = 0.
-        S: The same when the contact point sticks.
-        E: Energy dissipated per squared approach speed, e = 0: half the effective mass, kg.
+        S: The same if the contact point sticks.
+        E: Energy dissipated per squared approach speed, e = 0, which is half the effective mass, kg.
     """
 
     H: float
@@ -39,8 +38,8 @@ class Scalars:
 
     @staticmethod
     def of(found: ImpactQuantities) -> Scalars:
-        """Read them off; ``V`` and ``E`` do not exist where the contact cannot move along the normal."""
-        if _blocked(found):
+        """Return the numbers; ``V`` and ``E`` do not exist if the contact cannot move along the normal."""
+        if found.blocked:
             return Scalars(found.H, found.G, None, found.S, None)
         return Scalars(found.H, found.G, found.V, found.S, found.E)
 
@@ -50,18 +49,18 @@ class Scalars:
         return None if self.E is None else 1 / self.G
 
     def to_dict(self) -> dict[str, float | None]:
-        """JSON content."""
+        """Return JSON content."""
         return {"H": self.H, "G": self.G, "V": self.V, "S": self.S, "E": self.E}
 
 
 @dataclass(frozen=True)
 class VariantValue:
-    """What an impact means should the robot be another than it was modeled.
+    """The impact on one model variant.
 
     Attributes:
-        name: The scenario's.
-        objective: The objective there; ``None`` where it does not exist.
-        scalars: H, G, V, S, E of the leading contact there.
+        name: Name of the model variant.
+        objective: The objective on it; ``None`` where it does not exist.
+        scalars: H, G, V, S, E of the leading contact on it.
     """
 
     name: str
@@ -69,35 +68,28 @@ class VariantValue:
     scalars: Scalars
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
+        """Return JSON content."""
         return {"name": self.name, "objective": self.objective, **self.scalars.to_dict()}
 
 
-def _blocked(found: ImpactQuantities) -> bool:
-    return found.G <= _BLOCKED * float(np.linalg.eigvalsh(found.mobility)[-1])
-
-
 def variant_values(objective: ImpactObjective, q: Vector) -> tuple[VariantValue, ...]:
-    """The objective and its parts in each scenario."""
-    pairs = zip(objective.scenarios, objective.by_scenario, strict=True) if objective.scenarios else ()
+    """Return the objective and its parts on each model variant; empty if there is none."""
+    pairs = zip(objective.model_variants, objective.by_variant, strict=True) if objective.model_variants else ()
     return tuple(
-        VariantValue(scenario.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
-        for scenario, member in pairs
+        VariantValue(variant.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
+        for variant, member in pairs
     )
 
 
-def worst_member(objective: ImpactObjective, scenarios: tuple[VariantValue, ...]) -> ImpactObjective:
-    """The objective in the worst of its scenarios as evaluated, one where it does not exist before all others."""
-    if not scenarios:
-        return objective
-    values = [np.inf if scenario.objective is None else scenario.objective for scenario in scenarios]
-    return objective.by_scenario[int(np.argmax(values))]
+def worst_variant(variants: tuple[VariantValue, ...]) -> int:
+    """Return the index of the worst model variant; one without a value comes before all others."""
+    return int(np.argmax([np.inf if variant.objective is None else variant.objective for variant in variants]))
 
 
 def objective_value(objective: ImpactObjective, q: Vector) -> float | None:
-    """The objective; ``None`` where it does not exist: in any of its scenarios, of any normal of its cone."""
-    if objective.scenarios:
-        values = [objective_value(member, q) for member in objective.by_scenario]
+    """Return the objective; ``None`` if it does not exist for a model variant or a normal of the cone."""
+    if objective.model_variants:
+        values = [objective_value(member, q) for member in objective.by_variant]
         return None if None in values else max(v for v in values if v is not None)
     if isinstance(objective.worst_case, SingleImpact):
         scalars = Scalars.of(objective.oracle.quantities(q))
@@ -111,9 +103,9 @@ def objective_value(objective: ImpactObjective, q: Vector) -> float | None:
 
 
 def objective_gradient(objective: ImpactObjective, q: Vector, value: float | None) -> Vector | None:
-    """Tangent gradient, shape (nv,), where the objective has ``value``; a subgradient where tied.
+    """Return the tangent gradient where the objective has ``value``, shape (nv,); a subgradient at a tie.
 
-    ``None`` where it does not exist.
+    It is ``None`` where it does not exist.
     """
     values = np.linalg.eigvalsh(objective.oracle.quantities(q).mobility)
     singular = objective.kind == "sticking" and values[0] <= _SINGULAR * values[-1]

@@ -1,4 +1,4 @@
-"""Which feet stay: from what a user named, and what no impact can be at."""
+"""Resolve the names of supports, and refuse impacts at a support."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from impact_posture.settings import SupportKind
 
 
 def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support, ...]:
-    """Turn ``FRAME[:point|surface]`` into supports; without texts those of ``robot.toml``.
+    """Turn ``FRAME[:point|surface]`` into supports; ``None`` gives the supports of ``robot.toml``.
 
-    A frame that ``robot.toml`` lists keeps its kind, offset and size from there.
+    A frame that ``robot.toml`` lists keeps its offset and size, and its kind unless one is given.
 
     Raises:
-        FrameNotFound: With the nearest names.
-        InputError: A frame given twice.
+        FrameNotFound: There is no such frame; the error lists the nearest names.
+        InputError: A frame is given twice.
     """
     known = {spec.frame: Support.from_spec(spec) for spec in robot.spec.supports}
     if texts is None:
@@ -48,7 +48,11 @@ def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
 
 
 def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support]) -> None:
-    """Refuse an impact at a point that a support holds: nothing but the compliance would answer it."""
+    """Refuse an impact at a point that a support holds, because only the compliance would respond.
+
+    Raises:
+        ContactError: A support holds the contact point.
+    """
     point = point_on(robot, contact.frame, contact.offset)
     for support in supports:
         foot = point_on(robot, support.frame, support.offset)

@@ -1,4 +1,4 @@
-"""The velocity jump of an impact by name and unit, and which joint makes up ``H``."""
+"""The velocity jump of an impact by name and unit, and the share of each joint in ``H``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from impact_posture.dynamics.joints import joint_kind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.robot.robot import Robot
+from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
 
@@ -22,7 +23,7 @@ class Jump:
     Attributes:
         velocity: ``Δν``, shape (nv,), m/s and rad/s.
         norm: ``‖Δν‖_W``.
-        impulse: What the surface gives, world, shape (3,), N·s.
+        impulse: Impulse of the surface on the robot, world, shape (3,), N·s.
         largest: ``(name, value, unit)`` of the largest entries, largest first.
     """
 
@@ -37,13 +38,9 @@ class Jump:
         return float(np.linalg.norm(self.impulse))
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        return {
-            "velocity": [float(v) for v in self.velocity],
-            "norm": self.norm,
-            "impulse": [float(v) for v in self.impulse],
-            "largest": [{"name": name, "value": value, "unit": unit} for name, value, unit in self.largest],
-        }
+        """Return JSON content."""
+        largest = [{"name": name, "value": value, "unit": unit} for name, value, unit in self.largest]
+        return json_block(self) | {"largest": largest}
 
 
 @dataclass(frozen=True)
@@ -52,9 +49,9 @@ class Dominance:
 
     Attributes:
         joint: The joint with the largest share.
-        share: Its part of ``H = Σ a_i (Wa)_i``.
-        base: The floating base's part; zero without one.
-        line: The verdict in words.
+        share: Its share of ``H = Σ a_i (Wa)_i``.
+        base: Share of the floating base; zero for a fixed base.
+        line: The finding in words.
     """
 
     joint: str
@@ -68,18 +65,12 @@ class Dominance:
         return self.share > 0.5
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        return {
-            "joint": self.joint,
-            "share": self.share,
-            "base": self.base,
-            "dominates": self.dominates,
-            "line": self.line,
-        }
+        """Return JSON content."""
+        return json_block(self) | {"dominates": self.dominates}
 
 
 def tangent_units(robot: Robot) -> tuple[str, ...]:
-    """``m/s`` or ``rad/s`` for each of the nv velocity entries."""
+    """Return ``m/s`` or ``rad/s`` for each of the nv velocity entries."""
     units: list[str] = []
     for index in range(1, robot.model.njoints):
         subspace = joint_kind(robot.model.joints[index], str(robot.model.names[index])).subspace
@@ -88,7 +79,7 @@ def tangent_units(robot: Robot) -> tuple[str, ...]:
 
 
 def largest_entries(robot: Robot, values: Vector, count: int = 5) -> tuple[tuple[str, float, str], ...]:
-    """``(name, value, velocity unit)`` of the largest entries of a tangent vector, those above 0.1 % of the first."""
+    """Return ``(name, value, unit)`` of the largest entries of a tangent vector, above 0.1 % of the first."""
     units, sizes = tangent_units(robot), np.abs(values)
     order = np.argsort(-sizes, kind="stable")[:count]
     kept = [int(k) for k in order if sizes[k] > 1e-3 * sizes[order[0]]]
@@ -98,7 +89,7 @@ def largest_entries(robot: Robot, values: Vector, count: int = 5) -> tuple[tuple
 def merged_entries(
     robot: Robot, *jumps: Jump | None, count: int = 6
 ) -> list[tuple[str, str, tuple[float | None, ...]]]:
-    """``(name, unit, values)`` of the entries largest in any of the jumps; ``None`` for a missing jump."""
+    """Return ``(name, unit, values)`` of the entries that are largest in any jump; ``None`` for a missing jump."""
     units, names = tangent_units(robot), robot.tangent_names
     sizes = np.max([np.zeros(robot.nv), *(np.abs(j.velocity) for j in jumps if j is not None)], axis=0)
     order = np.argsort(-sizes, kind="stable")[:count]
@@ -110,13 +101,13 @@ def merged_entries(
 
 
 def weighed_jump(objective: ImpactObjective, velocity: Vector, impulse: Vector) -> Jump:
-    """Name and measure the jump ``velocity``, shape (nv,), in the metric at the oracle's posture."""
+    """Measure the jump ``velocity``, shape (nv,), in the metric at the posture of the oracle."""
     norm = float(np.sqrt(max(float(velocity @ objective.oracle.weigh(velocity)), 0.0)))
     return Jump(velocity, norm, impulse, largest_entries(objective.robot, velocity))
 
 
 def find_dominance(objective: ImpactObjective, found: ImpactQuantities) -> Dominance:
-    """Shares ``a_i (Wa)_i / H`` summed over each joint's entries."""
+    """Find the joint with the largest share of H: the sum of ``a_i (Wa)_i / H`` over its entries."""
     robot, oracle = objective.robot, objective.oracle
     parts = found.jump * oracle.weigh(found.jump)
     width = 6 if robot.floating else 0

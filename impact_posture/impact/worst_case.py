@@ -1,11 +1,13 @@
-"""The inner maximum of ``min_q max ‖Δν‖²``: over normals, impulses, models, or over nothing at all.
+"""The inner maximum of ``min_q max ‖Δν‖²``, over normals, impulses, models, or nothing at all.
 
-Each shape of the maximum has its own exact form.  All stand behind one protocol, so that the program, the C export
-and the certificate do not tell them apart.
+Each shape of the maximum has an exact form of its own.  One protocol hides which shape it is from the program, the
+C export and the certificate.  This module has the two shapes that need no mathematics of their own:
+:class:`SingleImpact` (no maximum) and :class:`ModelSet` (the worst of several robot models).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import Tree
+from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.kernel import ImpactKernel
-from impact_posture.impact.lifted import Guess, Lifted
+from impact_posture.impact.lifted import ABOVE, Guess, Lifted, worst_of, worst_of_guesses
 from impact_posture.impact.oracle import ImpactOracle
 
 Vector = NDArray[np.float64]
 
-# Of a finite maximum, members whose value is within this share of the largest take part in its subdifferential.
+# A member of a finite maximum is active if its value is within this share of the largest value.
 ACTIVE = 1e-6
 
 
@@ -30,7 +33,7 @@ class Subgradients:
 
     Attributes:
         gradients: Tangent gradients, shape (k, nv).
-        gaps: How far below the objective each one's own value is, shape (k,).
+        gaps: Distance of the value of each member below the objective, shape (k,).
     """
 
     gradients: Vector
@@ -38,67 +41,186 @@ class Subgradients:
 
     @property
     def first(self) -> Vector:
-        """One of them, a subgradient, shape (nv,)."""
+        """The first subgradient, shape (nv,)."""
         return np.asarray(self.gradients[0])
 
 
-class WorstCase(Protocol):
-    """The largest value that the impact may have at one posture."""
+class Minimized(Protocol):
+    """A function of the posture with a numeric value, subgradients and a lifted form for the program."""
+
+    @property
+    def attempts(self) -> int:
+        """Number of guesses from which the lifted form may be tried."""
+        ...
+
+    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
+        """Return the initial auxiliaries of the lifted form at ``q``, and their bounds."""
+        ...
+
+    def value(self, q: Vector) -> float:
+        """Return the value from Pinocchio's numbers, > 0.
+
+        Raises:
+            MetricError: The value does not exist at ``q``.
+        """
+        ...
+
+    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+        """Return vectors that span the subdifferential at ``q``, from Pinocchio's numbers.
+
+        There is one gradient where the value is smooth.  Members of a maximum count if they are at most ``within``
+        below it.
+        """
+        ...
+
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
+        """Return the value in terms of auxiliaries and equations at ``tree.q``; ``scale`` is a typical value."""
+        ...
+
+
+class WorstCase(Minimized, Protocol):
+    """The largest value that the impact may have at one posture; the parameters of ``lift`` are the normal."""
 
     @property
     def oracle(self) -> ImpactOracle:
         """Pinocchio's numbers for the leading contact, on the robot as modeled."""
         ...
 
-    @property
-    def attempts(self) -> int:
-        """From how many guesses the lifted form may be tried."""
-        ...
-
-    def value(self, q: Vector) -> float:
-        """The maximum from Pinocchio's numbers.
-
-        Raises:
-            MetricError: It does not exist at ``q``.
-        """
-        ...
-
     def gradient(self, q: Vector) -> Vector:
-        """Its tangent gradient, shape (nv,); where the maximum is tied, that of one of them."""
-        ...
-
-    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
-        """What spans its subdifferential; members at most ``within`` below the maximum count as well."""
+        """Return the tangent gradient, shape (nv,); at a tie, the gradient of one member."""
         ...
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Value and tangent gradient (nv) in the symbols of a kernel of the objective's robot and contact."""
+        """Return value and tangent gradient (nv) in the symbols of a kernel of the objective's robot and contact."""
         ...
 
-    def lift(self, tree: Tree, n: ca.SX, scale: ca.SX) -> Lifted:
-        """The maximum with its linear solves as unknowns of a program, at ``tree.q``."""
-        ...
+
+@dataclass(frozen=True)
+class SingleImpact:
+    """One impact along one normal: there is no maximum, because ``λ = λ̄``.
+
+    Attributes:
+        oracle: Pinocchio's numbers.
+        kind: The scalar that is minimized.
+        attempts: Guesses of the lifted form.
+    """
+
+    oracle: ImpactOracle
+    kind: ImpactKind
+    attempts: int = 1
+
+    def value(self, q: Vector) -> float:
+        """See :class:`Minimized`."""
+        return self.kind.value(self.oracle, q)
+
+    def gradient(self, q: Vector) -> Vector:
+        """See :class:`WorstCase`."""
+        return self.kind.gradient(self.oracle, q)
+
+    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+        """See :class:`Minimized`."""
+        return Subgradients(self.gradient(q)[None, :], np.zeros(1))
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """See :class:`WorstCase`."""
+        return self.kind.expressions(k)
+
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
+        """See :class:`Minimized`."""
+        return self.kind.lift(self.oracle.case, tree, parameters)
 
     def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
-        """Where the unknowns of :meth:`lift` start at ``q``."""
-        ...
+        """See :class:`Minimized`."""
+        return Guess.unbounded(self.kind.guess(self.oracle, q))
+
+
+@dataclass(frozen=True)
+class ModelSet:
+    """The worst of the same worst case on several robot models.
+
+    ``min_q max_k f_k(q)``, where ``f_k`` is the objective on the k-th model, becomes ``min t`` with ``t ≥ f_k(q)``.
+    Models between the variants do not count.  :mod:`impact_posture.posture.robustness` samples them.
+
+    Attributes:
+        members: The worst case on each model, the robot as modeled first.
+    """
+
+    members: tuple[WorstCase, ...]
+
+    @property
+    def oracle(self) -> ImpactOracle:
+        """See :class:`WorstCase`."""
+        return self.members[0].oracle
+
+    @property
+    def attempts(self) -> int:
+        """See :class:`Minimized`."""
+        return max(len(ABOVE), *[member.attempts for member in self.members])
+
+    def values(self, q: Vector) -> Vector:
+        """Return the value on each model, from Pinocchio's numbers, shape (k,)."""
+        return np.array([member.value(q) for member in self.members])
+
+    def worst(self, q: Vector) -> int:
+        """Return the index of the worst model."""
+        return finite_maximum(self.values(q))[0]
+
+    def value(self, q: Vector) -> float:
+        """See :class:`Minimized`."""
+        return float(self.values(q).max())
+
+    def gradient(self, q: Vector) -> Vector:
+        """See :class:`WorstCase`."""
+        return self.members[self.worst(q)].gradient(q)
+
+    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+        """See :class:`Minimized`; all models that tie contribute."""
+        _, tied, gaps = finite_maximum(self.values(q), within)
+        # The gap of a model below the worst model uses up that much of ``within``.
+        parts = [self.members[k].subgradients(q, max(within - gap, 0.0)) for k, gap in zip(tied, gaps, strict=True)]
+        return Subgradients(
+            np.vstack([part.gradients for part in parts]),
+            np.concatenate([part.gaps + gap for part, gap in zip(parts, gaps, strict=True)]),
+        )
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """See :class:`WorstCase`; the gradient is that of the worst model."""
+        pairs = []
+        for member in self.members:
+            # Limbs repeat in the model as it stands.  A payload on one limb makes them differ.
+            case = member.oracle.case
+            pairs.append(member.expressions(k if case.robot is k.case.robot else ImpactKernel(case, k.q, k.n)))
+        return first_of_largest([value for value, _ in pairs], [gradient for _, gradient in pairs])
+
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
+        """See :class:`Minimized`; each model has unknowns of its own, and ``t`` bounds all values."""
+        parts = []
+        for member in self.members:
+            model = member.oracle.robot.model
+            parts.append(member.lift(tree if model is tree.model else Tree(model, tree.q), parameters, scale))
+        return worst_of(parts, [part.value for part in parts], scale)
+
+    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
+        """See :class:`Minimized`."""
+        parts = [member.guess(q, scale, min(attempt, member.attempts - 1)) for member in self.members]
+        return worst_of_guesses(parts, self.value(q) / scale, attempt)
 
 
 def finite_maximum(values: Vector, within: float = 0.0) -> tuple[int, NDArray[np.int_], Vector]:
-    """Of finitely many values the first of the largest, all that tie with it (that one first), and their gaps.
+    """Return the first index of the largest values, the indices that tie with it (it first), and their gaps.
 
-    What ties is at most a share :data:`ACTIVE` below, or ``within``.
+    A value ties if it is at most a share :data:`ACTIVE`, or ``within``, below the largest value.
     """
     largest = float(values.max())
     near = np.flatnonzero(values >= largest - max(ACTIVE * abs(largest), within))
-    # The named one must not hang on rounding: the first of those that differ by rounding alone.
+    # The leading index must not depend on rounding, so it is the first of those that differ by rounding alone.
     leading = int(np.flatnonzero(values >= largest - 1e-12 * abs(largest))[0])
     order = np.concatenate([[leading], near[near != leading]])
     return leading, order, np.asarray(largest - values[order])
 
 
-def first_of_largest(values: list[ca.SX], choices: list[ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """The largest of expressions and what belongs to it, the first where they tie."""
+def first_of_largest(values: Sequence[ca.SX], choices: Sequence[ca.SX]) -> tuple[ca.SX, ca.SX]:
+    """Return the largest expression and the choice that belongs to it, the first one at a tie."""
     best, choice = values[0], choices[0]
     for value, other in zip(values[1:], choices[1:], strict=True):
         larger = value > best

@@ -18,7 +18,7 @@ from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
 from impact_posture.impact.scalars import objective_value
-from impact_posture.impact.single_impact import SingleImpact
+from impact_posture.impact.worst_case import SingleImpact
 from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
@@ -250,10 +250,8 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
     ]
     if view.objective.others:
         facts.insert(0, f"numbers and ellipsoids: {contact.frame} alone; objective: all contacts together")
-    if view.objective.scenarios:
-        facts.insert(
-            0, f"drawn and in numbers: the model as it stands; objective the worst of {len(view.objective.scenarios)}"
-        )
+    if count := len(view.objective.model_variants):
+        facts.insert(0, f"drawn and in numbers: the model as it stands; objective the worst of {count}")
     feet = [s.frame for s in view.objective.supports]
     facts.append(f"contact-consistent, on {', '.join(feet)}" if feet else "no supports")
     quantities: list[tuple[str, str, Callable[[ImpactQuantities], float | None]]] = [

@@ -1,4 +1,4 @@
-"""From requirements to constraints: the posture problem in the field's own terms, before any solver sees it."""
+"""Turn the requirements of a task into the constraints of a posture problem, before any solver sees it."""
 
 from __future__ import annotations
 
@@ -21,13 +21,11 @@ from impact_posture.posture.constraint import (
     HeldPose,
     HeldPosition,
     PositionBox,
+    base_point,
 )
-from impact_posture.posture.equalities import base_point
-from impact_posture.posture.every_variant import in_every_variant
-from impact_posture.posture.gauge import pin_undetermined
 from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem, Requirements
-from impact_posture.posture.regular import regularize
+from impact_posture.posture.regular import pin_undetermined, regularize
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import ContactPose
 
@@ -38,7 +36,7 @@ def build_problem(robot: Robot, objective: Objective, given: Vector, requirement
     """Turn requirements into constraints; nothing is solved yet.
 
     Raises:
-        InputError: Requirements that contradict each other or the robot.
+        InputError: The requirements contradict each other or the robot.
     """
     _check(robot, requirements)
     numeric = Numeric(robot.model).at(given)
@@ -48,7 +46,7 @@ def build_problem(robot: Robot, objective: Objective, given: Vector, requirement
         constraints.append(_held_support(robot, numeric, support))
     held = {s.frame for s in objective.supports}
     poses = (requirements.contact_pose, *requirements.other_poses)
-    # Two impacts at one frame, along two normals, hold it once.
+    # Two impacts at one frame along two normals hold the frame once.
     struck: dict[str, tuple[ImpactContact, ContactPose]] = {}
     # An objective without contacts leaves the contact pose unused.
     for contact, mode in zip(objective.contacts, poses, strict=bool(objective.contacts)):
@@ -71,7 +69,7 @@ def build_problem(robot: Robot, objective: Objective, given: Vector, requirement
     if isinstance(objective, ImpactObjective):
         if requirements.keep_contacts:
             constraints += _kept_feet(objective, numeric, requirements.friction)
-        constraints += in_every_variant(objective, numeric, requirements.friction, constraints)
+        constraints += _in_every_variant(objective, numeric, requirements.friction, constraints)
     lower, upper = _bounds(robot, chart, given, requirements)
     more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
     problem = PostureProblem(
@@ -83,18 +81,15 @@ def build_problem(robot: Robot, objective: Objective, given: Vector, requirement
 def _check(robot: Robot, requirements: Requirements) -> None:
     if not robot.floating and requirements.base != "free":
         raise InputError(
-            f"base '{requirements.base}' asked of a robot whose root is fixed",
+            f"base '{requirements.base}' does not fit a robot whose root is fixed",
             where="base",
             hint="leave it out or use `root='free-flyer'`",
         )
     for name, values in (("box", requirements.box), ("base_box", requirements.base_box)):
         if not all(np.isfinite(v) and v > 0 for v in values):
             raise InputError(f"half extents {values}", where=name, hint="give three lengths above zero")
-    for name, value in (
-        ("com_margin", requirements.com_margin),
-        ("limit_margin", requirements.limit_margin),
-        ("regularization", requirements.regularization),
-    ):
+    for name in ("com_margin", "limit_margin", "regularization"):
+        value = getattr(requirements, name)
         if not (np.isfinite(value) and value >= 0):
             raise InputError(f"is {value:g}", where=name, hint="give a number ≥ 0")
     if not (np.isfinite(requirements.friction) and requirements.friction > 0):
@@ -125,7 +120,7 @@ def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constrain
 
 
 def contact_target(robot: Robot, contact: ImpactContact, numeric: Numeric, requirements: Requirements) -> pin.SE3:
-    """Where a contact frame is to be: the target given, else where it is at ``numeric.q``."""
+    """Return the target pose of a contact frame, by default its pose at ``numeric.q``."""
     placement = numeric.placement(point_on(robot, contact.frame)).copy()
     if requirements.target_position is not None:
         placement.translation = np.array(requirements.target_position)
@@ -161,7 +156,7 @@ def _contact_constraints(
 
 
 def _kept_feet(objective: ImpactObjective, numeric: Numeric, friction: float) -> list[Constraint]:
-    """One constraint a contact: cones are convex, so what each impact leaves standing all together do."""
+    """One constraint for each contact; cones are convex, so feet that stay under each impact stay under all."""
     if objective.bilateral:
         raise InputError(
             "contacts that pull as well as push would have to leave the feet without any impulse",
@@ -169,6 +164,27 @@ def _kept_feet(objective: ImpactObjective, numeric: Numeric, friction: float) ->
             hint="leave out `bilateral=True` or `keep_contacts=True`",
         )
     return [KeptFeet(single, numeric, friction) for single in objective.singles]
+
+
+def _in_every_variant(
+    objective: ImpactObjective, numeric: Numeric, friction: float, constraints: Sequence[Constraint]
+) -> list[Constraint]:
+    """Constraints of the other model variants that the constraints of the robot as modeled do not imply.
+
+    A pose does not depend on the weight of the robot, but its center of mass and the support impulses do.  Without
+    these constraints a posture could tip over with the very payload that it was found for.
+    """
+    found: list[Constraint] = []
+    kept = any(isinstance(constraint, KeptFeet) for constraint in constraints)
+    centers = [constraint for constraint in constraints if isinstance(constraint, CenterOfMassOverFeet)]
+    for variant, member in zip(objective.model_variants[1:], objective.by_variant[1:], strict=True):
+        # The armature does not move the center of mass.
+        if variant.payload is not None and variant.armature_factor == 1:
+            loaded = variant.robot.model, variant.name
+            found += [CenterOfMassOverFeet(c.normals, c.offsets, c.margin, loaded) for c in centers]
+        if kept:
+            found += [KeptFeet(single, numeric, friction, variant.name) for single in member.singles]
+    return found
 
 
 def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements) -> list[Constraint]:
@@ -204,7 +220,7 @@ def _com_constraint(
             where="com_over_feet",
             hint="give three feet or soles with a size, or set com_over_feet = false, or `com=False`",
         ) from None
-    # One row an edge: qhull repeats the equation of an edge that it met in pieces.
+    # One row for each edge: qhull repeats the equation of an edge that it met in pieces.
     unique = np.unique(np.round(equations, 12), axis=0)
     return CenterOfMassOverFeet(unique[:, :2], -unique[:, 2], margin)
 

@@ -1,4 +1,4 @@
-"""What an optimal posture may be up to that no constraint forbids: said in words, since nothing prevents it."""
+"""Notes and warnings about an optimal posture that its numbers alone do not show."""
 
 from __future__ import annotations
 
@@ -7,50 +7,79 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
+from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.problem_settings import Prepared
-from impact_posture.posture.solve import PostureSolution
 from impact_posture.robot.actuation import hover
 
 Vector = NDArray[np.float64]
 
-# A joint further than this behind a surface, meters, is worth a word.
+# A contact counts as locked if its 1/mass falls below this share of the initial value.
+_LOCKED = 0.05
+# A joint further than this behind a surface gets a warning, meters.
 _BEHIND = 0.01
 
 
-def caveats(prepared: Prepared, solution: PostureSolution) -> list[str]:
-    """Lines about hovering, about the surface that is touched, about the ground and about the compiler."""
-    return [
-        *([solution.compiler_fault] if solution.compiler_fault else []),
-        *_hover_warnings(prepared, solution),
-        *_surface_warnings(prepared, solution),
-        *_ground_warnings(prepared, solution),
-    ]
+def percent(share: float) -> str:
+    """Return a share in percent; the digits suffice to show less than 100 as less, and zero has no minus sign."""
+    for digits in range(1, 15):
+        text = f"{100 * share:.{digits}f}"
+        if abs(share) >= 1 or abs(float(text)) != 100:
+            break
+    return f"{text.removeprefix('-') if float(text) == 0 else text}%"
 
 
-def _hover_warnings(prepared: Prepared, solution: PostureSolution) -> list[str]:
-    """What keeps an aerial robot from hovering in the optimal posture."""
+def notes_on_impacts(objective: Objective, initial: Vector, q: Vector) -> list[str]:
+    """Return notes on contacts that lock, and on jumps that fall per impulse but grow per approach speed."""
+    notes: list[str] = []
+    if not isinstance(objective, ImpactObjective):
+        return notes
+    for single in objective.singles:
+        start, end = single.oracle.quantities(initial), single.oracle.quantities(q)
+        before, after = start.G, end.G
+        where = f" at {single.contact.frame}" if objective.others else ""
+        if after < _LOCKED * before:
+            notes.append(
+                f"the contact{where} is nearly locked along the normal there: its effective mass is "
+                f"{before / max(after, 1e-300):.3g} times that of the start, and so is the impulse at a given "
+                "approach speed; compare V and S, or minimize them (`objective='speed'`, sticking)"
+            )
+        elif objective.kind == "impulse" and not objective.others and end.V > start.V * (1 + 1e-3):
+            notes.append(
+                f"at a given approach speed without friction the jump grows: V {start.V:.4g} to {end.V:.4g}; "
+                "`objective='speed'` minimizes that"
+            )
+    return notes
+
+
+def caveats(prepared: Prepared, initial: Vector, q: Vector) -> list[str]:
+    """Return warnings about hovering, the surface and the ground, for the initial and the optimal posture."""
+    return [*_hover_warnings(prepared, q), *_surface_warnings(prepared, initial, q), *_ground_warnings(prepared, q)]
+
+
+def _hover_warnings(prepared: Prepared, q: Vector) -> list[str]:
+    """Reasons why an aerial robot cannot hover in the optimal posture."""
     robot = prepared.impact.robot
     if robot.spec.propulsion is None or not robot.floating:
         return []
-    violations = hover(robot.model, robot.spec.propulsion, solution.q).violations
+    violations = hover(robot.model, robot.spec.propulsion, q).violations
     return [f"the robot cannot hover in the optimal posture: {violation}" for violation in violations]
 
 
-def _surface_warnings(prepared: Prepared, solution: PostureSolution) -> list[str]:
-    """Links whose origin lies behind the contact's plane: nothing keeps the robot on its side of the surface.
+def _surface_warnings(prepared: Prepared, initial: Vector, q: Vector) -> list[str]:
+    """Links whose origin lies behind the plane of the contact; no constraint keeps them on the side of the normal.
 
-    A push (a contact pose that is free) has no surface.
+    A push (a free contact pose) has no surface.
     """
     if prepared.problem.requirements.contact_pose == "free":
         return []
-    behind = [_joints_behind(prepared, q) for q in (solution.initial, solution.q)]
+    before, after = (_joints_behind(prepared, posture) for posture in (initial, q))
     lines = []
-    if behind[0]:
+    if before:
         lines.append(
-            f"the initial posture has {_named(behind[0])} behind the surface: the normal points out of it, "
+            f"the initial posture has {_named(before)} behind the surface: the normal points out of it, "
             "towards the robot; check its sign"
         )
-    new = [name for name in behind[1] if name not in behind[0]]
+    new = [name for name in after if name not in before]
     if new:
         lines.append(
             f"the optimal posture brings {_named(new)} behind the plane of the surface: it is not kept out of it; "
@@ -60,7 +89,7 @@ def _surface_warnings(prepared: Prepared, solution: PostureSolution) -> list[str
 
 
 def _joints_behind(prepared: Prepared, q: Vector) -> list[str]:
-    """Joints whose origin lies behind the contact's plane; the link that touches reaches to the surface itself."""
+    """Joints whose origin lies behind the plane of the contact, except the joint of the link that touches."""
     oracle = prepared.impact.objective.oracle.at(q)
     contact = oracle.numeric.placement(oracle.point).translation
     n, touching = oracle.n.copy(), oracle.point.joint
@@ -71,12 +100,12 @@ def _joints_behind(prepared: Prepared, q: Vector) -> list[str]:
     ]
 
 
-def _ground_warnings(prepared: Prepared, solution: PostureSolution) -> list[str]:
-    """Joints below the lowest foot, where level ground would be: nothing keeps a knee above it."""
+def _ground_warnings(prepared: Prepared, q: Vector) -> list[str]:
+    """Joints below the lowest foot, where level ground would be; no constraint keeps them above it."""
     robot, supports = prepared.impact.robot, prepared.impact.supports
     if not supports:
         return []
-    numeric = Numeric(robot.model).at(solution.q)
+    numeric = Numeric(robot.model).at(q)
     ground = min(numeric.placement(point_on(robot, s.frame, s.offset)).translation[2] for s in supports)
     below = [name for _, name, origin in _origins(prepared, numeric) if origin[2] < ground - _BEHIND]
     if not below:
@@ -88,7 +117,7 @@ def _ground_warnings(prepared: Prepared, solution: PostureSolution) -> list[str]
 
 
 def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Vector]]:
-    """Index, name and world origin of every joint at the numeric model's posture."""
+    """Index, name and world origin of every joint at the posture of ``numeric``."""
     model = prepared.impact.robot.model
     return [
         (i, "the base" if model.names[i] == "root_joint" else str(model.names[i]), numeric.data.oMi[i].translation)

@@ -1,4 +1,4 @@
-"""Does a posture solve the problem?  Asked of Pinocchio's numbers, never of the solver."""
+"""Check from Pinocchio's numbers, not from those of the solver, whether a posture solves the problem."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.posture.equalities import RANK_TOLERANCE, equality_jacobian
 from impact_posture.posture.posture_distance import distance_gradient
-from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.problem import RANK_TOLERANCE, PostureProblem, equality_jacobian
+from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
 
-# An inequality closer than this (m, rad) may carry a multiplier; the product of the two is the complementarity.
+# An inequality closer than this (m, rad) may have a multiplier.  The product of both is the complementarity.
 _ACTIVE = 1e-3
-# Of a maximum, members at most this share of f₀ below it take part: the solver's tolerance is a share of f₀ too, and
-# a large one of an objective that fell by orders of magnitude.  Half of what complementarity leaves to their gaps.
+# Members of a maximum count if they are at most this share of f₀ below it.  The tolerance of the solver is a share of
+# f₀ as well, and large for an objective that fell by orders of magnitude.  Complementarity allows twice this gap.
 _TIED = 5e-8
-# Multipliers below this are rounding.
+# A multiplier below this is rounding.
 _MULTIPLIER = 1e-6
 
 
 @dataclass(frozen=True)
 class Active:
-    """An inequality that holds the posture where it is.
+    """An active inequality.
 
     Attributes:
-        constraint: Its name, such as ``joint 'elbow'``.
+        constraint: Name, such as ``joint 'elbow'``.
         side: ``lower`` or ``upper``.
         multiplier: Rise of the scaled objective per unit of the bound, ≥ 0.
     """
@@ -53,7 +53,7 @@ class Certificate:
         pose_error_m: Largest position error of a held frame, meters.
         pose_error_rad: Largest orientation error of a held frame, radians.
         limits: Largest violation of a joint limit, rad or m.
-        recomputed_with: What computed it.
+        recomputed_with: Software that computed it.
         active: Inequalities with a multiplier.
     """
 
@@ -74,7 +74,7 @@ class Certificate:
         pose: float = 1e-6,
         primal: float = 1e-8,
     ) -> bool:
-        """Whether every number is within its tolerance."""
+        """Return whether every number is within its tolerance."""
         return (
             self.stationarity <= stationarity
             and self.primal <= primal
@@ -83,16 +83,8 @@ class Certificate:
         )
 
     def to_dict(self) -> dict[str, object]:
-        """The ``certificate`` block of ``result.json``."""
-        return {
-            "stationarity": self.stationarity,
-            "primal": self.primal,
-            "complementarity": self.complementarity,
-            "pose_error_m": self.pose_error_m,
-            "pose_error_rad": self.pose_error_rad,
-            "limits": self.limits,
-            "recomputed_with": self.recomputed_with,
-        }
+        """Return the ``certificate`` block of ``result.json``."""
+        return {key: value for key, value in json_block(self).items() if key != "active"}
 
 
 def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
@@ -124,10 +116,10 @@ def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
 
 
 def objective_gradients(problem: PostureProblem, q: Vector, scale: float) -> tuple[Vector, Vector]:
-    """What the program minimizes, objective/scale plus the regularization: what spans its subdifferential.
+    """Return vectors that span the subdifferential of objective/scale plus the regularization.
 
     Returns:
-        Tangent gradients, shape (k, nv), one where it is smooth; how far each one's own value lies below, shape (k,).
+        Tangent gradients, shape (k, nv), with k = 1 where the objective is smooth; gaps of their values, shape (k,).
     """
     found = problem.objective.subgradients(q, _TIED * scale)
     gradients = found.gradients / scale
@@ -139,7 +131,7 @@ def objective_gradients(problem: PostureProblem, q: Vector, scale: float) -> tup
 
 @dataclass(frozen=True, eq=False)
 class _Near:
-    """An inequality close to its bound: name, side, outward tangent gradient, distance."""
+    """An inequality close to its bound, with its outward tangent gradient and its distance."""
 
     name: str
     side: str
@@ -147,55 +139,50 @@ class _Near:
     slack: float
 
 
+def _near_bounds(name: str, value: float, low: float, high: float, gradient: Vector) -> list[_Near]:
+    """The bounds of a scalar that are near, given its tangent gradient."""
+    sides = _Near(name, "lower", -gradient, float(value - low)), _Near(name, "upper", gradient, float(high - value))
+    return [side for side in sides if side.slack < _ACTIVE]
+
+
 def _inequalities(problem: PostureProblem, numeric: Numeric) -> tuple[list[_Near], float]:
-    """Rows near their bound, and the largest violation of any constraint."""
+    """Inequality rows near their bound, and the largest violation of all constraints."""
     near: list[_Near] = []
     violation = 0.0
-    for constraint in problem.constraints:
-        value, jacobian = constraint.evaluate(numeric)
-        violation = max(violation, float(np.abs(value - np.clip(value, constraint.lower, constraint.upper)).max()))
-        if constraint.equality:
-            continue
-        for k in range(constraint.rows):
-            for side, slack, sign in (
-                ("lower", value[k] - constraint.lower[k], -1.0),
-                ("upper", constraint.upper[k] - value[k], 1.0),
-            ):
-                if slack < _ACTIVE:
-                    near.append(_Near(constraint.row_name(k), side, sign * jacobian[k], float(slack)))
+    for c in problem.constraints:
+        value, jacobian = c.evaluate(numeric)
+        violation = max(violation, float(np.abs(c.excess(value)).max()))
+        if not c.equality:
+            for k in range(c.rows):
+                near += _near_bounds(c.row_name(k), value[k], c.lower[k], c.upper[k], jacobian[k])
     return near, violation
 
 
 def _limits(problem: PostureProblem, q: Vector) -> tuple[list[_Near], float]:
-    """Joint limits that are near, and the largest violation of any."""
+    """Joint limits that are near, and the largest violation of all limits."""
     chart = Chart(problem.robot.model)
-    x = chart.to_x(q)
+    x, unit = chart.to_x(q), np.eye(problem.robot.nv)
     near: list[_Near] = []
     worst = 0.0
     for slot in chart.slots:
         if slot.kind.family not in ("revolute", "prismatic", "translation"):
             continue
-        for k in range(slot.kind.nv):
-            low, high = problem.lower[slot.x.start + k], problem.upper[slot.x.start + k]
-            value, unit = x[slot.x.start + k], np.eye(problem.robot.nv)[slot.v.start + k]
-            worst = max(worst, low - value, value - high)
-            if low == high:
-                continue  # held: an equality
-            name = f"joint '{slot.name}'"
-            if value - low < _ACTIVE:
-                near.append(_Near(name, "lower", -unit, float(value - low)))
-            if high - value < _ACTIVE:
-                near.append(_Near(name, "upper", unit, float(high - value)))
+        for k, v in zip(range(slot.x.start, slot.x.stop), range(slot.v.start, slot.v.stop), strict=True):
+            low, high = problem.lower[k], problem.upper[k]
+            worst = max(worst, low - x[k], x[k] - high)
+            # A held joint is an equality.
+            if low != high:
+                near += _near_bounds(f"joint '{slot.name}'", x[k], low, high, unit[v])
     return near, float(worst)
 
 
 def _multipliers(gradients: Vector, equalities: Vector, inequalities: Vector) -> tuple[Vector, Vector, Vector]:
-    """Weights of the gradients (≥ 0, sum 1) and multipliers of the inequalities (≥ 0) that best balance each other.
+    """Weights of the gradients (≥ 0, sum 1) and multipliers of the inequalities (≥ 0) with the least residual.
 
-    Equalities' multipliers are free: everything is projected onto their null space, whose rank may be deficient.
+    Multipliers of equalities have any sign, so all gradients are projected onto the null space of the equalities.
 
     Returns:
-        Weights, multipliers, and what stays unbalanced.
+        Weights, multipliers and residual.
     """
     count = len(gradients)
     if len(equalities):
@@ -209,7 +196,7 @@ def _multipliers(gradients: Vector, equalities: Vector, inequalities: Vector) ->
     if count == 1:
         multipliers, _ = scipy.optimize.nnls(bounds.T, -reduced[0])
         return np.ones(1), multipliers, free @ (reduced[0] + bounds.T @ multipliers)
-    # A row that asks for sum 1 scales the least residual's direction and does not turn it.
+    # A row with the sum 1 scales the solution, and does not turn the least residual.
     system = np.hstack([np.vstack([reduced.T, np.ones(count)]), np.vstack([bounds.T, np.zeros(len(bounds))])])
     found, _ = scipy.optimize.nnls(system, np.eye(len(system))[-1])
     found = found / found[:count].sum()

@@ -1,8 +1,8 @@
-"""Machine code for the program's functions where it pays, kept in a cache by content.
+"""Machine code for the functions of the program where it pays, in a cache by content.
 
-CasADi interprets its expressions at a few nanoseconds an operation; a compiler makes that a few tenths, after a wait
-of some 100 µs an operation.  So one optimization of a small robot is interpreted, and a study of thousands compiles
-once.
+CasADi interprets an operation in a few nanoseconds.  Machine code needs a few tenths of a nanosecond, but compiling
+takes about 100 µs for each operation.  So one optimization of a small robot is interpreted, and a study of thousands
+compiles once.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ CompileMode = Literal["auto", "always", "never"]
 _COMPILE_S_PER_OPERATION = 1.2e-4
 _SAVED_S_PER_OPERATION = 6e-9
 _ITERATIONS = 35
-# Above so many operations a function is not optimized: a compiler takes three times as long for code three times as
-# fast, which then is no longer what a solve waits for.
+# A function with more operations is not optimized.  The compiler would take three times as long for code three times
+# as fast, and the solve no longer waits for that code.
 _OPTIMIZED = 100_000
 
 
 class BuiltSolver(NamedTuple):
-    """``nlpsol``, whether it runs as machine code, and why it does not although it should; empty if it does."""
+    """``nlpsol``, whether it runs as machine code, and the reason why a compilation failed, else empty."""
 
     solver: ca.Function
     compiled: bool
@@ -44,8 +44,8 @@ def compiled_solver(
     """Build ``nlpsol`` on the expressions, compiled or interpreted.
 
     Raises:
-        CompilerError: ``always``, and there is no compiler or it fails.
-        OutputError: ``always``, and the cache cannot be written or is not the user's alone.
+        CompilerError: The mode is ``always``, and there is no compiler or it fails.
+        OutputError: The mode is ``always``, and the cache cannot be written or others can write to it.
     """
     interpreted: ca.Function | None = None
     try:
@@ -76,7 +76,7 @@ def _cached(problem: PostureProblem, options: dict[str, Any]) -> ca.Function | N
     try:
         return ca.nlpsol("posture", "ipopt", str(library), options)
     except RuntimeError:
-        # Made by another machine that shares the folder.
+        # Another machine that shares the folder built it.
         library.unlink(missing_ok=True)
         return None
 
@@ -87,12 +87,12 @@ def _pays(solver: ca.Function, starts: int) -> bool:
 
 
 def _key(problem: PostureProblem) -> str:
-    """Hash of what shapes the program's functions; targets, limits and the leading normal are parameters."""
+    """Hash of everything that shapes the functions; targets, limits and the leading normal are parameters."""
     content = [
         ca.CasadiMeta.version(),
         f"{platform.system()} {platform.machine()}",
         problem.robot.model_sha256,
-        # Where frames sit on their links is no part of the dynamics, but of every expression of a point.
+        # Placements of frames on links are no part of the dynamics, but of every expression of a point.
         *[f"{f.name} {f.parentJoint} {f.placement.homogeneous.tolist()}" for f in problem.robot.model.frames],
         problem.objective.structure,
         *[f"{c.structure}:{problem.carried(i)}" for i, c in enumerate(problem.constraints)],
@@ -101,11 +101,11 @@ def _key(problem: PostureProblem) -> str:
 
 
 def _compile(solver: ca.Function, compiler: list[str], name: str) -> None:
-    """Compile into the cache: each function in a file of its own, as many compilers at once as there are cores."""
+    """Compile into the cache, each function in a file of its own, with one compiler for each core."""
     library = cache_folder() / name
     with building(library) as folder:
         functions = [solver.oracle(), *[_shared(solver.get_function(name)) for name in solver.get_function()]]
-        # The largest first: nothing waits for it in the end.
+        # The largest function comes first, so that nothing waits for it at the end.
         functions.sort(key=lambda function: -int(function.n_instructions()))
         commands = [_command(function, compiler, folder) for function in functions]
         run_compilers(commands, folder)
@@ -114,14 +114,14 @@ def _compile(solver: ca.Function, compiler: list[str], name: str) -> None:
 
 
 def _shared(function: ca.Function) -> ca.Function:
-    """The same function with equal subexpressions computed once, which differentiation leaves many of."""
+    """The same function with equal subexpressions computed once.  Differentiation leaves many of them."""
     inputs = function.sx_in()
     names = (function.name_in(), function.name_out())
     return ca.Function(function.name(), inputs, function.call(inputs), *names, {"cse": True})
 
 
 def _command(function: ca.Function, compiler: list[str], folder: Path) -> list[str]:
-    """Write the function's C, and say how it is compiled."""
+    """Write the C code of a function, and return the command that compiles it."""
     name = function.name()
     generator = ca.CodeGenerator(f"{name}.c")
     generator.add(function)

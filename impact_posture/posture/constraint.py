@@ -1,7 +1,7 @@
-"""What a posture has to satisfy.  A constraint says it twice: as an expression, and in Pinocchio's numbers.
+"""Constraints on a posture, each as an expression and in Pinocchio's numbers.
 
-To add one, derive from :class:`Constraint` and give ``symbolic`` and ``evaluate``; the program, the search for
-feasible starts, the certificate and the elastic diagnosis take it from there.
+To add a constraint, derive from :class:`Constraint` and implement ``symbolic`` and ``evaluate``.  The program, the
+search for feasible starts, the certificate and the elastic diagnosis need nothing else.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ Vector = NDArray[np.float64]
 
 
 class Constraint(ABC):
-    """``lower ≤ c(q) ≤ upper``; an equality where both are zero.
+    """Abstract base of constraints ``lower ≤ c(q) ≤ upper``, which are equalities if both bounds are equal.
 
     Attributes:
-        name: What it is called when it is active or in conflict.
+        name: Name in lists of active and of conflicting constraints.
         parameters: Numbers that may change without rebuilding the program (targets, polygons).
         lower: Lower bounds, shape (rows,).
         upper: Upper bounds, shape (rows,).
@@ -43,37 +43,41 @@ class Constraint(ABC):
 
     @property
     def equality(self) -> bool:
-        """Whether it holds something at a value."""
+        """Whether the constraint is an equality."""
         return bool((self.lower == self.upper).all())
 
     @property
     def structure(self) -> str:
-        """What distinguishes two constraints apart from their parameters and bounds; part of the cache's key."""
+        """Text that distinguishes it apart from parameters and bounds; part of the key of the compile cache."""
         return f"{type(self).__name__}:{self.name}:{self.rows}"
 
     @abstractmethod
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """``c(q)`` as an expression, shape (rows, 1); ``tree`` was built with ``chart_x``."""
+        """Return ``c(q)`` as an expression, shape (rows, 1), of a ``tree`` that was built with ``chart_x``."""
 
     @abstractmethod
     def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
-        """``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``model.q``."""
+        """Return ``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``model.q``."""
+
+    def excess(self, value: Vector) -> Vector:
+        """Return how far ``c(q)`` lies outside its bounds, signed, shape (rows,)."""
+        return value - np.clip(value, self.lower, self.upper)
 
     def describe(self) -> str:
-        """The constraint in words, one line."""
+        """Describe the constraint in one line."""
         return f"{self.name} {'held' if self.equality else 'kept within its bounds'}"
 
     def row_name(self, row: int) -> str:
-        """What one row is called."""
+        """Return the name of a row."""
         return self.name if self.rows == 1 else f"{self.name}[{row}]"
 
     def pose_error(self, model: Numeric) -> tuple[float, float]:
-        """Error in meters and radians where it holds a pose, else zeros."""
+        """Return the error of a held pose in meters and radians; zeros for other constraints."""
         return 0.0, 0.0
 
 
 class HeldPosition(Constraint):
-    """The point stays where it is: ``p(q) − p*``, world axes, meters."""
+    """The point stays at ``p*``: ``p(q) − p* = 0``, world axes, meters."""
 
     def __init__(self, name: str, point: PointOnLink, target: Vector) -> None:
         self.name, self.point = name, point
@@ -94,7 +98,7 @@ class HeldPosition(Constraint):
 
 
 class PositionBox(HeldPosition):
-    """The point stays within a box around a place: ``|p(q) − p*| ≤ half``, world axes, meters."""
+    """The point stays within a box around ``p*``: ``|p(q) − p*| ≤ half``, world axes, meters."""
 
     def __init__(self, name: str, point: PointOnLink, target: Vector, half: Sequence[float]) -> None:
         super().__init__(name, point, target)
@@ -110,23 +114,22 @@ class PositionBox(HeldPosition):
         return f"{self.name} along {'xyz'[row]}"
 
     def pose_error(self, model: Numeric) -> tuple[float, float]:
-        """Distance outside the box."""
+        """Return the distance outside the box."""
         outside = np.maximum(np.abs(self.evaluate(model)[0]) - self.upper, 0.0)
         return float(np.linalg.norm(outside)), 0.0
 
 
 class HeldOrientation(Constraint):
-    """The frame keeps its orientation, or all of it but a turn about one axis.
+    """The frame keeps its orientation, or the direction of one of its axes.
 
-    ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)``: the vector part of the error's quaternion, polynomial in half angles.  It is
-    zero at the target only (at 180° it is largest, where a skew-symmetric error is zero again), smooth, and to first
-    order the rotation vector in radians.  With the first two components alone the frame's ``axis`` points as wanted
-    and its spin is free.
+    ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)`` is the vector part of the error quaternion, polynomial in half angles.  It is
+    smooth, and the rotation vector in radians to first order.  It is zero at the target only, and largest at 180°,
+    where a skew-symmetric error is zero again.  The first two components alone hold the direction of ``axis``.
 
     Args:
-        name: Its name.
-        point: Whose orientation.
-        target: Wanted world rotation, shape (3, 3).
+        name: Name of the constraint.
+        point: Point on the link whose orientation is held.
+        target: Desired world rotation, shape (3, 3).
         axis: Axis in the frame whose direction is held and about which it may turn; ``None`` holds all three.
     """
 
@@ -155,7 +158,7 @@ class HeldOrientation(Constraint):
         error = pin.Quaternion(self.parameters[:4]) * pin.Quaternion(placement.rotation) * right
         vector, w = np.array(error.coeffs()[:3]), float(error.w)
         sign = 1.0 if w >= 0 else -1.0
-        # d(2 vec(Q)) = (w I + [v]×) ω in the axes that Q turns, here the frame's times `right`.
+        # d(2 vec(Q)) = (w I + [v]×) ω in the axes that Q turns: those of the frame times `right`.
         body = (placement.rotation @ right.matrix()).T @ model.jacobian(self.point)[3:]
         J = (w * np.eye(3) + pin.skew(vector)) @ body
         return sign * 2 * vector[: self.rows], sign * J[: self.rows]
@@ -170,7 +173,7 @@ class HeldOrientation(Constraint):
 
 
 class HeldPose(Constraint):
-    """Position and orientation together: one name, six rows (five with a free spin)."""
+    """The frame keeps position and orientation: six rows, or five with a free spin."""
 
     def __init__(self, name: str, point: PointOnLink, target: pin.SE3, axis: Vector | None = None) -> None:
         self.name = name
@@ -202,13 +205,13 @@ class HeldPose(Constraint):
 
 
 class HeldTurn(Constraint):
-    """The base's turn about one axis of its own: ``2 axis·vec(Q*⁻¹ ⊗ Q(q))``.
+    """The base does not turn about one of its axes: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
 
     Args:
-        point: The base.
-        target: Orientation that counts as no turn, shape (3, 3).
+        point: Origin of the base.
+        target: Orientation without a turn, shape (3, 3).
         axis: Unit axis in the base, shape (3,).
-        name: Its name.
+        name: Name of the constraint.
     """
 
     def __init__(self, point: PointOnLink, target: Vector, axis: Vector, name: str) -> None:
@@ -229,13 +232,13 @@ class HeldTurn(Constraint):
 
 
 class CenterOfMassOverFeet(Constraint):
-    """The center of mass stays above the feet: ``margin − (A xy − b) ≥ 0`` written as ``A xy − b ≤ −margin``, meters.
+    """The center of mass stays above the feet: ``A xy − b ≤ −margin``, meters.
 
     Args:
         normals: Outward unit normals of the support polygon's edges, shape (k, 2).
         offsets: ``b``, shape (k,).
-        margin: Distance kept from the edges.
-        loaded: The model whose center of mass it is and what tells it from the problem's own; ``None``: that one.
+        margin: Least distance from the edges.
+        loaded: Another model and its name, whose center of mass counts; ``None`` for the model of the problem.
     """
 
     def __init__(
@@ -270,6 +273,11 @@ class CenterOfMassOverFeet(Constraint):
     def row_name(self, row: int) -> str:
         """See :class:`Constraint`."""
         return f"{self.name} (edge {row})"
+
+
+def base_point() -> PointOnLink:
+    """Return the origin of the link of a floating base."""
+    return PointOnLink(1, np.zeros(3), np.eye(3))
 
 
 def _coefficients(rotation: Vector) -> Vector:

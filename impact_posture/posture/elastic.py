@@ -1,4 +1,4 @@
-"""When nothing is feasible: which constraints conflict?  Found by letting each give way at a price."""
+"""Find the constraints that conflict in an infeasible problem, by relaxing each constraint at a price."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from impact_posture.posture.starts import random_posture
 
 Vector = NDArray[np.float64]
 
-# Below this (m, rad) a constraint counts as kept.
+# A constraint with a violation below this (m, rad) is satisfied.
 _KEPT = 1e-6
 
 
@@ -27,9 +27,9 @@ class ElasticAnswer:
     """The least violation that could be found.
 
     Attributes:
-        q: Where, shape (nq,).
-        conflicts: Constraints that give way there and by how much; empty if all are kept.
-        at_limits: Joints on a limit there.
+        q: Configuration with the least violation, shape (nq,).
+        conflicts: Violated constraints and their violation; empty if all are satisfied.
+        at_limits: Joints on a limit at ``q``.
     """
 
     q: Vector
@@ -38,11 +38,10 @@ class ElasticAnswer:
 
 
 def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAnswer:
-    """Minimize ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures."""
+    """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures."""
     chart = Chart(problem.robot.model)
     solver, rows = _build(problem, chart)
-    lower_rows = np.concatenate([c.lower[problem.carried(i)] for i, c in enumerate(problem.constraints)])
-    upper_rows = np.concatenate([c.upper[problem.carried(i)] for i, c in enumerate(problem.constraints)])
+    lower_rows, upper_rows = problem.row_bounds
     norms = np.zeros(len(chart.quaternion_slices()))
     rng = np.random.default_rng(seed)
     best: ElasticAnswer | None = None
@@ -70,12 +69,8 @@ def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAn
 def _build(problem: PostureProblem, chart: Chart) -> tuple[ca.Function, int]:
     x, reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
     tree = Tree(problem.robot.model, chart.configuration(x), x)
-    rows, targets = [ca.SX(0, 1)], []
-    for index, constraint in enumerate(problem.constraints):
-        p = ca.SX.sym(f"p{index}", len(constraint.parameters))
-        targets.append(p)
-        rows.append(constraint.symbolic(tree, p)[problem.carried(index)])
-    stacked = ca.vertcat(*rows)
+    rows, targets = problem.row_expressions(tree)
+    stacked = ca.vertcat(ca.SX(0, 1), *rows)
     k = stacked.numel()
     up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
     program = {
@@ -90,9 +85,8 @@ def _build(problem: PostureProblem, chart: Chart) -> tuple[ca.Function, int]:
 def _judge(problem: PostureProblem, chart: Chart, q: Vector) -> ElasticAnswer:
     numeric = Numeric(problem.robot.model).at(q)
     conflicts: dict[str, float] = {}
-    for constraint in problem.constraints:
-        value, _ = constraint.evaluate(numeric)
-        violation = float(np.linalg.norm(value - np.clip(value, constraint.lower, constraint.upper)))
+    for constraint, excess in zip(problem.constraints, problem.violations(numeric), strict=True):
+        violation = float(np.linalg.norm(excess))
         if violation > _KEPT:
             conflicts[constraint.name] = conflicts.get(constraint.name, 0.0) + violation
     x = chart.to_x(q)

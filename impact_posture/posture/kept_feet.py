@@ -1,4 +1,4 @@
-"""Feet that the impact must neither lift nor slide: their impulses stay in the friction cones."""
+"""The constraint that the impact neither lifts nor slides a foot."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ Vector = NDArray[np.float64]
 
 
 class KeptFeet(Constraint):
-    """``A f(q) ≤ 0`` with the supports' impulses ``f = −J_s a/ε`` per unit impulse, scaled to 1 at the start.
+    """Support impulses ``f = −J_s a/ε`` stay in the friction cones: ``A f(q) ≤ 0`` per unit impulse, 1 at the start.
 
-    These are the impulses of feet at compliance ε.  They are one member of the set that
-    :mod:`impact_posture.impact.contact_stability` asks about.  So the constraint is sufficient for the feet to stay,
-    and more than necessary where that set has several members.
+    These are the impulses of feet at compliance ε, one member of the set of
+    :mod:`impact_posture.impact.contact_stability`.  So the constraint is sufficient for the feet to stay.  It is
+    stricter than necessary where that set has several members.
 
     Args:
-        objective: Whose impact, one along the contact's normal, and whose feet.
-        numeric: At the given posture: soles keep their axes, for the feet are held.
-        friction: Coefficient.
-        scenario: Name of the model that it is, where there are several.
+        objective: Impact along the normal of the leading contact, and its supports.
+        numeric: Model at the given posture, which gives the axes of the soles, because the feet are held.
+        friction: Friction coefficient.
+        variant: Name of the model variant, if there are several.
     """
 
-    def __init__(self, objective: ImpactObjective, numeric: Numeric, friction: float, scenario: str = "") -> None:
-        self._where = f" ({scenario})" if scenario else ""
+    def __init__(self, objective: ImpactObjective, numeric: Numeric, friction: float, variant: str = "") -> None:
+        self._where = f" ({variant})" if variant else ""
         self.name = f"feet that stay{self._where}"
         self._robot, self._supports = objective.robot, objective.supports
         self._objective = replace(objective, normal_cone_deg=0.0)

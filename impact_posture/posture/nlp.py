@@ -1,14 +1,18 @@
-"""The nonlinear program: built once, solved for many starts, normals and targets.
+"""The nonlinear program, which is built once and solved for many starts, normals and targets.
 
-Formulation (the "lifted" one): the impact's linear solve is left to IPOPT::
+The lifted formulation leaves the linear solve of the impact to IPOPT::
 
     min over x, a, f, s   aᵀWa        (or λ/2)
-    subject to            M(q)a − J_sᵀf − Jᵀs = 0,  J_s a + εf = 0,  what ties s to n,
+    subject to            M(q)a − J_sᵀf − Jᵀs = 0,  J_s a + εf = 0,  equations of s and n,
                           c(q) within bounds,  |quaternions| = 1,  limits,
 
-so that every function is linear or quadratic in the auxiliaries and the exact Hessian stays small
-(``tests/benchmarks/formulations.py`` measures both forms).  An inner maximum adds its own form
+Every function is then linear or quadratic in the auxiliaries, and the exact Hessian stays small
+(``tests/benchmarks/formulations.py`` measures both forms).  An inner maximum adds a form of its own
 (:mod:`impact_posture.impact.worst_case`).
+
+NumPy, SciPy and CasADi (for MUMPS, within IPOPT) each bring a BLAS that uses all cores.  The systems here have about
+a hundred unknowns, so these threads only wait for each other and block the cores of parallel starts.
+:func:`one_blas_thread` stops that.
 """
 
 from __future__ import annotations
@@ -19,10 +23,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
+import threadpoolctl
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
@@ -40,31 +46,31 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.constr_viol_tol": 1e-10,
     "ipopt.dual_inf_tol": 1e-7,
     "ipopt.compl_inf_tol": 1e-9,
-    # Bounds are the robot's limits: they are not for the solver to relax.
+    # Bounds are limits of the robot, which the solver must not relax.
     "ipopt.bound_relax_factor": 0.0,
     "ipopt.honor_original_bounds": "yes",
     "ipopt.mu_strategy": "adaptive",
     "ipopt.max_iter": 300,
     "print_time": False,
     "calc_lam_p": False,
-    # Nobody asks for sensitivities.
+    # Nothing uses sensitivities.
     "no_nlp_grad": True,
     "error_on_fail": False,
 }
-# The equations of a cone's dual are quadratic, and a bound ``t`` falls as far as equations are broken for it: steps
-# that break them badly to gain in the objective never come back.
+# The equations of the dual of a cone are quadratic, and violated equations let the bound ``t`` fall.  A step that
+# violates them strongly to lower the objective never comes back.
 _WORST_OPTIONS = {"ipopt.theta_max_fact": 1.0}
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 @dataclass(frozen=True)
 class SolveRecord:
-    """What one run of the solver gave.
+    """Result of one run of the solver.
 
     Attributes:
-        q: Configuration at its end, shape (nq,).
-        status: IPOPT's word.
-        iterations: Its iterations.
+        q: Final configuration, shape (nq,).
+        status: Return status of IPOPT.
+        iterations: Iterations of IPOPT.
         time_s: Wall time of the call.
         cpu_s: Processor time of the call, all threads together.
     """
@@ -77,7 +83,7 @@ class SolveRecord:
 
     @property
     def converged(self) -> bool:
-        """Whether IPOPT says that it converged; no proof (see the certificate)."""
+        """Whether IPOPT reports convergence.  The certificate is the proof."""
         return self.status in CONVERGED
 
 
@@ -86,14 +92,14 @@ class PostureNLP:
     """A built program.
 
     Attributes:
-        problem: What it stands for.
-        chart: Coordinates.
-        solver: CasADi's ``nlpsol``.
-        size: Numbers of unknowns, of which the first ``chart.nx`` are ``x``.
-        bounded: How many of its rows, the last ones, are inequalities ``≤ 0`` of the objective.
-        build_time_s: Time to build (and compile) it.
+        problem: The posture problem.
+        chart: Coordinates of the robot.
+        solver: ``nlpsol`` of CasADi.
+        size: Number of unknowns, of which the first ``chart.nx`` are ``x``.
+        bounded: Number of last rows that are inequalities ``≤ 0`` of the objective.
+        build_time_s: Time to build and compile the program.
         compiled: Whether its functions run as machine code.
-        compiler_fault: Why they do not although they should; empty else.
+        compiler_fault: Reason why a compilation failed; empty else.
     """
 
     problem: PostureProblem
@@ -106,9 +112,12 @@ class PostureNLP:
     compiler_fault: str = ""
 
     def solve(self, start: Vector, *, scale: float | None = None, attempt: int = 0) -> SolveRecord:
-        """Solve from ``start``; the objective is divided by ``scale``, its value there unless given.
+        """Solve from ``start``.
 
-        ``attempt``: which of the objective's guesses to begin with.
+        Args:
+            start: Configuration, shape (nq,).
+            scale: Divisor of the objective; by default its value at ``start``.
+            attempt: Index of the guess of the objective.
         """
         problem, nx = self.problem, self.chart.nx
         x = np.clip(self.chart.to_x(start), problem.lower, problem.upper)
@@ -126,8 +135,31 @@ class PostureNLP:
         return SolveRecord(q, str(stats["return_status"]), int(stats["iter_count"]), elapsed, busy)
 
 
+class _CasadiOpenBLAS(threadpoolctl.OpenBLASController):  # type: ignore[misc]
+    """The OpenBLAS of the CasADi wheels, under its name there."""
+
+    internal_api = "casadi_openblas"
+    filename_prefixes = ("libcasadi-tp-openblas",)
+
+
+threadpoolctl.register(_CasadiOpenBLAS)
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Limit every BLAS of this process, and of processes forked within, to one thread."""
+    with _libraries().limit(limits=1):
+        yield
+
+
+@cache
+def _libraries() -> threadpoolctl.ThreadpoolController:
+    ca.has_nlpsol("ipopt")  # This loads IPOPT and its BLAS, because the controller finds loaded libraries only.
+    return threadpoolctl.ThreadpoolController()
+
+
 def run_solver(solver: ca.Function, **arguments: Vector) -> dict[str, ca.DM]:
-    """Call an ``nlpsol``; a Ctrl-C that IPOPT caught goes on as one."""
+    """Call an ``nlpsol``, and raise the Ctrl-C that IPOPT may catch."""
     with _noticing_interrupts():
         answer: dict[str, ca.DM] = solver(**arguments)
     return answer
@@ -135,7 +167,7 @@ def run_solver(solver: ca.Function, **arguments: Vector) -> dict[str, ca.DM]:
 
 @contextmanager
 def _noticing_interrupts() -> Iterator[None]:
-    """Raise a Ctrl-C after the solver where the solver took it for a failed evaluation and went on."""
+    """Raise a Ctrl-C after the solver, because the solver may take it for a failed evaluation and go on."""
     in_charge = (
         threading.current_thread() is threading.main_thread()
         and signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -159,7 +191,7 @@ def _noticing_interrupts() -> Iterator[None]:
 
 
 def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts: int = 1) -> PostureNLP:
-    """Build the program; ``starts`` tells how often it will be solved, so that compiling is worth it or not."""
+    """Build the program; the number of ``starts`` decides whether compiling pays."""
     began = time.perf_counter()
     chart = Chart(problem.robot.model)
     symbols, bounded = program(problem, chart)
@@ -171,31 +203,26 @@ def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts:
 
 
 def program(problem: PostureProblem, chart: Chart) -> tuple[dict[str, ca.SX], int]:
-    """Its expressions ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``, and how many last rows are ``≤ 0``."""
+    """Return ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``, and the number of last rows that are ``≤ 0``."""
     x = ca.SX.sym("x", chart.nx)
     own = ca.SX.sym("own", len(problem.objective.parameters))
     scale, weight = ca.SX.sym("scale"), ca.SX.sym("weight")
     reference = ca.SX.sym("reference", chart.nx)
     tree = Tree(problem.robot.model, chart.configuration(x), x)
     lifted = problem.objective.lift(tree, own, scale)
-    rows, targets = [chart.norms(x)], []
-    for index, constraint in enumerate(problem.constraints):
-        p = ca.SX.sym(f"p{index}", len(constraint.parameters))
-        targets.append(p)
-        rows.append(constraint.symbolic(tree, p)[problem.carried(index)])
-    rows += [lifted.residual, lifted.inequalities]
+    rows, targets = problem.row_expressions(tree)
     value = lifted.value / scale + weight * distance_squared(chart, tree.q, chart.configuration(reference))
     symbols = {
         "x": ca.vertcat(x, lifted.variables),
         "p": ca.vertcat(own, scale, weight, reference, *targets),
         "f": value,
-        "g": ca.vertcat(*rows),
+        "g": ca.vertcat(chart.norms(x), *rows, lifted.residual, lifted.inequalities),
     }
     return symbols, int(lifted.inequalities.numel())
 
 
 def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Vector:
-    """Values of the program's parameters."""
+    """Return the values of the parameters of the program."""
     return np.concatenate(
         [
             problem.objective.parameters,
@@ -208,10 +235,8 @@ def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Vector:
 
 def _row_bounds(problem: PostureProblem, nlp: PostureNLP) -> dict[str, Vector]:
     norms = np.zeros(len(nlp.chart.quaternion_slices()))
-    rows = list(enumerate(problem.constraints))
-    lower = np.concatenate([norms, *[c.lower[problem.carried(i)] for i, c in rows]])
-    upper = np.concatenate([norms, *[c.upper[problem.carried(i)] for i, c in rows]])
-    # The rest are the objective's: equations, then what bounds it from below.
+    lower, upper = (np.concatenate([norms, bounds]) for bounds in problem.row_bounds)
+    # The other rows belong to the objective: first equations, then inequalities that bound it from below.
     lifted = np.zeros(nlp.solver.size1_in("lbg") - len(lower))
     below = lifted.copy()
     below[lifted.size - nlp.bounded :] = -np.inf

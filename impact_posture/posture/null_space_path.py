@@ -1,4 +1,4 @@
-"""The way from the initial posture to the optimum, along the constraints."""
+"""The path from the initial posture to the optimum along the constraints."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class NullSpacePath:
-    """Postures that all satisfy the constraints, and the impact along them.
+    """Postures that satisfy the constraints, and the impact along them.
 
     Attributes:
         q: Postures, shape (N, nq).
-        s: Length of the way so far, tangent norm, shape (N,).
+        s: Path length, tangent norm, shape (N,).
         H: Squared jump per squared impulse, shape (N,).
         G: Inverse effective mass, shape (N,).
         V: Squared jump per squared approach speed, shape (N,).
-        S: The same when sticking, NaN where undefined, shape (N,).
-        objective: What was minimized, shape (N,).
+        S: The same if the contact sticks, NaN where undefined, shape (N,).
+        objective: The objective, shape (N,).
     """
 
     q: Vector

@@ -1,17 +1,17 @@
-"""What a smaller change would buy: the best objective within each distance from the initial posture.
+"""The Pareto front of objective and distance: the best objective within each distance from the initial posture.
 
 ::
 
     f(d) = min over q  objective(q)    subject to the problem's constraints and ‖q ⊖ q₀‖ ≤ d
 
-for a series of distances d, from zero to that of the optimum.  The distance is that of
+for a series of distances d from zero to that of the optimum.  The distance is that of
 :func:`~impact_posture.posture.posture_distance.distance_squared`.  It is a bound and not a penalty, because the
-minimizers of ``objective + w·distance²`` reach only the convex hull of the curve and jump over the rest of it.
+minimizers of ``objective + w·distance²`` reach the convex hull of the curve only.
 
-One program, whose bound is a row's bound, is solved along the curve outward from the initial posture and inward from
-the optimum, each solve from the end of the one before.  The best certified end at each distance counts.  Where its
-neighbor's end was found on another way, that way is tried here, too: so the curve is the lower envelope of the ways,
-and falls because better postures were found, not because it was made to.
+One program, with the distance as the bound of a row, is solved along two paths: outward from the initial posture and
+inward from the optimum.  Each solve starts at the end of the previous solve.  The best certified end at each distance
+counts.  If the end at the next distance was found on another path, that path is tried here as well.  So the curve is
+the lower envelope of the paths.  It falls only because better postures were found.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from impact_posture.posture.tradeoff import TradeOff, TradePoint, find_knee
 
 Vector = NDArray[np.float64]
 
-# Moves below this (rad, m) are none.
+# A move below this (rad, m) is zero.
 _STILL = 1e-6
-# A posture that is better by less (of the initial objective) is as good.
+# A posture is better only by more than this share of the initial objective.
 _EQUAL = 1e-9
-# From this rise (of the initial objective) on, a curve that should fall is said to rise.
+# A rise of the curve above this share of the initial objective is reported.
 _RISE = 1e-6
-# Other optima whose ways are followed, and rounds in which neighbors learn from each other.
-_WAYS, _ROUNDS = 3, 3
+# Number of other optima with a path of their own, and rounds of trying the paths of neighbors.
+_PATHS, _ROUNDS = 3, 3
 
 
 def pareto_front(
@@ -53,15 +53,15 @@ def pareto_front(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
 ) -> TradeOff:
-    """Follow the curve in ``points`` equal steps from the initial posture to the optimum's distance.
+    """Follow the curve in ``points`` equal steps from the initial posture to the distance of the optimum.
 
-    A regularization, which prices the distance that is bounded here, is left out.
+    The regularization is left out, because it is a price on the distance that is bounded here.
 
     Raises:
-        InputError: No points asked for.
+        InputError: The number of points is below 1.
     """
     if points < 1:
-        raise InputError(f"{points} points are asked for", where="tradeoff", hint="give 1 or more")
+        raise InputError(f"the number of points is {points}", where="tradeoff", hint="give 1 or more")
     problem = solution.problem
     chart = Chart(problem.robot.model)
     whole = distance(chart, solution.q, solution.initial)
@@ -89,19 +89,19 @@ def _bounded(problem: PostureProblem, center: Vector) -> PostureProblem:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """An end of a solve: the way that it was found on, and the point."""
+    """The end of a solve: the path on which it was found, and the point."""
 
-    way: str
+    path: str
     point: TradePoint
 
     @property
     def rank(self) -> tuple[bool, float]:
-        """Certified ones first, then the better ones."""
+        """Sort key: certified points first, then by objective."""
         return not self.point.certified, self.point.objective
 
 
 class _Curve:
-    """The curve while it is found."""
+    """The curve during the search."""
 
     def __init__(self, problem: PostureProblem, nlp: PostureNLP | None, initial: Vector, radii: list[float]) -> None:
         self._problem, self._nlp, self._initial, self._radii = problem, nlp, initial, radii
@@ -113,50 +113,50 @@ class _Curve:
         self._take(0, "outward", initial)
 
     def follow(self, solution: PostureSolution, progress: Progress | None) -> None:
-        """Outward from the initial posture, inward from the optimum and the other optima nearer than it."""
+        """Solve outward from the initial posture, and inward from the optimum and from nearer optima."""
         last = len(self._radii) - 1
         planned = 2 * last
         self._take(last, "inward", solution.q)
-        ways = [("inward", last, solution.q)]
-        for number, optimum in enumerate(solution.optima[1 : 1 + _WAYS]):
+        paths = [("inward", last, solution.q)]
+        for number, optimum in enumerate(solution.optima[1 : 1 + _PATHS]):
             away = distance(self._chart, optimum.q, self._initial)
             if away <= self._radii[last]:
                 k = int(np.searchsorted(self._radii, away))
-                ways.append((f"optimum {number}", k, optimum.q))
-                self._take(k, ways[-1][0], optimum.q)
+                paths.append((f"optimum {number}", k, optimum.q))
+                self._take(k, paths[-1][0], optimum.q)
                 planned += k - 1
 
         def step() -> None:
             if progress:
                 progress(min(self.solves, planned), planned)
 
-        for way, k, q in ways:
+        for path, k, q in paths:
             for inner in range(k - 1, 0, -1):
-                q = self._solve(inner, way, q)
+                q = self._solve(inner, path, q)
                 step()
         q = self._initial
         for k in range(1, last + 1):
             q = self._solve(k, "outward", q)
             step()
         for _ in range(_ROUNDS):
-            if not (self._learn(range(1, last + 1), -1) | self._learn(range(last - 1, 0, -1), +1)):
+            if not (self._try_neighbors(range(1, last + 1), -1) | self._try_neighbors(range(last - 1, 0, -1), +1)):
                 break
 
-    def _learn(self, order: range, neighbor: int) -> bool:
-        """Try each neighbor's way, where it is another one or does better; whether anything got better."""
+    def _try_neighbors(self, order: range, neighbor: int) -> bool:
+        """Try the path of each neighbor if it differs or does better; return whether a point improved."""
         better = False
         for k in order:
             own, other = self._best[k], self._best[k + neighbor]
             if other is None:
                 continue
             rises = own is not None and neighbor < 0 and other.point.objective < own.point.objective
-            if own is None or own.way != other.way or rises:
-                self._solve(k, other.way, other.point.q)
+            if own is None or own.path != other.path or rises:
+                self._solve(k, other.path, other.point.q)
                 better |= self._best[k] is not own
         return better
 
-    def _solve(self, k: int, way: str, start: Vector) -> Vector:
-        """Solve within radius ``k``, from ``start`` pulled back towards the initial posture if it is outside."""
+    def _solve(self, k: int, path: str, start: Vector) -> Vector:
+        """Solve within radius ``k``, from ``start`` or from its nearest point towards the initial posture."""
         radius = self._radii[k]
         key = (k, start.tobytes())
         if self._nlp is None or key in self._tried:
@@ -167,9 +167,9 @@ class _Curve:
             start = np.array(pin.interpolate(self._problem.robot.model, self._initial, start, radius / away))
         try:
             record, certificate = run_start(replace(self._nlp, problem=self._at(radius)), start, self._scale)
-            self._take(k, way, record.q, certificate)
+            self._take(k, path, record.q, certificate)
         except MetricError:
-            # This way led to where the objective does not exist.
+            # This path led to a posture where the objective does not exist.
             return start
         finally:
             self.solves += 1
@@ -179,9 +179,9 @@ class _Curve:
         ball = WithinDistance(self._chart, self._initial, radius)
         return replace(self._problem, constraints=(*self._problem.constraints[:-1], ball))
 
-    def _take(self, k: int, way: str, q: Vector, certificate: Certificate | None = None) -> None:
-        """Keep a posture if it keeps the constraints and is the best within radius ``k``."""
-        found = _Found(way, self._point(k, q, certificate))
+    def _take(self, k: int, path: str, q: Vector, certificate: Certificate | None = None) -> None:
+        """Keep a posture if it satisfies the constraints and is the best within radius ``k``."""
+        found = _Found(path, self._point(k, q, certificate))
         feasible = replace(found.point.certificate, stationarity=0.0, complementarity=0.0).holds()
         own = self._best[k]
         margin = _EQUAL * self._scale
@@ -204,10 +204,10 @@ class _Curve:
         )
 
     def finish(self, solution: PostureSolution, solve: float, build: float, notes: list[str]) -> TradeOff:
-        """The curve as it is now."""
+        """Return the curve as it is now."""
         points: list[TradePoint] = []
         for k, found in enumerate(self._best):
-            # Where no solve ended on the constraints, the posture of the distance before keeps them.
+            # If no solve ended on the constraints, the posture of the previous distance satisfies them.
             before = points[-1].q if points else self._initial
             points.append(self._point(k, before) if found is None else found.point)
         best = solution.problem.objective.value(solution.q)

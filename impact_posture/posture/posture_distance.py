@@ -1,4 +1,4 @@
-"""How far a posture is from another: squared distance, its tangent gradient, and a bound on it as a constraint."""
+"""The distance between two postures, its tangent gradient, and a bound on it as a constraint."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Vector = NDArray[np.float64]
 
 
 def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
-    """Squared distance of two configurations, ``SX`` or ``DM``: about ``‖q ⊖ reference‖²``, rad mixed with m.
+    """Return the squared distance of two configurations, ``SX`` or ``DM``: about ``‖q ⊖ reference‖²`` in rad and m.
 
-    Smooth everywhere: a turn by Δ counts ``4 (1 − (quaternion·quaternion)²) = 4 sin²(Δ/2)``, that of a continuous
-    joint ``2 (1 − cos Δ)``, which is the same; revolute and sliding joints and positions count Δ².
+    It is smooth everywhere.  A turn by Δ counts ``4 (1 − (quaternion·quaternion)²) = 4 sin²(Δ/2)``, which equals the
+    ``2 (1 − cos Δ)`` of a continuous joint.  Revolute and sliding joints and positions count Δ².
     """
     parts = []
     for slot in chart.slots:
@@ -29,18 +29,18 @@ def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
         if slot.kind.family in ("free-flyer", "spherical"):
             parts.append(4 * (1 - ca.dot(one[-4:], other[-4:]) ** 2))
             one, other = one[:-4], other[:-4]
-        # Of a cosine and a sine this is 2 (1 − cos Δ).
+        # For a cosine and a sine this is 2 (1 − cos Δ).
         parts.append(ca.sumsqr(one - other))
     return ca.sum1(ca.vertcat(*parts))
 
 
 def distance(chart: Chart, q: Vector, reference: Vector) -> float:
-    """Root of :func:`distance_squared` of two configurations, shape (nq,)."""
+    """Return the root of :func:`distance_squared` of two configurations, shape (nq,)."""
     return float(np.sqrt(max(float(distance_squared(chart, ca.DM(q), ca.DM(reference))), 0.0)))
 
 
 def distance_gradient(chart: Chart, q: Vector, reference: Vector) -> Vector:
-    """Tangent gradient of :func:`distance_squared` at ``q``, shape (nv,)."""
+    """Return the tangent gradient of :func:`distance_squared` at ``q``, shape (nv,)."""
     gradient = np.zeros(chart.nv)
     for slot in chart.slots:
         one, other, family = q[slot.q], reference[slot.q], slot.kind.family
@@ -63,14 +63,14 @@ def distance_gradient(chart: Chart, q: Vector, reference: Vector) -> Vector:
 
 
 class WithinDistance(Constraint):
-    """``distance_squared(q, reference) ≤ radius²``: a ball of postures.
+    """The posture stays in a ball: ``distance_squared(q, reference) ≤ radius²``.
 
-    The radius is a bound and the reference a parameter: one program serves all radii.
+    The radius is a bound and the reference a parameter, so one program serves all radii.
 
     Args:
         chart: Coordinates of the robot.
-        reference: Its center, shape (nq,).
-        radius: About ``‖q ⊖ reference‖``, > 0.
+        reference: Center of the ball, shape (nq,).
+        radius: Radius, about ``‖q ⊖ reference‖``, > 0.
     """
 
     def __init__(self, chart: Chart, reference: Vector, radius: float) -> None:

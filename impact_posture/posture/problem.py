@@ -1,12 +1,16 @@
-"""The posture problem as data: what is minimized, under which constraints, from where."""
+"""The posture problem as data: objective, constraints, bounds and start, and the rank of its equalities."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.constraint import Constraint
@@ -15,26 +19,29 @@ from impact_posture.settings import BaseMode, ContactPose, Vector3
 
 Vector = NDArray[np.float64]
 
+# A direction of the tangent space is held if a unit step along it moves a constraint by more than this.
+RANK_TOLERANCE = 1e-7
+
 
 @dataclass(frozen=True)
 class Requirements:
-    """What the task asks of the posture.
+    """Demands of the task on the posture.
 
     Attributes:
-        contact_pose: What is held of the contact frame; of several, the leading one.
-        other_poses: What is held of each other contact frame.
-        target_position: Contact frame's position, world, meters; ``None``: where it is.
-        target_quaternion: Contact frame's orientation x y z w; ``None``: as it is.
+        contact_pose: Part of the pose of the leading contact frame that is held.
+        other_poses: The same for each other contact frame.
+        target_position: Position of the contact frame, world, meters; ``None`` for its initial position.
+        target_quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
         box: Half extents of the box of ``contact_pose = box``, meters.
-        base: What the floating base may do: ``free``, ``level`` (tilt zero, yaw free), ``fixed``, ``box``.
+        base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``fixed`` or ``box``.
         base_box: Half extents of the box of ``base = box``, meters.
         keep: Frames whose pose is held.
         hold: Joints kept at their initial value.
         com_over_feet: Keep the center of mass above the support polygon.
-        com_asked: Whether that was asked for; else it is a habit of the robot, left where the feet span no area.
+        com_asked: Whether the user set ``com_over_feet``; else it is dropped if the feet span no area.
         com_margin: Distance from the polygon's edges, meters.
         keep_contacts: The impact must neither lift nor slide a foot.
-        friction: Coefficient for that.
+        friction: Friction coefficient for ``keep_contacts``.
         limit_margin: Distance from the joint limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
     """
@@ -63,14 +70,14 @@ class PostureProblem:
 
     Attributes:
         robot: The robot.
-        objective: What is minimized.
-        requirements: As asked for.
-        given: Posture that the user started from, shape (nq,).
-        constraints: All but bounds.
-        lower: Bounds in chart coordinates, margin included, held joints pinned, shape (nx,).
-        upper: As ``lower``.
-        rows: Rows of each constraint that the program carries; empty: all.
-        notes: What was decided for the user, one line each.
+        objective: The function that is minimized.
+        requirements: Demands of the task.
+        given: Posture of the user, shape (nq,).
+        constraints: All constraints except bounds.
+        lower: Lower bounds in chart coordinates, with margin, and with held joints pinned, shape (nx,).
+        upper: Upper bounds, shape (nx,).
+        rows: Rows of each constraint that the program carries; empty for all rows.
+        notes: Decisions that the builder made for the user, one line each.
     """
 
     robot: Robot
@@ -85,10 +92,10 @@ class PostureProblem:
 
     @property
     def impact(self) -> ImpactObjective:
-        """The objective, where it is that of an impact.
+        """The objective of an impact.
 
         Raises:
-            InputError: It is another one.
+            InputError: The objective is not that of an impact.
         """
         if not isinstance(self.objective, ImpactObjective):
             raise InputError(
@@ -99,13 +106,54 @@ class PostureProblem:
         return self.objective
 
     def carried(self, index: int) -> list[int]:
-        """Rows of constraint ``index`` that the program carries."""
+        """Return the rows of constraint ``index`` that the program carries."""
         return list(self.rows[index]) if self.rows else list(range(self.constraints[index].rows))
 
+    @property
+    def row_bounds(self) -> tuple[Vector, Vector]:
+        """Lower and upper bounds of all rows that the program carries."""
+        carried = [(c, self.carried(i)) for i, c in enumerate(self.constraints)]
+        empty = np.zeros(0)
+        return (
+            np.concatenate([empty, *[c.lower[rows] for c, rows in carried]]),
+            np.concatenate([empty, *[c.upper[rows] for c, rows in carried]]),
+        )
+
+    def row_expressions(self, tree: Tree) -> tuple[list[ca.SX], list[ca.SX]]:
+        """Return the rows that the program carries as expressions, and the symbols of their parameters."""
+        symbols = [ca.SX.sym(f"p{index}", len(c.parameters)) for index, c in enumerate(self.constraints)]
+        pairs = enumerate(zip(self.constraints, symbols, strict=True))
+        return [c.symbolic(tree, p)[self.carried(index)] for index, (c, p) in pairs], symbols
+
+    def violations(self, numeric: Numeric) -> list[Vector]:
+        """Return the signed violation of each constraint at ``numeric.q``, shape (rows,) each; zero if satisfied."""
+        return [constraint.excess(constraint.evaluate(numeric)[0]) for constraint in self.constraints]
+
     def describe(self) -> list[str]:
-        """The constraints in words, one line each."""
+        """Describe the constraints, one line each."""
         lines = [c.describe() for c in self.constraints]
         margin = self.requirements.limit_margin
         lines.append("joint limits" + (f", {margin:g} rad (m) inside" if margin else ""))
         lines += [f"joint '{joint}' held" for joint in self.requirements.hold]
         return lines
+
+
+def rank(jacobian: Vector) -> int:
+    """Return the rank of a constraint Jacobian at the tolerance of all counts of redundancy."""
+    return int(np.linalg.matrix_rank(jacobian, tol=RANK_TOLERANCE)) if jacobian.size else 0
+
+
+def equality_jacobian(problem: PostureProblem, numeric: Numeric) -> Vector:
+    """Return the tangent Jacobian of all equalities and held joints at ``numeric.q``, shape (rows, nv)."""
+    blocks = [held_rows(problem.robot, problem.requirements.hold)]
+    blocks += [c.evaluate(numeric)[1] for c in problem.constraints if c.equality]
+    return np.vstack(blocks)
+
+
+def held_rows(robot: Robot, hold: Sequence[str]) -> Vector:
+    """Return the unit rows of the tangent entries of held joints, shape (k, nv)."""
+    rows: list[int] = []
+    for joint in hold:
+        index = robot.joint_id(joint)
+        rows += range(robot.model.idx_vs[index], robot.model.idx_vs[index] + robot.model.nvs[index])
+    return np.eye(robot.nv)[rows]

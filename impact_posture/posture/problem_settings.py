@@ -1,4 +1,4 @@
-"""``problem.toml``: an optimization as a file.  Every key is the option of the same name, ``-`` written ``_``."""
+"""``problem.toml``: an optimization as a file.  Each key is the option of the same name with ``_`` for ``-``."""
 
 from __future__ import annotations
 
@@ -22,6 +22,10 @@ from impact_posture.settings import BaseMode, ProblemSettings
 from impact_posture.tables import read_toml, validate
 
 _FILES = ("srdf", "config")
+# Settings that are requirements as they are.
+_AS_SET = (
+    "target_position", "target_quaternion", "box", "base_box", "keep", "keep_contacts", "friction", "regularization",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,9 @@ class Prepared:
     """A problem ready to be solved.
 
     Attributes:
-        settings: As merged from file and command line.
-        impact: Robot, contact, metric, supports, given posture.
-        problem: The optimization.
+        settings: Settings of file and command line together.
+        impact: Robot, contact, metric, supports and given posture.
+        problem: The posture problem.
     """
 
     settings: ProblemSettings
@@ -40,10 +44,10 @@ class Prepared:
 
 
 def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemSettings:
-    """Read a ``problem.toml``; ``over`` (options of the command line) wins.  Paths in it start from its folder."""
+    """Read a ``problem.toml``, whose paths are relative to its folder; options in ``over`` replace its keys."""
     data = from_folder(read_toml(path), path.resolve().parent, (*_FILES, "weights", "armature", "posture"))
     over = over or {}
-    # What the command line says replaces what the file says of the same thing in other words.
+    # An option also replaces keys that state the same thing in another form.
     if over.get("metric", "weighted") != "weighted" and "weights" not in over:
         data.pop("weights", None)
     if "frame" in over or "normal" in over:
@@ -57,7 +61,7 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
 
 
 def make_settings(values: dict[str, object]) -> ProblemSettings:
-    """Check values that came as options."""
+    """Check values from options."""
     return validate(ProblemSettings, values, "options")
 
 
@@ -66,10 +70,10 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
 
     Args:
         settings: The problem.
-        impact: The impact that it is about, where that is built already; else the settings say it.
+        impact: The impact, if it is built already; by default that of the settings.
 
     Raises:
-        ImpactPostureError: The first thing that is wrong, in one line.
+        ImpactPostureError: A setting is wrong; the first fault, in one line.
     """
     impact = resolve(settings) if impact is None else impact
     if settings.q is not None:
@@ -84,10 +88,10 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
 
 
 def requirements(settings: ProblemSettings, objective: Objective) -> Requirements:
-    """What the task asks of the posture; what the settings leave open comes from the robot.
+    """Return the demands of the task on the posture; a setting that is ``None`` comes from the robot.
 
     Raises:
-        InputError: A setting about feet, of a robot without feet.
+        InputError: A setting is about feet, but there are no supports.
     """
     robot, spec = objective.robot, objective.robot.spec.constraints
     poses = [settings.contact_pose or robot.contact_pose(contact.frame) for contact in objective.contacts]
@@ -103,25 +107,18 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     return Requirements(
         contact_pose=poses[0] if poses else "free",
         other_poses=tuple(poses[1:]),
-        target_position=settings.target_position,
-        target_quaternion=settings.target_quaternion,
-        box=settings.box,
         base=settings.base or base,
-        base_box=settings.base_box,
-        keep=settings.keep,
         hold=free if settings.hold is None else settings.hold,
         com_over_feet=com,
         com_asked=settings.com is not None,
         com_margin=spec.com_margin if settings.com_margin is None else settings.com_margin,
-        keep_contacts=settings.keep_contacts,
-        friction=settings.friction,
         limit_margin=spec.limit_margin if settings.limit_margin is None else settings.limit_margin,
-        regularization=settings.regularization,
+        **{key: getattr(settings, key) for key in _AS_SET},
     )
 
 
 def resolved_settings(prepared: Prepared) -> ProblemSettings:
-    """The same problem with every default written out: solved again, it gives the same result."""
+    """Return the settings with all defaults written out, which give the same result again."""
     settings, impact, wanted = prepared.settings, prepared.impact, prepared.problem.requirements
     robot = settings.robot
     if names_a_path(robot, Path()):
@@ -133,15 +130,12 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         **_resolved_contacts(impact),
         "posture": None,
         "q": tuple(float(v) for v in impact.q),
-        # One key for all contacts: where they differ it is left to robot.toml, as it was.
+        # One key holds for all contacts, so several contacts keep the key as it was given.
         "contact_pose": settings.contact_pose if wanted.other_poses else wanted.contact_pose,
         "support": tuple(f"{s.frame}:{s.kind}" for s in impact.supports),
         "support_compliance": impact.objective.compliance if impact.supports else None,
-        "hold": wanted.hold,
-        "base": wanted.base,
+        **{key: getattr(wanted, key) for key in ("hold", "base", "com_margin", "limit_margin")},
         "com": any(isinstance(c, CenterOfMassOverFeet) for c in prepared.problem.constraints),
-        "com_margin": wanted.com_margin,
-        "limit_margin": wanted.limit_margin,
         "metric": impact.metric.kind,
         "weights": impact.metric.weights,
         "objective": impact.objective.kind,
@@ -150,7 +144,7 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         "normal_frame": impact.contact.normal_frame,
         "speed": impact.speed,
         "restitution": impact.restitution,
-        **_resolved_variants(impact.objective.scenarios),
+        **_resolved_variants(impact.objective.model_variants),
     }
     for key in _FILES:
         value = getattr(settings, key)
@@ -171,7 +165,7 @@ def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
 
 
 def _resolved_variants(variants: Sequence[ModelVariant]) -> dict[str, object]:
-    """The settings that make these model variants."""
+    """The settings that give these model variants."""
     # The model as stated is always among them.
     factors = {variant.armature_factor for variant in variants} - {1.0}
     if len(factors) == 1:
@@ -191,13 +185,13 @@ def _armature_by_joint(impact: ResolvedImpact) -> str | dict[str, float]:
 
 
 def dump_settings(settings: ProblemSettings) -> str:
-    """Write settings as TOML, keys in the model's order, what is ``None`` left out.
+    """Write settings as TOML, in the order of the fields and without those that are ``None``.
 
     Raises:
         SpecError: The path of a file is not UTF-8.
     """
     lines = [f"schema = {toml(settings.schema)}"]
-    # The robot first: a reader looks for it.
+    # The robot comes first, because a reader looks for it.
     for key in sorted((field.name for field in fields(ProblemSettings)), key=lambda name: name != "robot"):
         value = getattr(settings, key)
         if key != "schema" and value is not None and value != {}:

@@ -1,7 +1,8 @@
-"""Make a problem's equalities regular: independent where they repeat, held where they hold to second order only."""
+"""Make a problem well-posed: fix undetermined motions, leave out repeated equalities, hold apparent freedoms."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,31 +11,91 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.posture.constraint import HeldTurn
-from impact_posture.posture.equalities import RANK_TOLERANCE, base_point, equality_jacobian, held_rows, rank
-from impact_posture.posture.problem import PostureProblem
+from impact_posture.impact.objective import Objective
+from impact_posture.posture.constraint import Constraint, HeldPosition, HeldTurn, base_point
+from impact_posture.posture.problem import (
+    RANK_TOLERANCE,
+    PostureProblem,
+    Requirements,
+    equality_jacobian,
+    held_rows,
+    rank,
+)
 from impact_posture.posture.starts import Projector, feasible_start
+from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
 
-# Size of the trial turn (rad) and the share of it that must survive for the turn to be possible.
+# Size of the trial turn (rad), and the share of it that must survive for the turn to be possible.
 _TRIAL, _SURVIVES = 0.05, 0.1
 # Random feasible postures at which ranks are compared.
 _SAMPLES = 4
 
 
-def regularize(problem: PostureProblem) -> PostureProblem:
-    """Choose an independent set of equality rows for the program; hold turns that exist to first order only.
+def pin_undetermined(
+    robot: Robot,
+    objective: Objective,
+    numeric: Numeric,
+    requirements: Requirements,
+    constraints: Sequence[Constraint],
+) -> tuple[list[Constraint], list[str]]:
+    """Return constraints that fix the base where nothing else does, and notes for the user.
 
-    Four point feet on planar legs (solo8) are 12 equations of rank 10: two repeat others, and the base may roll to
-    first order although any finite roll would spread the feet.  A program cannot live with either.  The rows that
-    repeat others are left out of it (the certificate still checks them), and such a turn is held explicitly.
+    The value does not change if the whole robot moves, or turns about an axis that the objective does not see.  Such
+    motions are fixed at their initial value if the constraints allow them.  A free contact pose also fixes yaw,
+    because a turn of the whole robot towards the impact is no change of posture.
+    """
+    if not robot.floating:
+        return [], []
+    base = base_point()
+    placement = numeric.placement(base)
+    move = np.linalg.pinv(numeric.jacobian(base))
+    blind = objective.blind_motions()
+    turns = [motion[3:] for motion in blind if motion[3:].any()]
+    if objective.contacts and requirements.contact_pose == "free" and not objective.supports:
+        blind = np.vstack([blind, np.eye(6)[5]])
+    motions = move @ scipy.linalg.orth(blind.T)
+    added: list[Constraint] = []
+    notes: list[str] = []
+
+    def free() -> Vector:
+        """Base twists that are still allowed, world axes, shape (6, k)."""
+        rows = [c.evaluate(numeric)[1] @ motions for c in (*constraints, *added)]
+        if not rows:
+            return np.asarray(numeric.jacobian(base) @ motions)
+        allowed = scipy.linalg.null_space(np.vstack(rows), rcond=RANK_TOLERANCE)
+        return np.asarray(numeric.jacobian(base) @ motions @ allowed)
+
+    # A turn about another point moves the base as well, so turns are fixed before positions.
+    candidates = [("yaw", np.array([0.0, 0.0, 1.0]))]
+    if len(turns) == 1:
+        candidates.append(("turn about the normal", placement.rotation.T @ turns[0]))
+    candidates += [("roll", np.eye(3)[0]), ("pitch", np.eye(3)[1])]
+    for name, axis in candidates:
+        held = HeldTurn(base, placement.rotation, axis, f"base {name}")
+        if np.abs(held.evaluate(numeric)[1] @ move @ free()).max(initial=0.0) > 1e-3:
+            added.append(held)
+            notes.append(f"base {name} fixed at its initial value: nothing else determines it")
+    if np.abs(free()[:3]).max(initial=0.0) > 1e-3:
+        added.append(HeldPosition("base position", base, placement.translation))
+        notes.append("base position fixed at its initial value: nothing else determines it")
+    return added, notes
+
+
+def regularize(problem: PostureProblem) -> PostureProblem:
+    """Choose independent equality rows for the program, and hold turns that exist to first order only.
+
+    Four point feet on planar legs (solo8) give 12 equations of rank 10.  Two equations repeat others, and the base
+    may roll to first order although any finite roll would spread the feet.  A program can handle neither.  It leaves
+    out the repeated rows, which the certificate still checks, and holds the turn explicitly.
     """
     numeric = Numeric(problem.robot.model)
     jacobian = equality_jacobian(problem, numeric.at(problem.given))
     if rank(jacobian) == len(jacobian):
         return problem
-    postures = _feasible_postures(problem)
+    # The given posture pulled onto the constraints, and a few random feasible postures.
+    postures = [Projector(problem).project(problem.given).q]
+    postures += [q for k in range(1, _SAMPLES + 1) if (q := feasible_start(problem, k, seed=0)) is not None]
     added, notes = [], []
     if problem.robot.floating:
         rotation = numeric.at(postures[0]).placement(base_point()).rotation.copy()
@@ -44,7 +105,7 @@ def regularize(problem: PostureProblem) -> PostureProblem:
                 added.append(turn)
                 notes.append(f"{turn.name} held: the feet allow it to first order only")
     problem = replace(problem, constraints=(*problem.constraints, *added), notes=(*problem.notes, *notes))
-    # A posture may be singular by chance (a straight arm): only what repeats at the most regular one is left out.
+    # A posture may be singular by chance (a straight arm), so the most regular posture decides what repeats.
     generic = max(postures, key=lambda q: rank(equality_jacobian(problem, numeric.at(q))))
     jacobian = equality_jacobian(problem, numeric.at(generic))
     if rank(jacobian) == len(jacobian):
@@ -52,15 +113,8 @@ def regularize(problem: PostureProblem) -> PostureProblem:
     return replace(problem, rows=_independent_rows(problem, numeric.at(generic)))
 
 
-def _feasible_postures(problem: PostureProblem) -> list[Vector]:
-    """The given posture pulled onto the constraints, and a few random feasible ones."""
-    found = [Projector(problem).project(problem.given).q]
-    found += [q for k in range(1, _SAMPLES + 1) if (q := feasible_start(problem, k, seed=0)) is not None]
-    return found
-
-
 def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTurn, q: Vector) -> bool:
-    """Whether the equalities' linearization at ``q`` allows a turn that the equalities themselves undo."""
+    """Whether the linearized equalities at ``q`` allow a turn that the equalities themselves undo."""
     model = problem.robot.model
     jacobian = equality_jacobian(problem, numeric.at(q))
     free = scipy.linalg.null_space(jacobian, rcond=RANK_TOLERANCE)
@@ -70,14 +124,12 @@ def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTu
         return False
     equalities = [c for c in problem.constraints if c.equality]
     start = [c.evaluate(numeric)[0] for c in equalities]
+    held = np.zeros(len(held_rows(problem.robot, problem.requirements.hold)))
     q = pin.integrate(model, q, along * (_TRIAL / size))
     for _ in range(60):
         numeric.at(q)
-        residual = np.concatenate(
-            [np.zeros(len(held_rows(problem.robot, problem.requirements.hold)))]
-            + [c.evaluate(numeric)[0] - s for c, s in zip(equalities, start, strict=True)]
-        )
-        step = -np.linalg.pinv(equality_jacobian(problem, numeric), rcond=1e-9) @ residual
+        residual = [c.evaluate(numeric)[0] - s for c, s in zip(equalities, start, strict=True)]
+        step = -np.linalg.pinv(equality_jacobian(problem, numeric), rcond=1e-9) @ np.concatenate([held, *residual])
         q = pin.integrate(model, q, step)
         if np.abs(step).max() < 1e-12:
             break
@@ -86,14 +138,11 @@ def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTu
 
 
 def _independent_rows(problem: PostureProblem, numeric: Numeric) -> tuple[tuple[int, ...], ...]:
-    """For each constraint the rows that the program carries: all inequalities, independent equalities."""
+    """The rows of each constraint that the program carries: all inequalities, and independent equalities."""
     held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
-    labels, blocks = [], []
-    for index, constraint in enumerate(problem.constraints):
-        if constraint.equality:
-            blocks.append(constraint.evaluate(numeric)[1])
-            labels += [(index, row) for row in range(constraint.rows)]
-    stacked = np.vstack(blocks)
+    equalities = [(index, c) for index, c in enumerate(problem.constraints) if c.equality]
+    labels = [(index, row) for index, c in equalities for row in range(c.rows)]
+    stacked = np.vstack([c.evaluate(numeric)[1] for _, c in equalities])
     stacked[:, held] = 0.0
     _, triangle, order = scipy.linalg.qr(stacked.T, mode="economic", pivoting=True)
     count = int((np.abs(np.diag(triangle)) > RANK_TOLERANCE).sum())

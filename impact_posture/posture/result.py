@@ -1,4 +1,4 @@
-"""``result.json``: the answer as a document, and as arrays."""
+"""The result of an optimization as the document ``result.json`` and as arrays."""
 
 from __future__ import annotations
 
@@ -17,13 +17,20 @@ from impact_posture.posture.problem_settings import Prepared
 from impact_posture.posture.robustness import Robustness
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
+from impact_posture.tables import json_block
 from impact_posture.version import __version__
 
 SCHEMA = "impact-posture/result/1"
 
+# Attributes of a solution in the block ``solver``.
+_SOLVER = (
+    "status", "iterations", "solve_time_s", "build_time_s", "compiled",
+    "starts", "feasible_starts", "certified_starts",
+)  # fmt: skip
+
 
 def evaluations(prepared: Prepared, solution: PostureSolution) -> tuple[Evaluation, Evaluation]:
-    """The impact at the initial (feasible) and at the optimal posture."""
+    """Evaluate the impact at the initial (feasible) and at the optimal posture."""
     impact = prepared.impact
     initial = evaluate(impact.objective, solution.initial, impact.speed, impact.restitution)
     return initial, evaluate(impact.objective, solution.q, impact.speed, impact.restitution)
@@ -35,42 +42,28 @@ def result_document(
     robustness: Robustness | None = None,
     tradeoff: TradeOff | None = None,
 ) -> dict[str, object]:
-    """The content of ``result.json``; ``robustness`` and ``tradeoff`` are keys of it where there are such."""
+    """Return the content of ``result.json``; ``robustness`` and ``tradeoff`` are keys only if they are given."""
     initial, optimal = evaluations(prepared, solution)
     impact = prepared.impact
-    warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *caveats(prepared, solution))
+    fault = [solution.compiler_fault] if solution.compiler_fault else []
+    found = caveats(prepared, solution.initial, solution.q)
+    warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *found)
     curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list()}
     return {
         "schema": SCHEMA,
         **impact.to_dict(solution.initial),
         "constraints": prepared.problem.describe(),
-        "initial": {
-            "given_q": [float(v) for v in prepared.problem.given],
-            "moved": solution.moved,
-            **initial.to_dict(),
-        },
+        "initial": {"given_q": prepared.problem.given.tolist(), "moved": solution.moved, **initial.to_dict()},
         "optimal": optimal.to_dict(),
         "reduction": solution.reduction,
         **({} if robustness is None else {"robustness": robustness.to_dict()}),
         "redundancy": solution.redundancy,
         "certificate": solution.certificate.to_dict(),
-        "active": [
-            {"constraint": a.constraint, "side": a.side, "multiplier": a.multiplier}
-            for a in solution.certificate.active
-        ],
+        "active": [json_block(active) for active in solution.certificate.active],
         "solver": {
-            "status": solution.status,
-            "iterations": solution.iterations,
-            "solve_time_s": solution.solve_time_s,
-            "build_time_s": solution.build_time_s,
-            "compiled": solution.compiled,
+            **{key: getattr(solution, key) for key in _SOLVER},
             "seed": prepared.settings.seed,
-            "starts": solution.starts,
-            "feasible_starts": solution.feasible_starts,
-            "certified_starts": solution.certified_starts,
-            "optima": [
-                {"q": [float(v) for v in o.q], "objective": o.objective, "hits": o.hits} for o in solution.optima
-            ],
+            "optima": [json_block(optimum) for optimum in solution.optima],
         },
         **curve,
         "notes": [*solution.notes, *(tradeoff.notes if tradeoff else ())],
@@ -80,7 +73,7 @@ def result_document(
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that a result depends on."""
+    """Return the versions of all software that a result depends on."""
     found = {"impact-posture": __version__, "python": platform.python_version()}
     found |= {"casadi": ca.CasadiMeta.version(), "pinocchio": pin.__version__, "numpy": np.__version__}
     try:
@@ -93,7 +86,7 @@ def versions() -> dict[str, str]:
 def result_arrays(
     solution: PostureSolution, path: NullSpacePath, tradeoff: TradeOff | None = None
 ) -> dict[str, NDArray[np.float64]]:
-    """The content of ``result.npz``: postures, ellipsoids, jumps, the null-space path, and the trade-off."""
+    """Return the content of ``result.npz``: postures, ellipsoids, jumps, the null-space path and the trade-off."""
     oracle = solution.problem.impact.oracle
     arrays: dict[str, NDArray[np.float64]] = {}
     for name, q in (("initial", solution.initial), ("optimal", solution.q)):

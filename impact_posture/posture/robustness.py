@@ -1,4 +1,4 @@
-"""How far the optimum moves with the model: what robustness against a few scenarios costs and what it buys."""
+"""Robustness against model variants: how far the optimum moves, what it costs and what it gains."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
+from impact_posture.posture.caveats import percent
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.notes import percent
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.solve import SAME_POSTURE, PostureSolution, Progress, solve, wrapped_difference
 from impact_posture.robot.model_variant import between
+from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
 
-# Models drawn between the scenarios, to see whether something there is worse than all of them.
+# Number of models drawn between the variants, to check whether one is worse than all variants.
 _BETWEEN = 60
-# Shares below this are what the solver leaves, and constraints within this (m, rad) are kept.
+# A share below this is an error of the solver, and a constraint within this (m, rad) is satisfied.
 _NOISE = 1e-6
-_KEPT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class VariantOptimum:
-    """One scenario, and the posture that would be best if it were known to hold.
+    """One model variant, and the best posture for it alone.
 
     Attributes:
-        name: The scenario's.
+        name: Name of the model variant.
         at_robust: Its objective at the robust optimum.
-        own: Its objective at its own optimum; ``None`` where no start certified.
-        q: That optimum, shape (nq,), or ``None``.
-        moved: Tangent distance of it from the robust optimum, or ``None``.
+        own: Its objective at its own optimum; ``None`` if no start certified.
+        q: Its own optimum, shape (nq,), or ``None``.
+        moved: Tangent distance of its own optimum from the robust optimum, or ``None``.
     """
 
     name: str
@@ -47,31 +47,26 @@ class VariantOptimum:
     moved: float | None
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        return {
-            "name": self.name,
-            "at_robust": self.at_robust,
-            "own_optimum": self.own,
-            "own_q": None if self.q is None else [float(v) for v in self.q],
-            "moved": self.moved,
-        }
+        """Return JSON content."""
+        keys = {"own": "own_optimum", "q": "own_q"}
+        return {keys.get(key, key): value for key, value in json_block(self).items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Robustness:
-    """The robust optimum beside that of the model as it stands.
+    """Comparison of the robust optimum with the optimum of the model as it stands.
 
     Attributes:
-        scenarios: The first is the model as it stands.
-        worst_robust: The worst over the scenarios at the robust optimum.
-        worst_nominal: The same at the optimum of the model as it stands; ``None`` where that has none, or where it
-            breaks a constraint in another scenario.
-        broken: The constraints that it breaks.
-        between: The largest objective at the robust optimum among models drawn between the scenarios.
-        drawn: How many were drawn.
+        model_variants: All model variants, the model as it stands first.
+        worst_robust: Worst objective over the model variants at the robust optimum.
+        worst_nominal: The same at the optimum of the model as it stands; ``None`` if that does not exist, or violates
+            a constraint for another model variant.
+        broken: The violated constraints.
+        between: Largest objective at the robust optimum among models drawn between the model variants.
+        drawn: Number of drawn models.
     """
 
-    scenarios: tuple[VariantOptimum, ...]
+    model_variants: tuple[VariantOptimum, ...]
     worst_robust: float
     worst_nominal: float | None
     broken: tuple[str, ...]
@@ -80,14 +75,14 @@ class Robustness:
 
     @property
     def moved(self) -> float | None:
-        """How far the optimum moved from that of the model as it stands, tangent norm."""
-        return self.scenarios[0].moved
+        """Distance of the robust optimum from that of the model as it stands, tangent norm."""
+        return self.model_variants[0].moved
 
     @property
     def price(self) -> float | None:
         """Share by which the objective of the model as it stands is above its own optimum."""
-        own = self.scenarios[0].own
-        return None if own is None else self.scenarios[0].at_robust / own - 1
+        own = self.model_variants[0].own
+        return None if own is None else self.model_variants[0].at_robust / own - 1
 
     @property
     def gain(self) -> float | None:
@@ -114,27 +109,22 @@ class Robustness:
             f"the model as it stands is {percent(abs(self.price))} {'below' if lower else 'above'} its own optimum"
         )
         if self.between > self.worst_robust * (1 + _NOISE):
-            parts.append(f"between the scenarios it reaches {self.between:.4g}, above the worst of them")
+            parts.append(f"between the model variants it reaches {self.between:.4g}, above the worst of them")
         return "; ".join(parts)
 
     def to_dict(self) -> dict[str, object]:
-        """The ``robustness`` block of ``result.json``."""
-        return {
-            "moved": self.moved,
-            "price": self.price,
-            "gain": self.gain,
-            "worst_robust": self.worst_robust,
-            "worst_nominal": self.worst_nominal,
+        """Return the ``robustness`` block of ``result.json``."""
+        keys = ("moved", "price", "gain", "worst_robust", "worst_nominal", "line")
+        return {key: getattr(self, key) for key in keys} | {
             "broken": list(self.broken),
             "between": {"drawn": self.drawn, "largest": self.between},
-            "scenarios": [scenario.to_dict() for scenario in self.scenarios],
-            "line": self.line,
+            "scenarios": [variant.to_dict() for variant in self.model_variants],
         }
 
 
 @dataclass(frozen=True, eq=False)
 class RobustSolution:
-    """A solution, and what robustness means for it; ``None`` where nothing is uncertain."""
+    """A solution, and its robustness; ``None`` without model variants."""
 
     solution: PostureSolution
     robustness: Robustness | None
@@ -149,20 +139,22 @@ def solve_robustly(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
 ) -> RobustSolution:
-    """Solve; with scenarios each alone first, then all from the optima of these besides ``starts`` others.
+    """Solve a problem; with model variants solve each variant alone first.
+
+    The optima of the variants are starts of the robust problem, besides ``starts`` other starts.
 
     Raises:
         Infeasible, SolverFailed: See :func:`~impact_posture.posture.solve.solve`.
     """
     given, wanted = problem.given, problem.requirements
-    if not (isinstance(problem.objective, ImpactObjective) and problem.objective.scenarios):
+    if not (isinstance(problem.objective, ImpactObjective) and problem.objective.model_variants):
         return RobustSolution(
             solve(problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress), None
         )
-    # Each built anew: what the feet bear and where the center of mass is hangs on the model.
+    # Build each problem anew, because support impulses and the center of mass depend on the model.
     alone = [
-        build_problem(scenario.robot, member, given, wanted)
-        for scenario, member in zip(problem.impact.scenarios, problem.impact.by_scenario, strict=True)
+        build_problem(variant.robot, member, given, wanted)
+        for variant, member in zip(problem.impact.model_variants, problem.impact.by_variant, strict=True)
     ]
     total = starts * (len(alone) + 1)
 
@@ -179,27 +171,27 @@ def solve_robustly(
         problem, _apart(problem, [q for q in optima if q is not None and not _broken(problem, q)]), len(alone)
     )
     for k, (one, q) in enumerate(zip(alone, optima, strict=True)):
-        # What is best for all is not better for one than its own optimum: that was not the best.
+        # If the robust optimum is better for a variant than its own optimum, that one was not its best.
         if q is None or one.objective.value(solution.q) < one.objective.value(q) * (1 - _NOISE):
             optima[k] = _optimum(partial(run, one, (solution.q,), len(alone)))
     return RobustSolution(solution, compare_variants(solution, optima, seed))
 
 
 def compare_variants(solution: PostureSolution, optima: Sequence[Vector | None], seed: int = 0) -> Robustness:
-    """The robust optimum beside the optimum of each scenario alone, and among models drawn between the scenarios."""
+    """Compare the robust optimum with the optima of the variants, and with models drawn between the variants."""
     problem, objective = solution.problem, solution.problem.impact
     found: list[VariantOptimum] = []
-    for scenario, q in zip(objective.scenarios, optima, strict=True):
-        member = replace(objective, robot=scenario.robot, scenarios=())
+    for variant, q in zip(objective.model_variants, optima, strict=True):
+        member = replace(objective, robot=variant.robot, model_variants=())
         own = None if q is None else member.value(q)
         step = None if q is None else float(np.linalg.norm(wrapped_difference(problem, solution.q, q)))
-        found.append(VariantOptimum(scenario.name, member.value(solution.q), own, q, step))
+        found.append(VariantOptimum(variant.name, member.value(solution.q), own, q, step))
     nominal = optima[0]
     broken = () if nominal is None else tuple(_broken(problem, nominal))
-    drawn = between(objective.scenarios, _BETWEEN, seed)
-    values = [replace(objective, robot=robot, scenarios=()).value(solution.q) for robot in drawn]
+    drawn = between(objective.model_variants, _BETWEEN, seed)
+    values = [replace(objective, robot=robot, model_variants=()).value(solution.q) for robot in drawn]
     return Robustness(
-        scenarios=tuple(found),
+        model_variants=tuple(found),
         worst_robust=objective.value(solution.q),
         worst_nominal=None if nominal is None or broken else objective.value(nominal),
         broken=broken,
@@ -209,7 +201,7 @@ def compare_variants(solution: PostureSolution, optima: Sequence[Vector | None],
 
 
 def _apart(problem: PostureProblem, postures: Sequence[Vector]) -> list[Vector]:
-    """Those of some postures that are not nearly another one."""
+    """The postures without those that are nearly equal to an earlier posture."""
     found: list[Vector] = []
     for q in postures:
         if all(np.linalg.norm(wrapped_difference(problem, one, q)) > SAME_POSTURE for one in found):
@@ -219,12 +211,9 @@ def _apart(problem: PostureProblem, postures: Sequence[Vector]) -> list[Vector]:
 
 def _broken(problem: PostureProblem, q: Vector) -> list[str]:
     """Names of the constraints that a posture does not satisfy."""
-    numeric, found = Numeric(problem.robot.model).at(q), []
-    for constraint in problem.constraints:
-        value, _ = constraint.evaluate(numeric)
-        if np.abs(value - np.clip(value, constraint.lower, constraint.upper)).max(initial=0.0) > _KEPT:
-            found.append(constraint.name)
-    return found
+    violations = problem.violations(Numeric(problem.robot.model).at(q))
+    pairs = zip(problem.constraints, violations, strict=True)
+    return [constraint.name for constraint, excess in pairs if np.abs(excess).max(initial=0.0) > _NOISE]
 
 
 def _optimum(run: Callable[[], PostureSolution]) -> Vector | None:

@@ -1,4 +1,4 @@
-"""Multi-start: many feasible starts, one program, distinct optima, and the best that certifies."""
+"""Multi-start search: many feasible starts, one program, distinct optima, and the best certified posture."""
 
 from __future__ import annotations
 
@@ -14,24 +14,22 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ContactError, Infeasible, MetricError, SolverFailed
-from impact_posture.posture.blas import one_blas_thread
+from impact_posture.posture.caveats import notes_on_impacts
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.elastic import elastic
-from impact_posture.posture.equalities import equality_jacobian, rank
-from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp
-from impact_posture.posture.notes import notes_on_impacts
+from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp, one_blas_thread
 from impact_posture.posture.posture_distance import distance
-from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
 from impact_posture.posture.starts import Projector, feasible_start
 from impact_posture.processes import fork_map
 
 Vector = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
-# Optima closer than this in posture (tangent norm) and in objective (relative) are one.
+# Optima closer than this in posture (tangent norm) and in objective (relative) are the same optimum.
 SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
-# The starts from which one hit is few.
+# From this number of starts on, a single hit of the best optimum gets a note.
 _MANY = 8
 
 
@@ -41,8 +39,8 @@ class Optimum:
 
     Attributes:
         q: Posture, shape (nq,).
-        objective: Its value.
-        hits: Starts that ended there.
+        objective: Value of the objective.
+        hits: Number of starts that ended there.
     """
 
     q: Vector
@@ -52,26 +50,26 @@ class Optimum:
 
 @dataclass(frozen=True)
 class PostureSolution:
-    """The answer.
+    """The solution of a posture problem.
 
     Attributes:
-        problem: What was asked.
-        initial: The given posture, moved to the constraints where it did not satisfy them.
-        moved: How far, tangent norm.
+        problem: The posture problem.
+        initial: The given posture, moved to the constraints if it did not satisfy them.
+        moved: Length of that move, tangent norm.
         q: The best certified posture.
-        certificate: Of ``q``.
+        certificate: Certificate of ``q``.
         redundancy: Degrees of freedom that the equalities leave at ``q``.
         optima: Distinct optima, best first.
-        starts: Starts asked for.
-        feasible_starts: Starts that could be put on the constraints.
-        certified_starts: Starts whose end certified.
-        status: IPOPT's word for the best run.
+        starts: Number of starts.
+        feasible_starts: Starts that reached the constraints.
+        certified_starts: Starts that ended at a certified posture.
+        status: Return status of IPOPT for the best run.
         iterations: Iterations of the best run.
         solve_time_s: Wall time of all runs together.
         build_time_s: Time to build the program.
         compiled: Whether it ran as machine code.
-        notes: What a user should know about the answer.
-        compiler_fault: Why it did not run as machine code although it should; empty else.
+        notes: Notes for the user about the solution.
+        compiler_fault: Reason why a compilation failed; empty else.
     """
 
     problem: PostureProblem
@@ -122,8 +120,8 @@ def solve(
     """Solve from the given posture, from feasible ``guesses`` and from random feasible ones: ``starts`` in all.
 
     Raises:
-        Infeasible: No posture satisfies the constraints; names those that conflict.
-        SolverFailed: No run ended at a posture that certifies.
+        Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
+        SolverFailed: No run ended at a certified posture.
     """
     initial = _initial(problem, seed)
     began = time.perf_counter()
@@ -134,7 +132,7 @@ def solve(
     good = [r for r in runs if r.certificate is not None and r.certificate.holds()]
     if not good:
         raise _failure(runs)
-    # The first of equally good ones: the answer does not hang on which process was faster.
+    # Of equally good runs the first counts, so that the solution does not depend on the speed of processes.
     best = min(good, key=lambda r: round(r.minimized, 9))
     assert best.record is not None and best.certificate is not None  # noqa: S101 (narrows types)
     q, certificate, notes = best.record.q, best.certificate, []
@@ -175,11 +173,8 @@ def solve(
 
 
 def _initial(problem: PostureProblem, seed: int) -> Vector:
-    """The given posture on the constraints, or the reason why no posture is."""
-    start = feasible_start(problem, 0, seed)
-    if start is not None:
-        return start
-    for index in range(1, 5):
+    """The given posture pulled onto the constraints, or the first other start that reaches them."""
+    for index in range(5):
         start = feasible_start(problem, index, seed)
         if start is not None:
             return start
@@ -200,13 +195,13 @@ def _initial(problem: PostureProblem, seed: int) -> Vector:
 
 
 def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
-    """The objective at the start; it scales everything, so it has to exist.
+    """The objective at the start, which scales the program and so must exist.
 
     Raises:
         ContactError: The contact point cannot move along the normal there.
     """
     objective = problem.objective
-    # A normal along which nothing can move leaves rounding.
+    # The value is rounding if nothing can move along the normal.
     value = objective.value(initial) if objective.movable(initial) else 0.0
     if not (np.isfinite(value) and value > 0):
         frames = ", ".join(f"'{contact.frame}'" for contact in objective.contacts)
@@ -220,7 +215,7 @@ def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
 
 @one_blas_thread()
 def run_start(nlp: PostureNLP, start: Vector, scale: float) -> tuple[SolveRecord, Certificate]:
-    """Solve from one feasible start and certify what comes out; try the objective's other guesses if it does not."""
+    """Solve from a feasible start and certify the end; try the other guesses of the objective if it fails."""
     record = nlp.solve(start, scale=scale)
     certificate = certify(nlp.problem, record.q, scale)
     for attempt in range(1, nlp.problem.objective.attempts):
@@ -239,7 +234,7 @@ def run_start(nlp: PostureNLP, start: Vector, scale: float) -> tuple[SolveRecord
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """What every start shares: the program, the first starts, the scale, the seed of the others."""
+    """Data of all starts: the program, the first starts, the scale, and the seed of the other starts."""
 
     nlp: PostureNLP
     known: tuple[Vector, ...]
@@ -256,7 +251,7 @@ def _run(job: _Job, index: int) -> _Run:
         record, certificate = run_start(nlp, start, scale)
         objective = nlp.problem.objective.value(record.q)
     except MetricError:
-        # This start led to a posture where the objective does not exist; the others go on.
+        # This start led to a posture where the objective does not exist.  The other starts go on.
         return _Run(start, None, np.inf, np.inf, None)
     problem = nlp.problem
     minimized = objective / scale
@@ -267,7 +262,7 @@ def _run(job: _Job, index: int) -> _Run:
 
 def _run_all(job: _Job, starts: int, jobs: int, progress: Progress | None) -> list[_Run]:
     runs: dict[int, _Run] = {}
-    # Forking takes longer than three starts.
+    # A fork takes longer than three starts.
     with fork_map(partial(_run, job), starts, jobs if starts > 3 else 1) as results:
         for index, run in results:
             runs[index] = run
@@ -277,7 +272,7 @@ def _run_all(job: _Job, starts: int, jobs: int, progress: Progress | None) -> li
 
 
 def distinct(problem: PostureProblem, ends: list[tuple[Vector, float]]) -> tuple[Optimum, ...]:
-    """Gather ends that are the same posture, best objective first."""
+    """Group ends at the same posture, best objective first."""
     found: list[Optimum] = []
     for q, objective in sorted(ends, key=lambda end: end[1]):
         for k, known in enumerate(found):
@@ -291,7 +286,7 @@ def distinct(problem: PostureProblem, ends: list[tuple[Vector, float]]) -> tuple
 
 
 def wrapped_difference(problem: PostureProblem, one: Vector, other: Vector) -> Vector:
-    """``other ⊖ one`` with full turns of revolute joints taken out."""
+    """Return ``other ⊖ one`` without full turns of revolute joints."""
     step = np.array(pin.difference(problem.robot.model, one, other))
     for slot in Chart(problem.robot.model).slots:
         if slot.kind.family == "revolute":

@@ -1,4 +1,4 @@
-"""Feasible starts: random postures pulled onto the constraint manifold."""
+"""Feasible starts, which are random postures pulled onto the constraint manifold."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.posture.equalities import held_rows
-from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.problem import PostureProblem, held_rows
 
 Vector = NDArray[np.float64]
 
 _ATTEMPTS = 20
 _STEPS = 80
-# Of a matrix's size: what makes a singular one regular.
+# This share of the size of a singular matrix makes it regular.
 _ROUNDING = 1e-13
 
 
@@ -26,8 +25,8 @@ class Projection:
     """A posture pulled towards the constraints.
 
     Attributes:
-        q: Where it ended, shape (nq,).
-        violation: Largest violation there (m, rad, or the constraint's own unit).
+        q: Configuration, shape (nq,).
+        violation: Largest violation (m, rad, or the unit of the constraint).
     """
 
     q: Vector
@@ -35,7 +34,11 @@ class Projection:
 
 
 class Projector:
-    """Levenberg–Marquardt onto the constraints, inside the limits; held joints stay."""
+    """Levenberg–Marquardt onto the constraints within the limits; held joints do not move.
+
+    Args:
+        problem: The posture problem.
+    """
 
     def __init__(self, problem: PostureProblem) -> None:
         self.problem = problem
@@ -50,12 +53,12 @@ class Projector:
         return self.chart.to_q(x)
 
     def residual(self, q: Vector) -> tuple[Vector, Vector]:
-        """Violations of all rows (zero where an inequality holds) and their Jacobian, at ``q``."""
+        """Return the violations of all rows at ``q``, zero where an inequality holds, and their Jacobian."""
         self.numeric.at(q)
         values, jacobians = [np.zeros(0)], [np.zeros((0, self.problem.robot.nv))]
         for constraint in self.problem.constraints:
             value, jacobian = constraint.evaluate(self.numeric)
-            violation = value - np.clip(value, constraint.lower, constraint.upper)
+            violation = constraint.excess(value)
             values.append(violation)
             if not constraint.equality:
                 jacobian = np.where((violation != 0)[:, None], jacobian, 0.0)
@@ -63,7 +66,7 @@ class Projector:
         return np.concatenate(values), np.vstack(jacobians)
 
     def project(self, q: Vector, tolerance: float = 1e-9) -> Projection:
-        """Pull ``q`` onto the constraints; the result may still violate them."""
+        """Pull ``q`` onto the constraints.  The result may still violate them."""
         q = self.clip(q)
         value, jacobian = self.residual(q)
         damping = 1e-3
@@ -74,7 +77,7 @@ class Projector:
             free = jacobian.copy()
             free[:, self._held | self._blocked(q, -jacobian.T @ value)] = 0.0
             gram = free @ free.T
-            # Rows may repeat others (two frames on one link): damping that goes to zero must not go below rounding.
+            # Rows may repeat others (two frames on one link), so the damping must not fall below rounding.
             damped = damping * min(1.0, size) + _ROUNDING * max(1.0, float(np.trace(gram)))
             step = -free.T @ np.linalg.solve(gram + damped * np.eye(len(gram)), value)
             step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-12))
@@ -87,7 +90,7 @@ class Projector:
         return Projection(q, float(np.abs(value).max(initial=0.0)))
 
     def _blocked(self, q: Vector, direction: Vector) -> NDArray[np.bool_]:
-        """Joints on a limit that the descent direction would leave."""
+        """Joints on a limit that the descent direction would violate."""
         x = self.chart.to_x(q)
         blocked = np.zeros(self.problem.robot.nv, dtype=bool)
         for v, k in self._to_v:
@@ -98,10 +101,10 @@ class Projector:
 
 
 def feasible_start(problem: PostureProblem, index: int, seed: int, tolerance: float = 1e-8) -> Vector | None:
-    """Return the ``index``-th feasible start of a seed, or ``None`` where no attempt reached the constraints.
+    """Return the ``index``-th feasible start of a seed; ``None`` if no attempt reached the constraints.
 
-    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near it, even ones anywhere within the
-    limits: near ones are reached more often, far ones find other optima.
+    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near it, even starts anywhere within
+    the limits.  Near starts reach the constraints more often, far starts find other optima.
     """
     projector = Projector(problem)
     if index == 0:
@@ -117,7 +120,7 @@ def feasible_start(problem: PostureProblem, index: int, seed: int, tolerance: fl
 
 
 def random_posture(problem: PostureProblem, chart: Chart, rng: np.random.Generator, *, near: bool) -> Vector:
-    """A random posture within the bounds, not yet on the constraints."""
+    """Return a random posture within the bounds, not yet on the constraints."""
     model = problem.robot.model
     base = 6 if problem.robot.floating else 0
     if near:
@@ -142,7 +145,7 @@ def random_posture(problem: PostureProblem, chart: Chart, rng: np.random.Generat
 
 
 def _bounded_entries(chart: Chart) -> list[tuple[int, int]]:
-    """Pairs (tangent index, chart index) of coordinates that move one to one."""
+    """Pairs (tangent index, chart index) of coordinates that equal their tangent entry."""
     pairs = []
     for slot in chart.slots:
         if slot.kind.family in ("revolute", "prismatic", "translation"):

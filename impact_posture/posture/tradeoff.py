@@ -1,4 +1,4 @@
-"""The trade-off of objective against distance from the initial posture: its points, and where it has a knee."""
+"""The trade-off of objective against distance from the initial posture: its points and its knee."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.posture.certificate import Certificate
+from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
 
-# The part of the gain by which a knee lies above its part of the distance, at least.  A parabola, as every smooth
-# optimum has one around it, reaches 1/4.
+# Least excess of the share of the gain over the share of the distance at a knee.  A parabola, the shape around every
+# smooth optimum, reaches 1/4.
 KNEE = 1 / 3
 
 
@@ -22,14 +23,14 @@ class TradePoint:
 
     Attributes:
         within: The bound on the distance from the initial posture (rad mixed with m).
-        distance: How far the posture is from it; less than ``within`` where going farther buys nothing.
-        q: The posture, shape (nq,).
-        objective: Its objective.
+        distance: Distance of the posture, less than ``within`` if more distance gains nothing.
+        q: Posture, shape (nq,).
+        objective: Objective at the posture.
         H: Squared jump per squared impulse.
         G: Inverse effective mass, 1/kg.
         V: Squared jump per squared approach speed.
-        S: The same when sticking, ``None`` where undefined.
-        certificate: Of the problem with the bound; at distance zero its stationarity means nothing.
+        S: The same if the contact sticks, ``None`` where undefined.
+        certificate: Certificate of the problem with the bound; its stationarity has no meaning at distance zero.
     """
 
     within: float
@@ -49,31 +50,23 @@ class TradePoint:
         return replace(found, stationarity=0.0, complementarity=0.0).holds() if not self.within else found.holds()
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        return {
-            "within": self.within,
-            "distance": self.distance,
-            "objective": self.objective,
-            "H": self.H,
-            "G": self.G,
-            "V": self.V if np.isfinite(self.V) else None,
-            "S": self.S,
-            "certified": self.certified,
-            "q": [float(v) for v in self.q],
-        }
+        """Return JSON content."""
+        finite = self.V if np.isfinite(self.V) else None
+        values = json_block(self) | {"V": finite, "certified": self.certified}
+        return {key: value for key, value in values.items() if key != "certificate"}
 
 
 @dataclass(frozen=True, eq=False)
 class TradeOff:
-    """The curve.
+    """The best objective within each distance from the initial posture.
 
     Attributes:
-        points: By distance, the initial posture first.
-        knee: Index of the point at the knee, if there is one (:func:`find_knee`).
+        points: Points by distance, the initial posture first.
+        knee: Index of the point at the knee (:func:`find_knee`), or ``None``.
         solves: Runs of the solver.
-        solve_time_s: Wall time of them.
+        solve_time_s: Wall time of these runs.
         build_time_s: Time to build the program.
-        notes: What a user should know about the curve.
+        notes: Notes for the user about the curve.
     """
 
     points: tuple[TradePoint, ...]
@@ -84,20 +77,20 @@ class TradeOff:
     notes: tuple[str, ...]
 
     def to_list(self) -> list[dict[str, object]]:
-        """``tradeoff`` in ``result.json``."""
+        """Return the ``tradeoff`` block of ``result.json``."""
         return [{**point.to_dict(), "knee": k == self.knee} for k, point in enumerate(self.points)]
 
     def arrays(self) -> dict[str, Vector]:
-        """Entries of ``result.npz``: ``tradeoff_q`` (k, nq) and one number a point; NaN where S does not exist."""
+        """Return entries of ``result.npz``: ``tradeoff_q`` (k, nq) and arrays (k,), with NaN for a missing S."""
         names = ("within", "distance", "objective", "H", "G", "V", "q", "certified")
         found = {f"tradeoff_{name}": np.array([getattr(p, name) for p in self.points]) for name in names}
         return found | {"tradeoff_S": np.array([np.nan if p.S is None else p.S for p in self.points])}
 
 
 def find_knee(distances: Vector, objectives: Vector) -> int | None:
-    """Index of the point whose share of the whole gain exceeds its share of the whole distance most.
+    """Return the point whose share of the gain exceeds its share of the distance most.
 
-    ``None`` if it does so by less than :data:`KNEE`, or if nothing is gained.
+    It is ``None`` if the excess is below :data:`KNEE`, or if there is no gain.
     """
     far, gain = distances[-1] - distances[0], objectives[0] - objectives[-1]
     if not (far > 0 and gain > 0):

@@ -12,8 +12,8 @@ from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 
 AS_MODELED = "as modeled"
-# Each scenario is a model of its own in the program.
-MOST_SCENARIOS = 12
+# Each variant is a model of its own in the program.
+MOST_VARIANTS = 12
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def build_model_variants(
     """All pairs of an armature (as stated, lowest, highest) with a payload (none, or one of those given).
 
     Args:
-        robot: As modeled; the first scenario.
+        robot: As modeled; the first variant.
         armature_range: Factors on the stated armature, lowest and highest.
         payloads: Each is there or not, one at a time.
 
@@ -70,7 +70,7 @@ def build_model_variants(
         Empty where nothing is uncertain.
 
     Raises:
-        InputError: A range or a mass that makes no sense, a factor on an armature of zero, or too many scenarios.
+        InputError: A range or a mass that makes no sense, a factor on an armature of zero, or too many variants.
         FrameNotFound: Of a payload.
     """
     factors = _factors(robot, armature_range)
@@ -89,12 +89,12 @@ def build_model_variants(
         if payloads.count(payload) > 1:
             raise InputError(f"{payload.mass:g} kg at '{payload.frame}' is given twice", where="payload",
                              hint="remove one")  # fmt: skip
-    found = [_scenario(robot, factor, payload) for payload in (None, *payloads) for factor in factors]
-    if len(found) > MOST_SCENARIOS:
+    found = [_variant(robot, factor, payload) for payload in (None, *payloads) for factor in factors]
+    if len(found) > MOST_VARIANTS:
         raise InputError(
-            f"{len(found)} scenarios, each a model of its own",
+            f"{len(found)} model variants, each a model of its own",
             where="payload",
-            hint=f"have at most {MOST_SCENARIOS}",
+            hint=f"have at most {MOST_VARIANTS}",
         )
     return tuple(found) if len(found) > 1 else ()
 
@@ -118,7 +118,7 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
     return [1.0, *sorted({low, high} - {1.0})]
 
 
-def _scenario(robot: Robot, factor: float, payload: Payload | None) -> ModelVariant:
+def _variant(robot: Robot, factor: float, payload: Payload | None) -> ModelVariant:
     words = []
     model = robot.model
     if factor != 1 or payload is not None:
@@ -135,17 +135,17 @@ def _scenario(robot: Robot, factor: float, payload: Payload | None) -> ModelVari
     return ModelVariant(", ".join(words) or AS_MODELED, same, factor, payload)
 
 
-def between(scenarios: Sequence[ModelVariant], count: int, seed: int) -> list[Robot]:
-    """Robots drawn from between scenarios: any factor on the armature, any share of one of the payloads.
+def between(model_variants: Sequence[ModelVariant], count: int, seed: int) -> list[Robot]:
+    """Draw robots between model variants, with any factor on the armature and any share of one of the payloads.
 
     Args:
-        scenarios: As :func:`build_model_variants` gives them, the robot as modeled first.
+        model_variants: As :func:`build_model_variants` gives them, the robot as modeled first.
         count: How many.
         seed: Of the draw.
     """
     generator = np.random.default_rng(seed)
-    factors = [scenario.armature_factor for scenario in scenarios]
-    payloads = [scenario.payload for scenario in scenarios if scenario.payload is not None]
+    factors = [variant.armature_factor for variant in model_variants]
+    payloads = [variant.payload for variant in model_variants if variant.payload is not None]
     found = []
     for _ in range(count):
         # Evenly in the logarithm: half and twice are equally far from what is stated.
@@ -154,5 +154,5 @@ def between(scenarios: Sequence[ModelVariant], count: int, seed: int) -> list[Ro
         if payloads:
             whole = payloads[generator.integers(len(payloads))]
             payload = replace(whole, mass=float(generator.uniform(0, whole.mass)))
-        found.append(_scenario(scenarios[0].robot, factor, payload).robot)
+        found.append(_variant(model_variants[0].robot, factor, payload).robot)
     return found
