@@ -20,10 +20,11 @@ import typer
 from impact_posture.errors import ImpactPostureError, one_line
 from impact_posture.escape import printable
 from impact_posture_cli.option_names import as_options, option_of
-from impact_posture_cli.settings_options import UsageError
 
 DEBUG_VARIABLE = "IMPACT_POSTURE_DEBUG"
 _INTERRUPTED = 130
+# Base class of all usage errors of the Click that this Typer carries.
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def run(command: Any, arguments: Sequence[str]) -> int:

@@ -7,14 +7,22 @@ from __future__ import annotations
 
 import ast
 import re
-from dataclasses import fields
+from functools import cache
 from pathlib import Path
 
-from impact_posture.settings import ProblemSettings
-
-# What errors are about besides settings.
+# Options that are no settings.
 _OTHERS = {"compile", "controller", "force", "gain", "jobs", "mode", "out", "prefix", "samples", "sign"}
-_NAMES = {field.name for field in fields(ProblemSettings)} - {"robot", "schema", "q", "support_compliance"} | _OTHERS
+
+
+@cache
+def _names() -> set[str]:
+    """Names that are options: of settings, and the others."""
+    # Imported here because the help page does without.
+    from dataclasses import fields
+
+    from impact_posture.settings import ProblemSettings
+
+    return {f.name for f in fields(ProblemSettings)} - {"robot", "schema", "q", "support_compliance"} | _OTHERS
 
 
 def as_options(text: str) -> str:
@@ -25,7 +33,7 @@ def as_options(text: str) -> str:
 def option_of(where: str) -> str:
     """Write the place of an error as an option, where it is a setting; a setting may be the first of two words."""
     name, *rest = where.split(" ", maxsplit=1)
-    return " ".join([_option(name), *rest]) if name in _NAMES and not Path(where).exists() else where
+    return " ".join([_option(name), *rest]) if name in _names() and not Path(where).exists() else where
 
 
 def _as_option(found: re.Match[str]) -> str:

@@ -14,12 +14,10 @@ import typer
 from impact_posture.errors import ImpactPostureError
 from impact_posture.settings import CONTACT, METRIC, OUTPUT, ROBOT, TASK, ImpactSettings, RobotSettings, Setting
 from impact_posture.tables import validate
+from impact_posture_cli.error_boundary import UsageError
 
 _PANELS = (CONTACT, METRIC, ROBOT, TASK, OUTPUT)
 _Settings = TypeVar("_Settings", bound=RobotSettings)
-
-# What every usage error derives from, whichever Click this Typer carries.
-UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 NoSupport = Annotated[bool, typer.Option("--no-support", rich_help_panel=ROBOT, help="Nothing stays on the ground.")]
 

@@ -38,7 +38,7 @@ def compare(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run several controllers through an experiment, several seeds each: means with 95 % intervals."""
+    """Run ``impact-posture compare``."""
     labels = [text.strip() for text in controllers.split(",") if text.strip()]
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
@@ -47,15 +47,15 @@ def compare(
     from impact_posture.experiment.reproduction import comparison_document, jobs_of
     from impact_posture.output_folder import check_output
     from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_line
+    from impact_posture_cli.progress import progress
 
     labels = list(dict.fromkeys(labels))
     folder = None if out is None else Path(out)
     if folder is not None:
         check_output(folder, force=force, kind="comparison")
     store = None if folder is None else store_beside(folder)
-    with progress_line(shown=not (quiet or json)) as progress:
-        rows = run_all(scenario, labels, seeds=seeds, processes=jobs, store=store, progress=progress)
+    with progress("running", "runs", shown=not (quiet or json)) as advance:
+        rows = run_all(scenario, labels, seeds=seeds, processes=jobs, store=store, progress=advance)
         document = comparison_document(rows, seeds)
         if folder is not None and store is not None:
             formats = [f.value for f in format or ()] or FORMATS

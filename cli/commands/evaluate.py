@@ -22,7 +22,7 @@ def evaluate(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Measure an impact at a posture: H, G, V, S, E, ellipsoid, gradient, predicted jump."""
+    """Run ``impact-posture evaluate``."""
     given.check_contact()
     from impact_posture.impact.classical_ellipsoids import classical_ellipsoids
     from impact_posture.impact.evaluation import evaluate as evaluate_impact

@@ -9,7 +9,8 @@ import typer
 
 from impact_posture.settings import OUTPUT, RobotSettings
 from impact_posture_cli import options
-from impact_posture_cli.settings_options import Given, UsageError, with_settings
+from impact_posture_cli.error_boundary import UsageError
+from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.settings import LoadOptions
@@ -36,7 +37,7 @@ def inspect(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Show a robot: joints, frames, mass, limits, armature, postures, actuation."""
+    """Run ``impact-posture inspect``."""
     from impact_posture.robot.robot_loader import load_robot
     from impact_posture.robot.robot_summary import summarize
     from impact_posture_cli.output import Page, print_json

@@ -12,9 +12,9 @@ from impact_posture_cli import options
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
-    from impact_posture.job import Written
     from impact_posture.posture.problem_settings import Prepared
     from impact_posture.posture.solve import PostureSolution
+    from impact_posture.result_folder import Written
     from impact_posture_cli.output import Page
 
 RobotOrProblem = Annotated[
@@ -38,16 +38,16 @@ def optimize(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Find the posture that takes the impact best; write posture, pictures and C code."""
+    """Run ``impact-posture optimize``."""
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
     from impact_posture.front_door import PostureProblem
     from impact_posture.front_door import optimize as solve
-    from impact_posture.job import FORMATS, default_out
     from impact_posture.output_folder import check_output
     from impact_posture.posture.problem_settings import prepare
+    from impact_posture.result_folder import FORMATS, default_out
     from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_bar
+    from impact_posture_cli.progress import progress
 
     page = Page(quiet=quiet or json)
     prepared = prepare(settings)
@@ -56,29 +56,29 @@ def optimize(
     if not json:
         _announce(page, prepared)
     shown = not (quiet or json)
-    with progress_bar("solving", "starts", shown=shown, first="building the expressions") as progress:
+    with progress("solving", "starts", shown=shown, first="building the expressions") as advance:
         result = solve(
             PostureProblem.of(prepared),
             starts=settings.starts,
             seed=settings.seed,
             jobs=jobs,
             compile=compile,
-            progress=progress,
+            progress=advance,
         )
     if settings.tradeoff:
-        with progress_bar("solving", "points", shown=shown) as progress:
-            result = result.trade_off(settings.tradeoff, compile=compile, progress=progress)
+        with progress("solving", "points", shown=shown) as advance:
+            result = result.trade_off(settings.tradeoff, compile=compile, progress=advance)
     if not json:
         # Pictures and C code take longer than the answer: nobody waits for it because of them.
         _summarize(page, prepared, result.solution, result.document)
-    with progress_bar("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as progress:
+    with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
         written = result.save(
             folder,
             force=force,
             codegen=not no_codegen,
             formats=[f.value for f in format or ()] or FORMATS,
             jobs=jobs,
-            progress=progress,
+            progress=advance,
         )
     if written.compiler_error:
         page.warnings([f"the C code in c/ is written but could not be built: {written.compiler_error}"])

@@ -38,7 +38,7 @@ def reproduce(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run the paper's experiments: its table beside ours, figures, a summary. Goes on where it was interrupted."""
+    """Run ``impact-posture reproduce``."""
     from impact_posture.errors import ScenarioNotFound
     from impact_posture.experiment.folders import FORMATS, store_beside, write_reproduction
     from impact_posture.experiment.paper import PAPER
@@ -47,7 +47,7 @@ def reproduce(
     from impact_posture.experiment.reproduction_summary import advice
     from impact_posture.output_folder import check_output
     from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_line
+    from impact_posture_cli.progress import progress
 
     scenarios = list(dict.fromkeys(scenario)) if scenario else list(PAPER)
     for name in scenarios:
@@ -56,8 +56,8 @@ def reproduce(
     folder = Path(out)
     check_output(folder, force=force, kind="reproduction")
     store = store_beside(folder)
-    with progress_line(shown=not (quiet or json)) as progress:
-        found = reproduce_all(scenarios, seeds=seeds, everything=all_, processes=jobs, store=store, progress=progress)
+    with progress("running", "runs", shown=not (quiet or json)) as advance:
+        found = reproduce_all(scenarios, seeds=seeds, everything=all_, processes=jobs, store=store, progress=advance)
         plan = [job for name in scenarios for job in jobs_of(name, controllers_of(name, all_), seeds)]
         formats = [f.value for f in format or ()] or FORMATS
         document = write_reproduction(folder, found, plan, store, force=force, formats=formats)

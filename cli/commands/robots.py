@@ -6,7 +6,7 @@ from impact_posture_cli import options
 
 
 def robots(json: options.Json = False, quiet: options.Quiet = False) -> None:
-    """List the robots known by name, and how else to name one."""
+    """Run ``impact-posture robots``."""
     from impact_posture.robot.robot_summary import WAYS_TO_NAME, catalogue
     from impact_posture_cli.output import Page, print_json
 

@@ -71,7 +71,7 @@ def simulate(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run a controller through an experiment in MuJoCo; write metrics, time series and figures."""
+    """Run ``impact-posture simulate``."""
     from impact_posture.escape import file_name
     from impact_posture.experiment.folders import FORMATS, write_simulation
     from impact_posture.experiment.jobs import Job, execute
@@ -80,13 +80,13 @@ def simulate(
     from impact_posture.posture.blas import one_blas_thread
     from impact_posture.simulation.scenario_file import read_scenario
     from impact_posture_cli.output import Page, complain, print_json
-    from impact_posture_cli.progress import progress_line
+    from impact_posture_cli.progress import progress
 
     name = read_scenario(scenario).name
     job = Job(scenario, controller, seed, mode, free, gain, None if sign is None else int(sign))
     folder = Path(out) if out else Path(file_name(f"{name}-{job.label.replace(':', '-')}"))
     check_output(folder, force=force, kind="run")
-    with progress_line(shown=not (quiet or json)):
+    with progress("running", shown=not (quiet or json)):
         with one_blas_thread():
             runs, document = execute(job)
         formats = [f.value for f in format or ()] or FORMATS

@@ -16,9 +16,16 @@ from matplotlib.figure import Figure
 from impact_posture.errors import NameNotFound
 from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, path_figure, tradeoff_figure
 from impact_posture.plot.bars import Bar, bars_figure, draw_bars
-from impact_posture.plot.comparison import comparison_figure, controls_comparison_figure, draw_comparison
 from impact_posture.plot.robot_drawing import postures_figure
-from impact_posture.plot.run_figures import controls_figure, draw_run, joints_figure, metric_figure
+from impact_posture.plot.run_figures import (
+    comparison_figure,
+    controls_comparison_figure,
+    controls_figure,
+    draw_comparison,
+    draw_run,
+    joints_figure,
+    metric_figure,
+)
 from impact_posture.plot.run_view import RunView, Span
 from impact_posture.plot.snapshots import draw_snapshots, snapshots_figure
 from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save

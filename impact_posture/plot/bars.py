@@ -14,7 +14,6 @@ from matplotlib.patches import Patch
 
 from impact_posture.errors import InputError
 from impact_posture.escape import plot_label
-from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.style import (
     AFTER_BAR,
     BEFORE_BAR,
@@ -83,7 +82,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
     facts = ["less is better", "the same windows for every controller", "bars: ours, mean and 95 % interval"]
     with style():
         figure, body = framed(lead, ["  ·  ".join(facts)], sum(heights) + 0.4, NOTES)
-        panels = subplots(body, len(lines), columns, height_ratios=heights)
+        panels = body.subplots(len(lines), columns, squeeze=False, height_ratios=heights)
         for axes in panels.flat[len(groups) :]:
             axes.set_visible(False)
         for axes, name, group in zip(panels.flat, scenarios, groups, strict=False):

@@ -13,7 +13,6 @@ from matplotlib.patches import Patch
 
 from impact_posture.escape import plot_label
 from impact_posture.plot.robot_drawing import BODY, depth_of, draw_sticks, side_plane
-from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.shapes import Plane, Vector
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
@@ -90,7 +89,7 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
         figure, body = framed(
             *run_header(views), height * len(views) + 0.85, [f"{NOTES} {BODY}" if len(rows[0][0].body) else NOTES]
         )
-        panels = subplots(body, len(views), 3, sharex=True, sharey=True)
+        panels = body.subplots(len(views), 3, squeeze=False, sharex=True, sharey=True)
         for axes_row, row, view, arrow in zip(panels, rows, views, arrows, strict=True):
             for column, (axes, state, (word, time)) in enumerate(zip(axes_row, row, instants(view), strict=True)):
                 _surface(axes, view, plane, low, high)
