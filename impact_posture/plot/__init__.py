@@ -14,7 +14,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from impact_posture.errors import NameNotFound
-from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, path_figure, tradeoff_figure
+from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, path_figures
 from impact_posture.plot.bars import Bar, bars_figure, draw_bars
 from impact_posture.plot.robot_drawing import postures_figure
 from impact_posture.plot.run_figures import (
@@ -63,9 +63,9 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "ellipsoid": ellipsoid_figure.ellipsoid_figure,
     "postures": postures_figure,
     "jump": jump_figure.jump_figure,
-    "nullspace": path_figure.path_figure,
+    "nullspace": path_figures.path_figure,
     "classical": classical_figure.classical_figure,
-    "tradeoff": tradeoff_figure.tradeoff_figure,
+    "tradeoff": path_figures.tradeoff_figure,
 }
 
 

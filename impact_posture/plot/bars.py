@@ -24,7 +24,6 @@ from impact_posture.plot.style import (
     framed,
     save,
     shared_legend,
-    style,
 )
 from impact_posture.plot.view import number
 
@@ -80,8 +79,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
     heights = [0.55 + 0.3 * max(len(group) for group in line) for line in lines]
     lead = "Motion during impacts, ∫‖ν‖dt over the impact windows"
     facts = ["less is better", "the same windows for every controller", "bars: ours, mean and 95 % interval"]
-    with style():
-        figure, body = framed(lead, ["  ·  ".join(facts)], sum(heights) + 0.4, NOTES)
+    with framed(lead, ["  ·  ".join(facts)], sum(heights) + 0.4, NOTES) as (figure, body):
         panels = body.subplots(len(lines), columns, squeeze=False, height_ratios=heights)
         for axes in panels.flat[len(groups) :]:
             axes.set_visible(False)

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from impact_posture.plot.ellipsoid_figure import draw_normals, normal_label, normals, square_panel
 from impact_posture.plot.shapes import COORDINATE_PLANES, Plane, Vector, polar, shadow
-from impact_posture.plot.style import BLUE, GREEN, INK, VERMILLION, framed, shared_legend, style
+from impact_posture.plot.style import BLUE, GREEN, INK, VERMILLION, framed, shared_legend
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
 NOTES = (
@@ -90,8 +90,7 @@ def classical_figure(view: ResultView) -> Figure:
     kinds = kinds_of(view)
     limit = 1.18 * max(1.0, *(_longest(matrix) for kind in kinds for matrix in kind.finite))
     named = normals(view.before, view.after)
-    with style():
-        figure, body = framed(*header_lines(view), 5.2, NOTES)
+    with framed(*header_lines(view), 5.2, NOTES) as (figure, body):
         panels = body.subplots(2, 3)
         for row, word, which in ((panels[0], "before", 0), (panels[1], "after", 1)):
             own = named[min(which, len(named) - 1)]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from impact_posture.impact.cone import WorstNormal
+from impact_posture.plot.labels import draw_arrow
 from impact_posture.plot.shapes import Plane, Vector, cone_rim, cone_shadow, half_width
 from impact_posture.plot.style import GRAY, PALE, WORST_AFTER, WORST_BEFORE
 from impact_posture.plot.view import ResultView, number
@@ -31,10 +33,9 @@ def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) ->
         axes.plot(*outline, color=GRAY, linewidth=0.6, zorder=0.6)
     for word, found, _, line in _worst(view):
         for normal in found.normals:
-            tip = plane.axes @ normal * REACH * limit
-            arrow = {"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8, **line}
-            # The dashes on top, as with the ellipsoids.
-            axes.annotate("", tuple(tip), (0, 0), arrowprops=arrow, zorder=4.6 if word == "before" else 4.5)
+            # The dashes lie on top, as with the ellipsoids.
+            zorder = 4.6 if word == "before" else 4.5
+            draw_arrow(axes, np.zeros(2), plane.axes @ normal * REACH * limit, zorder, mutation_scale=8, **line)
 
 
 def draw_uncertainty_3d(axes: Any, view: ResultView, limit: float) -> None:
@@ -74,7 +75,7 @@ def _axes_of_cones(view: ResultView) -> list[Vector]:
 def _worst(view: ResultView) -> list[tuple[str, WorstNormal, Vector, dict[str, Any]]]:
     """Name, worst normals, ellipsoid and line of each posture that has them."""
     found = [
-        ("before", view.worst_before, view.before.ellipsoid, WORST_BEFORE),
-        ("after", view.worst_after, view.after.ellipsoid, WORST_AFTER),
+        ("before", view.worst[0], view.before.ellipsoid, WORST_BEFORE),
+        ("after", view.worst[1], view.after.ellipsoid, WORST_AFTER),
     ]
     return [(word, worst, ellipsoid, line) for word, worst, ellipsoid, line in found if worst is not None]

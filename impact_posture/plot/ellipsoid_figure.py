@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.plot.cone_figure import draw_uncertainty, draw_uncertainty_3d, has_cone, uncertainty_handles
-from impact_posture.plot.labels import Label, draw_end_on
+from impact_posture.plot.labels import Label, draw_arrow, draw_end_on
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
     Plane,
@@ -24,7 +24,7 @@ from impact_posture.plot.shapes import (
     upright_plane,
 )
 from impact_posture.plot.space import Space, frame_space
-from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, framed, style
+from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, framed
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
 _FREE = "Free (thin): the same robot as if its feet were not held."
@@ -55,15 +55,13 @@ def ellipsoid_figure(view: ResultView) -> Figure:
     normals in it.
     """
     states = [_State("before", view.before, BEFORE), _State("after", view.after, AFTER)]
-    for word, found, line in (("before", view.free_before, FREE_BEFORE), ("after", view.free_after, FREE_AFTER)):
-        if found is not None:
-            states.append(_State(f"{word}, free", found, line, free=True))
+    for word, found, line in zip(("before", "after"), view.free, (FREE_BEFORE, FREE_AFTER), strict=False):
+        states.append(_State(f"{word}, free", found, line, free=True))
     unit = f"{jump_unit(view)}/(N·s)"
     limit = common_limit([state.found.ellipsoid for state in states])
     n = view.after.normal
-    notes = " ".join([*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if has_cone(view) else [])])
-    with style():
-        figure, body = framed(*header_lines(view), 5.8, [notes])
+    notes = [*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if has_cone(view) else [])]
+    with framed(*header_lines(view), 5.8, notes) as (figure, body):
         grid = body.add_gridspec(2, 3, height_ratios=[1, 1.4])
         oblique = not any(plane.contains(n) for plane in COORDINATE_PLANES)
         panels = [(grid[0, column], plane) for column, plane in enumerate(COORDINATE_PLANES)]
@@ -107,8 +105,7 @@ def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Vector]], limit
             draw_end_on(axes, name, plane, n, np.zeros(2))
             continue
         tip = flat * limit * 0.92
-        arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0}
-        axes.annotate("", tuple(tip), (0, 0), arrowprops=arrow, zorder=5)
+        draw_arrow(axes, np.zeros(2), tip, 5, color=INK, linewidth=1.1)
         axes.add_artist(Label(name, tip, (flat[0], flat[1])))
 
 

@@ -37,6 +37,12 @@ class Label(Annotation):
         self.set_in_layout(False)
 
 
+def draw_arrow(axes: Any, tail: Vector, tip: Vector, zorder: float, **look: Any) -> None:
+    """Draw an arrow between two points of a panel, each of shape (2,)."""
+    look = {"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0} | look
+    axes.annotate("", tuple(tip), tuple(tail), arrowprops=look, zorder=zorder)
+
+
 def draw_end_on(axes: Any, name: str, plane: Plane, n: Vector, at: Vector, color: str = "black") -> None:
     """Draw a normal across the picture plane as a dot (towards the reader) or a cross (away) in a ring."""
     toward = float(np.cross(plane.axes[0], plane.axes[1]) @ n)

@@ -1,4 +1,4 @@
-"""Axes over time of the figures of runs: shaded windows, curves thinned to what can be seen, a legend."""
+"""Axes over time of the figures of runs: shaded windows, limits, curves, a legend."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
 
 from impact_posture.escape import plot_label
-from impact_posture.plot.path_figure import log_axis, spreads
+from impact_posture.plot.path_figures import log_axis, spreads
 from impact_posture.plot.run_panels import LINES, RUNS, Clip, Panel
 from impact_posture.plot.run_view import RunView, run_header
 from impact_posture.plot.shapes import Vector
-from impact_posture.plot.style import GRAY, INK, framed, shared_legend, style
+from impact_posture.plot.style import GRAY, INK, framed, shared_legend
 
 # Pink and light gray: far enough apart in a gray print, too.
 SHADES: dict[str, dict[str, Any]] = {
@@ -81,8 +81,8 @@ def time_figure(
         air: Additional height, inches.
     """
     columns = len(cells[0])
-    with style():
-        figure, body = framed(*run_header(views), height * len(cells) + air, [" ".join(notes)])
+    shown: dict[Panel, list[Any]] = {}
+    with framed(*run_header(views), height * len(cells) + air, notes) as (figure, body):
         ratios = list(widths[:columns]) or None
         axes = body.subplots(len(cells), columns, squeeze=False, width_ratios=ratios)
         for row, column in np.ndindex(*axes.shape):
@@ -92,6 +92,7 @@ def time_figure(
                 own.set_axis_off()
                 continue
             _draw(own, cell, views)
+            shown.setdefault(cell.panel, []).append(own)
             own.set_title(cell.title, loc=title_at, fontweight="bold")
             below = cells[row + 1][column] if row + 1 < len(cells) else None
             if below is None or below.frame != cell.frame:
@@ -102,23 +103,14 @@ def time_figure(
                 own.set_ylabel(cell.panel.label)
             else:
                 own.tick_params(labelleft=False)
-        panels = list(dict.fromkeys(cell.panel for row in cells for cell in row if cell is not None))
-        for panel in panels:
-            same = [axes[k] for k in np.ndindex(*axes.shape) if (c := cells[k[0]][k[1]]) and c.panel is panel]
+        for same in shown.values():
             limits = np.array([own.get_ylim() for own in same])
             for own in same:
                 own.set_ylim(limits.min(), limits.max())
         body.align_ylabels(list(axes[:, 0]))
-        heads = zip(panels, (_first(axes, cells, panel) for panel in panels), strict=True)
-        _legend(
-            body, _common_handles(views, panels), [(panel.label.split("  [")[0] + ":", own) for panel, own in heads]
-        )
+        heads = [(panel.label.split("  [")[0] + ":", same[0]) for panel, same in shown.items()]
+        _legend(body, _common_handles(views, list(shown)), heads)
     return figure
-
-
-def _first(axes: Any, cells: Sequence[Sequence[Cell | None]], panel: Panel) -> Any:
-    """The axes of the first row that show a panel."""
-    return next(axes[k, 0] for k, row in enumerate(cells) if row[0] is not None and row[0].panel is panel)
 
 
 def _draw(axes: Any, cell: Cell, views: Sequence[RunView]) -> None:
@@ -159,8 +151,7 @@ def _shade(axes: Any, view: RunView, clip: Clip) -> None:
 def _curve(axes: Any, view: RunView, values: Vector, clip: Clip, **look: Any) -> None:
     """Draw a curve within a clip, straight across gaps (NaN)."""
     inside = (view.t >= clip.begin) & (view.t <= clip.end) & np.isfinite(values)
-    t, y = thin(view.t[inside], values[inside])
-    axes.plot(clip.x(t), y, **look)
+    axes.plot(clip.x(view.t[inside]), values[inside], **look)
 
 
 def _saturation(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) -> None:
@@ -180,20 +171,6 @@ def _band(axes: Any, view: RunView, bounds: Vector, clip: Clip) -> None:
     starts = np.arange(0, len(t), max(len(t) // _BINS, 1))
     low, high = np.minimum.reduceat(bounds[:, 0], starts), np.maximum.reduceat(bounds[:, 1], starts)
     axes.fill_between(clip.x(t[starts]), low, high, **BAND)
-
-
-def thin(t: Vector, values: Vector) -> tuple[Vector, Vector]:
-    """Keep the lowest and the highest value of each bin of ticks at their own times, so that no peak is lost."""
-    step = len(t) // _BINS
-    if step < 4:
-        return t, values
-    starts = np.arange(0, len(t), step)
-    kept = {0, len(t) - 1}
-    for start in starts:
-        part = values[start : start + step]
-        kept |= {int(start + part.argmin()), int(start + part.argmax())}
-    order = np.array(sorted(kept))
-    return t[order], values[order]
 
 
 def _scale_metric(axes: Any, values: Sequence[Vector]) -> None:

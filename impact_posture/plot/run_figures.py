@@ -153,9 +153,8 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
     for first in range(0, len(views), columns):
         block = list(enumerate(views))[first : first + columns]
         for panel in panels:
-            row = [
-                Cell.of(panel, k, impacts(view), plot_label(view.name) * (panel is panels[0])) for k, view in block
-            ]
+            titles = [plot_label(view.name) if panel is panels[0] else "" for _, view in block]
+            row = [Cell.of(panel, k, impacts(view), title) for (k, view), title in zip(block, titles, strict=True)]
             cells.append([*row, *[None] * (columns - len(row))])
     return time_figure(views, cells, 1.7, _notes(panels, cells))
 

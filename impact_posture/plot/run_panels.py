@@ -149,7 +149,7 @@ def speed_panel(views: Sequence[RunView]) -> Panel:
 def rotor_panel(views: Sequence[RunView]) -> Panel | None:
     """Rotor speeds, the range of their commands, and the limits, as shares of the highest speed.
 
-    ``None`` for a robot without rotors.  Commands carry the noise of the sensors, so that six curves of them could not
+    ``None`` for a robot without rotors.  Commands carry the noise of the sensors. Six noisy curves could not
     be told apart.
     """
     one = views[0]

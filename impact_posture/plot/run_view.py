@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.plot.shapes import Vector
-from impact_posture.plot.view import number, velocity_units
+from impact_posture.plot.view import number
 from impact_posture.robot.robot import Robot
 
 Flags = NDArray[np.bool_]
@@ -145,7 +146,7 @@ class RunView:
     @cached_property
     def joint_units(self) -> tuple[str, ...]:
         """``rad`` or ``m`` of each."""
-        return tuple(unit.removesuffix("/s") for unit in velocity_units(self.robot)[self.first_joint :])
+        return tuple(unit.removesuffix("/s") for unit in tangent_units(self.robot)[self.first_joint :])
 
     @cached_property
     def positions(self) -> Vector:

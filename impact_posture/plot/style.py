@@ -79,26 +79,31 @@ def style() -> Iterator[None]:
         yield
 
 
-def framed(title: str, lines: Sequence[str], height: float, notes: Sequence[str] = ()) -> tuple[Figure, Any]:
-    """Make a figure with the header above and ``notes`` below; return it and the part to draw in.
+@contextmanager
+def framed(
+    title: str, lines: Sequence[str], height: float, notes: Sequence[str] = ()
+) -> Iterator[tuple[Figure, Any]]:
+    """Yield a figure with the header above and ``notes`` below, and the part to draw in; apply :func:`style`.
 
     Args:
         title: First line.
-        lines: Small print below it, broken between its facts where it is too long.
+        lines: Small print below the title, broken between its facts where a line is too long.
         height: Height of the part to draw in, inches.
-        notes: Sentences below the picture.
+        notes: Sentences of the paragraph below.
     """
     title = printable(title, longest=_LONGEST_TITLE)
     small = [part for line in lines for part in wrap(printable(line), SEPARATOR)]
-    below = [part for line in notes for part in wrap(line, " ")]
+    below = wrap(" ".join(notes), " ")
     head, foot = 0.26 + _LINE * len(small), 0.06 + _LINE * len(below)
-    figure = Figure(figsize=(WIDTH, head + height + foot), layout="constrained")
-    parts: Any = figure.subfigures(3, 1, height_ratios=[head, height, foot])
-    top, body, bottom = parts
-    top.text(0.012, 1 - 0.06 / head, title, fontsize=10, fontweight="bold", va="top", parse_math=False)
-    top.text(0.012, 1 - 0.26 / head, "\n".join(small), fontsize=_SMALL, va="top", linespacing=1.4, parse_math=False)
-    bottom.text(0.012, 1, "\n".join(below), fontsize=_SMALL, va="top", linespacing=1.4, color="#333333")
-    return figure, body
+    with style():
+        figure = Figure(figsize=(WIDTH, head + height + foot), layout="constrained")
+        parts: Any = figure.subfigures(3, 1, height_ratios=[head, height, foot])
+        top, body, bottom = parts
+        look = {"fontsize": _SMALL, "va": "top", "linespacing": 1.4}
+        top.text(0.012, 1 - 0.06 / head, title, fontsize=10, fontweight="bold", va="top", parse_math=False)
+        top.text(0.012, 1 - 0.26 / head, "\n".join(small), parse_math=False, **look)
+        bottom.text(0.012, 1, "\n".join(below), color="#333333", **look)
+        yield figure, body
 
 
 def wrap(line: str, separator: str) -> list[str]:

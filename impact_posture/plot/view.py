@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -19,12 +19,14 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
 from impact_posture.impact.scalars import objective_value
 from impact_posture.impact.single_impact import SingleImpact
+from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
 
 # Between the facts of a header line.
 SEPARATOR = "  ·  "
+_UNITS = {"H": "‖Δν‖²/(N·s)²", "G": "1/kg", "V": "‖Δν‖²/(m/s)²", "S": "‖Δν‖²/(m/s)²", "E": "kg"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,30 +121,17 @@ class ResultView:
         return self.objective.oracle.quantities(self.q_optimal)
 
     @cached_property
-    def free_before(self) -> ImpactQuantities | None:
-        """The quantities at ``q_initial`` without the supports; ``None`` where there are none."""
-        return self._free(self.q_initial)
+    def free(self) -> tuple[ImpactQuantities, ...]:
+        """Quantities before and after without the supports; empty for a robot that has no supports."""
+        if not self.objective.supports:
+            return ()
+        oracle = ImpactOracle(replace(self.objective.case, supports=()))
+        return oracle.quantities(self.q_initial), oracle.quantities(self.q_optimal)
 
     @cached_property
-    def free_after(self) -> ImpactQuantities | None:
-        """The quantities at ``q_optimal`` without the supports; ``None`` where there are none."""
-        return self._free(self.q_optimal)
-
-    def _free(self, q: Vector) -> ImpactQuantities | None:
-        objective = self.objective
-        if not objective.supports:
-            return None
-        return ImpactOracle(replace(objective.case, supports=())).quantities(q)
-
-    @cached_property
-    def worst_before(self) -> WorstNormal | None:
-        """The worst normal of the cone at ``q_initial``, world; ``None`` without a cone or where there is none."""
-        return self._worst(self.q_initial)
-
-    @cached_property
-    def worst_after(self) -> WorstNormal | None:
-        """The worst normal of the cone at ``q_optimal``, world; ``None`` without a cone or where there is none."""
-        return self._worst(self.q_optimal)
+    def worst(self) -> tuple[WorstNormal | None, WorstNormal | None]:
+        """World worst normals of the cone before and after; ``None`` without a cone or where none exists."""
+        return self._worst(self.q_initial), self._worst(self.q_optimal)
 
     def _worst(self, q: Vector) -> WorstNormal | None:
         cone = self.objective.normal_cone
@@ -173,29 +162,9 @@ def sample_path(
     model = objective.robot.model
     steps = [float(np.linalg.norm(pin.difference(model, q, p))) for q, p in pairwise(configurations)]
     found = [objective.oracle.quantities(q) for q in configurations]
-    return PathData(
-        s=np.concatenate([[0.0], np.cumsum(steps)]),
-        H=np.array([f.H for f in found]),
-        G=np.array([f.G for f in found]),
-        V=np.array([f.V for f in found]),
-        S=np.array([np.nan if f.S is None else f.S for f in found]),
-        start=start,
-        optimum=optimum,
-    )
-
-
-def velocity_units(robot: Robot) -> tuple[str, ...]:
-    """``m/s`` or ``rad/s`` for each of the nv velocity entries."""
-    units = []
-    for index in range(1, robot.model.njoints):
-        joint = robot.model.joints[index]
-        data = joint.createData()
-        own = pin.Model()
-        own.addJoint(0, joint, pin.SE3.Identity(), "joint")
-        joint.calc(data, pin.neutral(own))
-        motion = np.asarray(data.S).reshape(6, -1)
-        units += ["rad/s" if turns else "m/s" for turns in (np.abs(motion[3:]).max(axis=0) > 1e-12)]
-    return tuple(units)
+    # A missing S becomes NaN.
+    curves = {name: np.array([getattr(f, name) for f in found], dtype=float) for name in "HGVS"}
+    return PathData(np.concatenate([[0.0], np.cumsum(steps)]), **curves, start=start, optimum=optimum)
 
 
 def jump_unit(view: ResultView) -> str:
@@ -217,7 +186,7 @@ def objective_unit(view: ResultView) -> str:
 
 def mixed_unit(robot: Robot) -> str:
     """Unit of the Euclidean ``‖ν‖``: both units where it mixes them."""
-    kinds = [u for u in ("m/s", "rad/s") if u in velocity_units(robot)]
+    kinds = [u for u in ("m/s", "rad/s") if u in tangent_units(robot)]
     return kinds[0] if len(kinds) == 1 else f"({', '.join(kinds)})"
 
 
@@ -256,18 +225,11 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
         )
     feet = [s.frame for s in view.objective.supports]
     facts.append(f"contact-consistent, on {', '.join(feet)}" if feet else "no supports")
-    quantities: list[tuple[str, str, Callable[[ImpactQuantities], float | None]]] = [
-        ("H", "‖Δν‖²/(N·s)²", lambda f: f.H),
-        ("G", "1/kg", lambda f: f.G),
-        ("V", "‖Δν‖²/(m/s)²", lambda f: f.V),
-        ("S", "‖Δν‖²/(m/s)²", lambda f: f.S),
-        ("E", "kg", lambda f: f.E),
-    ]
-    numbers = [
-        f"{name} {number(get(view.before))} → {number(get(view.after))}"
-        + (f" {unit}" if (get(view.before), get(view.after)) != (None, None) else "")
-        for name, unit, get in quantities
-    ]
+    numbers = []
+    for name, unit in _UNITS.items():
+        first, second = getattr(view.before, name), getattr(view.after, name)
+        shown = f" {unit}" if (first, second) != (None, None) else ""
+        numbers.append(f"{name} {number(first)} → {number(second)}{shown}")
     return title, [SEPARATOR.join(facts), SEPARATOR.join(numbers)]
 
 

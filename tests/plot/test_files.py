@@ -15,9 +15,8 @@ from impact_posture.plot import FIGURES, FORMATS, FigureNotFound, ResultView, dr
 from impact_posture.plot.classical_figure import classical_figure
 from impact_posture.plot.ellipsoid_figure import ellipsoid_figure
 from impact_posture.plot.jump_figure import jump_figure
-from impact_posture.plot.path_figure import path_figure
+from impact_posture.plot.path_figures import path_figure, tradeoff_figure
 from impact_posture.plot.style import WIDTH
-from impact_posture.plot.tradeoff_figure import tradeoff_figure
 from tests.plot.page import defects
 from tests.plot.views import PENDULUM, make_view, text_of
 
