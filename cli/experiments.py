@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from impact_posture_cli.output import Page
+
 if TYPE_CHECKING:
     from impact_posture.experiment.statistics import Row
-    from impact_posture_cli.output import Page
 
 RUN = "Run"
 Mode = Literal["live", "held"]

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 from impact_posture.settings import ImpactSettings
 from impact_posture_cli import options
+from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.progress import progress
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
@@ -33,8 +35,6 @@ def codegen(
     if not from_result:
         given.check_contact()
     from impact_posture.codegen.export_folder import write_export
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress
 
     posture = None
     objectives: list[ImpactObjective]

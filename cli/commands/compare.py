@@ -10,6 +10,8 @@ import typer
 from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Processes, ScenarioName, Seeds, rows_table
+from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.progress import progress
 
 Controllers = Annotated[
     str,
@@ -46,8 +48,6 @@ def compare(
     from impact_posture.experiment.reproduction import compare as run_all
     from impact_posture.experiment.reproduction import comparison_document, jobs_of
     from impact_posture.output_folder import check_output
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress
 
     labels = list(dict.fromkeys(labels))
     folder = None if out is None else Path(out)
@@ -58,7 +58,7 @@ def compare(
         rows = run_all(scenario, labels, seeds=seeds, processes=jobs, store=store, progress=advance)
         document = comparison_document(rows, seeds)
         if folder is not None and store is not None:
-            formats = [f.value for f in format or ()] or FORMATS
+            formats = format or FORMATS
             write_comparison(folder, document, jobs_of(scenario, labels, seeds), store, force=force, formats=formats)
     if json:
         print_json(document)

@@ -10,11 +10,11 @@ import typer
 from impact_posture.settings import OUTPUT, RobotSettings
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
+from impact_posture_cli.output import Page, number, print_json
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.settings import LoadOptions
-    from impact_posture_cli.output import Page
 
 
 WriteRobotToml = Annotated[
@@ -40,7 +40,6 @@ def inspect(
     """Run ``impact-posture inspect``."""
     from impact_posture.robot.robot_loader import load_robot
     from impact_posture.robot.robot_summary import summarize
-    from impact_posture_cli.output import Page, print_json
 
     load = given.fill(RobotSettings, robot=robot)
     if write_robot_toml is not None:
@@ -65,7 +64,6 @@ def inspect(
 def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, quiet: bool) -> None:
     """Draft the robot's robot.toml."""
     from impact_posture.robot.draft import write_draft
-    from impact_posture_cli.output import Page, print_json
 
     path, draft = write_draft(robot, load, Path(out) if out else None, force=force)
     if json:
@@ -123,7 +121,6 @@ def _constraints(constraints: dict[str, Any]) -> str:
 
 
 def _joints(page: Page, summary: dict[str, Any]) -> None:
-    from impact_posture_cli.output import number
 
     def limits(joint: dict[str, Any]) -> str:
         if joint["lower"] is None and joint["upper"] is None:
@@ -173,7 +170,6 @@ def _postures(page: Page, summary: dict[str, Any]) -> None:
 
 
 def _actuation(page: Page, actuation: dict[str, Any]) -> None:
-    from impact_posture_cli.output import number
 
     page.gap()
     condition = number(actuation["condition"], missing="infinite")

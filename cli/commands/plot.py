@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from impact_posture_cli import options
+from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.progress import progress
 
 ResultFolder = Annotated[str, typer.Argument(metavar="RESULT_DIR", help="A folder that optimize wrote.")]
 Figures = Annotated[
@@ -35,12 +37,10 @@ def plot(
     from impact_posture.output_folder import add_to_record
     from impact_posture.plot import draw_all
     from impact_posture.result_folder import FORMATS, load_view
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress
 
     folder = Path(result_dir)
     into = Path(out) if out else folder
-    formats = [f.value for f in format or ()] or FORMATS
+    formats = format or FORMATS
     with progress("drawing", shown=not (quiet or json)):
         written = draw_all(load_view(folder), into, formats, figure)
     # In a result's folder they are ours, too.

@@ -10,6 +10,8 @@ import typer
 from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Processes, Seeds, rows_table
+from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.progress import progress
 
 All = Annotated[
     bool,
@@ -46,8 +48,6 @@ def reproduce(
     from impact_posture.experiment.reproduction import reproduce as reproduce_all
     from impact_posture.experiment.reproduction_summary import advice
     from impact_posture.output_folder import check_output
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress
 
     scenarios = list(dict.fromkeys(scenario)) if scenario else list(PAPER)
     for name in scenarios:
@@ -59,7 +59,7 @@ def reproduce(
     with progress("running", "runs", shown=not (quiet or json)) as advance:
         found = reproduce_all(scenarios, seeds=seeds, everything=all_, processes=jobs, store=store, progress=advance)
         plan = [job for name in scenarios for job in jobs_of(name, controllers_of(name, all_), seeds)]
-        formats = [f.value for f in format or ()] or FORMATS
+        formats = format or FORMATS
         document = write_reproduction(folder, found, plan, store, force=force, formats=formats)
     if json:
         print_json(document)

@@ -10,6 +10,8 @@ import typer
 
 from impact_posture.settings import CONTACT, OUTPUT, ImpactSettings, Vector3
 from impact_posture_cli import options
+from impact_posture_cli.output import Page, complain, print_json
+from impact_posture_cli.progress import progress
 from impact_posture_cli.settings_options import Given, check_direction, with_settings
 
 if TYPE_CHECKING:
@@ -50,8 +52,6 @@ def verify(
         given.check_contact()
     from impact_posture.impact.resolved_impact import resolve
     from impact_posture.verification.verification import verify as verify_objective
-    from impact_posture_cli.output import Page, complain, print_json
-    from impact_posture_cli.progress import progress
 
     normal = {} if "contact" in given.values else {"normal": given.values.get("normal", (0.0, 0.0, 1.0))}
     impact = _of_result(Path(robot)) if from_result else resolve(given.fill(ImpactSettings, robot=robot, **normal))
