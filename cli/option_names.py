@@ -1,6 +1,6 @@
-"""Settings in the library's messages, written as the options that a command line takes.
+"""Rewrite Python parameters in messages as options of the command line.
 
-The library names Python parameters, between backquotes in a sentence: ``force=True``, ``support=['foot']``.
+Messages of the library hold parameters between backquotes, for example ``force=True`` or ``support=['foot']``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _OTHERS = {"compile", "controller", "force", "gain", "jobs", "mode", "out", "pre
 
 @cache
 def _names() -> set[str]:
-    """Names that are options: of settings, and the others."""
+    """Return the names that are options: settings and others."""
     # Imported here because the help page does without.
     from dataclasses import fields
 
@@ -31,7 +31,7 @@ def as_options(text: str) -> str:
 
 
 def option_of(where: str) -> str:
-    """Write the place of an error as an option, where it is a setting; a setting may be the first of two words."""
+    """Write the place of an error as an option, where it is a setting or begins with a setting."""
     name, *rest = where.split(" ", maxsplit=1)
     return " ".join([_option(name), *rest]) if name in _names() and not Path(where).exists() else where
 

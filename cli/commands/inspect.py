@@ -62,7 +62,7 @@ def inspect(
 
 
 def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, quiet: bool) -> None:
-    """Draft the robot's robot.toml."""
+    """Draft a robot.toml."""
     from impact_posture.robot.draft import write_draft
 
     path, draft = write_draft(robot, load, Path(out) if out else None, force=force)
@@ -77,7 +77,7 @@ def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, 
         page.line("Then leave the options out that it answers, as in")
         beside = path.name == "robot.toml" and path.parent == Path(robot).parent
         config = "" if beside else f" --config {path}"
-        # Not broken at the terminal's edge: it is there to be copied.
+        # This line is not wrapped, because users copy it.
         page.console.print(f"  impact-posture optimize {robot}{config} --normal X Y Z", soft_wrap=True, markup=False)
 
 

@@ -69,7 +69,7 @@ def optimize(
         with progress("solving", "points", shown=shown) as advance:
             result = result.trade_off(settings.tradeoff, compile=compile, progress=advance)
     if not json:
-        # Pictures and C code take longer than the answer: nobody waits for it because of them.
+        # The result comes first, because figures and C code take longer.
         _summarize(page, prepared, result.solution, result.document)
     with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
         written = result.save(
@@ -101,7 +101,7 @@ def _settings(robot: str, given: Given) -> ProblemSettings:
 
 
 def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
-    """Refuse options that would do nothing beside the others."""
+    """Refuse options that have no effect without another option."""
     for name, used, hint in (
         ("box", settings.contact_pose == "box", "--contact-pose box"),
         ("base_box", settings.base == "box", "--base box"),
@@ -177,12 +177,12 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     )
     if "tradeoff" in document:
         _tradeoff(page, document["tradeoff"], [n for n in document["notes"] if n.startswith("trade-off:")])
-    # Those of the robot stood above the solving.
+    # The warnings of the robot were printed before the solver started.
     page.warnings(document["warnings"][len(prepared.impact.warnings) :])
 
 
 def _tradeoff(page: Page, points: list[dict[str, Any]], notes: list[str]) -> None:
-    """What a smaller change would buy."""
+    """Show the trade-off between the objective and the distance."""
     from impact_posture.posture.notes import percent
 
     page.gap()

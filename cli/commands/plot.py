@@ -43,7 +43,7 @@ def plot(
     formats = format or FORMATS
     with progress("drawing", shown=not (quiet or json)):
         written = draw_all(load_view(folder), into, formats, figure)
-    # In a result's folder they are ours, too.
+    # A result folder records these files as its own.
     add_to_record(into, written)
     if json:
         print_json({"schema": "impact-posture/plot/1", "files": [str(path) for path in written]})

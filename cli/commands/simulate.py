@@ -15,7 +15,7 @@ from impact_posture_cli.output import Page, complain, number, print_json
 from impact_posture_cli.progress import progress
 from impact_posture_cli.settings_options import positive
 
-# The exit code of a run that did not complete.
+# Exit code of a run that did not complete.
 _FAILED = 4
 
 Controller = Annotated[
@@ -148,7 +148,7 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
 
 
 def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[str, str]]:
-    """What a run that completed is measured by."""
+    """Return the metrics of a completed run as rows."""
     saturation = metrics["saturation_s"]
     joints = f"base {number(metrics['q_total_impact_base'])}, joints {number(metrics['q_total_impact_joints'])}"
     rows = [("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints})")]

@@ -82,7 +82,7 @@ def verify(
 
 
 def _of_result(folder: Path) -> ResolvedImpact:
-    """The impact that a result folder is about, at its optimum."""
+    """Return the impact of a result folder at the optimal posture."""
     from impact_posture.impact.resolved_impact import ResolvedImpact
     from impact_posture.result_folder import load_view
 

@@ -1,9 +1,8 @@
-"""Pictures of a result: :func:`draw_all` writes them, the ``*_figure`` functions return matplotlib figures.
+"""Figures of a result: :func:`draw_all` writes them, the ``*_figure`` functions return matplotlib figures.
 
-Of simulated runs: :func:`draw_run`, :func:`draw_comparison`, :func:`draw_snapshots` and :func:`draw_bars`, from a
-:class:`RunView` of each run.
+Figures of simulated runs: :func:`draw_run`, :func:`draw_comparison`, :func:`draw_snapshots` and :func:`draw_bars`.
 
-Nothing here touches pyplot's global state or shows a window.
+The package does not change the global state of pyplot and shows no window.
 """
 
 from __future__ import annotations
@@ -70,13 +69,16 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
 
 
 def drawable(view: ResultView) -> list[str]:
-    """Names of :data:`FIGURES` that the view has data for (``nullspace``: a path; ``tradeoff``: a trade-off)."""
+    """Return the names of the figures that the view has data for.
+
+    ``nullspace`` needs a path, ``tradeoff`` needs a trade-off.
+    """
     lacking = {"nullspace": view.path is None, "tradeoff": view.tradeoff is None}
     return [name for name in FIGURES if not lacking.get(name)]
 
 
 class FigureNotFound(NameNotFound):
-    """There is no figure of that name."""
+    """The name of a figure is unknown."""
 
     kind = "figure"
 
@@ -92,12 +94,12 @@ def draw_all(
     Args:
         view: The result.
         out: Folder, made if missing; files of the same name are replaced.
-        formats: Of ``png``, ``svg`` and ``pdf``.
+        formats: Some of ``png``, ``svg`` and ``pdf``.
         only: Names of :data:`FIGURES` to draw; all of :func:`drawable` if ``None``.
 
     Raises:
         FigureNotFound: An unknown name in ``only``.
-        InputError: An unknown format, or a figure asked for that the view has no data for.
+        InputError: An unknown format, or a figure in ``only`` that the view has no data for.
         OutputError: The folder or a file cannot be written.
     """
     wanted = check_formats(formats)

@@ -1,4 +1,4 @@
-"""Figure ``classical``: the velocity, force and impact ellipsoids over each other, each in its own stated unit."""
+"""Figure ``classical``: velocity, force and impact ellipsoids in the same panels, each in its own unit."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ _LOOKS: dict[str, dict[str, Any]] = {
     "force": {"color": VERMILLION, "linestyle": (0, (1, 1.2)), "linewidth": 1.6, "zorder": 3.6},
     "impact": {"color": BLUE, "linestyle": "-", "linewidth": 1.8, "zorder": 3.0},
 }
-# How far an ellipsoid without end is drawn, in units of the panel.
+# Half-length of an unbounded ellipsoid as drawn, in units of the panel.
 _ENDLESS = 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """One kind of ellipsoid in both postures.
+    """Kind of ellipsoid in both postures.
 
     Attributes:
         name: ``velocity``, ``force`` or ``impact``.
-        formula: Of its matrix.
+        formula: Formula of its matrix.
         unit: Unit of its semi-axes.
-        scale: What it is divided by: its longest semi-axis before (of those that end).
-        matrices: Before and after, divided by ``scale²``; cut far outside of the panel where they have no end.
-        finite: The same without the directions that have no end.
-        endless: Directions without end, columns, before and after.
+        scale: Its longest finite semi-axis before, by which it is divided.
+        matrices: Before and after, divided by ``scale²``, cut far outside of the panel where unbounded.
+        finite: The same without the unbounded directions.
+        endless: Unbounded directions as columns, before and after.
     """
 
     name: str
@@ -54,12 +54,12 @@ class Kind:
 
     @property
     def label(self) -> str:
-        """Legend entry, scale included."""
+        """Legend entry with the scale."""
         return f"{self.name}  {self.formula}:  1 = {number(self.scale)} {self.unit}"
 
 
 def kinds_of(view: ResultView) -> list[Kind]:
-    """The three kinds, scaled to be compared."""
+    """Return the three kinds of ellipsoids, scaled for comparison."""
     products = [J @ J.T for J in (view.jacobian(view.q_initial), view.jacobian(view.q_optimal))]
     impact = [view.before.ellipsoid, view.after.ellipsoid]
     none = (np.zeros((3, 0)), np.zeros((3, 0)))
@@ -84,8 +84,8 @@ def kinds_of(view: ResultView) -> list[Kind]:
 def classical_figure(view: ResultView) -> Figure:
     """Draw the shadows of ``JJᵀ``, ``(JJᵀ)⁻¹`` and ``Λ_c`` on the coordinate planes: before above, after below.
 
-    One scale for all panels, and one unit for each kind.  Where ``JJᵀ`` is singular the force ellipsoid has no end in
-    some direction: it runs off the panel, which says so.
+    All panels share a scale, and each kind has its own unit.  Where ``JJᵀ`` is singular the force ellipsoid is
+    unbounded: it leaves the panel, whose label says so.
     """
     kinds = kinds_of(view)
     limit = 1.18 * max(1.0, *(_longest(matrix) for kind in kinds for matrix in kind.finite))
@@ -113,7 +113,7 @@ def _longest(matrix: Vector) -> float:
 
 
 def _unbounded(plane: Plane, kind: Kind, which: int) -> str:
-    """A line where a kind has no end in the plane."""
+    """Return a line that says where a kind is unbounded in the plane."""
     directions = kind.endless[which]
     seen = np.linalg.svd(plane.axes @ directions, compute_uv=False) if directions.shape[1] else np.zeros(0)
     rank = int((seen > 1e-6).sum())

@@ -58,7 +58,7 @@ def jump_figure(view: ResultView) -> Figure:
 
 
 def groups_of(view: ResultView) -> list[tuple[str, list[int], str]]:
-    """Entries of ν that share a panel: name, indices and unit."""
+    """Return the groups of entries of ν that share a panel: name, indices and unit."""
     units = tangent_units(view.robot)
     base = 6 if view.robot.floating else 0
     groups = [("base,\nlinear", [0, 1, 2], "m/s"), ("base,\nangular", [3, 4, 5], "rad/s")] if base else []

@@ -27,7 +27,7 @@ _KNEE = (
 )
 
 
-# A spread above this is drawn on a log axis.
+# Ratio of the largest to the smallest value above which the axis is logarithmic.
 _SPREAD = 30.0
 # Upright line at a posture.
 _MARK: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": ":", "zorder": 1}
@@ -57,7 +57,7 @@ def path_figure(view: ResultView) -> Figure:
 
 
 def draw_shares(axes: Any, x: Vector, data: PathData | TradeOffData) -> bool:
-    """Draw H, G, V and S over ``x``, each divided by its value at the start; whether there was any to draw."""
+    """Draw H, G, V and S over ``x``, each divided by its value at the start; return whether any was drawn."""
     curves = {name: normalized(data, name) for name in QUANTITIES}
     drawn = {name: curve for name, curve in curves.items() if curve is not None}
     values = np.concatenate([curve[np.isfinite(curve)] for curve in drawn.values()]) if drawn else np.ones(1)
@@ -78,7 +78,7 @@ def draw_shares(axes: Any, x: Vector, data: PathData | TradeOffData) -> bool:
 
 
 def spreads(values: Vector, ratio: float = _SPREAD) -> bool:
-    """Whether positive values lie so far apart, by more than ``ratio``, that they want a log axis."""
+    """Return whether positive values spread by more than ``ratio``, so that they need a log axis."""
     positive = values[values > 0]
     return bool(positive.size) and float(positive.max() / positive.min()) > ratio
 
@@ -91,12 +91,12 @@ def log_axis(axes: Any) -> None:
 
 
 def undrawn(data: PathData | TradeOffData) -> list[str]:
-    """Quantities that have no curve: undefined, or zero at the start."""
+    """Return the quantities without a curve, because they are undefined or zero at the start."""
     return [name for name in QUANTITIES if normalized(data, name) is None]
 
 
 def normalized(path: PathData | TradeOffData, name: str) -> Vector | None:
-    """A quantity over its value at the start (its first value where it has none there); ``None`` where that is 0."""
+    """Divide a quantity by its value at the start, or by its nearest value; ``None`` where that is 0."""
     values = np.asarray(getattr(path, name), dtype=float)
     first = _first(path, name)
     if first is None or not values[first] > 0:
@@ -128,7 +128,7 @@ def _checked(path: PathData | None) -> PathData:
 
 
 def _mark(axes: Any, path: PathData) -> None:
-    """Upright lines at the start and the optimum, named above the axes."""
+    """Draw upright lines at the start and the optimum, named above the axes."""
     for word, index, align in (("start", path.start, "left"), ("optimum", path.optimum, "right")):
         axes.axvline(path.s[index], **_MARK)
         axes.annotate(
@@ -143,7 +143,7 @@ def _share(path: PathData, index: int) -> float:
 
 
 def share_notes(where: str, missing: list[str]) -> str:
-    """What to know of :func:`draw_shares`' curves."""
+    """Return the note on the curves of :func:`draw_shares`."""
     notes = "Each curve is divided by its value at the start; for H, V and S less is better. G is 1/effective mass."
     if "S" in missing:
         notes += f" S is undefined {where}."
@@ -173,7 +173,7 @@ def tradeoff_figure(view: ResultView) -> Figure:
             lower.axvline(data.within[data.knee], **_MARK)
         handles = upper.get_legend_handles_labels()[0]
         if drawn:
-            # A line without anything parts them from those of the panel below.
+            # A heading separates these entries from those of the panel below.
             handles += [Line2D([], [], linestyle="", label="value / start:"), *lower.get_legend_handles_labels()[0]]
         body.legend(handles=handles, loc="outside right center", handlelength=3.2)
         body.align_ylabels([upper, lower])
@@ -191,7 +191,7 @@ def _objective(axes: Any, data: TradeOffData, view: ResultView) -> None:
     if log:
         log_axis(axes)
     else:
-        # Air above and below, so that a curve that hardly falls does not fill the panel with noise.
+        # A margin above and below keeps the noise of an almost constant curve small.
         room = 0.08 * max(float(np.ptp(y)), 1e-3 * float(np.abs(y).max()))
         axes.set_ylim(float(y.min()) - room, float(y.max()) + 1.5 * room)
     axes.grid(True)
@@ -215,7 +215,7 @@ def _objective(axes: Any, data: TradeOffData, view: ResultView) -> None:
 
 
 def _title(data: TradeOffData) -> str:
-    """What half of the way buys, or what the knee does."""
+    """Return the gain at the knee, or at half of the distance."""
     y, x = data.objective, data.within
     gain = float(y[0] - y[-1])
     if not gain > 0:
@@ -224,4 +224,4 @@ def _title(data: TradeOffData) -> str:
         share, way = (y[0] - y[data.knee]) / gain, x[data.knee] / x[-1]
         return f"knee: {100 * share:.0f} % of the gain for {100 * way:.0f} % of the distance"
     half = float(np.interp(x[-1] / 2, x, y))
-    return f"half of the distance buys {100 * (y[0] - half) / gain:.0f} % of the gain; no knee"
+    return f"half of the distance yields {100 * (y[0] - half) / gain:.0f} % of the gain; no knee"

@@ -1,4 +1,4 @@
-"""Figure ``postures``: the robot's links in both postures, with the contact planes and the normals."""
+"""Figure ``postures``: the links of the robot in both postures, with the contact planes and the normals."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ HATCH = "/////"
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A contact plane to draw.
+    """Contact plane to draw.
 
     Attributes:
-        point: Its middle, shape (3,).
+        point: Middle of the plane, shape (3,).
         normal: Unit normal, shape (3,).
-        side: Of the square, m.
+        side: Side of the square, m.
         contact: Where n begins, shape (3,).
         reach: Length of n, m.
-        name: Of n.
-        color: Of the posture that it belongs to; gray of one that belongs to both.
+        name: Name of n.
+        color: Color of its posture; gray for a plane of both postures.
     """
 
     point: Vector
@@ -50,11 +50,11 @@ class Surface:
 
     @property
     def tip(self) -> Vector:
-        """Where n ends, shape (3,)."""
+        """Tip of n, shape (3,)."""
         return np.asarray(self.contact + self.reach * self.normal)
 
     def outline(self, plane: Plane) -> Vector:
-        """Corners of the strip of matter below it as seen from the side, shape (4, 2)."""
+        """Return the corners of the strip of matter below the plane as seen from the side, shape (4, 2)."""
         middle, n = plane.axes @ self.point, plane.axes @ self.normal
         along, deep = np.array([-n[1], n[0]]) * self.side / 2, -0.22 * self.side * n
         return np.array([middle + along, middle - along, middle - along + deep, middle + along + deep])
@@ -76,7 +76,7 @@ def postures_figure(view: ResultView) -> Figure:
     states = ((first, BEFORE), (second, AFTER))
     notes = [*stick_notes(first), _ENDS, _NORMAL]
     low, high = _window([first, second], plane, surfaces)
-    # As high as the view from the side needs, within a page's reason.
+    # As high as the view from the side needs, within the limits of a page.
     height = float(np.clip(3.1 * (high - low)[1] / (high - low)[0], 2.3, 3.6)) + 1.0
     with framed(*header_lines(view), height, notes) as (figure, body):
         grid = body.add_gridspec(1, 2)
@@ -96,12 +96,12 @@ def postures_figure(view: ResultView) -> Figure:
 
 
 def stick_notes(state: Skeleton) -> list[str]:
-    """Return what sticks and body show of the robot, and what not."""
+    """Return the notes on sticks and body."""
     return [STICKS, *([_BODY] if len(state.body) else [])]
 
 
 def side_plane(first: Skeleton, second: Skeleton) -> Plane:
-    """The coordinate plane that contains n and shows most of the motion; else the upright plane of n."""
+    """Return the coordinate plane that contains n and shows most of the motion; else the upright plane of n."""
     n = second.normal
     candidates = [plane for plane in (XZ, YZ, XY) if plane.contains(n)]
     if not candidates:
@@ -110,22 +110,22 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
     size = second.points - second.points.mean(axis=0)
 
     def shown(plane: Plane) -> float:
-        # The robot's own spread decides where there is little motion.
+        # The size of the robot decides where there is little motion.
         seen = float(np.linalg.norm(motion @ plane.axes.T) + 0.2 * np.linalg.norm(size @ plane.axes.T))
-        # A plan is harder to read than an elevation: it has to show much more.
+        # A view from above is harder to read, so that it has to show much more.
         return seen / 2 if plane is XY else seen
 
     return max(candidates, key=shown)
 
 
 def surfaces_of(first: Skeleton, second: Skeleton, letters: list[str], side: float) -> list[Surface]:
-    """The planes of each contact: one if it is the same before and after, two if it moves along n or turns."""
+    """Return the planes of each contact; both where the plane moves along n or turns."""
     found = []
     pairs = zip(first.contacts, second.contacts, first.normals, second.normals, letters, strict=True)
     for before, after, n_before, n_after, letter in pairs:
         way, turned = after - before, float(np.linalg.norm(n_before - n_after)) > 0.01
         if not turned and abs(float(way @ n_after)) < 0.03 * side:
-            # The same surface, touched at another place of it: wide enough for both.
+            # The same surface, touched at another place, is wide enough for both places.
             wide = side + float(np.linalg.norm(way))
             found.append(Surface((before + after) / 2, n_after, wide, after, 0.8 * side, f"n{letter}", GRAY))
             continue
@@ -136,16 +136,16 @@ def surfaces_of(first: Skeleton, second: Skeleton, letters: list[str], side: flo
 
 
 def _box(axes: Any, points: Vector) -> None:
-    """Equal 3-D axes around the points: a box whose edges have the lengths that they show."""
+    """Give 3-D axes equal scales around the points."""
     low, high = points.min(axis=0), points.max(axis=0)
-    # A planar robot's box keeps some depth.
+    # The box of a planar robot keeps some depth.
     half = np.maximum(0.54 * (high - low), 0.2 * float((high - low).max()))
     middle = (low + high) / 2
     frame_space(axes, middle - half, middle + half, "m", 5, azimuth=-60)
 
 
 def _window(states: list[Skeleton], plane: Plane, surfaces: list[Surface]) -> tuple[Vector, Vector]:
-    """Lower left and upper right corner of what the side view shows: everything drawn, with a margin."""
+    """Return the lower left and upper right corner of the side view, with a margin around all that is drawn."""
     drawn = [plane.axes @ state.points.T for state in states]
     for s in surfaces:
         drawn += [s.outline(plane).T, plane.axes @ s.tip[:, None]]
@@ -168,7 +168,7 @@ def frame_flat(axes: Any, low: Vector, high: Vector, bins: int) -> None:
 
 
 def depth_of(plane: Plane) -> str:
-    """The direction that a reader of the plane looks in."""
+    """Return the viewing direction of a plane."""
     if plane in COORDINATE_PLANES:
         return {"xz": "+y", "yz": "−x", "xy": "−z"}[plane.name]
     return "the horizontal across n"
@@ -198,7 +198,7 @@ def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane |
     for circle, arm in zip(state.rotors, state.arms, strict=True):
         _fill(axes, [circle], plane, color, 1.5)
         _draw(axes, np.hstack([circle, circle[:, :1]]), plane, **thin)
-        # One straight line each, thinner than a link: seen from the side they lie on each other.
+        # Straight lines, thinner than a link, because they lie on each other in the side view.
         _draw(axes, arm.T, plane, **(thin | {"linestyle": "-"}))
     _draw(axes, state.joints.T, plane, linestyle="", marker="o", markersize=2.6, color=color, zorder=4)
     look = {"linestyle": "", "markeredgecolor": "white", "color": color}

@@ -19,7 +19,7 @@ from impact_posture.plot.run_view import RunView, run_header
 from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import GRAY, INK, framed, shared_legend
 
-# Pink and light gray: far enough apart in a gray print, too.
+# Pink and light gray differ in a gray print as well.
 SHADES: dict[str, dict[str, Any]] = {
     "dwell": {"facecolor": "#f0f0f0", "edgecolor": "none", "zorder": 0.1},
     "impact": {"facecolor": "#edc3d6", "edgecolor": "none", "zorder": 0.2},
@@ -31,13 +31,13 @@ AT_LIMIT: dict[str, Any] = {
     "markeredgewidth": 0.4, "zorder": 5,
 }  # fmt: skip
 BAND: dict[str, Any] = {"facecolor": "#dcdcdc", "edgecolor": "none", "zorder": 1.2}
-# Points across a page's width; each shows the lowest and the highest value in it.
+# Bins across the width of a page.
 _BINS = 1000
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A panel in a place of a figure.
+    """Panel in a place of a figure.
 
     Attributes:
         panel: Its curves.
@@ -88,7 +88,7 @@ def time_figure(
         for row, column in np.ndindex(*axes.shape):
             cell, own = cells[row][column], axes[row, column]
             if cell is None:
-                # Stays as a place for the legend.
+                # The place stays free for the legend.
                 own.set_axis_off()
                 continue
             _draw(own, cell, views)
@@ -128,7 +128,7 @@ def _draw(axes: Any, cell: Cell, views: Sequence[RunView]) -> None:
             _band(axes, view, panel.ranges[which], clip)
         for k, values in enumerate(panel.values[which].T):
             looks, entry = (RUNS, which) if panel.overlay else (LINES, k)
-            # Commands carry the noise of the sensors: dashes of it are a blot.
+            # Commands carry the noise of the sensors, of which dashes make a blot.
             look = looks[entry % len(looks)] | ({"linestyle": "-", "linewidth": 0.7} if panel.noisy else {})
             name = panel.names[entry] if panel.names else ""
             _curve(axes, view, values, clip, label=plot_label(name) if name else None, **look)

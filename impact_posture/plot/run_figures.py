@@ -58,7 +58,7 @@ def draw_comparison(views: Sequence[RunView], out_dir: Path, formats: Iterable[s
     Args:
         views: A run of each controller (of a push: with the same sign). The nominal controller is drawn first.
         out_dir: Folder, made if missing; files of the same name are replaced.
-        formats: Of ``png``, ``svg`` and ``pdf``.
+        formats: Some of ``png``, ``svg`` and ``pdf``.
 
     Raises:
         InputError: No view, views of different scenarios or robots, an unknown format.

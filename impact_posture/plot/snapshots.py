@@ -1,4 +1,4 @@
-"""Figure ``snapshots``: the robot as sticks at three instants of a run, a row for each controller."""
+"""Figure ``snapshots``: sticks of the robot at three instants of a run, a row for each controller."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ from impact_posture.plot.style import (
 _START_NOTE = "Gray sticks show the robot at the start of the run."
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
 _START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
-# Just before the impact: a tick that it has no part in, s.
+# Time before the impact at which no tick contains it, s.
 _BEFORE = 0.005
 
 
 def draw_snapshots(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write ``snapshots`` of one run of each controller (nominal first) into ``out_dir``; return the paths.
+    """Write ``snapshots`` of a run of each controller (nominal first) into ``out_dir``; return the paths.
 
     Raises:
         InputError: No view, views of different scenarios or robots, an unknown format.
@@ -91,7 +91,7 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
             tails = np.stack([plane.axes @ state.contact - arrow, plane.axes @ state.contact], axis=1)
             low, high = np.minimum(low, tails.min(axis=1)), np.maximum(high, tails.max(axis=1))
     low, high = _window(low, high, views[0], plane)
-    # As high as the robot needs, within a page's reason.
+    # As high as the robot needs, within the limits of a page.
     highest = float(np.clip(8.5 / len(views), 1.2, 3.0))
     height = float(np.clip(2.1 * (high - low)[1] / (high - low)[0], 1.2, highest)) + 0.2
     with framed(*run_header(views), height * len(views) + 0.85, [*stick_notes(rows[0][0]), _START_NOTE]) as (
@@ -113,7 +113,7 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
             axes_row[0].set_ylabel(f"{plot_label(view.name)}\n{plane.up}  [m]")
         for axes in panels[-1]:
             axes.set_xlabel(f"{plane.right}  [m]")
-        # The lowest panels say what the eye looks along.
+        # The lowest panels name the viewing direction.
         panels[-1][1].set_xlabel(f"{plane.right}  [m]\nseen along {depth_of(plane)}")
         shared_legend(body, _handles(rows[0][0], views[0]), "lower")
     return figure
@@ -124,11 +124,11 @@ def _skeleton(view: RunView, tick: int) -> Skeleton:
 
 
 def _window(low: Vector, high: Vector, view: RunView, plane: Plane) -> tuple[Vector, Vector]:
-    """Corners of what is shown: all sticks, and the surface where it is seen from its edge."""
+    """Return the corners of a panel, which shows all sticks, and the surface where it is seen from its edge."""
     if view.surface is not None:
         touched = plane.axes @ view.surface
         n = plane.axes @ np.array(view.contact.normal)
-        # The surface's own place along its normal only: it has no end across.
+        # Only the place of the surface along its normal counts, because it has no end across.
         edge = touched - 0.05 * float((high - low).max()) * n
         for axis in range(2):
             if abs(n[axis]) > 0.5:
@@ -137,7 +137,7 @@ def _window(low: Vector, high: Vector, view: RunView, plane: Plane) -> tuple[Vec
 
 
 def _surface(axes: Any, view: RunView, plane: Plane, low: Vector, high: Vector) -> None:
-    """The surface from its edge, hatched behind it."""
+    """Draw the surface as seen from its edge, hatched behind it."""
     if view.surface is None:
         return
     n = plane.axes @ np.array(view.contact.normal)
@@ -146,7 +146,7 @@ def _surface(axes: Any, view: RunView, plane: Plane, low: Vector, high: Vector) 
     n = n / np.linalg.norm(n)
     size = 2 * float((high - low).max())
     point, along = plane.axes @ view.surface, size * np.array([-n[1], n[0]])
-    # From where the panel's middle is nearest.
+    # The strip begins next to the middle of the panel.
     point = point + along * float(along @ ((low + high) / 2 - point)) / size**2
     corners = np.array([point + along, point - along, point - along - size * n, point + along - size * n])
     axes.fill(*corners.T, facecolor="white", edgecolor=GRAY, hatch=HATCH, linewidth=0, zorder=0.5)
@@ -154,7 +154,7 @@ def _surface(axes: Any, view: RunView, plane: Plane, low: Vector, high: Vector) 
 
 
 def _arrow(view: RunView, state: Skeleton, plane: Plane, reach: float) -> Vector | None:
-    """The push from tail to tip in the picture; ``None`` where there is none."""
+    """Return the push from tail to tip in the figure; ``None`` without a push."""
     largest = view.force[int(np.argmax(np.linalg.norm(view.force, axis=1)))]
     size = float(np.linalg.norm(largest))
     if not view.pushed or size == 0:

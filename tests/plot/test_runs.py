@@ -397,7 +397,7 @@ def test_bad_input(flying: RunView, pushed: RunView, tmp_path: Path) -> None:
         dataclasses.replace(flying, t=flying.t[::-1])
     with pytest.raises(InputError, match="there is no run to draw"):
         draw_comparison([], tmp_path)
-    with pytest.raises(InputError, match=r"robot of nominal is solo8, of nominal tilthex_arm.*one scenario"):
+    with pytest.raises(InputError, match=r"robot of nominal is solo8, of nominal tilthex_arm.*same scenario"):
         draw_snapshots([flying, pushed], tmp_path)
     with pytest.raises(InputError, match="no format 'gif'"):
         draw_run(flying, tmp_path, ("gif",))
