@@ -154,7 +154,7 @@ def test_bad_input(pendulum: ResultView, panda: ResultView, tmp_path: Path) -> N
         draw_all(pendulum, tmp_path, ("gif",))
     with pytest.raises(InputError, match="no path to draw"):
         draw_all(panda, tmp_path, only=["nullspace"])
-    with pytest.raises(InputError, match=r"no trade-off to draw.*--tradeoff"):
+    with pytest.raises(InputError, match=r"no trade-off to draw.*`tradeoff`"):
         draw_all(panda, tmp_path, only=["tradeoff"])
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="cannot be written"):
