@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,9 +49,9 @@ class Kind:
     formula: str
     unit: str
     scale: float
-    matrices: tuple[Vector, Vector]
-    finite: tuple[Vector, Vector]
-    endless: tuple[Vector, Vector]
+    matrices: Sequence[Vector]
+    finite: Sequence[Vector]
+    endless: Sequence[Vector]
 
     @property
     def label(self) -> str:
@@ -62,22 +63,19 @@ def kinds_of(view: ResultView) -> list[Kind]:
     """Return the three kinds of ellipsoids, scaled for comparison."""
     products = [J @ J.T for J in (view.jacobian(view.q_initial), view.jacobian(view.q_optimal))]
     impact = [view.before.ellipsoid, view.after.ellipsoid]
-    none = (np.zeros((3, 0)), np.zeros((3, 0)))
+    bounded = np.zeros((3, 0))
     found = []
     for name, formula, unit, matrices, dual in (
         ("velocity", "J Jᵀ", "m/s", products, False),
         ("force", "(J Jᵀ)⁻¹", "N", products, True),
         ("impact", "Λ$_c$", f"{jump_unit(view)}/(N·s)", impact, False),
     ):
-        finite = [polar(matrix, 0.0)[0] for matrix in matrices] if dual else matrices
+        finite = [polar(matrix, 0.0)[0] if dual else matrix for matrix in matrices]
         scale = _longest(finite[0]) or _longest(finite[1]) or 1.0
-        drawn, endless = finite, none
-        if dual:
-            cut = [polar(matrix, _ENDLESS * scale) for matrix in matrices]
-            drawn, endless = [matrix for matrix, _ in cut], (cut[0][1], cut[1][1])
-        one, two = (matrix / scale**2 for matrix in drawn)
-        first, second = (matrix / scale**2 for matrix in finite)
-        found.append(Kind(name, formula, unit, scale, (one, two), (first, second), endless))
+        cut = [polar(matrix, _ENDLESS * scale) if dual else (matrix, bounded) for matrix in matrices]
+        drawn = [matrix / scale**2 for matrix, _ in cut]
+        shown = [matrix / scale**2 for matrix in finite]
+        found.append(Kind(name, formula, unit, scale, drawn, shown, [endless for _, endless in cut]))
     return found
 
 

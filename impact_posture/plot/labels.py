@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 from mpl_toolkits.mplot3d import proj3d
@@ -16,6 +16,8 @@ from impact_posture.plot.shapes import Plane, Vector
 _GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0, 36.0)
 _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
 _CLEAR = 2.0
+# Grids are lighter than ink, 0 (black) to 255. Thin lines between two pixels are gray.
+_INK = 205
 
 
 class Label(Annotation):
@@ -53,14 +55,18 @@ def draw_end_on(axes: Any, name: str, plane: Plane, n: Vector, at: Vector, color
 
 
 def place_labels(figure: Figure) -> None:
-    """Move the letters of a figure to places where nothing else is. The figure has been laid out and drawn."""
-    for axes in figure.axes:
-        labels = [text for text in axes.texts if isinstance(text, Label)]
-        if not labels:
-            continue
-        ink = np.vstack([np.zeros((0, 2)), *_ink(axes)])
-        for label in labels:
-            ink = np.vstack([ink, _place(axes, label, ink)])
+    """Move the letters of a figure to places where nothing else is. The figure has been laid out."""
+    labels = [(axes, text) for axes in figure.axes for text in axes.texts if isinstance(text, Label)]
+    for _, label in labels:
+        label.set_visible(False)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    # Rows of the image count from the top. Grids and faint fills are lighter than ink.
+    image = np.asarray(canvas.buffer_rgba())[::-1, :, :3].min(axis=2)
+    ink = np.argwhere(image < _INK)[:, ::-1] + 0.5
+    for axes, label in labels:
+        label.set_visible(True)
+        ink = np.vstack([ink, _place(axes, label, ink)])
 
 
 def _place(axes: Any, label: Label, ink: Vector) -> Vector:
@@ -86,42 +92,6 @@ def _place(axes: Any, label: Label, ink: Vector) -> Vector:
                 best, place = cost, center
     label.xyann = tuple((place - anchor) / scale)
     return _filled(place - half, place + half)
-
-
-def _ink(axes: Any) -> Iterator[Vector]:
-    """Yield points in pixels, at most a few apart, of all that an axes draws without its grid and letters."""
-    scale = axes.figure.dpi / 72
-    for line in axes.lines:
-        drawn = line.get_transform().transform(line.get_path().vertices)
-        if line.get_linestyle() not in ("None", " ", ""):
-            yield _along(drawn)
-        if line.get_marker() not in ("None", " ", "", None):
-            reach = line.get_markersize() * scale / 2
-            for center in drawn[np.isfinite(drawn).all(axis=1)]:
-                yield _filled(center - reach, center + reach)
-    arrows = [text.arrow_patch for text in axes.texts if getattr(text, "arrow_patch", None) is not None]
-    for patch in (*axes.patches, *arrows):
-        yield _along(patch.get_transform().transform_path(patch.get_path()).interpolated(8).vertices)
-    for collection in axes.collections:
-        transform = collection.get_transform()
-        for path in collection.get_paths():
-            yield _along(transform.transform(path.vertices))
-    for text in axes.texts:
-        if text.get_text() and not isinstance(text, Label):
-            box = text.get_window_extent()
-            yield _filled(box.min, box.max)
-
-
-def _along(points: Vector) -> Vector:
-    """Return points at most two pixels apart along the line through ``points``, shape (n, 2)."""
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < 2:
-        return points
-    # Points outside of every panel need not be farther away.
-    points = np.clip(points, -1e4, 1e4)
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    s = np.linspace(0.0, way[-1], 2 + int(way[-1] / 2))
-    return np.stack([np.interp(s, way, points[:, k]) for k in (0, 1)], axis=1)
 
 
 def _filled(low: Vector, high: Vector) -> Vector:

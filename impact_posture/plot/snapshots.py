@@ -171,5 +171,5 @@ def _handles(state: Skeleton, view: RunView) -> list[Any]:
     handles = robot_handles(state, {"now": _NOW, "start": _START}, BLUE)
     if view.surface is not None:
         return [*handles, Patch(facecolor=PALE, edgecolor=GRAY, hatch=HATCH, linewidth=0, label="surface")]
-    arrow = {"linestyle": "", "marker": r"$\rightarrow$", "markersize": 11, "color": VERMILLION}
+    arrow: dict[str, Any] = {"linestyle": "", "marker": r"$\rightarrow$", "markersize": 11, "color": VERMILLION}
     return [*handles, Line2D([], [], label="push (dashed: to come)", **arrow)]

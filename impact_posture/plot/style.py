@@ -150,14 +150,13 @@ def lay_out(figure: Figure) -> None:
     for _ in range(3):
         engine.execute(figure)
     figure.set_layout_engine("none")
-    figure.draw_without_rendering()
-    place_labels(figure)
     # Rounded, because the solver of the layout differs in the last digits from run to run.
     for part in figure.subfigs:
         box = part.bbox_relative
         box.p0, box.p1 = np.round(box.p0, 6), np.round(box.p1, 6)
     for axes in figure.axes:
         axes.set_position(np.round(axes.get_position(original=True).bounds, 6))
+    place_labels(figure)
 
 
 def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
