@@ -63,7 +63,7 @@ def place_labels(figure: Figure) -> None:
     canvas.draw()
     # Rows of the image count from the top. Grids and faint fills are lighter than ink.
     image = np.asarray(canvas.buffer_rgba())[::-1, :, :3].min(axis=2)
-    ink = np.argwhere(image < _INK)[:, ::-1] + 0.5
+    ink: Vector = np.argwhere(image < _INK)[:, ::-1].astype(np.float64) + 0.5
     for axes, label in labels:
         label.set_visible(True)
         ink = np.vstack([ink, _place(axes, label, ink)])
