@@ -22,7 +22,6 @@ from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.impact.metric import Metric, build_metric
 from impact_posture.impact.resolved_impact import ResolvedImpact, missing_support
 from impact_posture.impact.supports import refuse_held, resolve_supports
-from impact_posture.job import FORMATS, Written, result_view, write_result
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
@@ -33,6 +32,7 @@ from impact_posture.posture.result import result_document
 from impact_posture.posture.robustness import Robustness, solve_robustly
 from impact_posture.posture.solve import PostureSolution, Progress
 from impact_posture.posture.tradeoff import TradeOff
+from impact_posture.result_folder import FORMATS, Written, result_view, write_result
 from impact_posture.robot.model_variant import ModelVariant, Payload, build_model_variants
 from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
-import typer.main
 
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.pareto import pareto_front
@@ -21,7 +20,7 @@ from impact_posture.posture.solve import solve
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.settings import ContactPose, ProblemSettings
 from impact_posture.simulation.scenario import ScenarioTable
-from impact_posture_cli.app import app
+from impact_posture_cli.app import COMMANDS, build
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -122,7 +121,7 @@ def test_every_option_is_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
     reference = importlib.import_module("cli_reference").markdown()
     sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", reference, re.MULTILINE | re.DOTALL))
-    commands = typer.main.get_command(app).commands
+    commands = {name: build(name) for name in COMMANDS}
     assert list(sections) == list(commands)
     for name, command in commands.items():
         table = [line for line in sections[name].splitlines() if line.startswith("| `-")]
@@ -134,7 +133,7 @@ def test_every_option_is_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_every_problem_key_is_an_option() -> None:
     """``problem.toml`` says that each of its keys is an option."""
-    command = typer.main.get_command(app).commands["optimize"]
+    command = build("optimize")
     names = {o[2:].replace("-", "_") for p in command.params for o in p.opts if o.startswith("--")}
     names |= {"schema", "robot"}
     # Written by the tool itself: the start as numbers, and the compliance in force.

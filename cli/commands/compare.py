@@ -10,6 +10,8 @@ import typer
 from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Processes, ScenarioName, Seeds, rows_table
+from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.progress import progress
 
 Controllers = Annotated[
     str,
@@ -38,26 +40,23 @@ def compare(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run several controllers through an experiment, several seeds each: means with 95 % intervals."""
+    """Run ``impact-posture compare``."""
     labels = [text.strip() for text in controllers.split(",") if text.strip()]
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
     from impact_posture.experiment.folders import FORMATS, store_beside, write_comparison
     from impact_posture.experiment.reproduction import reproduce
     from impact_posture.output_folder import check_output
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_line
 
     plan = {scenario: list(dict.fromkeys(labels))}
     folder = None if out is None else Path(out)
     if folder is not None:
         check_output(folder, force=force, kind="comparison")
     store = None if folder is None else store_beside(folder)
-    with progress_line(shown=not (quiet or json)) as progress:
-        found = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=progress)
+    with progress("running", "runs", shown=not (quiet or json)) as advance:
+        found = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance)
         if folder is not None and store is not None:
-            formats = [f.value for f in format or ()] or FORMATS
-            write_comparison(folder, found, plan, store, force=force, formats=formats)
+            write_comparison(folder, found, plan, store, force=force, formats=format or FORMATS)
     if json:
         print_json(found.comparison())
         return

@@ -15,8 +15,8 @@ def loaded() -> None:
     import impact_posture.codegen.export
     import impact_posture.experiment.folders
     import impact_posture.impact.evaluation
-    import impact_posture.job
     import impact_posture.posture.robustness
+    import impact_posture.result_folder
     import impact_posture.robot.robot_summary
     import impact_posture.verification.verification  # noqa: F401
 
