@@ -35,7 +35,7 @@ from impact_posture.posture.problem_settings import (
 )
 from impact_posture.posture.robustness import Robustness, VariantOptimum, solve_robustly
 from impact_posture.posture.solve import solve
-from impact_posture.robot.model_variant import MOST_SCENARIOS, Payload, between, build_model_variants
+from impact_posture.robot.model_variant import MOST_VARIANTS, Payload, between, build_model_variants
 from impact_posture.robot.robot import Robot
 from tests.command import run
 from tests.helpers import (
@@ -113,7 +113,7 @@ def test_which_scenarios_there_are() -> None:
         ("panda", (0.0, 2.0), [], InputError, "above zero"),
         ("panda", (0.5, float("inf")), [], InputError, "range"),
         ("anymal_c", (0.5, 2.0), [], InputError, "no armature"),
-        ("panda", (0.5, 2.0), [("panda_hand", m) for m in (1.0, 2.0, 3.0, 4.0)], InputError, "15 scenarios"),
+        ("panda", (0.5, 2.0), [("panda_hand", m) for m in (1.0, 2.0, 3.0, 4.0)], InputError, "15 model variants"),
     ],
 )
 def test_refusals(
@@ -126,7 +126,7 @@ def test_refusals(
     with pytest.raises(kind) as caught:
         build_model_variants(robot(name), factors, [Payload(*payload) for payload in payloads])
     assert words in caught.value.line and "\n" not in caught.value.line
-    assert MOST_SCENARIOS == 12
+    assert MOST_VARIANTS == 12
 
 
 def test_robots_between_the_scenarios() -> None:
