@@ -15,7 +15,7 @@ help:
 	@echo "make wheel       build sdist and wheel, compare them with git, install, run every command, types"
 	@echo "make test-wheel  the same, then the whole suite against what was installed"
 	@echo "make lowest      the same with the lowest versions that pyproject.toml allows; PYTHON= tries another Python"
-	@echo "make bench       solve times, and the exported kernel beside its peers, on this machine"
+	@echo "make bench       how fast it is on this machine: solve times, ticks, the exported kernel beside its peers"
 	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
 	@echo "make study-robustness  where each controller helps: 40 random variations of each experiment (an hour or two)"
@@ -75,23 +75,20 @@ docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
 	@echo "docs/_build/html/index.html"
 
-bench: $(VENV)/.installed
-	$(BIN)/python -m tests.benchmarks.solve_times
-	$(BIN)/python -m tests.benchmarks.tsid_ticks
-	$(BIN)/python -m tests.benchmarks.extended_times
-	$(BIN)/impact-posture bench
+bench: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks solve loader tsid kernel
 
 study-impacts: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks.impact_bench --write
+	$(BIN)/python -m tests.benchmarks impacts --write
 
 reproduction: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks.reproduction --write
+	$(BIN)/python -m tests.benchmarks reproduction --write
 
 study-robustness: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks.robustness_study --jobs $(JOBS) --write
+	$(BIN)/python -m tests.benchmarks robustness --jobs $(JOBS) --write
 
 calibration: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks.restitution --write
+	$(BIN)/python -m tests.benchmarks restitution --write
 
 regression: $(VENV)/.installed
 	$(BIN)/python -m tests.regression.make

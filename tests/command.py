@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import IO
 
 # What the commands import when they run, once for all of them.
-import impact_posture.benchmark.measure
 import impact_posture.codegen.export
 import impact_posture.experiment.figures
 import impact_posture.experiment.folders

@@ -34,7 +34,7 @@ COMMANDS = [
     ["reproduce --scenario solo8-push --seeds 1 --jobs 1 --format png --out reproduction"],
     ["optimize ur5 --normal 0 0 1 --format png --out result", "plot result --format svg --out pictures"],
     ["robots", "inspect tilthex_arm", "evaluate ur5 --normal 0 0 1", "verify ur5 --samples 2"],
-    ["codegen ur5 --normal 0 0 1 --compile --out exported", "bench ur5 --peers differences,casadi --rounds 1"],
+    ["codegen ur5 --normal 0 0 1 --compile --out exported"],
 ]
 
 

@@ -17,8 +17,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.benchmark.pinocchio import eigen_headers
-from impact_posture.benchmark.workbench import Absent, cxx_compiler
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.errors import CompilerError
@@ -26,7 +24,7 @@ from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.toolchain import run_compiler
 from tests.helpers import Vector, assert_close, central_gradient, frame_placement, robot, unit
-from tests.tools import need_compiler
+from tests.tools import cxx_compiler, eigen_headers, need_compiler
 
 DOCS = Path(__file__).parents[1] / "docs"
 EXAMPLES = DOCS / "examples"
@@ -161,10 +159,9 @@ def test_held_tasks_have_the_jacobian_of_their_error(example: ModuleType) -> Non
 
 def eigen_program(folder: Path, floating: bool) -> Path:
     """The C++ example, built against the export in ``folder``; skips where a compiler or Eigen is missing."""
-    try:
-        compiler, eigen = cxx_compiler(), eigen_headers()
-    except Absent as absent:
-        pytest.skip(str(absent))
+    compiler, eigen = cxx_compiler(), eigen_headers()
+    if compiler is None or eigen is None:
+        pytest.skip("no C++ compiler (g++, clang++, $CXX), or no Eigen headers (cmeel-eigen, $EIGEN3_INCLUDE_DIR)")
     target = folder / "posture_acceleration"
     flags = ["-std=c++17", "-O0", "-Wall", "-Wextra", "-Werror", f"-DFLOATING_BASE={int(floating)}"]
     headers = ["-I", str(folder), "-isystem", str(eigen)]

@@ -1,4 +1,4 @@
-"""The impact bench in short: a few postures a robot, MuJoCo's jump beside the predicted one; and its page."""
+"""The study of impacts in short: a few postures a robot, MuJoCo's jump beside the predicted one; and its page."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 
-from tests.benchmarks.impact.study import CASES, Dropped, needed_friction
+from tests.benchmarks.core import page_of
+from tests.benchmarks.impact.study import STUDIED, Dropped, needed_friction
 from tests.benchmarks.impact.surface import Surface
-from tests.benchmarks.impact_bench import PAGE
 
 DOCS = Path(__file__).parents[1] / "docs"
 FLYING, ARM, STANDING = "tilthex_arm", "panda", "solo12"
@@ -23,8 +23,7 @@ POSTURES = 3
 
 @functools.cache
 def dropped(name: str) -> Dropped:
-    case = next(c for c in CASES if c.robot == name)
-    found = Dropped.prepare(case, POSTURES, seed=0)
+    found = Dropped.prepare(name, POSTURES, seed=0)
     assert len(found.scenes) == POSTURES
     return found
 
@@ -79,11 +78,11 @@ def test_the_sticking_impulse_says_which_postures_slide() -> None:
 
 def test_the_page_says_only_what_the_bench_printed() -> None:
     """Every decimal of the page stands in the generated tables, and the targets it calls met are met there."""
-    tables = PAGE.read_text(encoding="utf-8")
+    tables = page_of("impacts").read_text(encoding="utf-8")
     prose = (DOCS / "objectives.md").read_text(encoding="utf-8")
     printed = set(re.findall(r"\d+\.\d+", tables))
     said = set(re.findall(r"\d+\.\d+", prose))
     assert said
     assert said <= printed, f"not printed by the bench: {sorted(said - printed)}"
     for line in ("`speed`, no friction: rank", "`speed`, no friction: every jump", "`sticking`, sticks: rank"):
-        assert re.search(rf"{re.escape(line)}.*: met by all {len(CASES)}", tables), line
+        assert re.search(rf"{re.escape(line)}.*: met by all {len(STUDIED)}", tables), line

@@ -23,8 +23,8 @@ from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup, SinglePush, set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from tests.benchmarks.core import STUDIES, page_of
 from tests.benchmarks.robustness import outcomes
-from tests.benchmarks.robustness.advice import percent
 from tests.benchmarks.robustness.draws import RANGES, Draw, draw, prepare
 from tests.benchmarks.robustness.outcomes import (
     ATTEMPTS,
@@ -33,14 +33,13 @@ from tests.benchmarks.robustness.outcomes import (
     NotAdmissible,
     Outcome,
     Record,
-    Store,
     configuration,
     controllers,
     play,
 )
+from tests.benchmarks.robustness.page import MARK, page, percent, range_table
 from tests.benchmarks.robustness.statistics import agreement, change, misled, quantile, rank, split, summarize, worst
-from tests.benchmarks.robustness.tables import MARK, page, range_table
-from tests.benchmarks.robustness_study import HEAD, PAGE, study
+from tests.benchmarks.robustness.study import Store, study
 
 DOCS = Path(__file__).parents[1] / "docs"
 AERIAL, STANDING = "aerial-vertical", "solo8-push"
@@ -141,7 +140,7 @@ def test_what_goes_wrong_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     assert change(record, "robust") == math.inf
     assert change(record, "robust-speed") == 0
     assert Record.from_json(record.to_json()) == record
-    text = page({AERIAL: [record]}, 0)
+    text = "\n".join(page({AERIAL: [record]}, 0))
     assert "diverged 1" in text
     assert "nominal diverged: 1" in text
     assert f"- Failed, diverged: `{AERIAL}` number 0" in text
@@ -215,7 +214,7 @@ def test_what_goes_with_success_by_hand() -> None:
     assert bad is records[3]
     # H fell in three; in the first of them the jump rose.
     assert wrong is records[0]
-    text = page({AERIAL: records}, 0)
+    text = "\n".join(page({AERIAL: records}, 0))
     assert f"Worst motion: `{AERIAL}` number 3" in text
     assert f"H fell most and the jump rose: `{AERIAL}` number 0" in text
     assert "motion −50 %, jump +25 %, H 4 → 1" in text
@@ -224,15 +223,15 @@ def test_what_goes_with_success_by_hand() -> None:
 def test_the_advice_follows_the_numbers() -> None:
     good = [made(AERIAL, k, {"robust": (0.9, 1.0), "posture": (0.5, 0.5)}) for k in range(4)]
     poor = [made(AERIAL, k, {"robust": (1.1, 1.0), "posture": "fell"}) for k in range(4)]
-    advice = page({AERIAL: good}, 0).partition(MARK)[0]
+    advice = "\n".join(page({AERIAL: good}, 0)).partition(MARK)[0]
     assert "take `posture`: it moved the robot less than the nominal controller in 4 of 4" in advice
     assert "median −50 %" in advice
-    advice = page({AERIAL: poor}, 0).partition(MARK)[0]
+    advice = "\n".join(page({AERIAL: poor}, 0)).partition(MARK)[0]
     assert "nothing helps reliably" in advice
     assert "take" not in advice
     assert f"**What failed:** `posture` in `{AERIAL}` (fell in 4 of 4)." in advice
     live = [made(STANDING, k, {"robust": (0.7, 1.0), HELD: (0.99, 1.0)}) for k in range(4)]
-    assert f"`{STANDING}` −30 % live, −1 % held: stiffness" in page({STANDING: live}, 0)
+    assert f"`{STANDING}` −30 % live, −1 % held: stiffness" in "\n".join(page({STANDING: live}, 0))
 
 
 def test_an_interrupted_study_goes_on_and_says_the_same(tmp_path: Path) -> None:
@@ -252,10 +251,10 @@ def test_an_interrupted_study_goes_on_and_says_the_same(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         study(scenarios, 3, 0, 1, Store(tmp_path / "parts", 0), run=runner(4))
     said: list[str] = []
-    parts = study(scenarios, 3, 0, 1, Store(tmp_path / "parts", 0), run=runner(9), say=said.append)
+    parts = study(scenarios, 3, 0, 1, Store(tmp_path / "parts", 0), run=runner(9), tell=said.append)
     assert ran == first
     assert len(said) == 2
-    assert page(parts, 0) == page(whole, 0)
+    assert "\n".join(page(parts, 0)) == "\n".join(page(whole, 0))
     # Another seed, and records of a study with other ranges, are other studies.
     assert Store(tmp_path / "parts", 1).get(AERIAL, 0) is None
     [file] = (tmp_path / "parts").rglob(f"{AERIAL}/000.json")
@@ -264,8 +263,8 @@ def test_an_interrupted_study_goes_on_and_says_the_same(tmp_path: Path) -> None:
 
 
 def test_the_page_is_the_studys_and_the_prose_has_no_numbers_of_its_own() -> None:
-    written = PAGE.read_text(encoding="utf-8")
-    assert written.startswith(HEAD)
+    written = page_of("robustness").read_text(encoding="utf-8")
+    assert written.startswith(STUDIES["robustness"].head)
     assert MARK in written
     for line in range_table(list(RANGES)):
         assert line in written, f"make study-robustness: {line}"

@@ -12,7 +12,6 @@ from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.friction import point_cone, surface_cone, to_world
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.qpsolvers_solver import QpsolversSolver
 from impact_posture.tsid.task_formulation import legged_formulation
 from tests.helpers import frame_jacobian, mass_matrix, rng, robot
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, run
@@ -221,6 +220,9 @@ def test_torques_are_those_of_a_dense_program_assembled_apart(name: str, solver:
 @pytest.mark.parametrize("name", ["quadprog", "proxqp"])
 def test_other_solvers_agree_on_our_own_program(name: str) -> None:
     pytest.importorskip("quadprog" if name == "quadprog" else "proxsuite")
+    pytest.importorskip("qpsolvers")
+    from tests.qpsolvers_solver import QpsolversSolver
+
     settings = {} if name == "quadprog" else {"eps_abs": 1e-10, "max_iter": 10000}
     other = QpsolversSolver(name, **settings)
     for robot_name in ("solo8", "talos"):
@@ -323,7 +325,6 @@ def test_motion_of_feet_that_no_force_can_stop_relaxes_and_never_fails() -> None
         lambda: SupportContact(Point("left_sole_link"), normal=(0, 0, 2)),
         lambda: SupportContact(Point("left_sole_link"), weight=-1.0),
         lambda: legged_formulation(robot("panda"), JointPosture(robot("panda"))),
-        lambda: QpsolversSolver("no such solver"),
     ],
 )
 def test_what_makes_no_contact_is_refused(wrong: object) -> None:

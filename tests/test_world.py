@@ -15,11 +15,11 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.actuation import actuation_matrix, hover
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.actuator_command import ActuatorCommand, Push, Truth
-from impact_posture.simulation.restitution import ball
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors, Shape, Surface
 from impact_posture.simulation.world import World, build_world
 from impact_posture.simulation.world_builder import build_scene
 from tests.helpers import NAMES, Vector, assert_close, mass_matrix, random_configurations, rng, robot
+from tests.restitution import ball
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 

@@ -25,11 +25,11 @@ from impact_posture.robot.actuation import hover
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.simulation.actuator_command import ActuatorCommand, Push
-from impact_posture.simulation.restitution import ball, ideal_restitution, measure_restitution
 from impact_posture.simulation.rotors import Vibration
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors, Shape, Surface
 from impact_posture.simulation.world import World, build_world
 from tests.helpers import assert_close, mass_matrix, random_configurations, robot
+from tests.restitution import ball, ideal_restitution, measure_restitution
 
 pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 

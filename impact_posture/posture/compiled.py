@@ -22,7 +22,7 @@ from impact_posture.version import __version__
 
 CompileMode = Literal["auto", "always", "never"]
 
-# From what tests/benchmarks/solve_times.py prints for talos: 170,000 operations take about 20 s to compile, and each
+# From what tests/benchmarks/solve.py prints for talos: 170,000 operations take about 20 s to compile, and each
 # start of some 25 iterations is about 30 ms faster for it.  Orders of magnitude are enough to decide.
 _COMPILE_S_PER_OPERATION = 1.2e-4
 _SAVED_S_PER_OPERATION = 6e-9

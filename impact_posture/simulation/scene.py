@@ -20,8 +20,8 @@ class ContactLaw:
     At distance r (negative: depth) the contact's own acceleration is ``r* = −b r' − k r`` with ``b = 2/(d₁T)`` and
     ``k = d/(d₁Tζ)²`` of ``solref = (T, ζ)``; both negative, they are ``(−k, −b)``.  It gets the share ``d`` of what
     happens, ``r'' = d r* + (1 − d) r''₀`` with the acceleration without contact ``r''₀``.  Of
-    ``solimp = (d₀, d₁, width)`` the share goes from ``d₀`` at depth 0 to ``d₁`` at ``width`` (m).  What restitution a
-    law has is measured (:mod:`impact_posture.simulation.restitution`).
+    ``solimp = (d₀, d₁, width)`` the share goes from ``d₀`` at depth 0 to ``d₁`` at ``width`` (m).  The page on the
+    simulated world has the measured restitution of many laws (``make calibration``).
 
     Attributes:
         solref: T in seconds and damping ratio ζ.

@@ -1,60 +1,43 @@
 """The paper's experiments for the documentation: its controllers over many seeds, every controller over a few.
 
-Run: make reproduction, or
-python -m tests.benchmarks.reproduction [--seeds 10] [--others 2] [--jobs 2] [--write]
-
 Runs that are done are kept in build/reproduction; run it again after an interruption.
 """
 
 from __future__ import annotations
 
-import argparse
 import re
 import shutil
-import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
-from impact_posture.errors import ImpactPostureError
 from impact_posture.experiment.batch import Store
 from impact_posture.experiment.figures import draw_reproduction
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction, controllers_of, jobs_of, reproduce
 from impact_posture.experiment.reproduction_summary import LEGEND, advice, remarks, scenario_table, table_one
+from tests.benchmarks.core import ROOT, Request, say
 
-ROOT = Path(__file__).parents[2]
-PAGE, IMAGES = ROOT / "docs" / "generated" / "reproduction.md", ROOT / "docs" / "images" / "reproduction"
+IMAGES = ROOT / "docs" / "images" / "reproduction"
+# Seeds of all controllers.
+OTHERS = 2
 
 
-def main() -> int:
-    """Run, print, and with ``--write`` leave page and pictures for the documentation."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=10, help="of nominal, robust and the recommended controller")
-    parser.add_argument("--others", type=int, default=2, help="seeds of all controllers")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--write", action="store_true", help="write docs/generated and docs/images")
-    args = parser.parse_args()
-    store, scenarios = Store(ROOT / "build" / "reproduction"), tuple(PAPER)
+def lines(request: Request) -> Iterator[str]:
+    """The page; its pictures are drawn where it is written."""
+    scenarios, store = tuple(s for s in PAPER if request.only in s), Store(ROOT / "build" / "reproduction")
+    shared = {"processes": request.jobs, "store": store, "progress": lambda a, b: say(f"\r{a} of {b} runs", end="")}
     began = time.perf_counter()
-    try:
-        main_rows = reproduce(scenarios, seeds=args.seeds, processes=args.jobs, store=store, progress=_say)
-        took = time.perf_counter() - began
-        every = reproduce(
-            scenarios, seeds=args.others, everything=True, processes=args.jobs, store=store, progress=_say
-        )
-    except ImpactPostureError as error:
-        print(error, file=sys.stderr)
-        return 1
-    page = "\n\n".join(_page(main_rows, every)) + "\n"
-    print(f"\n{page}\nthe first part took {took:.0f} s with {args.jobs} processes, less what was kept")
-    if args.write:
-        PAGE.write_text(f"<!-- Written by `make reproduction`; do not edit. -->\n\n{page}", encoding="utf-8")
+    found = reproduce(scenarios, seeds=request.count, **shared)
+    say(f"\nthe first part took {time.perf_counter() - began:.0f} s, less what was kept")
+    every = reproduce(scenarios, seeds=OTHERS, everything=True, **shared)
+    yield "\n\n".join(_parts(found, every))
+    if request.write:
         first = [job for s in scenarios for job in jobs_of(s, controllers_of(s, False), 1)]
         with tempfile.TemporaryDirectory() as folder:
-            draw_reproduction(main_rows, first, store, Path(folder), ["png"])
+            draw_reproduction(found, first, store, Path(folder), ["png"])
             _take_shown(Path(folder))
-    return 0
 
 
 def _take_shown(folder: Path) -> None:
@@ -66,34 +49,14 @@ def _take_shown(folder: Path) -> None:
         shutil.copy(folder / name, IMAGES / name)
 
 
-def _page(found: Reproduction, every: Reproduction) -> list[str]:
+def _parts(found: Reproduction, every: Reproduction) -> Iterator[str]:
     seeds = ", ".join(str(k) for k in range(found.seeds))
     shown = f"seeds {seeds}; mean ± half of the 95 % confidence interval" if found.seeds > 2 else (
         f"seeds {seeds}; too few for intervals" if found.seeds > 1 else "seed 0 alone: no means, no intervals"
     )  # fmt: skip
-    parts = [
-        "## What to choose",
-        "\n".join(f"- {line}" for line in advice(found, every)),
-        "## Table I of the paper, and ours",
-        f"`q_total_impact`, {shown}.",
-        table_one(found),
-        LEGEND,
-    ]
+    yield from ("## What to choose", "\n".join(f"- {line}" for line in advice(found, every)))
+    yield from ("## Table I of the paper, and ours", f"`q_total_impact`, {shown}.", table_one(found), LEGEND)
+    few = f"means over seeds 0 to {every.seeds - 1}" if every.seeds > 1 else "seed 0"
     for scenario in found.scenarios:
-        few = f"means over seeds 0 to {every.seeds - 1}" if every.seeds > 1 else "seed 0"
-        parts += [
-            f"## {scenario}",
-            scenario_table(found.of(scenario)),
-            f"Every controller, {few}:",
-            scenario_table(every.of(scenario)),
-            " ".join(remarks(every, scenario)),
-        ]
-    return parts
-
-
-def _say(done: int, total: int) -> None:
-    print(f"\r{done} of {total} runs", end="", file=sys.stderr, flush=True)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+        yield from (f"## {scenario}", scenario_table(found.of(scenario)), f"Every controller, {few}:")
+        yield from (scenario_table(every.of(scenario)), " ".join(remarks(every, scenario)))

@@ -7,25 +7,31 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-from impact_posture.dynamics.mjcf import import_mujoco, write_mjcf
+from impact_posture.dynamics.mjcf import Mjcf, import_mujoco, write_mjcf
+from impact_posture.dynamics.mjcf_scene import WORLD, Additions
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
-from tests.benchmarks.impact.world import BALL, with_surface
-
-Vector = NDArray[np.float64]
+from tests.benchmarks.core import Vector
 
 # Steps of physics in one time constant of the contact, and the constants after which a contact counts as endless.
 _FINE, _PATIENCE = 50, 40
-# Rate at which friction and supports take a velocity to zero, over that of the contact.
-_GRIP = 10.0
-# MuJoCo's friction coefficient where nothing shall slide.
-_STICKY = 10.0
+# Rate at which friction and supports stop a velocity, over that of the contact; friction where nothing slides.
+_GRIP, _STICKY = 10.0, 10.0
 # Iterations on Coulomb's law within one step.
 _INNER = 20
 # Steps without a force after which the contact is over.
 _QUIET = 5
+# Radius of the ball at the contact point (any: the ball touches at the point itself); height of the point above the
+# plane (all postures meet it in the same part of a step); meters.
+_BALL, _GAP = 0.01, 1e-6
+# The stiffest constraint that MuJoCo takes, at any depth.
+_SOLIMP = "0.9999 0.9999 0.001"
+_OPTION = {
+    "gravity": "0 0 0", "integrator": "Euler", "cone": "elliptic", "solver": "Newton",
+    "tolerance": "0", "iterations": "200", "ls_iterations": "100", "ls_tolerance": "1e-6",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -33,46 +39,28 @@ class Surface:
     """What the robot meets, and how fast.
 
     The contact is MuJoCo's spring and damper, scaled by the mass that it feels: ``r'' = −2ζ r'/T − r/T²`` while it
-    pushes.
-
-    Attributes:
-        friction: Coulomb coefficient; 0 for none at all, infinite for a contact point that sticks.
-        convex: MuJoCo's own friction also between the two.  It is convex and lifts a sliding contact off the
-            surface, which looks like rebound; therefore Coulomb's law is else written out here.  What sticks is
-            always MuJoCo's own, with a coefficient of 10.
-        speed: Approach speed v_n, m/s.
-        damping: ζ: 2 rebounds with e = 0.05, 0.3 with 0.4, 0.1 with 0.7.
-        time: T in seconds; the contact lasts 1.5 T to 3 T.
+    pushes.  MuJoCo's own friction is convex and lifts a sliding contact off the surface, which looks like rebound:
+    Coulomb's law is written out here unless ``convex``.  What sticks is MuJoCo's own, with a coefficient of 10.
     """
 
-    friction: float = 0.0
-    speed: float = 1.0
-    damping: float = 2.0
-    time: float = 1e-4
+    friction: float = 0.0  # Coulomb coefficient; 0 for none at all, infinite for a contact point that sticks
+    speed: float = 1.0  # approach speed v_n, m/s
+    damping: float = 2.0  # ζ: 2 rebounds with e = 0.05, 0.3 with 0.4, 0.1 with 0.7
+    time: float = 1e-4  # T, s; the contact lasts 1.5 T to 3 T
     convex: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """One impact as it happened.
+    """One impact as it happened."""
 
-    Attributes:
-        jump: ``Δν`` in Pinocchio's coordinates, shape (nv,).
-        restitution: Normal speed after over before.
-        slip: Tangential speed of the contact point after over ``v_n`` (it is 0 before).
-        impulse: What the surface gave along n, N·s.
-        loss: Kinetic energy lost, J.
-        duration: Seconds from touch to the last force.
-        feet: Largest speed of a support after, over ``v_n``.
-    """
-
-    jump: Vector
-    restitution: float
-    slip: float
-    impulse: float
-    loss: float
-    duration: float
-    feet: float
+    jump: Vector  # Δν in Pinocchio's coordinates, shape (nv,)
+    restitution: float  # normal speed after over before
+    slip: float  # tangential speed of the contact point after over v_n (it is 0 before)
+    impulse: float  # what the surface gave along n, N s
+    loss: float  # kinetic energy lost, J
+    duration: float  # from touch to the last force, s
+    feet: float  # largest speed of a support after, over v_n
 
     @property
     def size(self) -> float:
@@ -104,7 +92,7 @@ class Scene:
         self._point, self._feet = oracle.point, oracle.feet
         written = write_mjcf(self._robot.model)
         self._layout = written.layout
-        self._model = with_surface(written, objective, q).compile()
+        self._model = _with_surface(written, objective, q).compile()
         self._ball_body = int(self._model.geom("ball").bodyid[0])
         self.approach = self._approach()
 
@@ -167,7 +155,7 @@ class Scene:
         self._mujoco.mj_forward(self._model, data)
         step, center, n = self._model.opt.timestep, data.geom("ball").xpos, self._n
         J = np.zeros((3, self._model.nv))
-        self._mujoco.mj_jac(self._model, data, J, None, center - BALL * n, self._ball_body)
+        self._mujoco.mj_jac(self._model, data, J, None, center - _BALL * n, self._ball_body)
         sliding, pushed = J @ (data.qvel + step * data.qacc), self._normal_force(data)
         sliding -= (n @ sliding) * n
         across = self._mobility @ n
@@ -206,3 +194,28 @@ class Scene:
             duration=duration,
             feet=float(max(feet, default=0.0)) / speed,
         )
+
+
+def _with_surface(written: Mjcf, objective: ImpactObjective, q: Vector) -> Mjcf:
+    """Add a ball at the contact point, the plane below it, and a tie to the world for each support, at ``q``."""
+    robot, oracle = objective.robot, objective.oracle.at(q)
+    numeric, n = Numeric(robot.model).at(q), oracle.n.copy()
+    added = Additions(written)
+    added.option(**_OPTION)
+    added.flag(limit="disable")
+
+    contact = point_on(robot, objective.contact.frame, objective.contact.offset)
+    position = numeric.placement(contact).translation
+    # The ball's lowest point is the contact point.
+    center = numeric.data.oMi[contact.joint].actInv(position + _BALL * n)
+    added.shape(contact.joint, "ball", "sphere", (_BALL,), pin.SE3(np.eye(3), center))
+    added.plane("surface", position - _GAP * n, n)
+    added.pair("surface", "ball", solimp=_SOLIMP, condim="1")
+
+    for k, support in enumerate(objective.supports):
+        foot = point_on(robot, support.frame, support.offset)
+        added.site(foot.joint, f"tie_{k}", pin.SE3(foot.rotation, foot.position))
+        added.site(WORLD, f"ground_{k}", numeric.placement(foot))
+        kind = "connect" if support.kind == "point" else "weld"
+        added.tie(kind, f"tie_{k}", f"ground_{k}", solimp=_SOLIMP)
+    return added.model()

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.posture.build_problem import build_problem
@@ -29,8 +28,7 @@ from impact_posture.simulation.scenario import (
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
 from impact_posture.simulation.world import build_world
-
-Array = NDArray[np.float64]
+from tests.benchmarks.core import Vector
 
 # To bound the time, the same for every draw and less than in the scenarios' files: contacts, seconds behind the
 # surface and between contacts; seconds for which a push waits for a robot that does not come to rest.
@@ -46,15 +44,7 @@ _BASE = 0.2
 
 @dataclass(frozen=True)
 class Range:
-    """What a draw chooses.
-
-    Attributes:
-        name: Key of the value.
-        low: Least.
-        high: Largest.
-        words: What it is, with its unit.
-        scale: ``linear``, ``log``, or ``sign`` (one of the two ends).
-    """
+    """What a draw chooses, from low to high: ``linear``, ``log``, or ``sign`` (one of the two ends)."""
 
     name: str
     low: float
@@ -126,15 +116,7 @@ _URDF_X, _URDF_Z = 0.08, -0.06
 
 @dataclass(frozen=True)
 class Draw:
-    """Of one configuration.
-
-    Attributes:
-        scenario: Varied.
-        number: Of the configuration.
-        attempt: How many draws before it were not admissible.
-        seed: Of the study.
-        values: What was chosen, by the ranges' names.
-    """
+    """Values of one configuration by the names of the ranges, after ``attempt`` draws that were not admissible."""
 
     scenario: str
     number: int
@@ -183,12 +165,8 @@ def _robust(control: Control, factor: float) -> Control:
 
 def _contacts(scenario: Scenario, task: RepeatedContacts, v: Mapping[str, float]) -> Scenario:
     tilt, roll = math.radians(v["tilt"]), math.radians(v["roll"])
-    if "elbow" in v:
-        elbow = v["fold"] * v["elbow"]
-        shoulder = tilt - elbow
-    else:
-        shoulder = v["shoulder"]
-        elbow = tilt - math.pi / 2 - shoulder
+    elbow = v["fold"] * v["elbow"] if "elbow" in v else tilt - math.pi / 2 - v["shoulder"]
+    shoulder = v.get("shoulder", tilt - elbow)
     return replace(
         scenario,
         joints={"shoulder_roll": roll, "shoulder_pitch": shoulder, "elbow_pitch": elbow},
@@ -202,15 +180,11 @@ def _push(scenario: Scenario, task: SinglePush, v: Mapping[str, float]) -> Scena
     control, (x, y, z), stiffer = scenario.control, task.force, v["stiffness"]
     footing = replace(control.footing or StanceGains(), friction=_TRUST * v["friction"])
     surfaces = tuple(replace(s, law=replace(s.law, friction=v["friction"])) for s in scenario.scene.surfaces)
+    force = (v["force"] * x, v["force"] * y, v["force"] * z)
     return replace(
         scenario,
         scene=replace(scenario.scene, surfaces=surfaces),
-        task=replace(
-            task,
-            force=(v["force"] * x, v["force"] * y, v["force"] * z),
-            signs=(int(v["sign"]),),
-            patience=PATIENCE,
-        ),
+        task=replace(task, force=force, signs=(int(v["sign"]),), patience=PATIENCE),
         control=replace(
             _robust(control, v["gain"]),
             footing=footing,
@@ -228,16 +202,13 @@ def _stiffer(gains: Gains, factor: float) -> Gains:
     return replace(gains, kp=factor * gains.kp)
 
 
-def _start(setup: Setup, chosen: Draw) -> Array:
+def _start(setup: Setup, chosen: Draw) -> Vector:
     """The scenario's posture, stirred and put back on its feet."""
     robot = setup.robot
     rng = _generator(chosen.scenario, chosen.number, chosen.attempt, chosen.seed, what=1)
+    hold = tuple(j for j in robot.spec.constraints.hold if j not in robot.locked)
     requirements = Requirements(
-        contact_pose="free",
-        hold=tuple(j for j in robot.spec.constraints.hold if j not in robot.locked),
-        com_over_feet=True,
-        com_margin=_COM_MARGIN,
-        com_asked=False,
+        contact_pose="free", hold=hold, com_over_feet=True, com_margin=_COM_MARGIN, com_asked=False
     )
     problem = build_problem(robot, scenario_objective(setup), setup.q, requirements)
     step = chosen.values["stir"] * rng.normal(size=robot.nv)

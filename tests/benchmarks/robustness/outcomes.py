@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -43,34 +41,19 @@ _RUNS = Callable[[ControllerFactory, str], tuple[Run, ...]]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one controller in one configuration.
+    """Of one controller in one configuration."""
 
-    Attributes:
-        failure: What went wrong; empty: nothing.
-        metrics: As :class:`~impact_posture.simulation.metrics.Metrics`; empty where there are none.
-        H: Before the impacts, mean.
-        V: The same.
-        offset: Of the center of mass from the line of the first impact, m.
-    """
-
-    failure: str = ""
-    metrics: Mapping[str, float] = field(default_factory=dict)
+    failure: str = ""  # what went wrong; empty: nothing
+    metrics: Mapping[str, float] = field(default_factory=dict)  # as simulation.metrics.Metrics; empty: there are none
     stops: tuple[str, ...] = ()
-    H: float | None = None
-    V: float | None = None
-    offset: float | None = None
+    H: float | None = None  # before the impacts, mean
+    V: float | None = None  # the same
+    offset: float | None = None  # of the center of mass from the line of the first impact, m
 
 
 @dataclass(frozen=True)
 class Record:
-    """Of one configuration.
-
-    Attributes:
-        draw: What was drawn.
-        rejected: Why each draw before it was not admissible.
-        q: Start posture.
-        outcomes: By controller.
-    """
+    """Of one configuration: the draw, why each before it was rejected, the start, and outcomes by controller."""
 
     draw: Draw
     rejected: tuple[str, ...]
@@ -192,31 +175,3 @@ def _offset(factory: ControllerFactory, found: Run) -> float | None:
     arm = np.array(pin.centerOfMass(robot.model, robot.model.createData(), q)) - place
     n = factory.setup.scenario.normal
     return float(np.linalg.norm(arm - n * (n @ arm)))
-
-
-class Store:
-    """Finished configurations, a file each: an interrupted study goes on where it was.
-
-    Args:
-        folder: Where they lie; made when the first is kept.
-        seed: Of the study.
-    """
-
-    def __init__(self, folder: Path, seed: int) -> None:
-        self._folder, self._seed = folder, seed
-
-    def _file(self, scenario: str, number: int) -> Path:
-        return self._folder / f"seed-{self._seed}" / scenario / f"{number:03d}.json"
-
-    def get(self, scenario: str, number: int) -> Record | None:
-        """What was kept of a configuration, if it still holds."""
-        file = self._file(scenario, number)
-        return Record.from_json(file.read_text(encoding="utf-8")) if file.is_file() else None
-
-    def keep(self, record: Record) -> None:
-        """Write it down, whole or not at all."""
-        file = self._file(record.draw.scenario, record.draw.number)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        beside = file.with_suffix(f".{os.getpid()}")
-        beside.write_text(record.to_json() + "\n", encoding="utf-8")
-        beside.replace(file)

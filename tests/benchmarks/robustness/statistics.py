@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import rankdata
+from scipy.stats import spearmanr
 
-from tests.benchmarks.robustness.outcomes import NOMINAL, Outcome, Record
+from tests.benchmarks.robustness.outcomes import NOMINAL, Record
 
 
 @dataclass(frozen=True)
@@ -19,31 +19,18 @@ class Summary:
 
     A controller that failed (raised, missed a contact, fell …) helped in nothing; in medians and quartiles it counts
     as worse than any that did not.
-
-    Attributes:
-        controller: Which.
-        count: Configurations.
-        helps: With less motion in the impact windows (``q_total_impact``) than nominal.
-        gentler: With a lower peak jump.
-        both: With both.
-        freer: Seconds at a control limit in the impact windows no more than nominal.
-        stops: With a joint on a position limit in the windows that was not there at the start.
-        quartiles: Of the relative change of the motion: lower quartile, median, upper quartile; ``inf``: failed.
-        jump: Median relative change of the peak jump.
-        saturation: Seconds at a limit, all configurations that did not fail: in the impact windows, and else.
-        failures: How many of each kind.
     """
 
     controller: str
     count: int
-    helps: int
-    gentler: int
+    helps: int  # with less motion in the impact windows (q_total_impact) than nominal
+    gentler: int  # with a lower peak jump
     both: int
-    freer: int
-    stops: int
-    quartiles: tuple[float, float, float]
-    jump: float
-    saturation: tuple[float, float]
+    freer: int  # with no more seconds at a control limit in the impact windows than nominal
+    stops: int  # with a joint on a position limit in the windows that was not there at the start
+    quartiles: tuple[float, ...]  # of the relative change of the motion: lower, median, upper; inf: failed
+    jump: float  # median relative change of the peak jump
+    saturation: tuple[float, ...]  # seconds at a limit of those that did not fail: in the windows, and else
     failures: Mapping[str, int]
 
 
@@ -58,33 +45,23 @@ def change(record: Record, controller: str, metric: str = "q_total_impact") -> f
 
 def summarize(records: Sequence[Record], controller: str) -> Summary:
     """Count and rank."""
-    outcomes = [record.outcomes[controller] for record in records]
-    fine = [o for o in outcomes if not o.failure]
-    motion = [change(record, controller) for record in records]
-    jumps = [change(record, controller, "peak_jump") for record in records]
-    freer = [
-        not r.outcomes[controller].failure
-        and r.outcomes[controller].metrics["saturation_inside"] <= r.outcomes[NOMINAL].metrics["saturation_inside"]
-        for r in records
-    ]
+    fine = [record for record in records if not record.outcomes[controller].failure]
+    motion, jumps = ([change(r, controller, metric) for r in records] for metric in ("q_total_impact", "peak_jump"))
+    inside = [[r.outcomes[c].metrics["saturation_inside"] for r in fine] for c in (controller, NOMINAL)]
+    outside = [r.outcomes[controller].metrics["saturation_outside"] for r in fine]
     return Summary(
         controller,
         len(records),
         helps=sum(m < 0 for m in motion),
         gentler=sum(j < 0 for j in jumps),
         both=sum(m < 0 and j < 0 for m, j in zip(motion, jumps, strict=True)),
-        freer=sum(freer),
-        stops=sum(bool(o.stops) for o in fine),
-        quartiles=(quantile(motion, 0.25), quantile(motion, 0.5), quantile(motion, 0.75)),
+        freer=sum(own <= nominal for own, nominal in zip(*inside, strict=True)),
+        stops=sum(bool(r.outcomes[controller].stops) for r in fine),
+        quartiles=tuple(quantile(motion, p) for p in (0.25, 0.5, 0.75)),
         jump=quantile(jumps, 0.5),
-        saturation=_sums(fine),
-        failures=Counter(o.failure for o in outcomes if o.failure),
+        saturation=(sum(inside[0]), sum(outside)),
+        failures=Counter(failure for r in records if (failure := r.outcomes[controller].failure)),
     )
-
-
-def _sums(fine: Sequence[Outcome]) -> tuple[float, float]:
-    inside, outside = (sum(o.metrics[f"saturation_{key}"] for o in fine) for key in ("inside", "outside"))
-    return inside, outside
 
 
 def quantile(values: Sequence[float], p: float) -> float:
@@ -109,11 +86,9 @@ class Split:
 
 def split(records: Sequence[Record], controller: str, choose: Callable[[Record], bool]) -> tuple[Split, Split]:
     """Those that are chosen, and the others."""
-    parts = []
-    for wanted in (True, False):
-        motion = [change(r, controller) for r in records if choose(r) is wanted]
-        parts.append(Split(len(motion), sum(m < 0 for m in motion), quantile(motion, 0.5) if motion else math.nan))
-    return parts[0], parts[1]
+    parts = [[change(r, controller) for r in records if choose(r) is wanted] for wanted in (True, False)]
+    chosen, others = (Split(len(m), sum(x < 0 for x in m), quantile(m, 0.5) if m else math.nan) for m in parts)
+    return chosen, others
 
 
 def fall(record: Record, controller: str, name: str) -> float | None:
@@ -138,10 +113,10 @@ def agreement(records: Sequence[Record], names: Sequence[str], of: str, metric: 
 def rank(records: Sequence[Record], controller: str, of: Callable[[Record], float | None]) -> float:
     """Spearman's correlation of a number with the *reduction* of the motion, among those that did not fail."""
     pairs = [(of(r), -change(r, controller)) for r in records if not r.outcomes[controller].failure]
-    known = np.array([(a, b) for a, b in pairs if a is not None], dtype=float).reshape(-1, 2)
+    known = np.array([pair for pair in pairs if pair[0] is not None], dtype=float).reshape(-1, 2)
     if len(known) < 3 or np.ptp(known, axis=0).min() == 0:
         return math.nan
-    return float(np.corrcoef(rankdata(known[:, 0]), rankdata(known[:, 1]))[0, 1])
+    return float(spearmanr(known).statistic)
 
 
 def worst(records: Sequence[Record], controller: str) -> Record | None:
@@ -152,12 +127,7 @@ def worst(records: Sequence[Record], controller: str) -> Record | None:
 
 def misled(records: Sequence[Record], controller: str) -> Record | None:
     """Where H fell most though the jump rose."""
-    risen = [
-        (fallen, r)
-        for r in records
-        if not r.outcomes[controller].failure
-        and change(r, controller, "peak_jump") > 0
-        and (fallen := fall(r, controller, "H")) is not None
-        and fallen > 0
-    ]
-    return max(risen, key=lambda pair: pair[0])[1] if risen else None
+    fine = [r for r in records if not r.outcomes[controller].failure and change(r, controller, "peak_jump") > 0]
+    fallen = {k: fall(r, controller, "H") or 0.0 for k, r in enumerate(fine)}
+    most = max(fallen, key=lambda k: fallen[k], default=None)
+    return None if most is None or fallen[most] <= 0 else fine[most]

@@ -20,7 +20,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.benchmark.count import Operations
 from impact_posture.robot.robot import Robot
 
 Pattern = NDArray[np.bool_]
@@ -29,19 +28,17 @@ _TINY = 1e-9
 
 
 class _Count:
-    """Running totals, and the steps that add to them; patterns go in and come out."""
+    """A running total, and the steps that add to it; patterns go in and come out."""
 
-    def __init__(self) -> None:
-        self.mul = self.add = self.div = self.trig = 0
+    total = 0
 
-    def ops(self, mul: int, add: int) -> None:
-        self.mul += mul
-        self.add += add
+    def ops(self, *counts: int) -> None:
+        self.total += sum(counts)
 
     def plus(self, x: Pattern, y: Pattern) -> Pattern:
         """Sum of two arrays; of symmetric matrices one triangle."""
         both = x & y
-        self.add += int(np.triu(both).sum() if both.ndim == 2 else both.sum())
+        self.ops(int(np.triu(both).sum() if both.ndim == 2 else both.sum()))
         return x | y
 
     def times(self, x: Pattern, y: Pattern, triangle: bool = False) -> Pattern:
@@ -70,9 +67,6 @@ class _Count:
         M[:, k] = self.turn(M[:, k], axis)
         M[k, :] = M[:, k] if symmetric else self.turn(M[k, :], axis)
         return M
-
-    def total(self) -> Operations:
-        return Operations(self.add, self.mul, self.div, self.trig)
 
 
 class _Joint:
@@ -130,7 +124,7 @@ class _Joint:
         else:
             A, B, D = (count.turn_matrix(M, 0, s) | M.any() for M, s in ((A, True), (B, False), (D, True)))
         moved = count.times(A, self.cross)
-        count.add += int((B & moved).sum())
+        count.ops(int((B & moved).sum()))
         shifted = B | moved
         first = count.times(self.cross, B, triangle=True)
         second = count.times(self.cross, shifted, triangle=True)
@@ -138,7 +132,7 @@ class _Joint:
         return np.block([[A, shifted], [shifted.T, D]])
 
 
-def floor(robot: Robot, contact: int) -> Operations:
+def floor(robot: Robot, contact: int) -> int:
     """Operations of H and ∇H of one robot with the contact on joint ``contact``'s link.
 
     Every joint has one degree of freedom, but for a free-flyer at the root.
@@ -150,29 +144,26 @@ def floor(robot: Robot, contact: int) -> Operations:
     while model.parents[min(chain)]:
         chain.add(int(model.parents[min(chain)]))
     reduced = _factorize(count, model, joints)
-    count.trig += 2 * sum(j.revolute for j in joints.values())
+    count.ops(2 * sum(j.revolute for j in joints.values()))
     for _ in based:
-        count.ops(15 + 50 + 2 * 36 + 3, 15 + 35 + 2 * 30)
-        count.div += 6
+        count.ops(15 + 50 + 2 * 36 + 3, 15 + 35 + 2 * 30, 6)
     passed = [_inward(count, joints, chain & set(joints), {contact}), _inward(count, joints, set(joints), set())]
     for forces in passed:
         before = _outward(count, model, joints, based)
         for i, joint in joints.items():
             if not joint.parent:
                 continue
-            rows = [r for r in range(6) if r != joint.row and (joint.revolute or r > 2)]
-            rows = [r for r in rows if r % 3 != joint.axis]
+            rows = [r for r in range(6) if r % 3 != joint.axis and (joint.revolute or r > 2)]
             f = count.times(reduced[i][rows], before[i][:, None])[:, 0]
             count.plus(f, forces.get(i, np.zeros(6, dtype=bool))[rows])
-            terms = int(sum(before[i][r] for r in rows))
-            count.ops(terms, terms)
+            count.ops(2 * int(sum(before[i][r] for r in rows)))
     # The normal outward along the chain and the turning couple inward, its row added; scale; H; the contact's arms.
     for i in sorted(chain & set(joints)):
         for inward in (False, True):
             joints[i].vector(count, np.ones(3, dtype=bool), inward)
-        count.ops(0, 1)
+        count.ops(1)
     count.ops(18 + 2 * model.nv, 12 + model.nv - 1)
-    return count.total()
+    return count.total
 
 
 def _factorize(count: _Count, model: pin.Model, joints: dict[int, _Joint]) -> dict[int, Pattern]:
@@ -181,17 +172,16 @@ def _factorize(count: _Count, model: pin.Model, joints: dict[int, _Joint]) -> di
     for i in sorted(joints, reverse=True):
         joint, body = joints[i], articulated[i]
         U = body[:, joint.row].copy()
-        count.ops(0, int(joint.armed))
-        count.div += 1
+        count.ops(int(joint.armed), 1)
         if not joint.parent:
             continue
         U[joint.row] = joint.armed
-        count.ops(int(U.sum()), 0)
+        count.ops(int(U.sum()))
         rest = body.copy()
         if not joint.armed:
             rest[joint.row, :] = rest[:, joint.row] = False
         update = np.outer(U, U)
-        count.ops(int(np.triu(update).sum()), 0)
+        count.ops(int(np.triu(update).sum()))
         reduced[i] = count.plus(rest, update)
         articulated[joint.parent] = count.plus(articulated[joint.parent], joint.inertia(count, reduced[i]))
     return reduced
@@ -209,13 +199,13 @@ def _inward(count: _Count, joints: dict[int, _Joint], active: set[int], loaded: 
         if not joint.parent:
             continue
         drive = np.arange(6) != joint.row if not joint.armed else np.ones(6, dtype=bool)
-        count.ops(int(drive.sum()), 0)
+        count.ops(int(drive.sum()))
         passed[i] = count.plus(bias[i], drive)
         moved = joint.force(count, passed[i])
         if joint.parent in joints:
             bias[joint.parent] = count.plus(bias[joint.parent], moved)
         else:
-            count.ops(0, 6)
+            count.ops(6)
     return passed
 
 
@@ -227,8 +217,6 @@ def _outward(count: _Count, model: pin.Model, joints: dict[int, _Joint], based: 
         moved = joint.motion(count, after[joint.parent]) if joint.parent else np.zeros(6, dtype=bool)
         if joint.parent:
             before[i] = moved
-            terms = int(moved.sum())
-            count.ops(terms, terms)  # rate − gain v⁻
-        own = np.arange(6) == joint.row
-        after[i] = count.plus(moved, own)
+            count.ops(2 * int(moved.sum()))  # rate − gain v⁻
+        after[i] = count.plus(moved, np.arange(6) == joint.row)
     return before

@@ -1,12 +1,9 @@
-"""What a compliance of the feet changes, and how many digits double precision keeps: against sixty digits.
-
-Run: python -m tests.benchmarks.support_digits [--write]
-"""
+"""What a compliance of the feet changes, and how many digits double precision keeps: against sixty digits."""
 
 from __future__ import annotations
 
-import argparse
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,65 +13,47 @@ from impact_posture.codegen.export import export
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot_loader import load_robot
+from tests.benchmarks.cases import CASES, Case
+from tests.benchmarks.core import Request, table
 from tests.exact import Exact, ExactImpact, digits, distance
 from tests.exact_bounds import Bounded
 from tests.helpers import random_configurations
 
-PAGE = Path(__file__).parents[2] / "docs" / "generated" / "digits.md"
-CASES = [
-    ("solo8", (1.0, 0.0, 0.0)),
-    ("solo8", (0.0, 1.0, 0.0)),
-    ("solo12", (1.0, 0.0, 0.0)),
-    ("bolt", (1.0, 0.0, 0.0)),
-    ("talos", (1.0, 0.0, 0.0)),
-]
+_CASES = ("solo8, four feet", "solo8, aside", "solo12", "bolt", "talos, two feet")
 COMPLIANCES = (1e-4, 1e-6, 1e-9)
-POSTURES = 3
 # Its bias is beyond doubles, and the rounding of J_s holds nothing at it.
 _RIGID = 1e-14
+_HEAD = "robot|n|rank of $J_s$|ε m|bound|$H$ moved|oracle: H|∇H|f|kernel: H|∇H|C: H|∇H".split("|")
 
 
-def main() -> None:
-    """Print the table; with ``--write`` renew the page."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--write", action="store_true", help=f"write {PAGE.name} of the documentation")
-    asked = parser.parse_args()
+def lines(request: Request) -> Iterator[str]:
+    """A row a case and compliance."""
+    yield (
+        f"The least digits over the default and {request.count} random postures; in brackets what backward error "
+        "analysis\npromises. $H$ moved: by the compliance, at most, against feet held exactly; before it the bound\n"
+        "$\\varepsilon/(\\sigma+\\varepsilon)$ on the share of what the feet do."
+    )
+    yield ""
+    wanted = [CASES[name] for name in _CASES if request.only in name]
     with digits():
-        page = "\n".join(_lines())
-    print(page)
-    if asked.write:
-        head = "<!-- Written by `python -m tests.benchmarks.support_digits --write`; do not edit. -->"
-        PAGE.write_text(f"{head}\n\n{page}\n", encoding="utf-8")
+        yield from table(_HEAD, (_row(case, share, request.count) for case in wanted for share in COMPLIANCES))
 
 
-def _lines() -> list[str]:
-    found = [
-        f"The least digits over the default and {POSTURES} random postures; in brackets what backward error analysis",
-        "promises. $H$ moved: by the compliance, at most, against feet held exactly; before it the bound",
-        "$\\varepsilon/(\\sigma+\\varepsilon)$ on the share of what the feet do.",
-        "",
-        "| robot | n | rank of $J_s$ | ε m | bound | $H$ moved | oracle: H | ∇H | f | kernel: H | ∇H | C: H | ∇H |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, normal in CASES:
-        for share in COMPLIANCES:
-            found.append(_row(name, normal, share))
-    return found
-
-
-def _row(name: str, normal: tuple[float, float, float], share: float) -> str:
-    robot = load_robot(name)
+def _row(case: Case, share: float, postures: int) -> list[str]:
+    robot, normal = load_robot(case.robot), case.normal or (0.0, 0.0, 1.0)
     supports = tuple(Support.from_spec(s) for s in robot.spec.supports)
     contact = ImpactContact(robot.spec.contact.frame or "", normal)
     objective = ImpactObjective(robot, contact, supports=supports, compliance=share / robot.mass)
-    kernel = objective.metric_fun()
+    kernel, oracle = objective.metric_fun(), objective.oracle
     kept: dict[str, list[tuple[float, float]]] = {}
     moved, bound, ranks = 0.0, 0.0, set()
     with tempfile.TemporaryDirectory() as folder:
         export(objective, Path(folder), prefix="feet", check=False)
         with compiled(Path(folder), "feet", robot.nq, robot.nv) as library:
-            for q in [robot.posture(), *random_configurations(robot.model, POSTURES, name, "digits", spread=0.5)]:
-                oracle = objective.oracle
+            for q in [
+                robot.posture(),
+                *random_configurations(robot.model, postures, robot.name, "digits", spread=0.5),
+            ]:
                 own, gradient = oracle.quantities(q), oracle.gradient_H(q)
                 x = Bounded(oracle.at(q), objective.compliance)
                 rigid = ExactImpact(oracle, _RIGID / robot.mass)
@@ -83,7 +62,6 @@ def _row(name: str, normal: tuple[float, float, float], share: float) -> str:
                 ranks.add(int(np.linalg.matrix_rank(oracle.Js, tol=1e-9)))
                 H, dH = (np.array(v).ravel() for v in kernel(q, oracle.n))
                 _, C_H, C_dH = library.eval(q, np.array(oracle.n))
-                least = 1e-3 * float(x.H)
                 for key, value, expected, promised in (
                     ("oracle H", own.H, np.array([x.H]), x.H_by_elimination),
                     ("oracle ∇H", gradient, x.grad_H, x.gradient_by_elimination),
@@ -93,11 +71,10 @@ def _row(name: str, normal: tuple[float, float, float], share: float) -> str:
                     ("C H", C_H, np.array([x.H]), x.H_by_heavy_feet),
                     ("C ∇H", C_dH, x.grad_H, x.gradient_by_heavy_feet),
                 ):
-                    kept.setdefault(key, []).append(_digits(value, expected, promised, least))
-    words = [f"{min(own for own, _ in pairs):.0f} ({min(b for _, b in pairs):.0f})" for pairs in kept.values()]
-    n = " ".join(f"{v:g}" for v in normal)
+                    kept.setdefault(key, []).append(_digits(value, expected, promised, 1e-3 * float(x.H)))
     rank = "–".join(str(r) for r in sorted({min(ranks), max(ranks)}))
-    return f"| {name} | {n} | {rank} | {share:.0e} | {bound:.1e} | {moved:.1e} | {' | '.join(words)} |"
+    cells = [robot.name, " ".join(f"{v:g}" for v in normal), rank, f"{share:.0e}", f"{bound:.1e}", f"{moved:.1e}"]
+    return cells + [f"{min(own for own, _ in pairs):.0f} ({min(b for _, b in pairs):.0f})" for pairs in kept.values()]
 
 
 def _digits(found: object, expected: Exact, promised: object, least: float) -> tuple[float, float]:
@@ -105,7 +82,3 @@ def _digits(found: object, expected: Exact, promised: object, least: float) -> t
     scale = max(float(np.max(np.abs(np.asarray(expected, dtype=float)))), least)
     worst = float(np.max(distance(found, expected))) / scale
     return -np.log10(max(worst, 1e-16)), -np.log10(float(np.max(np.asarray(promised))) / scale)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,8 +1,7 @@
-"""What rebound a contact law has, measured: a ball falls on it in the very world that robots are simulated in."""
+"""Measure the rebound of a contact law: a ball hits it in the very world that robots are simulated in."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,14 +80,8 @@ def measure_restitution(
         InputError: The ball does not come off, or the law does not fit the time step.
     """
     found = [_one(law, speed, timestep, mass, phase) for phase in _PHASES]
-    restitutions = [b.restitution for b in found]
-    return Bounce(
-        restitution=float(np.mean(restitutions)),
-        spread=float(np.ptp(restitutions)),
-        duration=_mean(found, "duration"),
-        depth=_mean(found, "depth"),
-        peak=_mean(found, "peak"),
-    )
+    mean = {key: float(np.mean([getattr(bounce, key) for bounce in found])) for key in Bounce.__annotations__}
+    return Bounce(**{**mean, "spread": float(np.ptp([bounce.restitution for bounce in found]))})
 
 
 def _one(law: ContactLaw, speed: float, timestep: float, mass: float, phase: float) -> Bounce:
@@ -123,7 +116,3 @@ def _follow(world: World, surface: Surface, speed: float) -> Bounce:
     duration, impulse = (pushed[-1] - pushed[0] + 1) * world.timestep, sum(forces) * world.timestep
     after = float(world.truth().v[2])
     return Bounce(after / speed, 0.0, duration, depth, max(forces) * duration / impulse)
-
-
-def _mean(found: Sequence[Bounce], name: str) -> float:
-    return float(np.mean([getattr(bounce, name) for bounce in found]))

@@ -1,0 +1,150 @@
+"""What all benchmarks share: the list of studies, the machine, clocks, starts, tables."""
+
+from __future__ import annotations
+
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.starts import feasible_start
+from impact_posture.toolchain import find_compiler
+from tests.benchmarks.build import compiler_version, processor
+
+Vector = NDArray[np.float64]
+
+ROOT = Path(__file__).parents[2]
+CRBA_CALLS = 2000
+
+
+@dataclass(frozen=True)
+class Study:
+    """A generator ``lines(request)`` of a module here, or another one by ``module:name``."""
+
+    name: str
+    source: str
+    about: str
+    count: int = 1
+    page: bool = True
+    target: str = ""  # of make, which writes its page
+
+    def lines(self, request: Request) -> Iterator[str]:
+        """Lines of its page, or of what it prints."""
+        module, _, function = self.source.partition(":")
+        return getattr(import_module(f"tests.benchmarks.{module}"), function or "lines")(request)
+
+    @property
+    def head(self) -> str:
+        """First line of its page."""
+        command = f"make {self.target}" if self.target else f"python -m tests.benchmarks {self.name} --write"
+        return f"<!-- Written by `{command}`; do not edit. -->"
+
+
+STUDIES = {
+    study.name: study
+    for study in (
+        Study("solve", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
+        Study("optima", "solve:optima", "whether 16 starts find what many starts find", 500, page=False),
+        Study("formulations", "formulations", "the linear solve inside the program or its objective", 12, page=False),
+        Study("kernel", "kernel.times", "H and ∇H beside Pinocchio C++, ADAM and CasADi; passes", 101),
+        Study("loader", "exported:loader", "a call of exported code from Python; passes", 100, page=False),
+        Study("tsid", "tsid", "a tick of the online controllers; ticks", 2000),
+        Study("digits", "digits", "the digits that double precision keeps with feet; random postures", 3),
+        Study("restitution", "restitution", "rebound of each contact law", target="calibration"),
+        Study("impacts", "impact.page", "objectives against impacts in MuJoCo; postures", 30, target="study-impacts"),
+        Study("robustness", "robustness.study", "where each controller helps; draws", 40, target="study-robustness"),
+        Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks of a study; ``missed`` takes the goals that it misses."""
+
+    only: str = ""
+    count: int = 1
+    seed: int = 0
+    number: int | None = None
+    jobs: int = 1
+    write: bool = False
+    missed: list[str] = field(default_factory=list)
+
+
+def page_of(name: str) -> Path:
+    """The page of a study in the documentation."""
+    return ROOT / "docs" / "generated" / f"{name}.md"
+
+
+def say(words: str, end: str = "\n") -> None:
+    """Tell the progress, beside the page."""
+    print(words, end=end, file=sys.stderr, flush=True)
+
+
+def table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> Iterator[str]:
+    """Lines of a Markdown table, each as soon as its row is there."""
+    yield f"| {' | '.join(head)} |"
+    yield "|" + "---|" * len(head)
+    yield from (f"| {' | '.join(row)} |" for row in rows)
+
+
+def cell(value: float | None, digits: int) -> str:
+    """A number of a table."""
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def machine(*packages: str) -> str:
+    """What this runs on and with: the processor, the compiler, and versions of packages."""
+    compiler = find_compiler()
+    versions = ", ".join(f"{name} {version(name)}" for name in ("casadi", "pin", "numpy", *packages))
+    return (
+        f"{processor()['name']} ({platform.machine()}), {os.cpu_count()} cores, load {os.getloadavg()[0]:.2f}; "
+        f"{compiler_version(compiler) if compiler else 'no compiler'}; Python {platform.python_version()}, {versions}"
+    )
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Keep this process on one core, where the system can."""
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
+    if allowed:
+        os.sched_setaffinity(0, {max(allowed)})
+    try:
+        yield
+    finally:
+        if allowed:
+            os.sched_setaffinity(0, allowed)
+
+
+def median_time(call: Callable[[], object], repeats: int) -> float:
+    """Median processor time of a call, seconds: what other programs take of a busy machine does not count."""
+    times = []
+    for _ in range(repeats):
+        began = time.thread_time()
+        call()
+        times.append(time.thread_time() - began)
+    return statistics.median(times)
+
+
+def crba_time(model: pin.Model) -> float:
+    """Median processor time of one Pinocchio ``crba`` from Python, seconds: the yardstick of a machine."""
+    data, q = model.createData(), pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))
+    return median_time(lambda: pin.crba(model, data, q), CRBA_CALLS)
+
+
+def feasible_starts(problem: PostureProblem, count: int, seed: int) -> list[Vector]:
+    """The first feasible of random postures, ``count`` of them."""
+    found = (feasible_start(problem, index, seed) for index in range(1, 4 * count))
+    return [start for start in found if start is not None][:count]
