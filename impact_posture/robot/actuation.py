@@ -73,17 +73,11 @@ class LateralForce:
     backward: float
     left: float
     right: float
-    mass: float
 
     @property
     def least(self) -> float:
         """Smallest of the four forces, N."""
         return float(np.min([self.forward, self.backward, self.left, self.right]))
-
-    @property
-    def least_acceleration(self) -> float:
-        """Smallest of the four forces per mass, m/s²."""
-        return self.least / self.mass
 
 
 def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
@@ -205,9 +199,6 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
     limits, and ``|h_j + M_j e a| <= τ_max`` for the joints, which do not move; ``e`` moves the whole robot in the
     direction.  The force is that at zero tilt if the base is level.
     """
-    # Imported here, because SciPy takes long to import and online controllers only need G.
-    from scipy.optimize import linprog
-
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)
     q = _configuration(model, q)
@@ -228,41 +219,47 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
         count = matrix.shape[1]
         held = np.isfinite(limits)
         zeros = np.zeros((int(held.sum()), count))
-        result = linprog(
-            np.r_[np.zeros(count), -1.0],
-            A_eq=np.column_stack([matrix, -push[:6]]),
-            b_eq=load[:6],
-            A_ub=np.block([[zeros, push[6:][held, None]], [zeros, -push[6:][held, None]]]),
-            b_ub=np.r_[(limits - load[6:])[held], (limits + load[6:])[held]],
-            bounds=[(low, high)] * count + [(0.0, None)],
-            method="highs",
+        found = _maximize_last(
+            np.column_stack([matrix, -push[:6]]),
+            load[:6],
+            np.block([[zeros, push[6:][held, None]], [zeros, -push[6:][held, None]]]),
+            np.r_[(limits - load[6:])[held], (limits + load[6:])[held]],
+            [(low, high)] * count + [(0.0, None)],
         )
-        return mass * float(result.x[-1]) if result.status == 0 else float("nan")
+        return float("nan") if found is None else mass * float(found[-1])
 
-    return LateralForce(largest(forward), largest(-forward), largest(left), largest(-left), mass)
+    return LateralForce(largest(forward), largest(-forward), largest(left), largest(-left))
 
 
 def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
     """Return the thrusts with ``A f = w`` farthest from their limits; without any, the nearest within the limits."""
-    from scipy.optimize import linprog, lsq_linear
+    from scipy.optimize import lsq_linear
 
     count = matrix.shape[1]
     if count == 6 and np.linalg.matrix_rank(matrix) == 6:
         return np.asarray(np.linalg.solve(matrix, wrench))
     # Variables f and s: low + s (high - low) <= f <= high - s (high - low) with the largest s.
     width = np.full((count, 1), high - low)
-    result = linprog(
-        np.r_[np.zeros(count), -1.0],
-        A_eq=np.column_stack([matrix, np.zeros(6)]),
-        b_eq=wrench,
-        A_ub=np.block([[-np.eye(count), width], [np.eye(count), width]]),
-        b_ub=np.r_[np.full(count, -low), np.full(count, high)],
-        bounds=[(None, None)] * (count + 1),
-        method="highs",
+    found = _maximize_last(
+        np.column_stack([matrix, np.zeros(6)]),
+        wrench,
+        np.block([[-np.eye(count), width], [np.eye(count), width]]),
+        np.r_[np.full(count, -low), np.full(count, high)],
+        [(None, None)] * (count + 1),
     )
-    if result.status == 0:
-        return np.asarray(result.x[:-1])
-    return np.asarray(lsq_linear(matrix, wrench, bounds=(low, high)).x)
+    return np.asarray(lsq_linear(matrix, wrench, bounds=(low, high)).x) if found is None else found[:-1]
+
+
+def _maximize_last(
+    A: Array, b: Array, A_upper: Array, b_upper: Array, bounds: list[tuple[float | None, float | None]]
+) -> Array | None:
+    """Return the ``x`` with the largest last entry subject to ``A x = b``, ``A_upper x ≤ b_upper`` and the bounds."""
+    # Imported here, because SciPy takes long to import and online controllers only need G.
+    from scipy.optimize import linprog
+
+    cost = np.r_[np.zeros(A.shape[1] - 1), -1.0]
+    result = linprog(cost, A_ub=A_upper, b_ub=b_upper, A_eq=A, b_eq=b, bounds=bounds, method="highs")
+    return np.asarray(result.x) if result.status == 0 else None
 
 
 def _configuration(model: pin.Model, q: ArrayLike) -> Array:

@@ -77,11 +77,6 @@ class QP:
         values = self.values(z)
         return float(max(np.max(self.lower - values), np.max(values - self.upper), 0.0))
 
-    def stationarity(self, z: Array, multipliers: Array) -> float:
-        """Return ``‖Hz + g + [I; A]ᵀλ‖_∞``."""
-        n = self.n
-        return float(np.max(np.abs(self.H @ z + self.g + multipliers[:n] + self.A.T @ multipliers[n:])))
-
 
 @dataclass(frozen=True, eq=False)
 class Solved:
