@@ -1,4 +1,4 @@
-"""Report of progress: long computations tell a listener what they are doing."""
+"""Progress of long jobs, which the library reports to a listener."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-# Takes the activity and the share of it that is done; ``None`` for an unknown share.
+# A listener takes the present activity and the share of it that is done, or ``None`` if that is unknown.
 Listener = Callable[[str, float | None], None]
 
 _LISTENERS: list[Listener] = []
@@ -16,14 +16,14 @@ if hasattr(os, "register_at_fork"):
 
 
 def tell(doing: str, share: float | None = None) -> None:
-    """Tell the current listener, if any, what is being done and the share that is done."""
+    """Report to the listener, if there is one."""
     if _LISTENERS:
         _LISTENERS[-1](doing, share)
 
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Send reports to ``listener`` within the block."""
+    """Report to ``listener`` within the block."""
     _LISTENERS.append(listener)
     try:
         yield
