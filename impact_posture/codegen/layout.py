@@ -66,12 +66,13 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
     """
     order = _depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
     angles, trig = _trig(graph, order)
-    needed = _needed(graph, functions, trig)
+    sources = [_sources(graph, trig, k) for k in range(len(graph.nodes))]
+    needed = _needed(graph, functions, sources)
     # What only the sines' array is made of has no statement.
     order = [k for k in order if k in needed]
     users: dict[int, list[int]] = {}
     for k in order:
-        for a in set(_sources(graph, trig, k)):
+        for a in set(sources[k]):
             users.setdefault(a, []).append(k)
     outputs = {_source(graph, k) for names in functions for name in names for k in graph.outputs[name]}
     inlined = _inlined(graph, order, users, outputs, needed, trig)
@@ -174,7 +175,10 @@ def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int
     return tuple(angles), trig
 
 
-def _needed(graph: Graph, functions: Sequence[Sequence[str]], trig: Mapping[int, int]) -> dict[int, frozenset[int]]:
+def _needed(
+    graph: Graph, functions: Sequence[Sequence[str]], sources: Sequence[list[int]]
+) -> dict[int, frozenset[int]]:
+    """Node → the functions that need it."""
     found: dict[int, set[int]] = {}
     for number, names in enumerate(functions):
         waiting = [_source(graph, k) for name in names for k in graph.outputs[name]]
@@ -182,7 +186,7 @@ def _needed(graph: Graph, functions: Sequence[Sequence[str]], trig: Mapping[int,
             k = waiting.pop()
             if number not in found.setdefault(k, set()):
                 found[k].add(number)
-                waiting += _sources(graph, trig, k)
+                waiting += sources[k]
     return {k: frozenset(v) for k, v in found.items()}
 
 

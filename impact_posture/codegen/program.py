@@ -6,11 +6,14 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import casadi as ca
 
 from impact_posture.errors import CompilerError
 
+# What CasADi calls an operation, the places that it reads, and those that it writes.
+_Instruction = tuple[int, Sequence[int], Sequence[int]]
 # Operations that vectors have in C.
 ARITHMETIC = frozenset({"+", "-", "*", "/", "neg", "inv"})
 _COMMUTE = frozenset({"+", "*"})
@@ -47,8 +50,7 @@ CALLS = {
 SINE, COSINE = CALLS[ca.OP_SIN], CALLS[ca.OP_COS]
 
 
-@dataclass(frozen=True)
-class Node:
+class Node(NamedTuple):
     """One operation.
 
     Attributes:
@@ -86,16 +88,16 @@ class Graph:
 
     def add(self, node: Node) -> int:
         """Number of the node, simplified where its operands are constants."""
-        if node.op in _COMMUTE:
-            node = Node(node.op, tuple(sorted(node.args)), node.width)
+        if node.op in _COMMUTE and node.args[0] > node.args[1]:
+            node = Node(node.op, node.args[::-1], node.width)
         simpler = self._simplified(node) if node.op in ARITHMETIC else None
         if isinstance(simpler, int):
             return simpler
         node = node if simpler is None else simpler
-        if node not in self._known:
-            self._known[node] = len(self.nodes)
+        number = self._known.setdefault(node, len(self.nodes))
+        if number == len(self.nodes):
             self.nodes.append(node)
-        return self._known[node]
+        return number
 
     def constant(self, *value: float) -> int:
         """A number, or a vector of them; a vector of equal numbers is the number."""
@@ -111,13 +113,14 @@ class Graph:
 
     def _simplified(self, node: Node) -> Node | int | None:
         operands = [self.nodes[a] for a in node.args]
-        if all(o.op == "const" for o in operands):
+        known = [o.op == "const" for o in operands]
+        if not any(known):
+            return operands[0].args[0] if node.op == "neg" and operands[0].op == "neg" else None
+        if all(known):
             width = max(o.width for o in operands)
             lanes = [[o.value[k if o.width > 1 else 0] for o in operands] for k in range(width)]
             return self.constant(*[_COMPUTE[node.op](*numbers) for numbers in lanes])
         values = [o.value[0] if o.op == "const" and o.width == 1 else None for o in operands]
-        if len(operands) == 1:
-            return operands[0].args[0] if node.op == "neg" and operands[0].op == "neg" else None
         (a, b), (x, y) = node.args, values
         fits = {k: self.nodes[k].width == node.width for k in (a, b)}
         if node.op == "*" and 0.0 in (x, y):
@@ -156,11 +159,13 @@ def graph_of(function: ca.Function, parameters: Mapping[str, Sequence[float]] | 
     function = _dense(function)
     names, constants = function.name_in(), dict(parameters or {})
     graph = Graph(tuple(names))
-    divisors = _divisors(function)
+    instructions = [
+        (function.instruction_id(k), function.instruction_input(k), function.instruction_output(k))
+        for k in range(function.n_instructions())
+    ]
+    divisors = _divisors(instructions)
     held: dict[int, int] = {}
-    for k in range(function.n_instructions()):
-        operation = function.instruction_id(k)
-        source, target = function.instruction_input(k), function.instruction_output(k)
+    for k, (operation, source, target) in enumerate(instructions):
         if operation == ca.OP_OUTPUT:
             name = function.name_out(target[0])
             entries = graph.outputs.setdefault(name, [graph.constant(0.0)] * function.numel_out(name))
@@ -190,14 +195,12 @@ def _operation(graph: Graph, operation: int, operands: list[int], divided: int) 
         return graph.add(Node("*", (first, graph.add(Node("inv", (operands[1],))))))
     if operation in _BINARY:
         return graph.add(Node(_BINARY[operation], (first, operands[1])))
-    unary = {
-        ca.OP_NEG: Node("neg", (first,)),
-        ca.OP_INV: Node("inv", (first,)),
-        ca.OP_SQ: Node("*", (first, first)),
-        ca.OP_TWICE: Node("+", (first, first)),
-    }
-    if operation in unary:
-        return graph.add(unary[operation])
+    if operation == ca.OP_NEG:
+        return graph.add(Node("neg", (first,)))
+    if operation == ca.OP_INV:
+        return graph.add(Node("inv", (first,)))
+    if operation in (ca.OP_SQ, ca.OP_TWICE):
+        return graph.add(Node("*" if operation == ca.OP_SQ else "+", (first, first)))
     if operation in CALLS:
         text = CALLS[operation]
         return graph.add(Node(text, tuple(operands[: 2 if "{1}" in text else 1])))
@@ -206,18 +209,17 @@ def _operation(graph: Graph, operation: int, operands: list[int], divided: int) 
     )
 
 
-def _divisors(function: ca.Function) -> list[int]:
+def _divisors(instructions: Sequence[_Instruction]) -> list[int]:
     """For each instruction that divides, how many divide by the same number."""
     made: dict[int, int] = {}
     by: dict[int, int] = {}
-    for k in range(function.n_instructions()):
-        operation, source = function.instruction_id(k), function.instruction_input(k)
+    for k, (operation, source, target) in enumerate(instructions):
         if operation in (ca.OP_DIV, ca.OP_INV):
             by[k] = made[source[1 if operation == ca.OP_DIV else 0]]
         if operation != ca.OP_OUTPUT:
-            made[function.instruction_output(k)[0]] = k
+            made[target[0]] = k
     counts = Counter(by.values())
-    return [counts[by[k]] if k in by else 0 for k in range(function.n_instructions())]
+    return [counts[by[k]] if k in by else 0 for k in range(len(instructions))]
 
 
 def _dense(function: ca.Function) -> ca.Function:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
@@ -17,6 +16,7 @@ import pytest
 from impact_posture.simulation.series import Series
 from impact_posture_cli.commands.simulate import _show
 from impact_posture_cli.output import Page
+from tests.command import on_terminal, read_terminal
 from tests.command import run as start
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
@@ -108,25 +108,17 @@ def test_contacts_are_counted_against_what_was_asked_for(capsys: pytest.CaptureF
 
 
 def test_progress_is_for_terminals(aerial: Path, tmp_path: Path) -> None:
-    def on_a_terminal(*arguments: str) -> str:
-        parent, child = os.openpty()
-        with subprocess.Popen(
-            [str(COMMAND), "simulate", str(aerial), "--out", "run", "--force", "--format", "png", *arguments],
-            stdout=subprocess.DEVNULL, stderr=child, cwd=tmp_path, env={**os.environ, "TERM": "xterm"},
-        ) as process:  # fmt: skip
-            os.close(child)
-            said = b""
-            with contextlib.suppress(OSError):
-                while part := os.read(parent, 65536):
-                    said += part
-            assert process.wait() == 0
-        os.close(parent)
-        return said.decode()
-
-    said = on_a_terminal()
+    asked = ("simulate", str(aerial), "--out", "run", "--force", "--format", "png")
+    ours, theirs = os.openpty()
+    with subprocess.Popen(
+        [COMMAND, *asked], stdout=subprocess.DEVNULL, stderr=theirs, cwd=tmp_path, env={**os.environ, "TERM": "xterm"}
+    ) as process:
+        os.close(theirs)
+        said = read_terminal(ours)
+    assert process.returncode == 0
     for words in ("loading", "building the expressions", "simulating, t = ", "drawing"):
         assert words in said, words
-    assert on_a_terminal("--quiet") == ""
+    assert on_terminal(*asked, "--quiet", cwd=tmp_path) == ""
 
 
 def test_compare(aerial: Path, tmp_path: Path) -> None:

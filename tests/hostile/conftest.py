@@ -12,13 +12,7 @@ from tests.hostile.arena import SMALL, strike
 @pytest.fixture(scope="session")
 def loaded() -> None:
     """Everything imported once: each attack then is a fork."""
-    import impact_posture.codegen.folder
-    import impact_posture.experiment.folders
-    import impact_posture.impact.evaluation
-    import impact_posture.job
-    import impact_posture.posture.robustness
-    import impact_posture.robot.summary
-    import impact_posture.verification.verify  # noqa: F401
+    import tests.command  # noqa: F401
 
 
 @pytest.fixture
