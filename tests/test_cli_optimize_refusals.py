@@ -172,7 +172,7 @@ def test_full_disk_leaves_nothing(tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = shutil.which("mount")
-    small = ["-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)]
+    small = ["-t", "tmpfs", "-o", "size=16k", "tmpfs", str(disk)]
     if mount is None or subprocess.run([mount, *small], capture_output=True, check=False).returncode != 0:
         pytest.skip("mount: no small disk can be made here")
     try:

@@ -7,23 +7,26 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from impact_posture.simulation import scenario_file
 from impact_posture.simulation.series import Series
 from impact_posture_cli.commands.simulate import _show
 from impact_posture_cli.output import Page
 from tests.command import on_terminal, read_terminal
 from tests.command import run as start
+from tests.experiments.conftest import shortened
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 
 
-def document(*arguments: str, cwd: Path) -> dict[str, Any]:
-    done = start(*arguments, "--json", cwd=cwd)
+def document(*arguments: str, cwd: Path, prepare: Callable[[], None] | None = None) -> dict[str, Any]:
+    done = start(*arguments, "--json", cwd=cwd, prepare=prepare)
     assert (done.returncode, done.stderr) == (0, "")
     found = json.loads(done.stdout)
     assert isinstance(found, dict)
@@ -122,7 +125,7 @@ def test_progress_is_for_terminals(aerial: Path, tmp_path: Path) -> None:
 
 
 def test_compare(aerial: Path, tmp_path: Path) -> None:
-    done = start("compare", str(aerial), "--controllers", "nominal,robust", "--seeds", "2", "--quiet", cwd=tmp_path)
+    done = start("compare", str(aerial), "--controllers", "nominal,robust", "--seeds", "1", "--quiet", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
     assert not list(tmp_path.iterdir())
@@ -149,9 +152,12 @@ def test_compare(aerial: Path, tmp_path: Path) -> None:
 
 def test_reproduce(tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
-    found = document(
-        "reproduce", "--scenario", "solo8-push", "--seeds", "1", "--out", "all", "--format", "png", cwd=tmp_path
-    )
+    # The scenario as shipped, with less time to settle in and none to recover in.
+    shipped = tmp_path / "scenarios"
+    shipped.mkdir()
+    (shipped / "solo8-push.toml").write_text(shortened("solo8-push", settle=1.0, patience=1.0, after=0.1))
+    asked = "reproduce --scenario solo8-push --seeds 1 --out all --format png".split()
+    found = document(*asked, cwd=tmp_path, prepare=lambda: setattr(scenario_file, "SHIPPED", shipped))
     rows = {row["controller"]: row for row in found["rows"]}
     assert {"nominal", "robust"} < set(rows) and all(row["scenario"] == "solo8-push" for row in found["rows"])
     assert rows["robust"]["paper"] == {"nominal": 0.411, "robust": 0.342, "reduction": 0.168}
