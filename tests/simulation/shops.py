@@ -44,10 +44,20 @@ def workshop(setup: Setup, free: bool = False) -> Workshop:
     return Workshop(setup, free=free, gradient_of=interpreted)
 
 
+def near(name: str, **changes: Any) -> Setup:
+    """A shipped scenario cut short; a surface that a hand goes to is 5 cm nearer."""
+    setup = shortened(name, **changes)
+    if name in PUSHES:
+        return setup
+    scenario = setup.scenario
+    surfaces = tuple(replace(s, gap=s.gap - 0.05) for s in scenario.scene.surfaces)
+    return set_up(replace(scenario, scene=replace(scenario.scene, surfaces=surfaces)))
+
+
 @functools.cache
 def shop(name: str, settle: float | None = None) -> Workshop:
-    """A shipped scenario cut short; one of each in a process."""
-    return workshop(shortened(name) if settle is None else shortened(name, settle=settle))
+    """A scenario of :func:`near`; one of each in a process."""
+    return workshop(near(name) if settle is None else near(name, settle=settle))
 
 
 def driven(made: Workshop, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
