@@ -44,6 +44,14 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(20_000, 20, 20)
 
 
+@pytest.fixture(scope="module")
+def unoptimized() -> Iterator[None]:
+    """Compile the C code of a module for its numbers alone: at -O2, as it is shipped, the others compile it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CFLAGS", "-O0")
+        yield
+
+
 @pytest.fixture
 def hostile_full(request: pytest.FixtureRequest) -> bool:
     return bool(request.config.getoption("--hostile-full"))

@@ -32,6 +32,8 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.loader import LoadOptions, load_robot
 from impact_posture.toolchain import find_compiler
 
+pytestmark = pytest.mark.usefixtures("unoptimized")
+
 UNIT = np.array([0.6, 0.0, 0.8])
 FRAMES = ("ee", "base_link")
 

@@ -22,6 +22,8 @@ from tests.command import on_terminal, read_terminal
 from tests.command import run as start
 from tests.experiments.conftest import shortened
 
+pytestmark = pytest.mark.usefixtures("unoptimized")
+
 COMMAND = Path(sys.executable).parent / "impact-posture"
 
 

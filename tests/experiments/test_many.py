@@ -14,6 +14,8 @@ from impact_posture.experiment import many
 from impact_posture.experiment.jobs import SCHEMA, Job, execute, workshop
 from impact_posture.experiment.many import Store, key_of, run_many
 
+pytestmark = pytest.mark.usefixtures("unoptimized")
+
 
 def test_a_run_answers_with_its_document(aerial: Path) -> None:
     runs, found = execute(Job(str(aerial), "nominal"))
