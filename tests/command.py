@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import logging
 import multiprocessing
 import os
@@ -10,19 +12,49 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import entry_points
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import IO
+
+import matplotlib.backends.backend_agg  # noqa: F401
+import PIL.Image
+import rich.cells
+import rich.markdown
+import rich.progress
+import rich.table
+import typer.rich_utils
+from matplotlib.figure import Figure
 
 # What the commands import when they run, once for all of them.
 import impact_posture.codegen.export
+import impact_posture.codegen.folder
 import impact_posture.experiment.figures
 import impact_posture.experiment.folders
 import impact_posture.experiment.reproduction
-import impact_posture.plot
+import impact_posture.impact.evaluation
+import impact_posture.plot.snapshots
+import impact_posture.posture.robustness
 import impact_posture.result_folder
+import impact_posture.robot.robot_summary
 import impact_posture.verification.verification
-from impact_posture_cli.main import main
+import impact_posture_cli.argv
+import impact_posture_cli.error_boundary
+import impact_posture_cli.output
+import impact_posture_cli.progress
+import impact_posture_cli.tables  # noqa: F401
+from impact_posture_cli.app import app
+
+with contextlib.suppress(ImportError):
+    import mujoco  # noqa: F401
+
+# What these read or build once in a process.
+PIL.Image.preinit()
+rich.cells.cell_len("×")
+PARSER = typer.main.get_command(app)
+
+# The program that the installation puts on the path.
+(MAIN,) = (entry.load() for entry in entry_points(group="console_scripts", name="impact-posture"))
 
 
 def run(
@@ -35,23 +67,69 @@ def run(
 ) -> subprocess.CompletedProcess[str]:
     """Run ``impact-posture`` with arguments, as its entry point does; ``env`` is added to the environment.
 
-    Without ``pictures`` one figure is drawn instead of all: they take most of the time of a small robot's answer.
+    Without ``pictures`` the figures are blank: to draw them takes most of the time of a small robot's answer.
     The timeout ends what hangs; it is no bound on how long a command takes.
     """
-    words = [str(argument) for argument in arguments]
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
-        target = (words, cwd, {"COLUMNS": "80", "NO_COLOR": "1", **(env or {})}, prepare, out, errors)
-        child = multiprocessing.get_context("fork").Process(target=_command, args=(*target, pictures))
-        child.start()
+        child = start(arguments, out.fileno(), errors.fileno(), cwd, env, prepare, pictures)
         child.join(timeout)
         if child.exitcode is None:
             child.kill()
-            raise subprocess.TimeoutExpired(words, timeout)
+            raise subprocess.TimeoutExpired([str(argument) for argument in arguments], timeout)
         texts = []
         for file in (out, errors):
             file.seek(0)
             texts.append(file.read().decode())
-    return subprocess.CompletedProcess(words, child.exitcode, *texts)
+    return subprocess.CompletedProcess([str(argument) for argument in arguments], child.exitcode, *texts)
+
+
+def refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
+    """One line, the right code, no traceback."""
+    assert done.returncode == code, (done.returncode, done.stdout, done.stderr)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("error:")]
+    assert len(lines) == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in lines[0], lines[0]
+
+
+def on_terminal(*arguments: object, cwd: Path) -> str:
+    """Run with standard error on a terminal; return what came there."""
+    ours, theirs = os.openpty()
+    with tempfile.TemporaryFile() as out:
+        child = start(arguments, out.fileno(), theirs, cwd, {"TERM": "xterm"})
+        os.close(theirs)
+        said = read_terminal(ours)
+        child.join()
+    assert child.exitcode == 0, said
+    return said
+
+
+def read_terminal(ours: int) -> str:
+    """What comes on a terminal until nobody has it open any more; ``ours`` is then closed."""
+    said = b""
+    with contextlib.suppress(OSError):
+        while part := os.read(ours, 65536):
+            said += part
+    os.close(ours)
+    return said.decode()
+
+
+def start(
+    arguments: Sequence[object],
+    out: int,
+    errors: int,
+    cwd: Path | None = None,
+    env: Mapping[str, str] | None = None,
+    prepare: Callable[[], None] | None = None,
+    pictures: bool = False,
+) -> BaseProcess:
+    """Start what :func:`run` waits for, its standard output and error on these descriptors."""
+    words = [str(argument) for argument in arguments]
+    target = (words, cwd, {"COLUMNS": "80", "NO_COLOR": "1", **(env or {})}, prepare, out, errors, pictures)
+    child = multiprocessing.get_context("fork").Process(target=_command, args=target)
+    child.start()
+    return child
 
 
 def _command(
@@ -59,13 +137,15 @@ def _command(
     cwd: Path | None,
     env: Mapping[str, str],
     prepare: Callable[[], None] | None,
-    out: IO[bytes],
-    errors: IO[bytes],
+    out: int,
+    errors: int,
     pictures: bool,
 ) -> None:
     """Become what a shell would have started: streams, folder, signals and warnings are those of a new program."""
-    os.dup2(out.fileno(), 1)
-    os.dup2(errors.fileno(), 2)
+    # The test's objects are left alone: a page that is looked at is a page that is copied.
+    gc.freeze()
+    os.dup2(out, 1)
+    os.dup2(errors, 2)
     sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
     os.environ.update(env)
     os.chdir(cwd or ".")
@@ -75,11 +155,17 @@ def _command(
     for category in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
         warnings.simplefilter("ignore", category)
     if not pictures:
-        impact_posture.plot.drawable = lambda view: ["jump"]
-        # Of a run the snapshots stay.
+        impact_posture.plot.FIGURES.update(dict.fromkeys(impact_posture.plot.FIGURES, _blank))
+        # Of a run the snapshots stay, as blank.
         figures = impact_posture.experiment.figures
         figures.draw_run = figures.draw_comparison = lambda *arguments: []
+        impact_posture.plot.snapshots.snapshots_figure = _blank
     if prepare is not None:
         prepare()
+    typer.main.get_command = lambda app: PARSER
     sys.argv = ["impact-posture", *words]
-    main()
+    MAIN()
+
+
+def _blank(views: object) -> Figure:
+    return Figure(figsize=(1, 1))

@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+import gc
 import os
+import sys
 from collections.abc import Iterator
+from pathlib import Path
+
+# Where no bytecode may be written beside the sources, each process that a test starts would compile all that it
+# imports, for seconds.  They share what the first of them has compiled.
+if sys.dont_write_bytecode and not sys.pycache_prefix:
+    sys.pycache_prefix = str(Path(__file__).parents[1] / "build" / "bytecode")
+    sys.dont_write_bytecode = False
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # Before numpy is imported: workers that share the cores must not each start a thread on every core.
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -24,6 +35,21 @@ settings.load_profile("impact-posture")
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--rounding", type=int, metavar="SEED", help="linear algebra as another processor may round it")
     parser.addoption("--hostile-full", action="store_true", help="attack at length: minutes instead of seconds")
+
+
+def pytest_collection_finish() -> None:
+    """Leave to the collector what the tests make: what was imported stays, and was looked through again and again."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
+
+
+@pytest.fixture(scope="module")
+def unoptimized() -> Iterator[None]:
+    """Compile the C code of a module for its numbers alone: at -O2, as it is shipped, the others compile it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CFLAGS", "-O0")
+        yield
 
 
 @pytest.fixture

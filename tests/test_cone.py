@@ -43,6 +43,8 @@ from tests.helpers import (
 )
 from tests.tools import need_compiler
 
+pytestmark = pytest.mark.usefixtures("unoptimized")
+
 ANGLES = (1.0, 5.0, 20.0, 45.0, 80.0)
 ROBOTS = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "solo8": "base_link", "talos": "gripper_right_base_link"}
 CONE_KINDS: tuple[ObjectiveKind, ...] = ("impulse", "sticking", "energy")
@@ -188,12 +190,11 @@ def test_ties_are_flagged() -> None:
 
 
 @pytest.mark.parametrize("kind", CONE_KINDS)
-@pytest.mark.parametrize("axes", ["world", "contact"])
 @pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo8"])
-def test_gradient_where_the_worst_normal_is_unique(name: str, axes: str, kind: ObjectiveKind) -> None:
+def test_gradient_where_the_worst_normal_is_unique(name: str, kind: ObjectiveKind) -> None:
     found = robot(name)
     feet = tuple(Support.from_spec(s) for s in found.spec.supports) if kind == "impulse" else ()
-    for degrees, metric in ((5.0, "kinetic"), (45.0, "euclidean")):
+    for degrees, metric, axes in ((5.0, "kinetic", "contact"), (45.0, "euclidean", "world")):
         contact = ImpactContact(ROBOTS[name], tuple(unit(rng(name, axes, kind))), (0.02, 0, 0.01), axes)  # type: ignore[arg-type]
         objective = ImpactObjective(found, contact, Metric(metric), kind, feet, normal_cone_deg=degrees)  # type: ignore[arg-type]
         (q,) = random_configurations(found.model, 1, name, axes, kind, degrees, spread=0.4)

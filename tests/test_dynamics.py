@@ -302,7 +302,7 @@ def trees(draw: st.DrawFn) -> pin.Model:
     return random_tree(kinds, climbs, draw(st.integers(0, 10_000)), draw(st.booleans()))
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(trees(), st.integers(0, 10_000))
 def test_random_tree_agrees_with_pinocchio(model: pin.Model, seed: int) -> None:
     (q,) = random_configurations(model, 1, seed)

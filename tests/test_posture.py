@@ -71,7 +71,7 @@ def test_no_posture_along_the_null_space_is_better(
     assert solution.redundancy == 1
     assert solution.certificate.holds()
     best = problem.objective.value(solution.q)
-    line = walk(problem, solution.q, 0.01, 150) + walk(problem, solution.q, -0.01, 150)
+    line = walk(problem, solution.q, 0.02, 75) + walk(problem, solution.q, -0.02, 75)
     assert len(line) > 50
     assert min(problem.objective.value(q) for q in line) >= best * (1 - 1e-9)
     assert max(problem.objective.value(q) for q in line) > best * (1 + 1e-6)

@@ -388,20 +388,24 @@ def test_refusals(settings_: dict[str, object], kind: type[ImpactPostureError], 
 # ---- the C export -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda r: r.name)
-def test_exported_hands_of_talos(tmp_path: Path, real: Real) -> None:
+@pytest.mark.parametrize(
+    ("name", "hands", "real"),
+    [("talos", HANDS, DOUBLE), ("panda", ("panda_hand_tcp", "panda_link4"), FLOAT)],
+    ids=["talos, double", "panda, float"],
+)
+def test_exported_hands(tmp_path: Path, name: str, hands: tuple[str, str], real: Real) -> None:
     need_compiler()
     # Legs and torso are made rigid: half the code to compile, and every hand is where it was.
-    legs = tuple(name for name in robot("talos").joint_names if name.startswith(("leg", "head", "gripper", "torso")))
-    found = load_robot("talos", LoadOptions(lock=legs))
-    right, left = (ImpactContact(frame, (-1.0, 0.1, 0.0), impulse=i) for frame, i in zip(HANDS, (1, 3), strict=True))
+    legs = tuple(joint for joint in robot(name).joint_names if joint.startswith(("leg", "head", "gripper", "torso")))
+    found = load_robot(name, LoadOptions(lock=legs))
+    right, left = (ImpactContact(frame, (-1.0, 0.1, 0.0), impulse=i) for frame, i in zip(hands, (1, 3), strict=True))
     objective = ImpactObjective(found, right, others=(left,))
     written = export(objective, tmp_path, prefix="hands", real=real, check=False)
     assert written.manifest["several"]["symbols"] == {"objective": "hands_objective"}
-    assert [b["frame"] for b in written.manifest["several"]["contacts"]] == list(HANDS)
+    assert [b["frame"] for b in written.manifest["several"]["contacts"]] == list(hands)
     build_library(tmp_path, "hands", library_path(tmp_path, "hands"), ("-O0",))
     both = ImpactGradient.load(tmp_path, robot=found)
-    alone = ImpactGradient.load(tmp_path, robot=found, frame=HANDS[1])
+    alone = ImpactGradient.load(tmp_path, robot=found, frame=hands[1])
     tolerance = 1e-8 if real is DOUBLE else 1e-4
     for q in sample_postures(found, 5, 1):
         value, gradient = both.objective(q)

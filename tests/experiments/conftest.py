@@ -34,5 +34,5 @@ def push(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Both pushes, soon."""
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
     path = tmp_path_factory.mktemp("scenarios") / "push.toml"
-    path.write_text(shortened("solo8-push", settle=0.3, still=0.05, after=0.1), encoding="utf-8")
+    path.write_text(shortened("solo8-push", settle=0.3, quiet=0.5, still=0.05, after=0.1), encoding="utf-8")
     return path

@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from impact_posture.simulation import scenario_file
 from impact_posture.simulation.series import Series
 from impact_posture_cli.commands.simulate import _show
 from impact_posture_cli.output import Page
+from tests.command import on_terminal, read_terminal
 from tests.command import run as start
+from tests.experiments.conftest import shortened
+
+pytestmark = pytest.mark.usefixtures("unoptimized")
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 
 
-def document(*arguments: str, cwd: Path) -> dict[str, Any]:
-    done = start(*arguments, "--json", cwd=cwd)
+def document(*arguments: str, cwd: Path, prepare: Callable[[], None] | None = None) -> dict[str, Any]:
+    done = start(*arguments, "--json", cwd=cwd, prepare=prepare)
     assert (done.returncode, done.stderr) == (0, "")
     found = json.loads(done.stdout)
     assert isinstance(found, dict)
@@ -108,29 +113,21 @@ def test_contacts_are_counted_against_what_was_asked_for(capsys: pytest.CaptureF
 
 
 def test_progress_is_for_terminals(aerial: Path, tmp_path: Path) -> None:
-    def on_a_terminal(*arguments: str) -> str:
-        parent, child = os.openpty()
-        with subprocess.Popen(
-            [str(COMMAND), "simulate", str(aerial), "--out", "run", "--force", "--format", "png", *arguments],
-            stdout=subprocess.DEVNULL, stderr=child, cwd=tmp_path, env={**os.environ, "TERM": "xterm"},
-        ) as process:  # fmt: skip
-            os.close(child)
-            said = b""
-            with contextlib.suppress(OSError):
-                while part := os.read(parent, 65536):
-                    said += part
-            assert process.wait() == 0
-        os.close(parent)
-        return said.decode()
-
-    said = on_a_terminal()
+    asked = ("simulate", str(aerial), "--out", "run", "--force", "--format", "png")
+    ours, theirs = os.openpty()
+    with subprocess.Popen(
+        [COMMAND, *asked], stdout=subprocess.DEVNULL, stderr=theirs, cwd=tmp_path, env={**os.environ, "TERM": "xterm"}
+    ) as process:
+        os.close(theirs)
+        said = read_terminal(ours)
+    assert process.returncode == 0
     for words in ("loading", "building the expressions", "simulating, t = ", "drawing"):
         assert words in said, words
-    assert on_a_terminal("--quiet") == ""
+    assert on_terminal(*asked, "--quiet", cwd=tmp_path) == ""
 
 
 def test_compare(aerial: Path, tmp_path: Path) -> None:
-    done = start("compare", str(aerial), "--controllers", "nominal,robust", "--seeds", "2", "--quiet", cwd=tmp_path)
+    done = start("compare", str(aerial), "--controllers", "nominal,robust", "--seeds", "1", "--quiet", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
     assert not list(tmp_path.iterdir())
@@ -157,9 +154,12 @@ def test_compare(aerial: Path, tmp_path: Path) -> None:
 
 def test_reproduce(tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
-    found = document(
-        "reproduce", "--scenario", "solo8-push", "--seeds", "1", "--out", "all", "--format", "png", cwd=tmp_path
-    )
+    # The scenario as shipped, with less time to settle in and none to recover in.
+    shipped = tmp_path / "scenarios"
+    shipped.mkdir()
+    (shipped / "solo8-push.toml").write_text(shortened("solo8-push", settle=1.0, patience=1.0, after=0.1))
+    asked = "reproduce --scenario solo8-push --seeds 1 --out all --format png".split()
+    found = document(*asked, cwd=tmp_path, prepare=lambda: setattr(scenario_file, "SHIPPED", shipped))
     rows = {row["controller"]: row for row in found["rows"]}
     assert {"nominal", "robust"} < set(rows) and all(row["scenario"] == "solo8-push" for row in found["rows"])
     assert rows["robust"]["paper"] == {"nominal": 0.411, "robust": 0.342, "reduction": 0.168}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import resource
@@ -14,11 +15,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import typer
-
-from impact_posture_cli.app import app
 from impact_posture_cli.argv import put_right
 from impact_posture_cli.error_boundary import run
+from tests.command import PARSER
 
 CODES = {0, 1, 2, 3, 4, 130, 143}
 # Of a usage error: how to call it, and what was wrong.
@@ -114,6 +113,7 @@ def attack(
 def _become(folder: Path, argv: tuple[str, ...], streams: list[int]) -> None:
     code = 70
     try:
+        gc.freeze()
         signal.alarm(PATIENCE)
         resource.setrlimit(resource.RLIMIT_CPU, (BUSY, BUSY))
         os.chdir(folder)
@@ -121,7 +121,7 @@ def _become(folder: Path, argv: tuple[str, ...], streams: list[int]) -> None:
             os.dup2(stream, number)
         sys.stdout, sys.stderr = (io.TextIOWrapper(os.fdopen(n, "wb", closefd=False)) for n in (1, 2))
         sys.argv = ["impact-posture", *argv]
-        code = run(typer.main.get_command(app), put_right(argv))
+        code = run(PARSER, put_right(argv))
         for file in (sys.stdout, sys.stderr):
             file.flush()
     finally:

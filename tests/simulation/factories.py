@@ -44,10 +44,20 @@ def controller_factory(setup: Setup, free: bool = False) -> ControllerFactory:
     return ControllerFactory(setup, free=free, gradient_of=interpreted)
 
 
+def near(name: str, **changes: Any) -> Setup:
+    """A shipped scenario cut short; a surface that a hand goes to is 5 cm nearer."""
+    setup = shortened(name, **changes)
+    if name in PUSHES:
+        return setup
+    scenario = setup.scenario
+    surfaces = tuple(replace(s, gap=s.gap - 0.05) for s in scenario.surfaces)
+    return set_up(replace(scenario, surfaces=surfaces))
+
+
 @functools.cache
 def factory(name: str, settle: float | None = None) -> ControllerFactory:
-    """A shipped scenario cut short; one of each in a process."""
-    return controller_factory(shortened(name) if settle is None else shortened(name, settle=settle))
+    """A scenario of :func:`near`; one of each in a process."""
+    return controller_factory(near(name) if settle is None else near(name, settle=settle))
 
 
 def driven(made: ControllerFactory, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:

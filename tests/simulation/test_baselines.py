@@ -229,7 +229,7 @@ def test_the_approach_is_no_velocity_error() -> None:
     task = made.setup.scenario.task
     assert isinstance(task, RepeatedContacts)
     reference, driver = Reference(task, made.setup.gap), invariant("aerial-vertical")
-    point = reference.at(task.settle + 0.5)
+    point = reference.at(task.settle + 0.4)
     assert point.speed == pytest.approx(0.5)
     v = np.zeros(9)
     v[2] = -point.speed

@@ -145,7 +145,7 @@ def test_held_freezes_posture_center_of_mass_and_base_where_they_are(name: str, 
     # What is held is what was measured in the last tick before.
     assert np.abs(way).max() < 0.01
     wanted = [np.array(t.target) for t in driver.controller.formulation.weighted]  # type: ignore[attr-defined]
-    last = play.go(2.5 if name in AERIAL else 0.8).q
+    last = play.go(1.8 if name in AERIAL else 0.8).q
     np.testing.assert_array_equal(driver.posture.target, target)
     for task, kept in zip(driver.controller.formulation.weighted, wanted, strict=True):
         np.testing.assert_array_equal(task.target, kept)  # type: ignore[attr-defined]
@@ -224,7 +224,7 @@ def test_the_posture_driver_reaches_its_goal(name: str) -> None:
     play.driver.brace()
     play.go(MOVE / 2)
     assert 0.4 < play.driver.level < 0.6
-    reached = play.go(MOVE / 2 + 1.5).q
+    reached = play.go(MOVE / 2 + 0.8).q
     assert play.driver.level == 1
     np.testing.assert_array_equal(play.driver.posture.target, goal)
     if name in PUSHES:

@@ -27,20 +27,21 @@ def _mujoco() -> None:
 # Measured: q of nominal 0.280-0.309, 0.112-0.127, 0.409, 0.284; reductions of q 74-75, 80-81, 12.2, 52 %; of H 97.8,
 # 69, 2.2, 78 %.
 @pytest.mark.parametrize(
-    ("name", "changes", "nominal", "reduction", "lowered"),
+    ("name", "settle", "changes", "nominal", "reduction", "lowered"),
     [
-        ("aerial-vertical", {"settle": 3.0}, (0.22, 0.37), (0.65, 0.85), (0.95, 0.99)),
-        ("aerial-lateral", {"settle": 3.0}, (0.08, 0.16), (0.70, 0.90), (0.60, 0.78)),
-        ("solo8-push", {"settle": 3.0, "patience": 2.0, "duration": 0.4}, (0.38, 0.44), (0.09, 0.16), (0.015, 0.03)),
-        ("talos-push", {"settle": 6.0, "patience": 1.0, "duration": 0.4}, (0.26, 0.31), (0.42, 0.62), (0.70, 0.85)),
+        ("aerial-vertical", 2.0, {}, (0.22, 0.37), (0.65, 0.85), (0.95, 0.99)),
+        ("aerial-lateral", 1.5, {}, (0.08, 0.16), (0.70, 0.90), (0.60, 0.78)),
+        ("solo8-push", 1.5, {"patience": 2.0, "duration": 0.4}, (0.38, 0.44), (0.09, 0.16), (0.015, 0.03)),
+        ("talos-push", 4.0, {"patience": 1.0, "duration": 0.4}, (0.26, 0.31), (0.42, 0.62), (0.70, 0.85)),
     ],
 )
 def test_robust_against_nominal(
-    name: str, changes: dict[str, Any], nominal: Band, reduction: Band, lowered: Band
+    name: str, settle: float, changes: dict[str, Any], nominal: Band, reduction: Band, lowered: Band
 ) -> None:
-    made = controller_factory(shortened(name, **changes))
     metrics, before = [], []
-    for controller in ("nominal", "robust"):
+    # The nominal one has nothing to go to; the robust one has its posture by then (q and H as after 6 s, within 8 %).
+    for controller, seconds in (("nominal", 0.5), ("robust", settle)):
+        made = controller_factory(shortened(name, settle=seconds, **changes))
         found = driven(made, controller)
         metrics.append(measure(made.setup, found))
         before.append(predict(made.setup, made.objective(), found)[0].H)
