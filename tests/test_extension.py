@@ -178,10 +178,10 @@ def test_another_controller_lives_through_a_scenario() -> None:
     needs_mujoco()
     made = SetbackFactory(shortened("aerial-vertical"), gradient_of=interpreted)
     (bent,), (nominal,) = run(made, "setback"), run(made, "nominal")
-    begin = nominal.impacts[0].begin
+    begin = nominal.of("impact")[0].begin
     before = [found.series.q[np.searchsorted(found.series.t, begin) - 2] for found in (bent, nominal)]
     moved = float(before[0][-1] - before[1][-1])
     assert -0.2 < moved < -0.1
     for found, level in ((bent, 1.0), (nominal, 0.0)):
-        assert found.away is None and found.impacts[0].touched
+        assert found.away is None and found.of("impact")[0].touched
         assert found.series.level[-1] == level

@@ -106,8 +106,8 @@ def test_a_scenarios_mounting_reaches_the_robot(tmp_path: Path) -> None:
     without = tmp_path / "plain.toml"
     lines = [line for line in text.splitlines() if not line.startswith("mounting")]
     without.write_text("\n".join(lines), encoding="utf-8")
-    assert dict(read_scenario(without).load.mounting) == {}
-    mounted, plain = (load_robot(found.robot, load) for load in (found.load, replace(found.load, mounting={})))
+    assert dict(read_scenario(without).mounting) == {}
+    mounted, plain = (load_robot(found.robot, scenario) for scenario in (found, replace(found, mounting={})))
     assert mounted.model_sha256 != plain.model_sha256
 
 
