@@ -1,15 +1,47 @@
-"""The Typer app: the subcommands of ``impact-posture``."""
+"""The Typer app: the subcommands of ``impact-posture``, each imported when it is called."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from impact_posture_cli.commands import COMMANDS
 
+
+def load(name: str) -> Any:
+    """Import the function behind a subcommand."""
+    return getattr(import_module(f"impact_posture_cli.commands.{name}"), name)
+
+
+def build(name: str) -> Any:
+    """Build the parser of a subcommand with all its options."""
+    single = typer.Typer(add_completion=False)
+    single.command(name, help=COMMANDS[name])(load(name))
+    return typer.main.get_command(single)
+
+
+class CommandGroup(TyperGroup):
+    """Group of subcommands that builds the parser of the called subcommand only.
+
+    The help page needs no more than :data:`COMMANDS`.
+    """
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands = {name: TyperCommand(name, help=text) for name, text in COMMANDS.items()}
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the called subcommand and build its parser."""
+        name, _, rest = super().resolve_command(ctx, args)
+        return name, build(str(name)), rest
+
+
 app = typer.Typer(
     name="impact-posture",
+    cls=CommandGroup,
     help="Find the posture in which a redundant robot takes an impact best, see why, and hand it to the controller.",
     epilog="Each command has its own --help. ROBOT: a name from 'impact-posture robots', or a path to a .urdf.",
     no_args_is_help=True,
@@ -32,8 +64,4 @@ def root(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Carry the options that stand before a command."""
-
-
-for name, command in COMMANDS.items():
-    app.command(name)(command)
+    """Read the options that stand before a subcommand."""

@@ -1,4 +1,4 @@
-"""Words of the command line put into the form that Typer takes, before it reads them."""
+"""Arguments of the command line put into the form that Typer reads."""
 
 from __future__ import annotations
 
@@ -6,19 +6,17 @@ import re
 from collections.abc import Sequence
 from itertools import zip_longest
 
-from impact_posture.settings import TRADEOFF_POINTS
-
 
 def put_right(arguments: Sequence[str]) -> list[str]:
-    """Apply all of the below."""
+    """Join pairs and fill in optional values."""
     return fill_optional(in_pairs(arguments))
 
 
-# Options whose value may be left out: what a value looks like, and what stands for none.
+# Options whose value may be left out, and the pattern of a value.
 _OPTIONAL = {
-    # Whole or not: what is no whole number is for the option itself to refuse.
-    "--tradeoff": (re.compile(r"[+-]?[0-9.]+$"), str(TRADEOFF_POINTS)),
-    "--write-robot-toml": (re.compile(r".*\.toml$"), ""),
+    # Any number; the option itself refuses what is no whole number.
+    "--tradeoff": re.compile(r"[+-]?[0-9.]+$"),
+    "--write-robot-toml": re.compile(r".*\.toml$"),
 }
 
 
@@ -34,10 +32,19 @@ def in_pairs(arguments: Sequence[str]) -> list[str]:
 
 
 def fill_optional(arguments: Sequence[str]) -> list[str]:
-    """Give options of ``_OPTIONAL`` a value where none follows: Typer has none whose value may be left out."""
+    """Give options of ``_OPTIONAL`` a value where none follows: Typer has no options with an optional value."""
     filled: list[str] = []
     for word, following in zip_longest(arguments, arguments[1:], fillvalue=""):
         filled.append(word)
-        if word in _OPTIONAL and not _OPTIONAL[word][0].match(following):
-            filled.append(_OPTIONAL[word][1])
+        if word in _OPTIONAL and not _OPTIONAL[word].match(following):
+            filled.append(_default(word))
     return filled
+
+
+def _default(option: str) -> str:
+    """Value of an option that is given without one."""
+    if option != "--tradeoff":
+        return ""
+    from impact_posture.settings import TRADEOFF_POINTS
+
+    return str(TRADEOFF_POINTS)

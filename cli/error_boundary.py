@@ -1,4 +1,4 @@
-"""The one place where an error becomes a line on standard error and an exit code."""
+"""Error boundary: turn each error into a line on standard error and an exit code."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ import typer
 from impact_posture.errors import ImpactPostureError, one_line
 from impact_posture.escape import printable
 from impact_posture_cli.option_names import as_options, option_of
-from impact_posture_cli.settings_options import UsageError
 
 DEBUG_VARIABLE = "IMPACT_POSTURE_DEBUG"
 _INTERRUPTED = 130
+# Base class of all usage errors of the Click that this Typer carries.
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def run(command: Any, arguments: Sequence[str]) -> int:
@@ -32,17 +33,17 @@ def run(command: Any, arguments: Sequence[str]) -> int:
     0 done; 1 an error to act on; 2 a wrong command line; other codes as the error says; 130 interrupted.  One line on
     standard error, and with ``--json`` the same as ``{"error": {code, kind, what, where, hint}}`` on standard output.
     """
-    # Where no folder for its caches can be written, matplotlib logs what it does about that.
+    # Matplotlib logs a warning where it cannot write a folder for its caches.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            # λ and × must not crash a terminal that has no letter for them.
+            # λ and × must not crash a terminal without these letters.
             stream.reconfigure(errors="replace")
     wants_json = "--json" in arguments
     try:
         with warnings.catch_warnings():
             if not os.environ.get(DEBUG_VARIABLE):
-                # Libraries' own, such as NumPy's of an overflow: the results are checked, and say what is wrong.
+                # Libraries warn, for example NumPy of an overflow. Checks of the results say what is wrong.
                 warnings.simplefilter("ignore")
             code = command.main(args=list(arguments), prog_name="impact-posture", standalone_mode=False)
         sys.stdout.flush()
@@ -95,7 +96,7 @@ def _explain(error: Exception, wants_json: bool) -> int:
 
 
 def _usage(error: Any, wants_json: bool) -> int:
-    """Typer's own message, plain: how to call it, and what was wrong."""
+    """Print the message of Typer without colors: the usage and the error."""
     code = int(getattr(error, "exit_code", 2))
     _in_our_words(error)
     shown = io.StringIO()
@@ -110,8 +111,8 @@ def _usage(error: Any, wants_json: bool) -> int:
 
 
 def _in_our_words(error: Any) -> None:
-    """Say of an option with few values what the library says of such a key in a file."""
-    # Typer has no hook for this, and its words differ from version to version; the two lists are in all of them.
+    """Give the message of an invalid choice the words that the library has for a key in a file."""
+    # Typer has no hook for this. The wording differs between versions; all contain the value and the choices.
     given = re.search(r"'(.*?)' is not one of (.*)", str(getattr(error, "message", "")))
     if given:
         from impact_posture.errors import not_one_of
@@ -139,13 +140,13 @@ def _document(code: int, kind: str, what: str, where: str, hint: str) -> None:
 
 
 def _closed_pipe() -> int:
-    """The reader has gone (``| head``): say nothing, and keep the interpreter quiet at its end."""
+    """Return the exit code without a message when the reader has closed the pipe (``| head``)."""
     _discard_output()
     return 1
 
 
 def _discard_output() -> None:
-    """What could not be written must not fail again when the interpreter flushes it."""
+    """Discard unwritten output, so that the last flush of the interpreter does not fail."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()

@@ -1,4 +1,4 @@
-"""What the commands that run experiments have in common: options, and tables."""
+"""Options and tables of the commands that run experiments."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from impact_posture_cli.output import Page
+
 if TYPE_CHECKING:
     from impact_posture.experiment.statistics import Row
-    from impact_posture_cli.output import Page
 
 RUN = "Run"
 Mode = Literal["live", "held"]
@@ -27,7 +28,7 @@ Processes = Annotated[
 
 
 def rows_table(page: Page, rows: tuple[Row, ...] | list[Row]) -> None:
-    """Controllers of a scenario, a row each."""
+    """Write a table with a row for each controller of a scenario."""
     from impact_posture.experiment.reproduction_summary import interval_text, percent
 
     lines = []

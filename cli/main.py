@@ -1,4 +1,4 @@
-"""The ``impact-posture`` command: what concerns the process comes first, then everything else."""
+"""Entry point of ``impact-posture``: prepare the process, then run the command line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def main() -> None:
     prepare()
     if fault := memory_fault():
         sys.exit(refuse(fault))
-    # Not before: a signal that comes while these are imported ends the process quietly, too.
+    # Imported after prepare(), so that a signal during these imports ends the process quietly.
     import typer
 
     from impact_posture_cli.app import app

@@ -1,20 +1,28 @@
-"""Settings in the library's messages, written as the options that a command line takes.
+"""Rewrite Python parameters in messages as options of the command line.
 
-The library names Python parameters, between backquotes in a sentence: ``force=True``, ``support=['foot']``.
+Messages of the library hold parameters between backquotes, for example ``force=True`` or ``support=['foot']``.
 """
 
 from __future__ import annotations
 
 import ast
 import re
-from dataclasses import fields
+from functools import cache
 from pathlib import Path
 
-from impact_posture.settings import ProblemSettings
-
-# What errors are about besides settings.
+# Options that are no settings.
 _OTHERS = {"compile", "controller", "force", "gain", "jobs", "mode", "out", "prefix", "samples", "sign"}
-_NAMES = {field.name for field in fields(ProblemSettings)} - {"robot", "schema", "q", "support_compliance"} | _OTHERS
+
+
+@cache
+def _names() -> set[str]:
+    """Return the names that are options: settings and others."""
+    # Imported here because the help page does without.
+    from dataclasses import fields
+
+    from impact_posture.settings import ProblemSettings
+
+    return {f.name for f in fields(ProblemSettings)} - {"robot", "schema", "q", "support_compliance"} | _OTHERS
 
 
 def as_options(text: str) -> str:
@@ -23,9 +31,9 @@ def as_options(text: str) -> str:
 
 
 def option_of(where: str) -> str:
-    """Write the place of an error as an option, where it is a setting; a setting may be the first of two words."""
+    """Write the place of an error as an option, where it is a setting or begins with a setting."""
     name, *rest = where.split(" ", maxsplit=1)
-    return " ".join([_option(name), *rest]) if name in _NAMES and not Path(where).exists() else where
+    return " ".join([_option(name), *rest]) if name in _names() and not Path(where).exists() else where
 
 
 def _as_option(found: re.Match[str]) -> str:

@@ -1,4 +1,4 @@
-"""The options that commands share besides the settings of a problem: name, check, help."""
+"""Options that several commands share besides the settings of a problem."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CompileMode = Literal["auto", "always", "never"]
 
 
 class PictureFormat(StrEnum):
-    """Typer takes lists of enumerations, not of literals."""
+    """Formats of figures, an enumeration because Typer has no lists of literals."""
 
     png = "png"
     svg = "svg"

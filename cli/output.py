@@ -1,4 +1,4 @@
-"""What the command line shows: Rich tables for people, one JSON document for programs, warnings apart."""
+"""Output of the commands: Rich tables for people, a JSON document for programs, warnings on standard error."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 
 
 def print_json(document: object) -> None:
-    """Write one strictly valid JSON document to standard output: NaN and infinity would raise here."""
+    """Write a strictly valid JSON document to standard output. NaN and infinity raise ``ValueError``."""
     sys.stdout.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def complain(line: str) -> None:
-    """Write one line to standard error."""
+    """Write a line to standard error."""
     sys.stderr.write(f"{one_line(line)}\n")
 
 
 class Page:
-    """A page of titled tables on standard output; warnings go to standard error."""
+    """Titled tables on standard output, and warnings on standard error."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         from rich.console import Console
@@ -35,7 +35,7 @@ class Page:
         self.quiet = quiet
 
     def title(self, text: str, detail: str = "") -> None:
-        """A bold line."""
+        """Write a bold line."""
         from rich.text import Text
 
         line = Text(printable(text), style="bold")
@@ -44,17 +44,17 @@ class Page:
         self.console.print(line)
 
     def line(self, text: str, *, style: str = "") -> None:
-        """A paragraph, wrapped at words."""
+        """Write a paragraph, wrapped at words."""
         from rich.text import Text
 
         self.console.print(Text(printable(as_options(text)), style=style))
 
     def gap(self) -> None:
-        """An empty line."""
+        """Write an empty line."""
         self.console.print()
 
     def pairs(self, rows: Iterable[tuple[str, str]]) -> None:
-        """Two columns: what, and its value."""
+        """Write two columns: names and values."""
         self.table((), [(f"  {key}", value) for key, value in rows], dim=0)
 
     def table(
@@ -66,14 +66,14 @@ class Page:
         dim: int | None = None,
         fold: int = -1,
     ) -> None:
-        """A table; text is taken as it is, never as markup.
+        """Write a table of plain text, which Rich does not read as markup.
 
         Args:
-            headers: Titles of the columns; none for a table without a head.
+            headers: Titles of the columns; empty for a table without titles.
             rows: Cells as text.
-            right: Columns aligned to the right: numbers.
-            dim: A column of lesser weight.
-            fold: The column that wraps where the terminal is too narrow; the others stay whole.
+            right: Columns of numbers, which are aligned to the right.
+            dim: Column in dim letters.
+            fold: Column that wraps where the terminal is too narrow. The other columns do not wrap.
         """
         from rich.table import Table
         from rich.text import Text
@@ -95,14 +95,14 @@ class Page:
         self.console.print(table)
 
     def warnings(self, lines: Iterable[str]) -> None:
-        """One line each on standard error, unless quiet."""
+        """Write each warning on a line of standard error, unless quiet."""
         if not self.quiet:
             for line in lines:
                 complain(f"warning: {as_options(line)}")
 
 
 def number(value: float | None, unit: str = "", *, missing: str = "undefined") -> str:
-    """Four significant digits with a unit, or what to say where there is none."""
+    """Format a number with four significant digits and a unit; return ``missing`` for ``None``."""
     if value is None:
         return missing
     text = f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
@@ -110,13 +110,13 @@ def number(value: float | None, unit: str = "", *, missing: str = "undefined") -
 
 
 def vector(values: Iterable[Any]) -> str:
-    """A unit vector; right-aligned, its numbers stand below each other."""
+    """Format a unit vector with numbers of equal width."""
     # Adding zero turns -0.0 into 0.0.
     return " ".join(f"{round(float(v), 3) + 0.0:6.3f}" for v in values).strip()
 
 
 def worst_normal(block: dict[str, Any], normal: Iterable[Any]) -> str:
-    """Where in the cone the worst normal lies, from an evaluation's ``cone`` block."""
+    """Describe where in the cone the worst normal lies, from the ``cone`` block of an evaluation."""
     others = len(block["normals"]) - 1
     tied = f", tied: {vector(block['normals'][1])} is as bad" if others else ""
     more = f", and {others - 1} more" if others > 1 else ""

@@ -1,4 +1,4 @@
-"""What the process makes of its surroundings: signals, closed streams, settings meant for other programs."""
+"""Setup of the process: signals, closed streams, environment variables, limit on the memory."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ _LEAST_MEMORY = 1 << 30
 
 
 def prepare() -> None:
-    """Make the process safe to run and to end.  For the entry point alone: it changes the whole process."""
+    """Make the process safe to run and to end.  Only the entry point calls this, because it changes the process."""
     _open_streams()
-    # A notebook's backend, or one that does not exist, must not end what only writes files.
+    # A backend for notebooks, or a missing backend, must not stop a program that only writes files.
     os.environ["MPLBACKEND"] = "agg"
-    # Matrices are small here: threads of the linear algebra only take memory, and fail to start where it is scarce.
+    # The matrices are small. Threads of the linear algebra take memory, and fail to start where memory is scarce.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     for number in _WORDS:
-        # What is ignored stays so: nohup, and a shell's jobs in the background.
+        # Ignored signals stay ignored: by nohup, and for background jobs of a shell.
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
 
 
 def finish() -> None:
-    """Take no more signals: all is done, and the interpreter gives their default back while it ends."""
+    """Ignore signals from now on, because the interpreter restores their default while it ends."""
     for number in _WORDS:
         signal.signal(number, signal.SIG_IGN)
 
 
 def memory_fault() -> str:
-    """What is wrong with the limit on the process's memory; empty for nothing."""
+    """Say what is wrong with the memory limit of the process; empty if nothing is."""
     if sys.platform == "win32":
         return ""
     import resource
@@ -48,19 +48,22 @@ def memory_fault() -> str:
 
 
 def _open_streams() -> None:
-    """Put nothing in the place of closed streams: a file opened later must not become standard output."""
+    """Open the null device for closed streams, so that no file opened later becomes standard output."""
     for number in (0, 1, 2):
         try:
             os.fstat(number)
         except OSError:
-            # The lowest number that is free, which is this one.
+            # The system takes the lowest free number, which is this number.
             os.open(os.devnull, os.O_RDWR)
     sys.stdout = sys.stdout or open(1, "w", closefd=False)
     sys.stderr = sys.stderr or open(2, "w", closefd=False)
 
 
 def _end(number: int, frame: object) -> None:
-    """End at once, cleanly; not by an exception, which C++ libraries swallow.  A second signal skips the cleaning."""
+    """End at once after cleaning up, without an exception, because C++ libraries swallow exceptions.
+
+    A second signal skips the cleaning.
+    """
     library = sys.modules.get("impact_posture.processes")
     leave = partial(_leave, number)
     if library is None or _SEEN:
@@ -75,11 +78,11 @@ def _leave(number: int) -> None:
 
 
 def refuse(what: str, code: int = 1, kind: str = "MemoryError") -> int:
-    """Write an error before, or instead of, everything else, and return its code."""
+    """Write an error without Typer and return its exit code."""
     with suppress(OSError):
         os.write(2, f"error: {what}\n".encode())
         if "--json" in sys.argv:
-            # Not through sys.stdout: a signal may have come while it was written to.
+            # Not through sys.stdout, because a signal may have interrupted a write to it.
             content = f'{{"code": {code}, "kind": "{kind}", "what": "{what}", "where": "", "hint": ""}}'
             os.write(1, f'{{"error": {content}}}\n'.encode())
     return code

@@ -1,4 +1,4 @@
-"""The settings of a problem as options: made from the fields of the settings, and read back into them."""
+"""Options made from the fields of the settings, and settings read back from the options."""
 
 from __future__ import annotations
 
@@ -14,22 +14,20 @@ import typer
 from impact_posture.errors import ImpactPostureError
 from impact_posture.settings import CONTACT, METRIC, OUTPUT, ROBOT, TASK, ImpactSettings, RobotSettings, Setting
 from impact_posture.tables import validate
+from impact_posture_cli.error_boundary import UsageError
 
 _PANELS = (CONTACT, METRIC, ROBOT, TASK, OUTPUT)
 _Settings = TypeVar("_Settings", bound=RobotSettings)
-
-# What every usage error derives from, whichever Click this Typer carries.
-UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 NoSupport = Annotated[bool, typer.Option("--no-support", rich_help_panel=ROBOT, help="Nothing stays on the ground.")]
 
 
 @dataclass(frozen=True)
 class Given:
-    """The settings that stand on the command line; a default is not given.
+    """Settings that stand on the command line, without defaults.
 
     Attributes:
-        context: Typer's context of the command.
+        context: Context of the command in Typer.
         values: The settings by name.
     """
 
@@ -37,11 +35,11 @@ class Given:
     values: dict[str, Any]
 
     def fill(self, settings: type[_Settings], **more: Any) -> _Settings:
-        """Make settings of these values and ``more``; ``more`` wins."""
+        """Make settings of these values and ``more``, which has priority."""
         return validate(settings, self.values | more, "options")
 
     def check_contact(self) -> None:
-        """Ask for ``--normal`` or ``--contact``, and not for both.
+        """Check that either ``--normal`` or ``--contact`` is given.
 
         Raises:
             UsageError: Exit code 2.
@@ -52,10 +50,10 @@ class Given:
             raise UsageError("--contact stands instead of --frame and --normal: give one of the two.")
 
     def is_result(self, robot: str, free: Collection[str]) -> bool:
-        """Whether ROBOT|RESULT_DIR is a folder that optimize wrote; ``free`` are the options that go with it.
+        """Return whether ROBOT|RESULT_DIR is a result folder; ``free`` are the options that go with a result folder.
 
         Raises:
-            UsageError: An option beside RESULT_DIR says what the folder says already; exit code 2.
+            UsageError: An option contradicts the result folder; exit code 2.
         """
         if not (Path(robot) / "result.json").is_file():
             return False
@@ -70,12 +68,12 @@ class Given:
 def with_settings(
     settings: type[RobotSettings], *, without: Collection[str] = (), **changed: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of all settings; it is called with ``given`` and with its own parameters.
+    """Give a command the options of all settings. The command receives ``given`` and its own parameters.
 
     Args:
         settings: The dataclass whose annotated fields become options.
         without: Fields that the command does not take.
-        changed: Annotations of fields whose option differs in this command.
+        changed: Annotations of the fields whose options differ in this command.
     """
     made = _options(settings, without) | {name: (hint, None) for name, hint in changed.items()}
     if "support" in made:
@@ -106,7 +104,7 @@ def with_settings(
 
 
 def _settings_of(settings: type[RobotSettings]) -> dict[str, tuple[Any, Setting]]:
-    """Type and description of each field that has an option."""
+    """Return type and description of each field that has an option."""
     found = {}
     for name, hint in get_type_hints(settings, include_extras=True).items():
         described = [m for m in getattr(hint, "__metadata__", ()) if isinstance(m, Setting)]
@@ -116,7 +114,7 @@ def _settings_of(settings: type[RobotSettings]) -> dict[str, tuple[Any, Setting]
 
 
 def _options(settings: type[RobotSettings], without: Collection[str]) -> dict[str, tuple[Any, Any]]:
-    """Annotation and default of each option, panel by panel."""
+    """Return annotation and default of each option, panel by panel."""
     known, found = _settings_of(settings), {}
     defaults: dict[str, Any] = {f.name: None if f.default is MISSING else f.default for f in fields(settings)}
     for name in sorted((n for n in known if n not in without), key=lambda n: _PANELS.index(known[n][1].panel)):
@@ -138,7 +136,7 @@ def _options(settings: type[RobotSettings], without: Collection[str]) -> dict[st
 
 
 def _option_type(kind: Any, setting: Setting, optional: bool) -> Any:
-    """What Typer makes of a field's type."""
+    """Return the type of an option for Typer from the type of a field."""
     if setting.repeatable:
         return list[str] | None
     inner = [t for t in get_args(kind) if t is not type(None)] if get_origin(kind) in (Union, UnionType) else [kind]
@@ -160,13 +158,13 @@ def _callback(setting: Setting) -> Callable[[Any], Any]:
 
 
 positive = _callback(Setting("", holds=lambda value: 0 < value < float("inf"), demand="give a number above zero"))
-"""Refuse what is not above zero."""
+"""Callback that refuses numbers that are not above zero."""
 check_direction = _callback(_settings_of(ImpactSettings)["normal"][1])
-"""Refuse what has no direction."""
+"""Callback that refuses a vector of length zero."""
 
 
 def _value(setting: Setting, value: Any) -> Any:
-    """What the words of an option mean."""
+    """Return the value of a setting from the text of its option."""
     if setting.parse is not None:
         return setting.parse(value)
     return tuple(value) if isinstance(value, list) else value

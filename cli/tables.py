@@ -1,17 +1,19 @@
-"""What the inner maximum was over: lines on several contacts and on model variants, alike for every command."""
+"""Summary of an impact, alike for every command: what it is, its quantities, and its worst cases."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
+
+from impact_posture_cli.output import Page, number, vector, worst_normal
 
 if TYPE_CHECKING:
     from impact_posture.impact.contact import ImpactContact
-    from impact_posture_cli.output import Page
+    from impact_posture.impact.resolved_impact import ResolvedImpact
 
 
 def contact_names(contacts: Sequence[ImpactContact]) -> list[str]:
-    """What each of several contacts is called: its frame, and its normal where one frame is struck along two."""
+    """Name each contact by its frame, and by its normal where several contacts share the frame."""
     frames = [contact.frame for contact in contacts]
     return [
         f"{c.frame} ({', '.join(f'{v:.3g}' for v in c.normal)})" if frames.count(c.frame) > 1 else c.frame
@@ -19,40 +21,90 @@ def contact_names(contacts: Sequence[ImpactContact]) -> list[str]:
     ]
 
 
-def impulses_line(frames: Sequence[str], worst: Mapping[str, Any]) -> str:
-    """The worst impulses of several contacts in words."""
+def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: str) -> list[tuple[str, str]]:
+    """Describe an impact: normals, contact point, supports, metric, armature.
+
+    Args:
+        impact: The impact.
+        normals: Normal of each contact.
+        axes: What the normals are given in.
+    """
+    objective, contact, metric = impact.objective, impact.contact, impact.metric
+    rows = []
+    for name, one, normal in zip(contact_names(objective.contacts), objective.contacts, normals, strict=True):
+        limit = f", up to {one.impulse:g} N·s" if objective.others else ""
+        rows.append((f"normal at {name}" if objective.others else "normal", f"{vector(normal)} ({axes}){limit}"))
+    if any(contact.offset):
+        offset = ", ".join(f"{v:g}" for v in contact.offset)
+        rows.append(("contact point", f"{offset} m from {contact.frame}, in its axes"))
+    feet = ", ".join(f"{s.frame} ({s.kind})" for s in impact.supports)
+    rows.append(("supports", f"{feet}; compliance {objective.compliance:.3g} 1/kg" if feet else "none"))
+    rows.append(("metric", f"{metric.kind} ({metric.source})" if metric.source else metric.kind))
+    return [*rows, ("armature from", impact.robot.armature_source)]
+
+
+def quantities(impact: ResolvedImpact) -> list[tuple[str, str, str]]:
+    """Return key, unit and meaning of H, G, V, S and E in the metric of an impact."""
+    kinetic = impact.metric.kind == "kinetic"
+    per_impulse, per_speed = ("1/kg", "kg") if kinetic else ("jump²/(N·s)²", "jump²/(m/s)²")
+    return [
+        ("H", per_impulse, "jump² per impulse²"),
+        ("G", "1/kg", "inverse effective mass along n"),
+        ("V", per_speed, "jump² per approach speed², no friction"),
+        ("S", per_speed, "the same when the contact sticks"),
+        ("E", "kg", "energy lost per approach speed², e = 0"),
+    ]
+
+
+def worst_tables(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[str, Any]]) -> None:
+    """Show each of several contacts alone, and the objective of each model variant.
+
+    Args:
+        page: Where to write.
+        frames: Names of the contacts.
+        blocks: Evaluations by name, as in ``result.json``.  The contacts are those of the last evaluation.
+    """
+    last = list(blocks.values())[-1]
+    if "by_contact" in last:
+        keys = ("H", "G", "V", "S")
+        pairs = zip(frames, last["by_contact"], strict=True)
+        rows = [(f"  {frame}", *(number(block[key]) for key in keys)) for frame, block in pairs]
+        page.gap()
+        page.table(("  each contact alone", *keys), rows, right=(1, 2, 3, 4))
+    if "by_scenario" in last:
+        rows = []
+        for k, variant in enumerate(last["by_scenario"]):
+            marks = [" ←" if block["worst_scenario"] == variant["name"] else "  " for block in blocks.values()]
+            values = [number(block["by_scenario"][k]["objective"]) for block in blocks.values()]
+            rows.append((f"  {variant['name']}", *map("".join, zip(values, marks, strict=True))))
+        page.gap()
+        page.table(("  objective by model variant (← worst)", *blocks), rows, right=tuple(range(1, 1 + len(blocks))))
+
+
+def worst_lines(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[str, Any]]) -> None:
+    """Say the worst normal, the worst impulses and whether the feet stay, for each evaluation by name."""
+    named = {f" {name}" if len(blocks) > 1 else "": block for name, block in blocks.items()}
+    for when, block in named.items():
+        if "cone" in block:
+            page.line(f"worst normal{when}: {worst_normal(block['cone'], block['worst_normal'])}")
+        if "worst_impulses" in block:
+            page.line(f"worst impulses{when}: {_impulses(frames, block['worst_impulses'])}")
+    for when, block in named.items():
+        for name, one in zip(frames, block.get("by_contact", [block]), strict=True):
+            if "footing" in one:
+                where = f" (impact at {name})" if "by_contact" in block else ""
+                page.line(f"feet{when}{where}: {one['footing']['verdict']}")
+
+
+def _impulses(frames: Sequence[str], worst: Mapping[str, Any]) -> str:
+    """Name the worst impulses of several contacts."""
     parts = [f"{value:g} N·s at {frame}" for frame, value in zip(frames, worst["impulses"], strict=True) if value]
     tied = len(worst["corners"]) - 1
     others = f" ({tied} other {'corner is' if tied == 1 else 'corners are'} as bad)" if tied else ""
     return ", ".join(parts) + others
 
 
-def alone_line(page: Page, frames: Sequence[str]) -> None:
-    """Whose the numbers of one contact are, where there are several."""
-    page.line(f"  (H, G, V, S, E, ellipsoid, gradient and jumps: of an impact at {frames[0]} alone)", style="dim")
-
-
-def contacts_table(page: Page, frames: Sequence[str], blocks: Sequence[Mapping[str, Any]]) -> None:
-    """H, G, V, S of each of several contacts, as if it were alone."""
-    from impact_posture_cli.output import number
-
-    rows = [
-        (f"  {frame}", *(number(block[key]) for key in ("H", "G", "V", "S")))
-        for frame, block in zip(frames, blocks, strict=True)
-    ]
-    page.gap()
-    page.table(("  each contact alone", "H", "G", "V", "S"), rows, right=(1, 2, 3, 4))
-
-
-def variants_table(page: Page, blocks: Sequence[Mapping[str, Any]], titles: Sequence[str]) -> None:
-    """The objective for each model variant, with one column for each evaluation."""
-    from impact_posture_cli.output import number
-
-    rows = []
-    for k, variant in enumerate(blocks[0]["by_scenario"]):
-        worst = [block["worst_scenario"] == variant["name"] for block in blocks]
-        values = [number(block["by_scenario"][k]["objective"]) + (" ←" if bad else "  ")
-                  for block, bad in zip(blocks, worst, strict=True)]  # fmt: skip
-        rows.append((f"  {variant['name']}", *values))
-    page.gap()
-    page.table(("  objective by model variant (← worst)", *titles), rows, right=tuple(range(1, 1 + len(titles))))
+def alone_line(page: Page, frames: Sequence[str], what: str) -> None:
+    """Say of which contact the numbers are, where there are several."""
+    if len(frames) > 1:
+        page.line(f"  ({what}: of an impact at {frames[0]} alone)", style="dim")

@@ -22,15 +22,10 @@ from impact_posture.version import __version__
 
 if TYPE_CHECKING:
     from impact_posture import tsid
+    from impact_posture.codegen.export import Export
     from impact_posture.codegen.impact_gradient import ImpactGradient
     from impact_posture.errors import ImpactPostureError
-    from impact_posture.front_door import (
-        Export,
-        ImpactObjective,
-        PostureProblem,
-        PostureResult,
-        optimize,
-    )
+    from impact_posture.front_door import ImpactObjective, PostureProblem, PostureResult, optimize
     from impact_posture.impact.contact import ImpactContact, Support
     from impact_posture.impact.metric import Metric
     from impact_posture.robot.robot import Robot
@@ -38,7 +33,7 @@ if TYPE_CHECKING:
 
 
 _HOMES = {
-    "Export": "front_door",
+    "Export": "codegen.export",
     "ImpactContact": "impact.contact",
     "ImpactGradient": "codegen.impact_gradient",
     "ImpactObjective": "front_door",

@@ -1,4 +1,4 @@
-"""Every error that a user can act on: one root, exceptions that carry data and say what to do.
+"""Errors that a user can act on, with one root class; they carry data and a hint.
 
 The command line prints ``what``, ``where`` and ``hint`` as one line and exits with ``exit_code``.
 """
@@ -11,12 +11,12 @@ from typing import ClassVar
 
 from impact_posture.escape import printable
 
-# A longer name loses its middle in a message.
+# Longest name in a message.  A longer name loses its middle.
 _LONGEST_NAME = 200
 
 
 def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:
-    """Return the known names closest to ``name``, best first; the first few known ones if none is close."""
+    """Return the known names closest to ``name``, best first, or the first known names if none is close."""
     names = list(known)
     folded = {n.casefold(): n for n in names}
     close = [folded[c] for c in difflib.get_close_matches(name.casefold(), folded, n=count, cutoff=0.5)]
@@ -25,12 +25,12 @@ def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:
 
 
 def one_line(text: str) -> str:
-    """Return a message on one line, and nothing in it that steers a terminal."""
+    """Return a message on one line, without characters that control a terminal."""
     return printable(" ".join(text.split()))
 
 
 def not_one_of(value: object, choices: Iterable[str]) -> tuple[str, str]:
-    """Say that a value is none of the few that there are: what is wrong, and what to do."""
+    """Return the fault and the hint for a value that is none of the choices."""
     names = list(choices)
     folded = {name.casefold(): name for name in names}
     text = str(value).casefold()
@@ -44,9 +44,9 @@ class ImpactPostureError(Exception):
     """Root of all errors of this package.
 
     Args:
-        what: What is wrong, without a full stop.
-        where: Which file, option, joint or frame is meant.
-        hint: What the user can do about it.
+        what: Fault, without a full stop.
+        where: File, option, joint or frame with the fault.
+        hint: Action by which the user corrects it.
     """
 
     exit_code: ClassVar[int] = 1
@@ -62,7 +62,7 @@ class ImpactPostureError(Exception):
         return f"{text}; {self.hint}" if self.hint else text
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Subclasses take other arguments, yet worker processes must be able to send them home.
+        # Subclasses take other arguments, but worker processes must be able to return them.
         return (_rebuild, (type(self), self.__dict__.copy(), self.line))
 
 
@@ -74,7 +74,7 @@ def _rebuild(cls: type[ImpactPostureError], state: dict[str, object], line: str)
 
 
 class InputError(ImpactPostureError):
-    """A value that the user gave is wrong."""
+    """A value given by the user is wrong."""
 
 
 class NameNotFound(InputError):
@@ -92,49 +92,49 @@ class NameNotFound(InputError):
 
 
 class RobotNotFound(NameNotFound):
-    """No robot of that name is known."""
+    """No robot has this name."""
 
     kind = "robot"
 
 
 class FrameNotFound(NameNotFound):
-    """The robot has no frame of that name."""
+    """The robot has no frame of this name."""
 
     kind = "frame"
 
 
 class JointNotFound(NameNotFound):
-    """The robot has no joint of that name."""
+    """The robot has no joint of this name."""
 
     kind = "joint"
 
 
 class PostureNotFound(NameNotFound):
-    """The robot has no named posture, and there is no such file."""
+    """The robot has no posture of this name, and no file has it either."""
 
     kind = "posture"
 
 
 class ScenarioNotFound(NameNotFound):
-    """No experiment of that name is shipped."""
+    """No shipped scenario has this name."""
 
     kind = "scenario"
 
 
 class ControllerNotFound(NameNotFound):
-    """No controller of that name is compared."""
+    """No controller has this name."""
 
     kind = "controller"
 
 
 class PackageNotFound(NameNotFound):
-    """A ``package://`` or ``example-robot-data:`` path leads nowhere."""
+    """A ``package://`` or ``example-robot-data:`` path does not exist."""
 
     kind = "path"
 
 
 class UrdfError(InputError):
-    """The URDF or SRDF cannot be read or makes no robot."""
+    """The URDF or SRDF cannot be read or describes no robot."""
 
 
 class InertiaError(UrdfError):
@@ -142,15 +142,15 @@ class InertiaError(UrdfError):
 
 
 class SpecError(InputError):
-    """A robot.toml, problem.toml or other file of ours has a wrong key or value."""
+    """A robot.toml, problem.toml or another input file has a wrong key or value."""
 
 
 class PostureError(InputError):
-    """A posture has the wrong length, a swapped or non-unit quaternion, or leaves the limits."""
+    """A posture has a wrong length or quaternion, or violates the limits."""
 
 
 class NotWithinLimits(PostureError):
-    """A joint lies outside its position limits."""
+    """A joint is outside its position limits."""
 
     def __init__(self, joint: str, value: float, lower: float, upper: float, *, where: str = "posture") -> None:
         self.joint, self.value, self.lower, self.upper = joint, value, lower, upper
@@ -162,27 +162,27 @@ class NotWithinLimits(PostureError):
 
 
 class ContactError(InputError):
-    """A contact is degenerate: a zero normal, or a frame that nothing massive carries."""
+    """A contact is degenerate, because its normal is zero or its frame moves no mass."""
 
 
 class MetricError(InputError):
-    """A metric or objective that cannot be computed for this robot or contact."""
+    """A metric or objective cannot be computed for this robot or contact."""
 
 
 class UnsupportedJoint(InputError):
-    """A joint type that the symbolic dynamics does not know."""
+    """The symbolic dynamics do not support a joint type."""
 
 
 class OutputError(InputError):
-    """An output folder exists, or cannot be written."""
+    """An output folder exists or cannot be written."""
 
 
 class CompilerError(InputError):
-    """The C compiler is missing or failed; carries its words and the command."""
+    """The C compiler is missing or failed; carries its output and the command."""
 
 
 class ManifestMismatch(InputError):
-    """A C export was made for another robot than the one in hand; carries what differs, and both values."""
+    """A C export was made for another robot; carries the key that differs, and both values."""
 
     def __init__(self, key: str, exported: object, found: object, *, where: str = "manifest", hint: str = "") -> None:
         self.key, self.exported, self.found = key, exported, found
@@ -214,7 +214,7 @@ class Infeasible(ImpactPostureError):
 
 
 class SolverFailed(ImpactPostureError):
-    """The solver did not converge from any start, or its answer failed the certificate."""
+    """The solver converged from no start, or its answer failed the certificate."""
 
     exit_code = 4
 
@@ -231,7 +231,7 @@ class WorkerDied(ImpactPostureError):
 
 
 class SimulationDiverged(ImpactPostureError):
-    """A simulation's state ran away; carries the time."""
+    """The state of a simulation diverged; carries the time."""
 
     exit_code = 4
 

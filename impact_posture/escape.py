@@ -1,6 +1,6 @@
-"""Names as text in other languages.  The names of robots, joints, frames and files are data, whoever chose them.
+"""Escapes for names in other languages.  The names of robots, joints, frames and files are data, not code.
 
-Every name that leaves the program goes through one of these functions, by the language that it enters.
+Every name that leaves the program passes through the function of its output language.
 """
 
 from __future__ import annotations
@@ -10,21 +10,21 @@ import re
 import unicodedata
 import zlib
 
-# What our own texts write that C comments should not rely on a compiler to read.
+# ASCII for the symbols of our texts, because a compiler may not read others in C comments.
 _ASCII = str.maketrans({"·": " ", "²": "^2", "×": "x", "λ": "l", "ε": "eps", "⁻": "^-", "¹": "1"})
-# Linkers and file systems take more (255 bytes a file name), with room for what is appended.
+# Linkers and file systems accept more (255 bytes per file name), which leaves room for suffixes.
 _LONGEST_IDENTIFIER, _LONGEST_FILE_NAME, _LONGEST_LABEL = 100, 120, 60
 
 
 def printable(text: str, *, keep: str = "", longest: int = 0) -> str:
-    r"""Return text without anything that steers a terminal or turns the direction of writing.
+    r"""Return text without characters that control a terminal or change the writing direction.
 
-    Control and format characters, line separators and lone surrogates become ``\x1b``, ``\u202e`` and the like.
+    Control and format characters, line separators and lone surrogates become escapes such as ``\x1b`` and ``\u202e``.
 
     Args:
         text: Any text.
         keep: Characters that stay, such as line breaks.
-        longest: Leave the middle of a longer text away; 0 keeps all of it.
+        longest: Longest result, which drops the middle of a longer text; 0 keeps all of it.
     """
     if longest and len(text) > longest:
         half = longest // 2
@@ -43,7 +43,7 @@ def _code_point(character: str) -> str:
 
 
 def identifier(text: str) -> str:
-    """Return letters, digits and single underscores of ASCII; a long text ends in a checksum of all of it."""
+    """Return an identifier of ASCII letters, digits and single underscores; a long one ends in a checksum."""
     found = re.sub(r"_{2,}", "_", re.sub(r"[^A-Za-z0-9]", "_", text)).strip("_")
     if len(found) <= _LONGEST_IDENTIFIER:
         return found
@@ -51,7 +51,7 @@ def identifier(text: str) -> str:
 
 
 def file_name(text: str) -> str:
-    """Return the name of a file or folder: no separator, no leading dot or dash, not too long for a file system."""
+    """Return a name for a file or folder, without separators or a leading dot or dash, and of limited length."""
     found = re.sub(r"[^\w.+@=-]", "_", text).lstrip(".-")
     return found.encode("utf-8", "replace")[:_LONGEST_FILE_NAME].decode("utf-8", "ignore") or "_"
 
@@ -62,31 +62,31 @@ def c_comment(text: str) -> str:
 
 
 def toml(value: object) -> str:
-    """Return a value of TOML, on one line, which reads back as the same.
+    """Return a value as TOML on one line, which reads back as the same value.
 
     Raises:
-        UnicodeEncodeError: A text holds half a surrogate pair (a path that is not UTF-8), which TOML cannot.
+        UnicodeEncodeError: A text contains half a surrogate pair (a path that is not UTF-8), which TOML forbids.
     """
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{toml(str(key))} = {toml(one)}" for key, one in value.items()) + " }"
+        return "{ " + ", ".join(f"{toml(str(key))} = {toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(toml, value)) + "]"
     if isinstance(value, float):
         return repr(value)
-    # JSON's integers and booleans are TOML's, and its strings but for pairs of surrogates, which TOML has none of.
+    # JSON and TOML write integers, booleans and strings alike, except that TOML has no surrogate pairs.
     text = json.dumps(value, ensure_ascii=False)
     text.encode("utf-8")
     return "".join(c if _is_visible(c) else rf"\U{ord(c):08X}" for c in text)
 
 
 def xml_name(text: str) -> str:
-    """Return a name that XML can hold and MuJoCo finds again; an empty one would be none there."""
+    """Return a name that XML can hold and MuJoCo can find, also for an empty name."""
     return printable(text) or "(empty)"
 
 
 def markdown(text: str) -> str:
-    """Return text that stands as it is in Markdown, in a cell of a table too."""
-    # A bracket alone is no link, and underscores between letters emphasize nothing.
+    """Return text that Markdown shows unchanged, also in a table cell."""
+    # A single bracket makes no link, and underscores between letters make no emphasis.
     return re.sub(r"[\\`*<>|&$~#!]|\](?=[\[(:]|$)|_+", _escape_markdown, printable(text))
 
 
@@ -97,6 +97,6 @@ def _escape_markdown(found: re.Match[str]) -> str:
 
 
 def plot_label(text: str) -> str:
-    """Return a label for matplotlib, which reads dollars as mathematics and hides what begins with an underscore."""
+    """Return a label for matplotlib, which reads dollars as math and hides labels that begin with an underscore."""
     found = printable(text, longest=_LONGEST_LABEL).replace("$", r"\$")
     return f" {found}" if found.startswith("_") else found

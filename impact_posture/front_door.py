@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.codegen.export_folder import WrittenExport, write_export
-from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.export import Export, write_export
 from impact_posture.errors import InputError
 from impact_posture.impact import objective as core
 from impact_posture.impact.contact import ImpactContact, Support
@@ -23,7 +22,6 @@ from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.impact.metric import Metric, build_metric
 from impact_posture.impact.resolved_impact import ResolvedImpact, missing_support
 from impact_posture.impact.supports import refuse_held, resolve_supports
-from impact_posture.job import FORMATS, Written, result_view, write_result
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
@@ -34,6 +32,7 @@ from impact_posture.posture.result import result_document
 from impact_posture.posture.robustness import Robustness, solve_robustly
 from impact_posture.posture.solve import PostureSolution, Progress
 from impact_posture.posture.tradeoff import TradeOff
+from impact_posture.result_folder import FORMATS, Written, result_view, write_result
 from impact_posture.robot.model_variant import ModelVariant, Payload, build_model_variants
 from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot
@@ -46,27 +45,6 @@ from impact_posture.settings import (
 from impact_posture.tables import validate
 
 Vector = NDArray[np.float64]
-
-
-class Export:
-    """C code in a folder, and the library that was built from it.
-
-    Attributes:
-        written: The folder, its files and functions.
-        robot: The robot of the exported objective.
-    """
-
-    def __init__(self, written: WrittenExport, robot: Robot) -> None:
-        self.written, self.robot = written, robot
-
-    @property
-    def out(self) -> Path:
-        """The folder."""
-        return self.written.out
-
-    def load(self, **options: Any) -> ImpactGradient:
-        """Load the library, which runs its code; the options are those of :meth:`ImpactGradient.load`."""
-        return ImpactGradient.load(self.out, robot=self.robot, **options)
 
 
 class ImpactObjective(core.ImpactObjective):
@@ -139,7 +117,7 @@ class ImpactObjective(core.ImpactObjective):
             build: Whether to build and check the library, if a C compiler is installed.
             options: Options ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
         """
-        return Export(write_export([self], Path(out), build=build, **options), self.robot)
+        return write_export([self], Path(out), build=build, **options)
 
 
 def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
@@ -320,8 +298,7 @@ class PostureResult:
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
         """Write the C code as :meth:`ImpactObjective.export` does, with the optimal posture as a constant."""
         objective = self.problem.problem.impact
-        written = write_export([objective], Path(out), posture=self.q, build=build, **options)
-        return Export(written, objective.robot)
+        return write_export([objective], Path(out), posture=self.q, build=build, **options)
 
 
 def optimize(

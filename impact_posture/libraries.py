@@ -1,7 +1,8 @@
-"""Shared libraries: sealed where they are built, checked before they are loaded, kept in the user's own cache.
+"""Shared libraries: build them, seal them, check them before they are loaded, and keep them in the cache of the user.
 
-Loading a library runs its code, and a damaged one ends the process.  So a library of ours has its SHA-256 beside it,
-another one must at least be as long as its header says, and the cache is the user's alone.
+Loading a library runs its code, and a damaged library ends the process.  So a library that is built here has its
+SHA-256 beside it.  Any other library must at least be as long as its header says.  Nobody but the user may write the
+cache.
 """
 
 from __future__ import annotations
@@ -12,38 +13,92 @@ import os
 import stat
 import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from impact_posture.errors import OutputError, SpecError
 from impact_posture.output_folder import scratch_folder
+from impact_posture.toolchain import find_compiler, no_compiler, run_compiler, words_of
+from impact_posture.version import __version__
 
 _REBUILD = "delete it: it is built again"
-# ELF's header behind its 16 bytes of identity, and the entries of its program header up to the length in the file.
+# Fields of an ELF header after its 16 bytes of identity, and of a program header up to the length in the file.
 _HEADER = {1: "HHIIIIIHHHHHH", 2: "HHIQQQIHHHHHH"}
 _SEGMENT = {1: "IIIII", 2: "IIQQQQ"}
 
 
-# ---- seals --------------------------------------------------------------------------------------------------------
+# ---- building -----------------------------------------------------------------------------------------------------
+
+# Strict C forbids fused multiply-adds by default.
+_FLAGS = ("-std=c99", "-O2", "-ffp-contract=fast", "-fPIC", "-shared")
 
 
-def seal_path(library: Path) -> Path:
-    """Where the seal of a library is: ``sha256sum --check`` reads it too."""
-    return library.with_name(f"{library.name}.sha256")
+def library_path(folder: Path, prefix: str) -> Path:
+    """Return ``lib<prefix>.so`` in a folder."""
+    return folder / f"lib{prefix}.so"
 
 
-def put_library(built: Path, library: Path) -> None:
-    """Move a library that was built beside into its place, with its seal; interrupted, it is there without a seal."""
-    seal, beside = seal_path(library), built.with_name(f"{built.name}.sha256")
+def build_library(folder: Path, prefix: str, library: Path | None = None, flags: Sequence[str] = ()) -> Path:
+    """Compile ``<prefix>.c`` in ``folder`` into a sealed shared library, and return where it is.
+
+    Args:
+        folder: The folder of the source.
+        prefix: The name of the source without its ending.
+        library: The library to write; ``lib<prefix>.so`` beside the source by default.
+        flags: Flags of the compiler after those of strict C and of ``$CFLAGS``.
+
+    Raises:
+        CompilerError: There is no compiler, or it failed; with its first error line and the command.
+        OutputError: The library cannot be written.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise no_compiler("codegen")
+    library = (library_path(folder, prefix) if library is None else library).absolute()
+    with building(library) as scratch:
+        built = str(scratch / library.name)
+        run_compiler([*compiler, *_FLAGS, *words_of("CFLAGS"), *flags, f"{prefix}.c", "-o", built, "-lm"], folder)
+    return library
+
+
+@contextmanager
+def building(library: Path) -> Iterator[Path]:
+    """Yield a folder to build in; a library of that name in it then takes its place, with its seal.
+
+    An interruption leaves the earlier library, or the new one without a seal.
+
+    Raises:
+        OutputError: The library cannot be written, for example because the disk is full.
+    """
+    try:
+        with scratch_folder(library.parent) as folder:
+            yield folder
+            if (built := folder / library.name).is_file():
+                _put(built, library)
+    except OSError as error:
+        raise OutputError(
+            f"cannot be written ({error.strerror or error})",
+            where=str(library.parent),
+            hint="free some space or check the permissions; IMPACT_POSTURE_CACHE names another cache",
+        ) from None
+
+
+def _put(built: Path, library: Path) -> None:
+    seal, beside = seal_path(library), seal_path(built)
     beside.write_text(f"{_digest(built)}  {library.name}\n", encoding="utf-8")
     seal.unlink(missing_ok=True)
     os.replace(built, library)
     os.replace(beside, seal)
 
 
+def seal_path(library: Path) -> Path:
+    """Return where the seal of a library is; ``sha256sum --check`` reads it."""
+    return library.with_name(f"{library.name}.sha256")
+
+
 def is_sealed(library: Path) -> bool | None:
-    """Whether a library is what was sealed; ``None`` where there is no seal."""
+    """Return whether a library still has the content that was sealed; ``None`` where there is no seal."""
     try:
         words = seal_path(library).read_text(encoding="utf-8", errors="replace").split()
     except FileNotFoundError:
@@ -60,11 +115,11 @@ def _digest(path: Path) -> str:
 
 
 def load_library(library: Path) -> ctypes.CDLL:
-    """Load a library that is whole, which runs its code.
+    """Load a whole library, which runs its code.
 
     Raises:
-        SpecError: It is not what was sealed, has no seal and is shorter than its header says, is for another
-            processor, or cannot be loaded.
+        SpecError: The library differs from what was sealed, or cannot be loaded.  A library without a seal is refused
+            if it is shorter than its header says or is for another processor.
     """
     try:
         sealed = is_sealed(library)
@@ -79,7 +134,7 @@ def load_library(library: Path) -> ctypes.CDLL:
 
 
 def _fault(library: Path) -> str:
-    """What a header says against loading; nothing of formats other than ELF, whose loaders check themselves."""
+    """Return what an ELF header says against loading; empty for other formats, because their loaders check them."""
     size = library.stat().st_size
     with library.open("rb") as file:
         start = file.read(64)
@@ -106,7 +161,7 @@ def _fault(library: Path) -> str:
 
 
 def _machine() -> int | None:
-    """ELF's number of the processor that runs this; ``None`` where the interpreter is no ELF file."""
+    """Return the ELF number of this processor; ``None`` where the interpreter is no ELF file."""
     with suppress(OSError), open(os.path.realpath(sys.executable), "rb") as file:
         start = file.read(20)
         if start[:4] == b"\x7fELF":
@@ -118,11 +173,11 @@ def _machine() -> int | None:
 
 
 def cache_path() -> Path:
-    """Where compiled code is kept: ``$IMPACT_POSTURE_CACHE``, else in the user's cache folder; it need not exist."""
+    """Return the folder of compiled code: ``$IMPACT_POSTURE_CACHE``, else one in the user's cache folder."""
     own = os.environ.get("IMPACT_POSTURE_CACHE")
     if own:
         return Path(own).absolute()
-    # A relative path is to be ignored, says the XDG specification.
+    # The XDG specification says to ignore a relative path.
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
     try:
         return (base if base.is_absolute() else Path.home() / ".cache") / "impact-posture"
@@ -131,10 +186,10 @@ def cache_path() -> Path:
 
 
 def cache_folder(*parts: str) -> Path:
-    """Return a folder of the cache, made where it is missing, for its user alone.
+    """Return a folder of the cache; make it for its user alone where it is missing.
 
     Raises:
-        OutputError: It cannot be made, or is not the user's alone.
+        OutputError: The folder cannot be made, or others may write it.
     """
     folder = cache_path()
     try:
@@ -149,31 +204,26 @@ def cache_folder(*parts: str) -> Path:
     return folder
 
 
-@contextmanager
-def building(library: Path) -> Iterator[Path]:
-    """Yield a folder to build in; a library of that name in it then takes its place in the cache, sealed.
+def source_key(content: Iterable[str], *packages: str) -> str:
+    """Return a short hash of what shapes compiled code.
 
-    Raises:
-        OutputError: The cache cannot be written, for example because the disk is full.
+    Args:
+        content: What the code depends on.
+        packages: Packages of this library whose formulas write the code; a changed formula gives another key.
     """
-    try:
-        with scratch_folder(library.parent) as folder:
-            yield folder
-            if (built := folder / library.name).is_file():
-                put_library(built, library)
-    except OSError as error:
-        raise OutputError(
-            f"cannot be written ({error.strerror or error})",
-            where=str(library.parent),
-            hint="free some space, or set IMPACT_POSTURE_CACHE to another folder",
-        ) from None
+    digest = hashlib.sha256("\n".join([__version__, *content]).encode())
+    for package in packages:
+        for path in sorted((Path(__file__).parent / package).glob("**/*")):
+            if path.suffix in (".py", ".jinja"):
+                digest.update(path.read_bytes())
+    return digest.hexdigest()[:32]
 
 
 def check_private(path: Path) -> None:
-    """Refuse what another user could have put there: who owns or may write it chooses the code that runs.
+    """Refuse a path that another user controls, because that user chooses the code that runs.
 
     Raises:
-        OutputError: Another user owns it or may write it.
+        OutputError: Another user owns the path or may write it.
     """
     found = path.stat()
     if found.st_uid not in (os.geteuid(), 0):
@@ -183,10 +233,10 @@ def check_private(path: Path) -> None:
 
 
 def is_cached(library: Path) -> bool:
-    """Whether the cache has a library as it was built; what is damaged goes.
+    """Return whether the cache has a library as it was built; delete a damaged one.
 
     Raises:
-        OutputError: The library, or a folder of the cache on the way to it, is not the user's alone.
+        OutputError: Others may write the library, or a folder of the cache that holds it.
     """
     root = cache_path()
     try:

@@ -1,10 +1,10 @@
-"""Output folders and temporary ones: whole or not at all, nothing left behind, never over what is not ours.
+"""Output folders and temporary folders: written whole or not at all, and never over the files of others.
 
 Each output folder holds a record, ``.impact-posture.json``, of the files that were written into it.  ``--force``
-replaces a folder only if the record names everything that is there.
+replaces a folder only if the record names every file in it.
 
-A temporary folder has the same file from its first moment on, locked by the process that works in it.  One that
-nobody locks was left by a process that was killed, and the next one that works in the same place removes it.
+A temporary folder has the same file from its first moment on, locked by the process that works in it.  A folder that
+nobody locks is what a killed process left.  The next process that works in the same place removes it.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
     Args:
         out: The folder to be written.
         force: Whether an existing folder of the same kind may be replaced.
-        kind: What will be written there.
+        kind: The kind of content.
 
     Raises:
-        OutputError: It exists, is no folder, holds what is not ours, cannot be replaced, or its parent cannot be
+        OutputError: The folder exists, is no folder, holds foreign files, cannot be replaced, or its parent cannot be
             written.
     """
     if out.is_symlink():
@@ -58,20 +58,20 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
         if not force:
             raise OutputError("exists", where=str(out), hint="choose another --out, or --force to replace it")
         _check_ours(out, kind)
-    parent = _first_existing(out.absolute().parent)
+    parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError("cannot be written", where=str(parent), hint="choose another --out")
 
 
 @contextmanager
 def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] = ()) -> Iterator[Path]:
-    """Yield a folder beside ``out`` to write into; on success it takes ``out``'s place, else nothing is left.
+    """Yield a folder beside ``out`` to write into.  On success it takes the place of ``out``, else nothing remains.
 
     Args:
         out: The folder to be written.
         force: Whether an existing folder of the same kind may be replaced.
-        kind: What will be written.
-        products: Files that what is written may make there later, such as libraries; they count as ours.
+        kind: The kind of content.
+        products: Files that the content may make there later, such as libraries; they count as ours.
 
     Raises:
         OutputError: As :func:`check_output`, or the disk is full or not writable.
@@ -79,7 +79,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
     check_output(out, force=force, kind=kind)
     out = out.absolute()
     try:
-        with _parents_of(out), _scratch(out.parent, 0o777) as beside:
+        with _parents_of(out), scratch_folder(out.parent, 0o777) as beside:
             try:
                 yield beside
             except OutputError as error:
@@ -97,30 +97,11 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
         ) from error
 
 
-@contextmanager
-def scratch_folder(parent: Path | None = None) -> Iterator[Path]:
-    """Yield a temporary folder, nobody else's to read; it is gone behind the block, and when a signal ends us.
-
-    Args:
-        parent: Where; the system's folder for such things by default.
-
-    Raises:
-        OutputError: The system has no such folder.
-        OSError: It cannot be made.
-    """
-    try:
-        parent = Path(tempfile.gettempdir()) if parent is None else parent
-    except FileNotFoundError:
-        raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to one") from None
-    with _scratch(parent, 0o700) as folder:
-        yield folder
-
-
 def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None:
-    """Name everything in a folder as ours, and ``products`` that may be made there later.
+    """Record every file in a folder as ours, and ``products`` that may be made there later.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The record cannot be written.
     """
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
     content = {"schema": SCHEMA, "kind": kind, "files": files, "products": sorted(products)}
@@ -128,29 +109,47 @@ def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None
 
 
 def is_ours(folder: Path, kind: Kind) -> bool:
-    """Whether a folder has the record of that kind; not whether nothing else is in it."""
+    """Return whether a folder has a record of this kind; it may hold other files too."""
     content = _read_record(folder)
     return content is not None and content["kind"] == kind
 
 
 def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
-    """Name more files as ours in a folder that has a record; elsewhere nothing happens.
+    """Record more files as ours in a folder that has a record; do nothing in another folder.
 
     Raises:
-        OSError: The record cannot be written.
+        OutputError: The record cannot be written.
     """
     content = _read_record(folder)
     if content is None:
         return
     added = {path.absolute().relative_to(folder.absolute()).as_posix() for path in paths}
     content["files"] = sorted(added.union(content["files"]))
-    beside = folder / f"{RECORD}.{os.getpid()}.part"
-    with undone(lambda: beside.unlink(missing_ok=True)):
-        beside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        os.replace(beside, folder / RECORD)
+    write_whole(folder / RECORD, json.dumps(content, indent=1) + "\n")
 
 
-# ---- what is ours --------------------------------------------------------------------------------------------------
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that appears whole or not at all.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+
+    def remove() -> None:
+        with suppress(OSError):
+            beside.unlink()
+
+    try:
+        with undone(remove):
+            beside.write_text(text, encoding="utf-8", newline="\n")
+            os.replace(beside, path)
+    except OSError as error:
+        hint = "check the disk and permissions"
+        raise OutputError(f"cannot be written ({error.strerror})", where=str(path), hint=hint) from None
+
+
+# ---- ownership -----------------------------------------------------------------------------------------------------
 
 
 def _check_ours(out: Path, kind: Kind) -> None:
@@ -170,7 +169,7 @@ def _check_ours(out: Path, kind: Kind) -> None:
 
 
 def _foreign(folder: Path, ours: set[str], below: str = "") -> list[str]:
-    """What a folder holds that neither ``ours`` nor its own record names, sorted."""
+    """Return the names in a folder that neither ``ours`` nor its own record has, sorted."""
     content = _read_record(folder)
     names = [] if content is None else [RECORD, *content["files"], *content["products"]]
     ours = ours.union(below + name for name in names)
@@ -201,10 +200,10 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
-    """Put ``beside`` in ``out``'s place; whatever interrupts it, one of the two results is there."""
+    """Put ``beside`` in the place of ``out``.  After any interruption one of the two results is there."""
     if not force or not out.exists():
         try:
-            # Atomic; on a folder that somebody filled meanwhile it fails instead of replacing it.
+            # This is atomic, and fails on a folder that somebody filled meanwhile.
             os.rename(beside, out)
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
@@ -213,11 +212,11 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
                 ) from None
             raise
         return
-    # A name that is never swept: killed between the two renames, the old result waits there for its user.
+    # Nobody sweeps this name.  If the process is killed between the two renames, the user finds the old result there.
     old = out.with_name(f"{out.name}.old-{secrets.token_hex(4)}")
     os.rename(out, old)
     try:
-        # Again, where nobody else writes any more.
+        # Check again, because nobody else writes there any more.
         if any(old.iterdir()):
             _check_ours(old, kind)
         os.rename(beside, out)
@@ -231,7 +230,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
 
 @contextmanager
 def _parents_of(out: Path) -> Iterator[None]:
-    """Make the folders above ``out``; those that stay empty go again."""
+    """Make the folders above ``out``, and remove those that stay empty."""
     missing = [folder for folder in out.parents if not folder.exists()]
 
     def remove() -> None:
@@ -250,28 +249,36 @@ def _parents_of(out: Path) -> Iterator[None]:
         yield
 
 
-def _first_existing(path: Path) -> Path:
-    while not path.exists():
-        path = path.parent
-    return path
-
-
 # ---- temporary folders ---------------------------------------------------------------------------------------------
 
 
 @contextmanager
-def _scratch(parent: Path, mode: int) -> Iterator[Path]:
+def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Path]:
+    """Yield a temporary folder.  It is removed after the block, also after a signal.
+
+    Args:
+        parent: The folder above it; the system's temporary folder by default.
+        mode: Permissions; only the user can read it by default.
+
+    Raises:
+        OutputError: The system has no temporary folder.
+        OSError: The folder cannot be made.
+    """
+    try:
+        parent = Path(tempfile.gettempdir()) if parent is None else parent
+    except FileNotFoundError:
+        raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to one") from None
     _sweep(parent)
     folder = parent / f"{_SCRATCH}{secrets.token_hex(4)}"
-    # Before it exists: no signal falls between.
+    # The folder does not exist yet, so no signal can come between.
     with undone(lambda: _remove(folder)):
         folder.mkdir(mode)
         record = os.open(folder / RECORD, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         try:
-            # Where nothing can be locked, nothing is swept either.
+            # Where nothing can be locked, nothing is swept.
             with suppress(OSError):
                 fcntl.flock(record, fcntl.LOCK_EX)
-            # After the lock: who finds the record unlocked finds it empty, and leaves it alone.
+            # This follows the lock.  A process that finds the record unlocked finds it empty, and leaves it alone.
             os.write(record, json.dumps({"schema": SCHEMA, "host": os.uname().nodename}).encode())
             yield folder
         finally:
@@ -279,10 +286,10 @@ def _scratch(parent: Path, mode: int) -> Iterator[Path]:
 
 
 def _sweep(parent: Path) -> None:
-    """Remove the temporary folders here that a process of ours has left that is gone."""
+    """Remove the temporary folders that processes of this package left when they were killed."""
     with suppress(OSError):
         for folder in parent.glob(f"{_SCRATCH}*"):
-            with suppress(OSError, ValueError, RecursionError):
+            with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
                 _sweep_one(folder)
 
 
@@ -291,20 +298,18 @@ def _sweep_one(folder: Path) -> None:
         return
     record = os.open(folder / RECORD, os.O_RDWR | os.O_NOFOLLOW)
     try:
-        # Fails where its process is alive.
+        # This fails while the process of the folder lives.
         fcntl.flock(record, fcntl.LOCK_EX | fcntl.LOCK_NB)
         content = json.loads(os.read(record, 1 << 24))
-        # Locks may not reach across machines.  A folder that was moved away as a whole names no machine.
+        # Locks may not reach across machines.  The record of a finished folder names no machine.
         if content["schema"] == SCHEMA and content.get("host", os.uname().nodename) == os.uname().nodename:
             _remove(folder)
-    except (KeyError, TypeError):
-        return
     finally:
         os.close(record)
 
 
 def _remove(folder: Path) -> None:
-    """Remove a temporary folder, its record last: what is interrupted is still known as ours."""
+    """Remove a temporary folder and its record last, so that after an interruption it still counts as ours."""
     with suppress(OSError):
         for entry in os.scandir(folder):
             if entry.is_dir(follow_symlinks=False):

@@ -1,4 +1,4 @@
-"""What users write in one word: a contact, an armature, a payload."""
+"""Parsers of contacts, armatures and payloads that users write as text."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from impact_posture.errors import ContactError, InputError
 
 
 def parse_contact(text: str) -> tuple[str, tuple[float, float, float], float | None]:
-    """Read ``FRAME:NX,NY,NZ[:IMPULSE]``; the frame's name may hold colons itself.
+    """Read ``FRAME:NX,NY,NZ[:IMPULSE]``; the name of the frame may contain colons.
 
     Raises:
-        ContactError: It does not have this form.
+        ContactError: The text does not have this form.
     """
     hint = "write FRAME:NX,NY,NZ or FRAME:NX,NY,NZ:IMPULSE"
     parts = text.split(":")
@@ -33,7 +33,7 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
     """Read ``--armature``: ``none``, one file, or any number of ``JOINT=VALUE``.
 
     Raises:
-        InputError: A mixture, or a value that is no number.
+        InputError: The forms are mixed, or a value is no number.
     """
     if not texts:
         return None
@@ -48,16 +48,16 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
             values[joint] = float(value)
         except ValueError:
             raise InputError(
-                f"'{text}' is no JOINT=VALUE", where="armature", hint="give none, one file, or JOINT=VALUE each"
+                f"'{text}' is no JOINT=VALUE", where="armature", hint="give none, one file, or only JOINT=VALUE"
             ) from None
     return values
 
 
 def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
-    """Read ``FRAME:MASS`` each; the frame's name may hold colons itself.
+    """Read texts ``FRAME:MASS``; the name of a frame may contain colons.
 
     Raises:
-        InputError: One does not have this form.
+        InputError: A text does not have this form.
     """
     found = []
     for text in texts:

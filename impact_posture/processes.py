@@ -1,4 +1,4 @@
-"""Work that is shared among forked processes, what a process does twice from one state, and how it ends early."""
+"""Share work among forked processes, run a function in a copy of this process, and end a process early."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from impact_posture.errors import WorkerDied
 
 _Result = TypeVar("_Result")
 
-# What a user or a system ends a process with; a closed terminal sends SIGHUP.
+# Signals by which a user or a system ends a process.  A closed terminal sends SIGHUP.
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-# Workers are forked and find the function here: what it holds (a CasADi solver) cannot be sent to them.
+# Forked workers find the function here, because the objects that it holds (a CasADi solver) cannot be sent to them.
 _WORK: dict[str, Callable[[int], Any]] = {}
 
-# What a process that ends early must undo, and which process has begun it: a fork inherits the list.
+# What a process must undo when it ends early, with the process that began it, because a fork inherits the list.
 _UNFINISHED: list[tuple[int, Callable[[], None]]] = []
 
-# How many blocks hold signals, and what came meanwhile.
+# Number of blocks that hold signals, and the ends that signals requested meanwhile.
 _HELD = [0]
 _LATER: list[Callable[[], None]] = []
 
@@ -37,9 +37,9 @@ _PR_SET_PDEATHSIG = 1
 
 @contextmanager
 def undone(undo: Callable[[], None]) -> Iterator[None]:
-    """Call ``undo`` when the block is left, also when a signal ends the process within it (:func:`end_early`).
+    """Call ``undo`` when the block ends, also when a signal ends the process within it (:func:`end_early`).
 
-    A signal may come while ``undo`` runs: it must bear being called twice.
+    A signal may come while ``undo`` runs, so a second call of ``undo`` must do no harm.
     """
     entry = (os.getpid(), undo)
     _UNFINISHED.append(entry)
@@ -52,8 +52,9 @@ def undone(undo: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Let no signal end the process within the block; one that comes takes effect behind it."""
-    # The mask for what is forked here; the count for this process, where another thread takes the signal.
+    """Let no signal end the process within the block; a signal that comes takes effect after it."""
+    # The mask protects processes that are forked here.  The count protects this one, because any thread may get a
+    # signal.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     _HELD[0] += 1
     try:
@@ -68,8 +69,8 @@ def signals_held() -> Iterator[None]:
 def end_early(leave: Callable[[], None]) -> None:
     """Kill the workers, undo what this process has not finished, newest first, and ``leave``.
 
-    For a signal's handler; ``leave`` calls ``os._exit``.  An exception would not do: the wrappers of C++ libraries
-    take a ``KeyboardInterrupt`` for a failed conversion and go on.
+    A signal handler calls this function, and ``leave`` calls ``os._exit``.  An exception is not enough, because the
+    wrappers of C++ libraries take a ``KeyboardInterrupt`` for a failed conversion and go on.
     """
     if _HELD[0]:
         _LATER.append(leave)
@@ -95,13 +96,13 @@ def _worker(index: int) -> tuple[int, Any]:
 
 @contextmanager
 def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Iterator[Iterator[tuple[int, _Result]]]:
-    """``(index, function(index))`` for each index below ``count``, as they finish.
+    """Yield ``(index, function(index))`` for each index below ``count``, in the order in which they finish.
 
-    In forked processes where ``jobs`` is more than one and the system can fork; else one after the other, here.  When
-    the block is left, in peace or by Ctrl-C, no process is left running; nor, on Linux, when this process is killed.
+    The calls run in forked processes if ``jobs`` is more than one and the system can fork, else in this process, one
+    after the other.  No process outlives the block, not even after Ctrl-C; on Linux none outlives this process.
 
     Raises:
-        WorkerDied: A worker was killed, for example for want of memory.
+        WorkerDied: A worker was killed, for example for lack of memory.
     """
     if min(jobs, count) < 2 or "fork" not in multiprocessing.get_all_start_methods():
         yield ((index, function(index)) for index in range(count))
@@ -110,8 +111,8 @@ def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Itera
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(min(jobs, count), multiprocessing.get_context("fork"), _depend, (os.getpid(),))
     try:
-        # The workers are forked here.  Signals reach every process of the terminal's group: workers must not act on
-        # them, not even at birth.
+        # The workers are forked here.  A signal reaches every process of the terminal.  No worker may act on it, not
+        # even at its start.
         with signals_held():
             futures = [pool.submit(_worker, index) for index in range(count)]
         yield _finished(futures)
@@ -131,10 +132,10 @@ def _finished(futures: list[Future[tuple[int, _Result]]]) -> Iterator[tuple[int,
 
 @contextmanager
 def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
-    """Begin ``function()`` in a copy of this process, at the very state that it is in; yield what waits for its end.
+    """Start ``function()`` in a copy of this process and yield a function that waits for its result.
 
-    For state that cannot be copied otherwise (physics, solvers).  The copy's exceptions are raised here.  When the
-    block is left, the copy is gone.
+    This copies state that cannot be copied otherwise (physics, solvers).  Exceptions of the copy are raised here.
+    The copy does not outlive the block.
 
     Raises:
         OSError: The system cannot fork.
@@ -170,7 +171,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
 
 
 def _answer(function: Callable[[], Any], writer: Any) -> NoReturn:
-    """Live as a copy: send what comes, and end without any of the original's clean-up."""
+    """Run in the copy: send the result, and end without the clean-up of the original."""
     try:
         try:
             answer = (True, function())
@@ -182,7 +183,7 @@ def _answer(function: Callable[[], Any], writer: Any) -> NoReturn:
 
 
 def _depend(parent: int) -> None:
-    """Leave signals to the parent, except SIGTERM, which a pool ends its workers with; end when the parent ends."""
+    """Ignore signals except SIGTERM, by which a pool ends its workers; end when the parent ends."""
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)

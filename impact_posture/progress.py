@@ -1,4 +1,4 @@
-"""Whoever waits is told what takes so long: the library tells, and the one that listens shows it."""
+"""Progress of long jobs, which the library reports to a listener."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-# Of what is being done, and the share of it that is done; ``None`` where nobody knows.
+# A listener takes the present activity and the share of it that is done, or ``None`` if that is unknown.
 Listener = Callable[[str, float | None], None]
 
 _LISTENERS: list[Listener] = []
-# A forked copy must not write on the original's terminal.
+# A forked process must not write on the terminal of its parent.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_LISTENERS.clear)
 
 
 def tell(doing: str, share: float | None = None) -> None:
-    """Tell the listener, where there is one."""
+    """Report to the listener, if there is one."""
     if _LISTENERS:
         _LISTENERS[-1](doing, share)
 
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Let ``listener`` be told within the block."""
+    """Report to ``listener`` within the block."""
     _LISTENERS.append(listener)
     try:
         yield

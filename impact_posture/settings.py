@@ -1,8 +1,8 @@
-"""The settings of a problem: one description for the command line, ``problem.toml`` and Python.
+"""Settings of a problem, described once for the command line, ``problem.toml`` and Python.
 
 A setting is a field of :class:`RobotSettings`, :class:`ImpactSettings` or :class:`ProblemSettings`.  Its annotation
-carries all that anybody needs to know about it: type, allowed values, meaning, and how it is written as an option.
-The command line makes its options from these fields, ``problem.toml`` its keys, and Python its keyword arguments.
+carries its type, allowed values, meaning and spelling as an option.  The command line makes its options from these
+fields, ``problem.toml`` its keys, and Python its keyword arguments.
 
 Nothing heavy is imported here, because ``--help`` reads this module.
 """
@@ -28,24 +28,24 @@ SupportKind = Literal["point", "surface"]
 
 CONTACT, METRIC, ROBOT, TASK, OUTPUT = "Contact", "Measure", "Robot", "Task", "Output"
 
-# Distances of --tradeoff without a number.
+# Number of distances of --tradeoff without a number.
 TRADEOFF_POINTS = 16
 _LARGEST = float("inf")
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What the annotation of a setting says besides its type.
+    """Annotation of a setting, besides its type.
 
     Attributes:
-        help: Its meaning in one line.
-        panel: The part of ``--help`` where the option stands.
-        takes: What the option takes, as ``--help`` writes it.
-        default: The default in words, where it comes from the robot.
-        demand: What a value must be, as an error says it.
-        holds: Whether a value is that.
-        option: How the option is spelled, if not like the field.
-        parse: Makes the value from all words that the command line gives.
+        help: Meaning in one line.
+        panel: Part of ``--help`` with the option.
+        takes: Placeholder of the value in ``--help``.
+        default: Default in words, if it comes from the robot.
+        demand: Demand on a value, as an error states it.
+        holds: Whether a value meets the demand.
+        option: Spelling of the option, if it differs from the field.
+        parse: Function from all words of the command line to the value.
         repeatable: Whether the option may be given several times.
     """
 
@@ -63,7 +63,7 @@ class Setting:
         """Return the value.
 
         Raises:
-            ValueError: It is not what it must be.
+            ValueError: The value does not meet the demand.
         """
         if value is not None and self.holds is not None and not self.holds(value):
             raise ValueError(self.demand)
@@ -108,7 +108,7 @@ def _masses(value: tuple[tuple[str, float], ...]) -> bool:
 
 
 def _contacts(value: Any) -> bool:
-    """Whether each is written as a contact and has a direction."""
+    """Tell whether each text is a contact with a direction."""
     for text in (value,) if isinstance(value, str) else value:
         try:
             _, normal, impulse = parse_contact(text)
@@ -126,18 +126,18 @@ _ZERO_OR_MORE = {"holds": _not_negative, "demand": "give a number, zero or more"
 
 @dataclass(frozen=True, kw_only=True)
 class LoadOptions:
-    """How a robot is loaded; what is ``None`` comes from its ``robot.toml``.
+    """Options of loading a robot; the ``robot.toml`` provides a value for ``None``.
 
     Attributes:
         lock: Joints made rigid at the default posture: names, or patterns such as ``gripper_*``.
-        lock_massless: Whether all joints that move no mass are made rigid, too.
+        lock_massless: Whether all joints that move no mass are also made rigid.
         root: ``free-flyer`` puts the robot on a floating base, ``fixed`` welds it to the world.
-        armature: ``"none"``, a TOML file's path, or values by joint, kg·m² (kg if prismatic).  ``None`` takes
+        armature: ``"none"``, path of a TOML file, or values by joint, kg·m² (kg if prismatic).  ``None`` takes
             the values of robot.toml, else the rotor data of the SRDF, else zero.
-        config: Path of another robot.toml than the one beside the URDF.
-        srdf: Another SRDF: a path, or ``example-robot-data:<path below robots/>``.
-        package_dir: Folders where ``package://`` paths lead.  Dynamics needs none, pictures may.
-        mounting: How far joints sit from where the URDF has them, by joint: meters, in the parent joint's axes.
+        config: Path of a robot.toml that replaces the one beside the URDF.
+        srdf: SRDF: a path, or ``example-robot-data:<path below robots/>``.
+        package_dir: Folders of ``package://`` paths.  Dynamics need none, but pictures may.
+        mounting: Displacement of joints from their place in the URDF, by joint, meters, in the parent joint's axes.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
@@ -149,8 +149,10 @@ class LoadOptions:
             ROBOT, "JOINT", repeatable=True,
         ),
     ] = ()  # fmt: skip
-    lock_massless: Annotated[bool, Setting("Joints that move no mass are made rigid, all of them.", ROBOT)] = False
-    root: Annotated[Root | None, Setting("What the base hangs on.", ROBOT, default="robot.toml's")] = None
+    lock_massless: Annotated[bool, Setting("Make all joints that move no mass rigid.", ROBOT)] = False
+    root: Annotated[Root | None, Setting("Joint between the world and the base.", ROBOT, default="robot.toml's")] = (
+        None
+    )
     armature: Annotated[
         str | Mapping[str, float] | None,
         Setting(
@@ -159,7 +161,7 @@ class LoadOptions:
         ),
     ] = None  # fmt: skip
     config: Annotated[
-        str | None, Setting("What URDF cannot say about the robot.", ROBOT, "ROBOT.TOML", "beside the URDF")
+        str | None, Setting("Data of the robot that URDF cannot hold.", ROBOT, "ROBOT.TOML", "beside the URDF")
     ] = None
     srdf: Annotated[
         str | None,
@@ -168,14 +170,14 @@ class LoadOptions:
         ),
     ] = None  # fmt: skip
     package_dir: Annotated[
-        tuple[str, ...], Setting("Where package:// leads; repeatable.", ROBOT, "DIR", repeatable=True)
+        tuple[str, ...], Setting("Folder of package:// paths; repeatable.", ROBOT, "DIR", repeatable=True)
     ] = ()
     mounting: Mapping[str, Vector3] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSettings(LoadOptions):
-    """Which robot, and how it is loaded.
+    """The robot, and the options of loading it.
 
     Attributes:
         robot: Known name, path to a ``.urdf``, or ``example-robot-data:<path>``.
@@ -186,7 +188,7 @@ class RobotSettings(LoadOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ImpactSettings(RobotSettings):
-    """One impact of a robot; what is ``None`` comes from the robot."""
+    """An impact of a robot; the robot provides a value for ``None``."""
 
     frame: Annotated[str | None, Setting("Contact frame.", CONTACT, "F", "the robot's")] = None
     normal: Annotated[
@@ -200,15 +202,15 @@ class ImpactSettings(RobotSettings):
         Vector3 | None,
         Setting("Contact point from the frame's origin, in the frame, m.", CONTACT, "X Y Z", "0 0 0", **_NUMBER),
     ] = None
-    normal_frame: Annotated[NormalFrame, Setting("Axes that the normal is given in.", CONTACT)] = "world"
+    normal_frame: Annotated[NormalFrame, Setting("Axes of the normal.", CONTACT)] = "world"
     contact: Annotated[
         str | tuple[str, ...] | None,
         Setting(
-            "Instead of --frame and --normal; repeatable: up to 6 contacts at once.",
+            "Contact, in place of --frame and --normal; repeatable for up to 6 contacts at once.",
             CONTACT, "FRAME:NX,NY,NZ[:IMPULSE]", holds=_contacts, repeatable=True,
         ),
     ] = None  # fmt: skip
-    bilateral: Annotated[bool, Setting("Several contacts can pull as well as push (grasps).", CONTACT)] = False
+    bilateral: Annotated[bool, Setting("Contacts can also pull, as in a grasp.", CONTACT)] = False
     impulse: Annotated[
         float, Setting("Bound on the impulse, N·s.", CONTACT, holds=_positive, demand="give a number above zero")
     ] = 1.0
@@ -222,7 +224,7 @@ class ImpactSettings(RobotSettings):
     ] = 0.0  # fmt: skip
     metric: Annotated[
         MetricKind,
-        Setting("How the velocity jump is weighed: euclidean, kinetic or weighted.", METRIC, "KIND"),
+        Setting("Norm of the velocity jump: euclidean, kinetic or weighted.", METRIC, "KIND"),
     ] = "euclidean"
     weights: Annotated[
         str | tuple[float, ...] | None,
@@ -248,7 +250,7 @@ class ImpactSettings(RobotSettings):
     armature_range: Annotated[
         tuple[float, float] | None,
         Setting(
-            "Factors on the armature, lowest and highest, whose worst counts.",
+            "Lowest and highest factor on the armature; the worst case counts.",
             METRIC, "LOW HIGH", "as stated", holds=_factors,
             demand="give two factors above zero, the lower first, such as 0.5 2",
         ),
@@ -256,7 +258,7 @@ class ImpactSettings(RobotSettings):
     payload: Annotated[
         tuple[tuple[str, float], ...],
         Setting(
-            "Mass in kg that the robot may or may not carry there; repeatable; the worst counts.",
+            "Mass in kg that the robot may carry at the frame; repeatable; the worst case counts.",
             METRIC, "FRAME MASS", holds=_masses,
             demand="give a frame and kg above zero each", parse=parse_payloads, repeatable=True,
         ),
@@ -279,7 +281,7 @@ class ImpactSettings(RobotSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemSettings(ImpactSettings):
-    """The content of a ``problem.toml``; what is ``None`` comes from the robot or is the option's default."""
+    """Content of a ``problem.toml``; the robot or the default of the option provides a value for ``None``."""
 
     schema: Literal["impact-posture/problem/1"] = "impact-posture/problem/1"
     q: tuple[float, ...] | None = None
@@ -293,7 +295,7 @@ class ProblemSettings(ImpactSettings):
     contact_pose: Annotated[
         ContactPose | None,
         Setting(
-            "What is held of the contact frame: full, position, aligned, free or box.",
+            "Constraint on the contact frame: full, position, aligned, free or box.",
             TASK, "KIND", "robot.toml's, else full",
         ),
     ] = None  # fmt: skip
@@ -312,7 +314,7 @@ class ProblemSettings(ImpactSettings):
     base: Annotated[
         BaseMode | None,
         Setting(
-            "What a floating base may do: free, level, fixed or box.", TASK, "KIND", "robot.toml's, else free"
+            "Constraint on a floating base: free, level, fixed or box.", TASK, "KIND", "robot.toml's, else free"
         ),
     ] = None  # fmt: skip
     base_box: Annotated[Vector3, Setting("Half extents of --base box, m.", TASK, "X Y Z", **_LENGTHS)] = (
@@ -329,7 +331,8 @@ class ProblemSettings(ImpactSettings):
     com_margin: Annotated[
         float | None,
         Setting(
-            "Its distance from the support polygon's edges, m.", TASK, default="robot.toml's", **_ZERO_OR_MORE
+            "Distance of the center of mass from the support polygon's edges, m.", TASK, default="robot.toml's",
+            **_ZERO_OR_MORE,
         ),
     ] = None  # fmt: skip
     keep_contacts: Annotated[bool, Setting("The impact must neither lift nor slide a foot.", TASK)] = False
@@ -338,17 +341,17 @@ class ProblemSettings(ImpactSettings):
         float | None,
         Setting("Distance from the joint limits, rad or m.", TASK, default="robot.toml's", **_ZERO_OR_MORE),
     ] = None
-    regularization: Annotated[float, Setting("Weight of staying near the start.", TASK, **_ZERO_OR_MORE)] = 0.0
+    regularization: Annotated[float, Setting("Weight of the distance from the start.", TASK, **_ZERO_OR_MORE)] = 0.0
     tradeoff: Annotated[
         int,
         Setting(
-            "What a smaller change would buy: the best objective within each of K distances from the start, "
-            f"{TRADEOFF_POINTS} if K is left out; 0: none.",
+            "Best objective within each of K distances from the start, which shows the gain of smaller changes; "
+            f"{TRADEOFF_POINTS} distances without K, none for 0.",
             TASK, "[K]", holds=_not_negative, demand="give a whole number, zero or more",
         ),
     ] = 0  # fmt: skip
     starts: Annotated[
-        int, Setting("Starting points of the search.", OUTPUT, holds=_positive, demand="give 1 or more")
+        int, Setting("Number of starting points of the search.", OUTPUT, holds=_positive, demand="give 1 or more")
     ] = 16
     seed: Annotated[
         int, Setting("Seed of the random starts.", OUTPUT, holds=_not_negative, demand="give 0 or more")

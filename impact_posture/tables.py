@@ -1,4 +1,4 @@
-"""Tables that users write as TOML files or as options: read, and checked against the dataclass that they fill."""
+"""Reading of tables from TOML files or options, and their validation against dataclasses."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ import tomllib
 from dataclasses import asdict, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, ClassVar, TypeVar, get_type_hints
 
-from impact_posture.errors import SpecError, nearest, not_one_of
+from impact_posture.errors import InputError, SpecError, nearest, not_one_of
 
 _Table = TypeVar("_Table")
 
 STRICT = {"extra": "forbid", "strict": True}
-"""``__pydantic_config__`` of a dataclass that refuses unknown keys, and a number in quotes or a true for 1."""
+"""``__pydantic_config__`` of a dataclass that refuses unknown keys, numbers in quotes, and ``true`` for 1."""
 
 
 def validate(cls: type[_Table], data: object, where: str) -> _Table:
     """Make a dataclass of a table; the first fault becomes one line with the nearest valid key.
 
     Args:
-        cls: A dataclass, whose fields may be dataclasses; ``__pydantic_config__`` says how strict it is.
-        data: The table, as :func:`read_toml` gives it; a ``schema_`` field is read from the key ``schema``.
-        where: The file, for the error.
+        cls: Dataclass, whose fields may be dataclasses; its ``__pydantic_config__`` defines how strict it is.
+        data: Table from :func:`read_toml`; the key ``schema`` fills a field ``schema_``.
+        where: File to name in errors.
 
     Raises:
         SpecError: A key is unknown or missing, or a value does not fit.
@@ -32,12 +32,12 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
     from pydantic import ValidationError
 
     try:
-        # As JSON, since strict dataclasses take no table of Python.
+        # As JSON, because strict dataclasses do not accept Python dictionaries.
         text = json.dumps(data, default=_plain)
         made: _Table = _adapter(cls).validate_json(text)  # type: ignore[arg-type]
         return made
     except ValidationError as error:
-        # A misspelt key that must be there is misspelt first, and missing second.
+        # A misspelt key is reported before the key that is then missing.
         faults = error.errors()
         fault = next((f for f in faults if f["type"] in _UNKNOWN), faults[0])
         location = tuple(part for part in fault["loc"] if not (isinstance(part, str) and "[" in part))
@@ -47,7 +47,7 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
             raise SpecError(f"unknown key '{path}'", where=where, hint=f"did you mean {close}?") from None
         what, hint = str(fault["msg"]), "correct the value"
         if fault["type"] == "value_error":
-            # The demand of a setting is what to do.
+            # The demand of a setting is the hint.
             raise SpecError(
                 f"key '{path}' is {fault['input']}", where=where, hint=str(fault["ctx"]["error"])
             ) from None
@@ -77,23 +77,19 @@ def _adapter(cls: type) -> Any:
 
 
 def _keys_at(cls: type, location: tuple[int | str, ...]) -> list[str]:
-    """The keys of the table at a place inside the table of ``cls``."""
+    """Return the keys of the table at a location inside the table of ``cls``."""
     for part in location:
         hint = get_type_hints(cls).get(str(part))
-        inner = [
-            c for c in (hint, *getattr(hint, "__args__", ())) if isinstance(c, type) and hasattr(c, "__annotations__")
-        ]
+        inner = [c for c in (hint, *getattr(hint, "__args__", ())) if isinstance(c, type) and is_dataclass(c)]
         cls = inner[0] if inner else cls
-    if not is_dataclass(cls):
-        return [name.rstrip("_") for name in cls.model_fields]  # type: ignore[attr-defined]
     return [field.name for field in fields(cls)]
 
 
 def read_toml(path: Path) -> dict[str, object]:
-    """Read a TOML file; a missing or malformed one becomes one line.
+    """Read a TOML file.
 
     Raises:
-        SpecError: There is no such file, it cannot be read, or it is no TOML.
+        SpecError: There is no such file, it cannot be read, or it is no valid TOML.
     """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
@@ -105,3 +101,39 @@ def read_toml(path: Path) -> dict[str, object]:
         raise SpecError("is nested too deeply", where=str(path), hint="correct the syntax") from None
     except tomllib.TOMLDecodeError as error:
         raise SpecError(f"is not valid TOML ({error})", where=str(path), hint="correct the syntax") from None
+
+
+class Checked:
+    """Base of a dataclass whose annotations say which values it takes, in a file and in Python."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+
+    def __post_init__(self) -> None:
+        """Check every value against its annotation.
+
+        Raises:
+            InputError: A value does not fit.
+        """
+        from pydantic import ValidationError
+
+        for name, adapter in _field_adapters(type(self)).items():  # type: ignore[arg-type]
+            try:
+                adapter.validate_python(getattr(self, name))
+            except ValidationError as error:
+                # Of the alternatives of a union, the one that fits best fails deepest.
+                fault = max(error.errors(), key=lambda fault: len(fault["loc"]))
+                missing = fault["type"] == "missing"
+                index = "".join(f"[{part}]" for part in fault["loc"] if isinstance(part, int) and not missing)
+                raise InputError(
+                    f"{name}{index} is {fault['input']!r}",
+                    where=type(self).__name__,
+                    hint=fault["msg"].replace("Input should", "it should"),
+                ) from None
+
+
+@cache
+def _field_adapters(cls: type) -> dict[str, Any]:
+    from pydantic import TypeAdapter
+
+    hints = get_type_hints(cls, include_extras=True)
+    return {field.name: TypeAdapter(hints[field.name]) for field in fields(cls)}

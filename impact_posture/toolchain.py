@@ -1,4 +1,4 @@
-"""The user's C compiler: found once, called one way."""
+"""The C compiler of the user: find it and run it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from pathlib import Path
 from impact_posture.errors import CompilerError
 from impact_posture.processes import undone
 
-# A compiler is several processes.  They are one group, which ends when the pipe on standard input does: when this
-# process closes it, and when this process is killed.
+GET_ONE = "install gcc or clang, or set CC"
+
+# A compiler is several processes.  The shell makes them one group and kills it when the pipe on standard input ends,
+# which happens when this process closes the pipe and when this process is killed.
 _GUARD = (
     "exec 3<&0 </dev/null; { read -r _ <&3; kill -KILL 0; } >/dev/null 2>&1 & "
     '"$@" 3<&-; code=$?; kill -KILL $!; exit $code'
@@ -23,22 +25,27 @@ _GUARD = (
 
 
 def find_compiler() -> list[str] | None:
-    """The C compiler as the head of a command: ``$CC`` (which may carry options), cc, gcc or clang; else ``None``.
+    """Return the C compiler as the head of a command: ``$CC`` (with its options), cc, gcc or clang; else ``None``.
 
     Raises:
-        CompilerError: ``$CC`` is no command: a quote is open.
+        CompilerError: ``$CC`` has an open quote.
     """
-    for words in (words_of("CC"), ["cc"], ["gcc"], ["clang"]):
-        if words and shutil.which(words[0]):
-            return words
+    for command in (words_of("CC"), ["cc"], ["gcc"], ["clang"]):
+        if command and shutil.which(command[0]):
+            return command
     return None
 
 
+def no_compiler(where: str) -> CompilerError:
+    """Build the error for a machine without a C compiler."""
+    return CompilerError("no C compiler found", where=where, hint=GET_ONE)
+
+
 def words_of(variable: str) -> list[str]:
-    """An environment variable's words, split as a shell does.
+    """Return the words of an environment variable, split as a shell does.
 
     Raises:
-        CompilerError: A quote is open.
+        CompilerError: The variable has an open quote.
     """
     text = os.environ.get(variable, "")
     try:
@@ -50,25 +57,25 @@ def words_of(variable: str) -> list[str]:
 
 
 def run_compiler(command: list[str], folder: Path) -> None:
-    """Run a compiler's command in ``folder``.
+    """Run one compiler command in ``folder``.
 
     Raises:
-        CompilerError: With the compiler's first error line and the command.
+        CompilerError: The command failed; with the first error line of the compiler.
     """
     run_compilers([command], folder)
 
 
 def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
-    """Run compilers' commands in ``folder``, as many at once as there are cores, in this order.
+    """Run compiler commands in ``folder``, as many at once as there are cores, in this order.
 
     Raises:
-        CompilerError: With the first error line of the first one that failed, and its command.
+        CompilerError: A command failed; with the first error line of the first failure.
     """
     waiting, running = list(commands), list[tuple[list[str], subprocess.Popen[str]]]()
     reader, writer = os.pipe()
 
     def stop() -> None:
-        """Leave none behind, nor what it has started itself."""
+        """Kill every compiler and the processes that it has started."""
         for _, process in running:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
@@ -82,9 +89,9 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
                     command = waiting.pop(0)
                     running.append((command, _start(command, folder, reader)))
                 command, process = running[0]
-                said = "".join(reversed(process.communicate()))
+                output = "".join(reversed(process.communicate()))
                 running.pop(0)
-                _check(command, folder, process.returncode, said)
+                _check(command, folder, process.returncode, output)
     finally:
         for _, process in running:
             process.communicate()
@@ -92,7 +99,7 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
 
 def _start(command: list[str], folder: Path, tied_to: int) -> subprocess.Popen[str]:
     pipe = subprocess.PIPE
-    # What a killed compiler leaves goes with the folder that it was to write into.
+    # The temporary files of a killed compiler go with the folder of its result.
     beside = (folder / command[command.index("-o") + 1]).absolute().parent
     try:
         return subprocess.Popen(
@@ -104,11 +111,11 @@ def _start(command: list[str], folder: Path, tied_to: int) -> subprocess.Popen[s
 
 
 def _check(command: list[str], folder: Path, code: int, output: str) -> None:
-    """Refuse what failed: ``output`` is standard error, then standard output."""
+    """Refuse a command that failed; ``output`` is its standard error, then its standard output."""
     if code == 0 and (folder / command[command.index("-o") + 1]).is_file():
         return
-    said = [line for line in output.splitlines() if line.strip()]
-    first = next((line for line in said if "error" in line.lower()), said[0] if said else None)
+    lines = [line for line in output.splitlines() if line.strip()]
+    first = next((line for line in lines if "error" in line.lower()), lines[0] if lines else None)
     raise CompilerError(
         f"{first or f'it said nothing, exit code {code}'} (command: {shlex.join(command)}, in {folder})",
         where="the C compiler failed",

@@ -19,8 +19,8 @@ import impact_posture.codegen.export
 import impact_posture.experiment.figures
 import impact_posture.experiment.folders
 import impact_posture.experiment.reproduction
-import impact_posture.job
 import impact_posture.plot
+import impact_posture.result_folder
 import impact_posture.verification.verification
 from impact_posture_cli.main import main
 

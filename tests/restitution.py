@@ -1,7 +1,8 @@
-"""Measure the rebound of a contact law: a ball hits it in the very world that robots are simulated in."""
+"""Restitution of a contact law, measured with a ball in the world that robots are simulated in."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,22 +16,22 @@ from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Shape, S
 from impact_posture.simulation.world import World, build_world
 
 _RADIUS = 0.02
-# Time constants of the law after which a contact counts as endless.
+# Number of time constants of the law after which a contact counts as endless.
 _PATIENCE = 200
-# Where in a time step the ball touches, as shares of it: restitution depends on that a little.
+# Shares of a time step after which the ball touches, because restitution depends on that a little.
 _PHASES = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
 @dataclass(frozen=True)
 class Bounce:
-    """One impact, averaged over the places in a time step where it may begin.
+    """An impact, averaged over the parts of a time step where it may begin.
 
     Attributes:
         restitution: Normal speed after over before.
-        spread: Largest less smallest restitution over those places.
-        duration: From the first to the last force, s.
-        depth: How deep the ball went, m.
-        peak: Largest force times duration over impulse: 1 for a constant force.
+        spread: Largest minus smallest restitution over those parts.
+        duration: Time from the first to the last force, s.
+        depth: Largest depth of the ball, m.
+        peak: Largest force times duration over impulse, 1 for a constant force.
     """
 
     restitution: float
@@ -41,10 +42,10 @@ class Bounce:
 
 
 def ideal_restitution(damping: float) -> float:
-    """Restitution of ``r'' = −2ζω r' − ω² r``, which lets go when it would have to pull, at any ω.
+    """Return the restitution of ``r'' = −2ζω r' − ω² r`` at any ω, where the contact ends when it would have to pull.
 
     ``exp(−2ζ arccos ζ/√(1 − ζ²))`` below ζ = 1, ``e⁻²`` there, ``exp(−2ζ arcosh ζ/√(ζ² − 1))`` above.  A
-    :class:`ContactLaw` comes to it as its share d goes to 1 and its time constant is many time steps.
+    :class:`ContactLaw` approaches it when its share d is near 1 and its time constant is many time steps.
 
     Args:
         damping: ζ, at least zero.
@@ -56,7 +57,7 @@ def ideal_restitution(damping: float) -> float:
 
 
 def ball(mass: float = 1.0, radius: float = _RADIUS) -> Robot:
-    """A robot without joints: a solid ball, frame ``ball`` in its center."""
+    """Return a robot without joints: a solid ball, with the frame ``ball`` in its center."""
     model = pin.Model()
     joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
     model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, radius), pin.SE3.Identity())
@@ -71,23 +72,29 @@ def measure_restitution(
     """Let a ball hit a surface squarely, without gravity.
 
     Args:
-        law: Of the surface.
-        speed: Of approach, m/s.
-        timestep: Of the physics, s.
-        mass: Of the ball, kg; makes no difference, since MuJoCo scales the law by the mass that it feels.
+        law: Contact law of the surface.
+        speed: Approach speed, m/s.
+        timestep: Time step of the physics, s.
+        mass: Mass of the ball, kg.  It makes no difference, because MuJoCo scales the law by the mass that it feels.
 
     Raises:
-        InputError: The ball does not come off, or the law does not fit the time step.
+        InputError: The ball stays on the surface, or the law does not fit the time step.
     """
     found = [_one(law, speed, timestep, mass, phase) for phase in _PHASES]
-    mean = {key: float(np.mean([getattr(bounce, key) for bounce in found])) for key in Bounce.__annotations__}
-    return Bounce(**{**mean, "spread": float(np.ptp([bounce.restitution for bounce in found]))})
+    restitutions = [b.restitution for b in found]
+    return Bounce(
+        restitution=float(np.mean(restitutions)),
+        spread=float(np.ptp(restitutions)),
+        duration=_mean(found, "duration"),
+        depth=_mean(found, "depth"),
+        peak=_mean(found, "peak"),
+    )
 
 
 def _one(law: ContactLaw, speed: float, timestep: float, mass: float, phase: float) -> Bounce:
     robot = ball(mass)
     scene = Scene(
-        surfaces=(Surface("floor", (0, 0, 1), gap=phase * speed * timestep, law=law),),
+        surfaces=(Surface("floor", (0, 0, 1), gap=phase * speed * timestep, **vars(law)),),
         shapes=(Shape("ball", size=(_RADIUS,), center=(0, 0, 0)),),
         physics=Physics(timestep, gravity=(0, 0, 0)),
     )
@@ -97,10 +104,10 @@ def _one(law: ContactLaw, speed: float, timestep: float, mass: float, phase: flo
 
 
 def _follow(world: World, surface: Surface, speed: float) -> Bounce:
-    """Step until the surface has let go."""
-    law = surface.law
+    """Step until the contact ends."""
     idle = ActuatorCommand(np.zeros(0), np.zeros(0))
-    constant = law.solref[0] if law.solref[0] > 0 else 1 / np.sqrt(-law.solref[0])
+    time = surface.solref[0]
+    constant = time if time > 0 else 1 / np.sqrt(-time)
     forces, depth, ended = [0.0], 0.0, False
     for _ in range(int(_PATIENCE * constant / world.timestep)):
         world.step(idle)
@@ -111,8 +118,12 @@ def _follow(world: World, surface: Surface, speed: float) -> Bounce:
         if ended:
             break
     if not ended:
-        raise InputError(f"the ball stays on it (solref {law.solref})", where="contact law", hint="damp it less")
+        raise InputError(f"the ball stays on it (solref {surface.solref})", where="contact law", hint="damp it less")
     pushed = np.flatnonzero(forces)
     duration, impulse = (pushed[-1] - pushed[0] + 1) * world.timestep, sum(forces) * world.timestep
     after = float(world.truth().v[2])
     return Bounce(after / speed, 0.0, duration, depth, max(forces) * duration / impulse)
+
+
+def _mean(found: Sequence[Bounce], name: str) -> float:
+    return float(np.mean([getattr(bounce, name) for bounce in found]))

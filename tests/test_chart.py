@@ -1,4 +1,4 @@
-"""The manifold as expressions: the retraction, its tangent map, and the chart that the optimizer moves in."""
+"""The chart that the optimizer moves in, and gradients on the tangent space."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.dynamics.chart import Chart, integrate, tangent_map
-from impact_posture.dynamics.tree import Coupling, PointOnLink, Product, Tree, Wrench
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.tree import PointOnLink, Tree, Wrench
 from tests.helpers import NAMES, Vector, assert_close, random_configurations, rng, robot
-
-# From far below the series' switch, across it (1e-2), to several turns.
-STEPS = [0.0, 1e-300, 1e-12, 1e-8, 1e-5, 1e-3, 9.9e-3, 1.01e-2, 0.1, 1.0, 3.1, 6.3, 20.0]
+from tests.tangent import tangent_map
 
 
 @functools.cache
@@ -37,70 +35,14 @@ def _model(name: str) -> pin.Model:
 
 
 @functools.cache
-def functions(name: str) -> tuple[Chart, ca.Function, ca.Function]:
-    model = _model(name)
-    chart = Chart(model)
-    q, v = ca.SX.sym("q", model.nq), ca.SX.sym("v", model.nv)
-    return (
-        chart,
-        ca.Function("integrate", [q, v], [integrate(chart, q, v)]),
-        ca.Function("tangent", [q], [tangent_map(chart, q)]),
-    )
-
-
-def same_side(chart: Chart, q: Vector, like: Vector) -> Vector:
-    """Turn quaternions to the half that ``like`` lies in: both halves are the same rotation."""
-    q = q.copy()
-    for slot in chart.slots:
-        if slot.kind.family in ("free-flyer", "spherical"):
-            part = slice(slot.q.stop - 4, slot.q.stop)
-            q[part] *= np.sign(q[part] @ like[part])
-    return q
-
-
-@pytest.mark.parametrize("name", [*NAMES, "mixed"])
-def test_integrate_is_pinocchios(name: str) -> None:
-    model = _model(name)
-    chart, integrate_fun, _ = functions(name)
-    generator = rng(name, "integrate")
-    for q, size in zip(random_configurations(model, len(STEPS), name), STEPS, strict=True):
-        v = size * generator.normal(size=model.nv)
-        found = np.array(integrate_fun(q, v)).reshape(-1)
-        expected = np.array(pin.integrate(model, q, v))
-        assert_close(found, same_side(chart, expected, found), 1e-13, f"step {size:g}")
-
-
-def test_integrate_by_hand() -> None:
-    # A quarter turn to the left while driving ahead at speed v: an arc of radius 2v/π.
-    model = pin.Model()
-    model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")
-    chart = Chart(model)
-    q, v = ca.SX.sym("q", 4), ca.SX.sym("v", 3)
-    integrate_fun = ca.Function("f", [q, v], [integrate(chart, q, v)])
-    arc = np.array(integrate_fun([1.0, 2.0, 1.0, 0.0], [np.pi / 2, 0.0, np.pi / 2])).reshape(-1)
-    np.testing.assert_allclose(arc, [2.0, 3.0, 0.0, 1.0], atol=1e-15)
-
-
-@pytest.mark.parametrize("name", [*NAMES, "mixed"])
-def test_integrate_is_smooth_at_zero(name: str) -> None:
-    """First and second derivatives of ``q ⊕ v`` at ``v = 0`` are finite; the first is the tangent map."""
-    model = _model(name)
-    chart, _, tangent_fun = functions(name)
-    q, v = ca.SX.sym("q", model.nq), ca.SX.sym("v", model.nv)
-    step = integrate(chart, q, v)
-    weight = rng(name, "weight").normal(size=model.nq)
-    hessian, _ = ca.hessian(ca.dot(ca.SX(weight), step), v)
-    derivatives = ca.Function("d", [q, v], [ca.jacobian(step, v), hessian])
-    (at,) = random_configurations(model, 1, name, "smooth")
-    first, second = (np.array(d) for d in derivatives(at, np.zeros(model.nv)))
-    assert np.isfinite(second).all()
-    assert_close(first, tangent_fun(at), 1e-14, "jacobian at zero")
+def chart_of(name: str) -> Chart:
+    return Chart(_model(name))
 
 
 @pytest.mark.parametrize("name", [*NAMES, "mixed"])
 def test_tangent_map_is_the_derivative_of_pinocchios_integrate(name: str) -> None:
-    model = _model(name)
-    _, _, tangent_fun = functions(name)
+    model, symbol = _model(name), ca.SX.sym("q", _model(name).nq)
+    tangent_fun = ca.Function("tangent", [symbol], [tangent_map(chart_of(name), symbol)])
     step = 1e-3
     for q in random_configurations(model, 2, name, "tangent"):
 
@@ -122,22 +64,19 @@ def test_adjoint_gradients_are_casadis_derivatives_on_the_tangent_space(name: st
     q = ca.SX.sym("q", model.nq)
     tree = Tree(model, q)
     point = PointOnLink(model.njoints - 1, generator.normal(size=3), np.array(pin.SE3.Random().rotation))
-    fixed = [ca.SX(generator.normal(size=model.nv)) for _ in range(2)]
-    at_u, at_v = (tree.velocities(rate) for rate in fixed)
+    v, tau, other_tau = (ca.SX(generator.normal(size=model.nv)) for _ in range(3))
     force, moment = ca.SX(generator.normal(size=3)), ca.SX(generator.normal(size=3))
-    cases: dict[str, tuple[ca.SX, ca.SX]] = {"uMv": (
-        ca.dot(fixed[0], tree.mass_times(fixed[1])), tree.bracket_gradient(products=[Product(at_u, at_v)])
-    )}  # fmt: skip
-    for in_frame in (False, True):
-        wrench = Wrench(point, force, moment, in_frame=in_frame)
-        value = ca.dot(tree.generalized_force([wrench]), fixed[1])
-        cases[f"wJv {in_frame}"] = (value, tree.bracket_gradient([Coupling(wrench, at_v)]))
+    energy = ca.dot(v, tree.mass_times(v))
+    cases: dict[str, tuple[ca.SX, ca.SX]] = {"vMv": (energy, tree.energy_gradient(tree.velocities(v)))}
     direction = tree.rotation(point) @ force
     cases["turning"] = (ca.dot(direction, moment), tree.turning_gradient(point, direction, moment))
-    # d(τᵀM⁻¹τ) = −aᵀ dM a: the bracket holds a fixed although it depends on q.
-    a, at_a = tree.solve(tau=fixed[0])
-    half = tree.bracket_gradient(products=[Product(at_a, at_a, -1.0)])
-    cases["τᵀM⁻¹τ"] = (ca.dot(fixed[0], a), half)
+    # The pair's bracket holds both answers fixed although they depend on q: d(τᵀM⁻¹τ') = −a'ᵀ dM a.
+    x, y = tree.respond(tau=tau), tree.respond(tau=other_tau)
+    cases["τᵀM⁻¹τ'"] = (ca.dot(other_tau, x.a), tree.pair_gradient(x, y))
+    for in_frame in (False, True):
+        # With x = M⁻¹(τ + Jᵀw) and y = M⁻¹τ': d(τ'ᵀx) = wᵀ dJ y − yᵀ dM x.
+        pushed = tree.respond(tau=tau, wrenches=[Wrench(point, force, moment, in_frame=in_frame)])
+        cases[f"τᵀM⁻¹Jᵀw {in_frame}"] = (ca.dot(other_tau, pushed.a), tree.pair_gradient(pushed, y))
     tangent = tangent_map(tree.chart, q)
     for what, (value, gradient) in cases.items():
         pair = ca.Function("pair", [q], [ca.gradient(value, q).T @ tangent, gradient])
@@ -149,7 +88,7 @@ def test_adjoint_gradients_are_casadis_derivatives_on_the_tangent_space(name: st
 @pytest.mark.parametrize("name", [*NAMES, "mixed"])
 def test_chart_round_trip(name: str) -> None:
     model = _model(name)
-    chart, _, _ = functions(name)
+    chart = chart_of(name)
     x = ca.SX.sym("x", chart.nx)
     configuration_fun = ca.Function("q", [x], [chart.configuration(x), chart.norms(x)])
     for q in random_configurations(model, 4, name, "chart", spread=3.0):
@@ -163,7 +102,7 @@ def test_chart_round_trip(name: str) -> None:
 
 
 def test_to_q_normalizes_quaternions() -> None:
-    chart, _, _ = functions("mixed")
+    chart = chart_of("mixed")
     x = chart.to_x(random_configurations(mixed_model(), 1, "normalize")[0])
     stretched = x.copy()
     for part in chart.quaternion_slices():
@@ -172,7 +111,7 @@ def test_to_q_normalizes_quaternions() -> None:
 
 
 def test_several_turns_of_a_continuous_joint_are_one_configuration() -> None:
-    chart, _, _ = functions("kinova")
+    chart = chart_of("kinova")
     (slot, *_) = [s for s in chart.slots if s.kind.family == "continuous"]
     x = chart.to_x(robot("kinova").posture())
     turned = x.copy()
@@ -183,7 +122,7 @@ def test_several_turns_of_a_continuous_joint_are_one_configuration() -> None:
 @pytest.mark.parametrize("name", [*NAMES, "mixed"])
 def test_bounds_are_the_models(name: str) -> None:
     model = _model(name)
-    chart, _, _ = functions(name)
+    chart = chart_of(name)
     lower, upper = chart.bounds()
     assert (lower <= upper).all()
     for slot in chart.slots:

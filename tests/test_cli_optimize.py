@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from impact_posture import plot
-from impact_posture.job import load_view
 from impact_posture.plot.view import header_lines
+from impact_posture.result_folder import load_view
 from tests.command import run
 
 COMMAND = Path(sys.executable).parent / "impact-posture"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
 import re
 import subprocess
 from collections.abc import Iterator
@@ -14,17 +15,14 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from jinja2 import UndefinedError
 
-from impact_posture.codegen.build_check import (
-    CompiledExport,
-    casadi_difference,
-    compile_and_check,
-    compiled,
-    oracle_difference,
-)
+from impact_posture.codegen.build_check import compile_and_check, largest_difference
 from impact_posture.codegen.export import Export, export
+from impact_posture.codegen.functions import casadi_reference, oracle_reference
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.naming import c_identifier
+from impact_posture.codegen.render import Verbatim, _environment
 from impact_posture.errors import CompilerError, InputError, MetricError, OutputError, PostureError
 from impact_posture.escape import c_comment
 from impact_posture.impact.contact import ImpactContact, Support
@@ -33,6 +31,8 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import ObjectiveKind
 from impact_posture.toolchain import find_compiler, run_compiler
+from tests import exported
+from tests.exported import Exported
 from tests.tools import need, need_compiler
 
 KINOVA = "example-robot-data:kinova_description/robots/kinova.urdf"
@@ -89,7 +89,7 @@ CASES = {
 class Built:
     objective: ImpactObjective
     export: Export
-    library: CompiledExport
+    library: Exported
     folder: Path
 
 
@@ -100,7 +100,7 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     folder = tmp_path_factory.mktemp(request.param)
     robot = objective.robot
     written = export(objective, folder, posture=sample_postures(robot, 1, 7)[0], check=False)
-    with compiled(folder, written.prefix, robot.nq, robot.nv, STRICT) as library:
+    with exported.built(folder, written.prefix, STRICT) as library:
         yield Built(objective, written, library, folder)
 
 
@@ -122,13 +122,13 @@ def pendulum(tmp_path: Path) -> str:
 def test_agrees_with_casadi(built: Built) -> None:
     # The C divides by multiplying with reciprocals; stiff feet (1/ε of 1e4 robots) turn its last digits into this.
     tolerance = 1e-10 if built.objective.supports else 1e-12
-    assert casadi_difference(built.library, built.objective, 10) <= tolerance
+    assert largest_difference(built.library.gradient, built.objective, casadi_reference, 10) <= tolerance
 
 
 def test_agrees_with_pinocchio(built: Built) -> None:
     # The oracle solves the KKT system of feet at compliance 1e-4/m: its condition costs four digits and more.
     tolerance = 1e-8 if built.objective.supports else 1e-11
-    assert oracle_difference(built.library, built.objective, 10) <= tolerance
+    assert largest_difference(built.library.gradient, built.objective, oracle_reference, 10) <= tolerance
 
 
 def test_gradients_are_those_of_the_values(built: Built) -> None:
@@ -153,7 +153,7 @@ def test_free_beside_standing(built: Built) -> None:
     assert (frame["free"] is None) == (not objective.supports)
     if objective.supports:
         free = replace(objective, supports=())
-        assert oracle_difference(built.library.at(f"{built.export.prefix}_free"), free, 5) <= 1e-10
+        assert largest_difference(built.library.free().gradient, free, oracle_reference, 5) <= 1e-10
         q, n = np.array(frame["self_test"]["q"]), np.array(frame["self_test"]["n"])
         assert frame["free"]["self_test"]["q"] == frame["self_test"]["q"]
         assert abs(built.library.eval(q, n)[1] / frame["free"]["self_test"]["H"] - 1) > 1e-3
@@ -207,7 +207,7 @@ def test_code_for_a_quantity_that_does_not_exist(pendulum: str, tmp_path: Path) 
     robot = load_robot(pendulum)
     objective = ImpactObjective(robot, ImpactContact("tip", (1.0, 0.0, 0.0)), kind="speed")
     export(objective, tmp_path, prefix="pend")
-    with compiled(tmp_path, "pend", 1, 1) as library:
+    with exported.built(tmp_path, "pend") as library:
         assert library.objective(np.zeros(1))[0] == 3
         assert library.objective(np.full(1, 0.1))[0] == 0
         assert library.eval(np.zeros(1), np.array([1.0, 0.0, 0.0])) == (0, 0.0, np.zeros(1))
@@ -242,10 +242,10 @@ def test_object_holds_no_writable_data(built: Built, tmp_path: Path) -> None:
     lines = subprocess.run([nm, str(target)], capture_output=True, text=True, check=True).stdout.splitlines()
     kinds = {line.split()[-2] for line in lines}
     assert not kinds & set("bBdDcCsSgG")
-    exported = {line.split()[-1].lstrip("_") for line in lines if line.split()[-2] in "TR"}
+    names = {line.split()[-1].lstrip("_") for line in lines if line.split()[-2] in "TR"}
     free = built.export.manifest["frames"][0]["free"]
     expected = set(built.export.manifest["symbols"].values()) | set(free["symbols"].values() if free else ())
-    assert exported == expected
+    assert names == expected
 
 
 def test_works_from_several_threads(built: Built) -> None:
@@ -263,14 +263,14 @@ def test_gradient_may_overwrite_the_configuration(built: Built) -> None:
     _, H, gradient = built.library.eval(q, UNIT)
     shared, value, n = q.copy(), np.zeros(1), UNIT.copy()
     pointers = [v.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for v in (shared, n, value, shared)]
-    assert getattr(built.library.library, f"{built.export.prefix}_eval")(*pointers) == 0
+    assert getattr(built.library.gradient._library, f"{built.export.prefix}_eval")(*pointers) == 0
     assert value[0] == H
     np.testing.assert_array_equal(shared[: gradient.size], gradient)
 
 
 def test_posture_is_a_constant(built: Built) -> None:
     robot, prefix = built.objective.robot, built.export.prefix
-    array = (ctypes.c_double * robot.nq).in_dll(built.library.library, f"{prefix}_posture")
+    array = (ctypes.c_double * robot.nq).in_dll(built.library.gradient._library, f"{prefix}_posture")
     np.testing.assert_array_equal(np.array(array), sample_postures(robot, 1, 7)[0])
     np.testing.assert_array_equal(built.export.manifest["posture"], np.array(array))
 
@@ -438,7 +438,7 @@ def test_compiled_code_that_computes_something_else(pendulum: str, tmp_path: Pat
     changed = source.read_text().replace("*H = ", "*H = 1.000001 * ")
     assert changed != source.read_text()
     source.write_text(changed)
-    with pytest.raises(CompilerError, match="differs from CasADi's"):
+    with pytest.raises(CompilerError, match="differ from those of CasADi"):
         compile_and_check(tmp_path, "pend", objective)
 
 
@@ -493,10 +493,24 @@ def test_bad_folder_and_posture(pendulum: str, tmp_path: Path) -> None:
         export(objective, tmp_path, posture=np.zeros(2), check=False)
     with pytest.raises(PostureError):
         export(objective, tmp_path, posture=np.full(1, np.nan), check=False)
-    (tmp_path / ".pendulum_tip.h.part").mkdir()
+    (tmp_path / f".pendulum_tip.h.{os.getpid()}.part").mkdir()
     with pytest.raises(OutputError, match="cannot be written"):
         export(objective, tmp_path, check=False)
 
 
 def test_names_cannot_end_a_comment() -> None:
     assert c_comment("a*/ int x; /* \\ ??/ \n ü") == "a_/ int x; /_ _ __/ _ _"
+
+
+def test_templates_escape_every_text_and_refuse_unknown_names() -> None:
+    environment = _environment(c_comment)
+    assert environment.from_string("{{ name }} {{ code }}").render(name="*/", code=Verbatim("*/")) == "_/ */"
+    assert environment.from_string("{{ values | doubles }}").render(values=[-1.5]) == "{\n    -1.5\n  }"
+    for text in (
+        "{{ nobody }}",
+        "{{ name.nobody }}",
+        "{% if nobody %}{% endif %}",
+        "{% for x in nobody %}{% endfor %}",
+    ):
+        with pytest.raises(UndefinedError):
+            environment.from_string(text).render(name="x")

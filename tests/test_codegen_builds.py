@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impact_posture.codegen.build_check import casadi_difference, compiled, oracle_difference, self_test_tolerance
+from impact_posture.codegen.build_check import largest_difference, self_test_tolerance
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
-from impact_posture.codegen.export import export
-from impact_posture.codegen.export_folder import write_export
+from impact_posture.codegen.export import export, write_export
+from impact_posture.codegen.functions import casadi_reference, oracle_reference
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.library import products
 from impact_posture.codegen.manifest import sample_postures
+from impact_posture.codegen.naming import products
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.metric import Metric
@@ -27,7 +27,7 @@ from impact_posture.output_folder import RECORD
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import LoadOptions
 from impact_posture.toolchain import run_compiler
-from tests import command
+from tests import command, exported
 from tests.tools import need, need_compiler
 
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
@@ -81,10 +81,10 @@ def test_every_joint_type_metric_and_objective(tmp_path: Path, metric: Any, kind
         robot, ImpactContact("l8", (1.0, 0.3, -0.2), (0.02, 0, 0.1), impulse=1.3), Metric(metric, weights), kind
     )
     written = export(objective, tmp_path, prefix="chain", real=real, check=False)
-    with compiled(tmp_path, "chain", robot.nq, robot.nv, ("-O0", *STRICT), real) as library:
+    with exported.built(tmp_path, "chain", ("-O0", *STRICT)) as library:
         tolerance = 1e-11 if real is DOUBLE else self_test_tolerance(objective, real)
-        assert casadi_difference(library, objective, 5) <= tolerance
-        assert oracle_difference(library, objective, 5) <= max(tolerance, 1e-10)
+        assert largest_difference(library.gradient, objective, casadi_reference, 5) <= tolerance
+        assert largest_difference(library.gradient, objective, oracle_reference, 5) <= max(tolerance, 1e-10)
     assert written.manifest["real"] == real.name
 
 
@@ -231,7 +231,7 @@ def test_prefixes_that_cmake_and_make_keep_for_themselves(arm: ImpactObjective, 
 
 
 def test_a_prefix_that_hides_a_header_of_c(arm: ImpactObjective, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"taken by C's math\.h"):
+    with pytest.raises(InputError, match=r"name of the C header math\.h"):
         export(arm, tmp_path, prefix="math")
 
 
@@ -278,7 +278,7 @@ def test_folder_is_replaced_only_if_it_is_an_export(arm: ImpactObjective, tmp_pa
         write_export([arm], ours, prefix="second")
     assert (ours / "first.c").is_file()
     written = write_export([arm], ours, prefix="second", force=True)
-    assert sorted(p.name for p in ours.iterdir()) == sorted([RECORD, *(p.name for p in written.export.files)])
+    assert sorted(p.name for p in ours.iterdir()) == sorted([RECORD, *(p.name for p in written.files)])
 
 
 def test_build_in_the_folder(arm: ImpactObjective, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,7 +317,7 @@ def test_a_build_that_fails_leaves_what_was_there(
         def interrupt(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("impact_posture.codegen.library.run_compiler", interrupt)
+        monkeypatch.setattr("impact_posture.libraries.run_compiler", interrupt)
     for out in (kept, tmp_path / "none"):
         with pytest.raises(error):
             write_export([arm], out, prefix="arm", build=True, force=True)

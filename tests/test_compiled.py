@@ -111,7 +111,7 @@ def test_auto_falls_back_with_one_warning(
     if how == "compiler":
         monkeypatch.setenv("CC", need("false"))
     elif how == "disk":
-        monkeypatch.setattr(libraries, "put_library", full_disk)
+        monkeypatch.setattr(libraries, "_put", full_disk)
     elif how == "cache":
         cache.write_text("a file")
     else:

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
-import typer.main
-from pydantic import BaseModel
 
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.pareto import pareto_front
@@ -21,8 +19,8 @@ from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.settings import ContactPose, ProblemSettings
-from impact_posture.simulation.scenario_file import ScenarioFile
-from impact_posture_cli.app import app
+from impact_posture.simulation.scenario import ScenarioTable
+from impact_posture_cli.app import COMMANDS, build
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -41,34 +39,24 @@ def rows(page: Path) -> dict[str, list[str]]:
 
 
 def nested(annotation: object) -> type | None:
-    """The model inside ``Model``, ``Model | None``, ``tuple[Model, ...]`` or ``dict[str, Model]``."""
-    if inspect.isclass(annotation) and (is_dataclass(annotation) or issubclass(annotation, BaseModel)):
+    """The dataclass inside ``Table``, ``Table | None``, ``tuple[Table, ...]`` or ``dict[str, Table]``."""
+    if inspect.isclass(annotation) and is_dataclass(annotation):
         return annotation
     return next((m for a in getattr(annotation, "__args__", ()) if (m := nested(a)) is not None), None)
 
 
-def keys(model: type, prefix: str = "") -> dict[str, object]:
-    """Dotted keys of a model and their defaults; ``...`` where there is none."""
+def keys(table: type, prefix: str = "") -> dict[str, object]:
+    """Dotted keys of a dataclass and their defaults; ``...`` where there is none."""
     found: dict[str, object] = {}
-    if is_dataclass(model):
-        hints = get_type_hints(model)
-        for one in fields(model):
-            inner = nested(hints[one.name])
-            default = one.default if one.default_factory is MISSING else one.default_factory()
-            if inner is not None:
-                named = str(hints[one.name]).startswith("dict")
-                found |= keys(inner, f"{prefix}{one.name}.NAME." if named else f"{prefix}{one.name}.")
-            else:
-                found[prefix + one.name] = ... if default is MISSING else default
-        return found
-    for name, field in model.model_fields.items():
-        key = prefix + (field.alias or name)
-        inner = nested(field.annotation)
+    hints = get_type_hints(table)
+    for one in fields(table):
+        inner = nested(hints[one.name])
+        default = one.default if one.default_factory is MISSING else one.default_factory()
         if inner is not None:
-            named = str(field.annotation).startswith("dict")
-            found |= keys(inner, f"{key}.NAME." if named else f"{key}.")
+            named = str(hints[one.name]).startswith("dict")
+            found |= keys(inner, f"{prefix}{one.name}.NAME." if named else f"{prefix}{one.name}.")
         else:
-            found[key] = ... if field.is_required() else field.default
+            found[prefix + one.name] = ... if default is MISSING else default
     return found
 
 
@@ -121,7 +109,7 @@ def test_every_problem_toml_key_has_its_row() -> None:
 
 
 def test_every_scenario_toml_key_has_its_row() -> None:
-    expected, found = keys(ScenarioFile), rows(DOCS / "reference" / "scenario-toml.md")
+    expected, found = keys(ScenarioTable), rows(DOCS / "reference" / "scenario-toml.md")
     assert set(found) == set(expected)
     for key, value in expected.items():
         assert found[key][1] == shown_default(value), f"default of {key}"
@@ -133,7 +121,7 @@ def test_every_option_is_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
     reference = importlib.import_module("cli_reference").markdown()
     sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", reference, re.MULTILINE | re.DOTALL))
-    commands = typer.main.get_command(app).commands
+    commands = {name: build(name) for name in COMMANDS}
     assert list(sections) == list(commands)
     for name, command in commands.items():
         table = [line for line in sections[name].splitlines() if line.startswith("| `-")]
@@ -145,7 +133,7 @@ def test_every_option_is_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_every_problem_key_is_an_option() -> None:
     """``problem.toml`` says that each of its keys is an option."""
-    command = typer.main.get_command(app).commands["optimize"]
+    command = build("optimize")
     names = {o[2:].replace("-", "_") for p in command.params for o in p.opts if o.startswith("--")}
     names |= {"schema", "robot"}
     # Written by the tool itself: the start as numbers, and the compliance in force.

@@ -15,7 +15,8 @@ from impact_posture.errors import InputError, OutputError
 from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.draft import Draft, write_draft
-from impact_posture.robot.guess import feet, support, tips
+from impact_posture.robot.foot_shape import support
+from impact_posture.robot.guess import feet, tips
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.spec import RobotSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, robots_data

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.joints import joint_kind
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.dynamics.tree import Coupling, PointOnLink, Product, Tree, Wrench
+from impact_posture.dynamics.tree import PointOnLink, Tree, Wrench
 from impact_posture.errors import UnsupportedJoint
 from impact_posture.robot.urdf import build_model
 from tests.helpers import (
@@ -60,13 +60,16 @@ def build(model: pin.Model, frame: int) -> Symbolic:
     tree = Tree(model, q)
     point = point_at(model, frame)
     world, local = Wrench(point, w[:3], w[3:]), Wrench(point, w[:3], w[3:], in_frame=True)
-    at_v, at_u = tree.velocities(v), tree.velocities(u)
-    solved, rates = tree.solve(tau=tau, wrenches=[world])
+    at_v = tree.velocities(v)
+    solved, other = tree.respond(tau=tau, wrenches=[world]), tree.respond(tau=u, wrenches=[local])
+    rates = solved.velocities
     outputs = {
         "M": tree.mass_matrix(),
         "M v": tree.mass_times(v),
-        "solve": tree.solve(tau=tau)[0],
-        "solve with wrench": solved,
+        "M v of known velocities": tree.mass_times(v, at_v, extra=False),
+        "solve": tree.respond(tau=tau).a,
+        "solve with wrench": solved.a,
+        "solve with wrench in frame": other.a,
         "solve's velocities": ca.horzcat(*[rates[i] for i in sorted(rates)]),
         "velocities": ca.horzcat(*[at_v[i] for i in sorted(at_v)]),
         "force": tree.generalized_force([world]),
@@ -76,9 +79,8 @@ def build(model: pin.Model, frame: int) -> Symbolic:
         "rotation": tree.rotation(point),
         "com": tree.center_of_mass(),
         "J v": tree.point_velocity(point, at_v),
-        "gradient uMv": tree.bracket_gradient(products=[Product(at_u, at_v)]),
-        "gradient wJv": tree.bracket_gradient([Coupling(world, at_v)]),
-        "gradient wJv in frame": tree.bracket_gradient([Coupling(local, at_v)]),
+        "gradient vMv": tree.energy_gradient(at_v),
+        "gradient of a pair": tree.pair_gradient(solved, other),
     }
     names = list(outputs)
     all_fun = ca.Function(
@@ -93,8 +95,9 @@ def build(model: pin.Model, frame: int) -> Symbolic:
 
 
 OUTPUTS = (
-    "M", "M v", "solve", "solve with wrench", "solve's velocities", "velocities", "force", "force in frame",
-    "two forces", "position", "rotation", "com", "J v", "gradient uMv", "gradient wJv", "gradient wJv in frame",
+    "M", "M v", "M v of known velocities", "solve", "solve with wrench", "solve with wrench in frame",
+    "solve's velocities", "velocities", "force", "force in frame", "two forces", "position", "rotation", "com", "J v",
+    "gradient vMv", "gradient of a pair",
 )  # fmt: skip
 
 
@@ -112,12 +115,14 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
         pin.forwardKinematics(model, data, q, rate)
         return np.column_stack([data.v[i].vector for i in range(1, model.njoints)])
 
-    accelerated = np.linalg.solve(M, tau + J.T @ w)
+    accelerated, other = np.linalg.solve(M, tau + J.T @ w), np.linalg.solve(M, u + J.T @ turned)
     expected: dict[str, Vector] = {
         "M": M,
         "M v": M @ v,
+        "M v of known velocities": M @ v,
         "solve": np.linalg.solve(M, tau),
         "solve with wrench": accelerated,
+        "solve with wrench in frame": other,
         "solve's velocities": link_velocities(accelerated),
         "velocities": link_velocities(v),
         "force": J.T @ w,
@@ -132,13 +137,15 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
         assert_close(found[name], value, TOLERANCE, name)
     # Pinocchio's derivative algorithms, which share nothing with the backward sweeps under test.
     numeric, point = Numeric(model).at(q), point_at(model, frame)
+    terms = (
+        (numeric.coupling_gradient(point, w, other), np.abs(w) @ np.abs(J @ other)),
+        (numeric.coupling_gradient(point, w, accelerated, in_frame=True), np.abs(turned) @ np.abs(J @ accelerated)),
+        (-numeric.inertial_gradient(other, accelerated), np.abs(other) @ np.abs(M @ accelerated)),
+    )
     gradients = {
-        "gradient uMv": (numeric.inertial_gradient(u, v), np.abs(u) @ np.abs(M @ v)),
-        "gradient wJv": (numeric.coupling_gradient(point, w, v), np.abs(w) @ np.abs(J @ v)),
-        "gradient wJv in frame": (
-            numeric.coupling_gradient(point, w, v, in_frame=True), np.abs(turned) @ np.abs(J @ v)
-        ),
-    }  # fmt: skip
+        "gradient vMv": (numeric.inertial_gradient(v, v), np.abs(v) @ np.abs(M @ v)),
+        "gradient of a pair": (sum(gradient for gradient, _ in terms), max(scale for _, scale in terms)),
+    }
     for name, (value, scale) in gradients.items():
         assert_close(found[name], value, TOLERANCE, name, scale)
     quaternion, position = (np.array(o).reshape(-1) for o in symbolic.chart_fun(symbolic.chart.to_x(q)))

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from impact_posture.codegen.emitter import DOUBLE, Constants, Dialect, Emitter, c_double
+from impact_posture.codegen.emitter import DOUBLE, Constants, Emitter, c_double
 from impact_posture.codegen.graph import CALLS, graph_of
 from impact_posture.codegen.layout import lay_out
 from impact_posture.errors import CompilerError
@@ -24,7 +24,7 @@ def c_function(function: ca.Function) -> str:
     graph = graph_of(function)
     layout = lay_out(graph, [function.name_out()], block=10)
     constants = Constants("f", DOUBLE)
-    emitter = Emitter(layout, Dialect("f", DOUBLE, {1: "double"}), 8, constants)
+    emitter = Emitter(layout, "f", DOUBLE, {1: "double"}, constants)
     blocks = "\n".join(block.text for block in emitter.blocks)
     parameters = [f"const double *{v}" for v in graph.inputs] + [f"double *{v}" for v in graph.outputs]
     angles = len(layout.angles)

@@ -19,11 +19,11 @@ import pytest
 from impact_posture import libraries
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.library import build_library
 from impact_posture.codegen.reader import read_manifest
 from impact_posture.errors import CompilerError, OutputError, SpecError
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.libraries import build_library
 from impact_posture.robot.robot_loader import load_robot
 from tests.plot.views import PENDULUM
 from tests.tools import need, need_compiler

@@ -14,7 +14,6 @@ import scipy.optimize
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.library import build_library, library_path
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import FrameNotFound, ImpactPostureError, InputError, SpecError
@@ -23,6 +22,7 @@ from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.worst_case import ModelSet
+from impact_posture.libraries import build_library, library_path
 from impact_posture.posture.constraint import CenterOfMassOverFeet
 from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem

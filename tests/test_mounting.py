@@ -100,7 +100,7 @@ def test_the_floating_base_itself_is_not_mounted() -> None:
 
 def test_a_scenarios_mounting_reaches_the_robot(tmp_path: Path) -> None:
     found = read_scenario("aerial-vertical")
-    assert found.load.mounting == {"shoulder_roll": (-0.08, 0.0, 0.0)}
+    assert found.mounting == {"shoulder_roll": (-0.08, 0.0, 0.0)}
     text = Path(found.source).read_text(encoding="utf-8")
     assert "mounting = " in text
     without = tmp_path / "plain.toml"

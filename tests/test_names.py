@@ -26,8 +26,8 @@ from impact_posture import errors, escape
 from impact_posture.codegen.code import build_code
 from impact_posture.codegen.emitter import DOUBLE
 from impact_posture.codegen.export import default_prefix, export
-from impact_posture.codegen.variants import variants
-from impact_posture.dynamics.mjcf import write_mjcf
+from impact_posture.codegen.functions import named_objectives
+from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.experiment.reproduction import Reproduction
 from impact_posture.experiment.reproduction_summary import summary
 from impact_posture.experiment.statistics import Row
@@ -120,7 +120,7 @@ def exports(arm: Robot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
     # Names are no part of the functions: they are made once.
     point = (0.3, 0.0, 0.0)
     harmless = ImpactObjective(arm, ImpactContact("tip", (0, 0.6, 0.8), point))
-    code = build_code(variants([harmless], "arm"), "arm", DOUBLE)
+    code = build_code(named_objectives([harmless], "arm"), "arm", DOUBLE)
     folders = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("impact_posture.codegen.export.build_code", lambda *_, **__: code)
@@ -251,7 +251,7 @@ def test_a_path_that_is_not_utf8_is_refused() -> None:
 def test_mujoco_loads_every_name(arm: Robot, many: Robot) -> None:
     pytest.importorskip("mujoco")
     for robot in (many, *[renamed(arm, name) for name in NASTY]):
-        written = write_mjcf(robot.model, robot.name)
+        written = build_mjcf(robot.model, robot.name)
         model = written.compile()
         assert model.nv == robot.nv
         assert all(model.site(site).id >= 0 for site in written.sites.values())
@@ -264,7 +264,7 @@ def test_mujoco_loads_a_scene_with_such_surfaces_and_shapes(arm: Robot) -> None:
     for name in NASTY:
         robot = renamed(arm, name)
         surface = Surface(name, (0.0, 0.0, 1.0), gap=0.1)
-        built = build_scene(robot, Scene((surface,), (Shape(name),)), robot.posture())
+        built = build_scene(robot, Scene((surface,), (Shape(name, (0.01,)),)), robot.posture())
         model = built.mjcf.compile()
         assert (model.npair, model.ngeom) == (1, 2) and model.geom(built.shape_geoms[0]).id >= 0, ascii(name)[:60]
 

@@ -1,4 +1,4 @@
-"""Twin branches in vectors: the same numbers as Pinocchio's, on random robots and on those that have twins."""
+"""Repeated limbs in SIMD lanes: the numbers of Pinocchio, on random robots and on known ones."""
 
 from __future__ import annotations
 
@@ -13,16 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from impact_posture.codegen.build_check import compiled, oracle_difference
-from impact_posture.codegen.code import build_code
-from impact_posture.codegen.emitter import DOUBLE
+from impact_posture.codegen.build_check import largest_difference
 from impact_posture.codegen.export import export
-from impact_posture.codegen.functions import Library, library
-from impact_posture.codegen.graph import ARITHMETIC, COSINE, Graph, graph_of
+from impact_posture.codegen.functions import NamedObjective, library, oracle_reference
+from impact_posture.codegen.graph import ARITHMETIC, COSINE, Graph
 from impact_posture.codegen.layout import lay_out
-from impact_posture.codegen.simd_lanes import packed
 from impact_posture.codegen.sums import rebuilt
-from impact_posture.codegen.variants import variants
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.impact_case import ImpactCase
@@ -32,18 +28,19 @@ from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import LoadOptions
 from impact_posture.toolchain import run_compiler
+from tests.exported import built
 from tests.helpers import assert_close, random_configurations, rng, robot, unit
 from tests.tools import need_compiler
 
 KINDS = ("revolute", "prismatic", "continuous")
 AXES = ("1 0 0", "0 1 0", "0 0 -1", "0.6 0 0.8")
 COMPUTE: dict[str, Callable[..., np.ndarray]] = {
-    "+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide, "neg": np.negative, "inv": np.reciprocal,
+    "+": np.add, "-": np.subtract, "*": np.multiply, "neg": np.negative, "inv": np.reciprocal,
 }  # fmt: skip
 
 
-def twin_urdf(branch: list[int], branches: int, seed: int, *, odd: bool) -> str:
-    """Branches of the same joints and of other numbers on a body; with ``odd``, one more with other joints."""
+def limbs_urdf(limb: list[int], limbs: int, seed: int, *, odd: bool) -> str:
+    """Limbs with the same joints and other numbers on a body; with ``odd``, one more limb with other joints."""
     generator = np.random.default_rng(seed)
 
     def numbers(low: float, high: float, count: int = 3) -> str:
@@ -59,7 +56,7 @@ def twin_urdf(branch: list[int], branches: int, seed: int, *, odd: bool) -> str:
         )
 
     parts = [link("body")]
-    lists = [(f"b{k}", branch) for k in range(branches)] + ([("odd", [*branch, 5])] if odd else [])
+    lists = [(f"b{k}", limb) for k in range(limbs)] + ([("odd", [*limb, 5])] if odd else [])
     for name, codes in lists:
         parent = "body"
         for depth, code in enumerate(codes):
@@ -71,7 +68,7 @@ def twin_urdf(branch: list[int], branches: int, seed: int, *, odd: bool) -> str:
                 f'<origin xyz="{numbers(-0.3, 0.3)}" rpy="{numbers(-1, 1)}"/><axis xyz="{axis}"/>{limit}</joint>',
             ]
             parent = f"{name}_{depth}"
-    return f'<robot name="twins">{"".join(parts)}</robot>'
+    return f'<robot name="limbs">{"".join(parts)}</robot>'
 
 
 def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -94,10 +91,6 @@ def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarr
         assert np.size(value) == node.width
         found.append(value)
     return {name: np.array([float(found[k]) for k in nodes]) for name, nodes in graph.outputs.items()}
-
-
-def packed_of(found: Library) -> Graph:
-    return packed(graph_of(found.function), found.seeds, {"constants": list(found.constants)})
 
 
 def shares(graph: Graph) -> dict[int, int]:
@@ -124,29 +117,29 @@ def shares(graph: Graph) -> dict[int, int]:
     st.sampled_from(["fixed", "free-flyer"]),
     st.sampled_from(["euclidean", "kinetic", "weighted"]),
 )
-def test_random_twins_against_pinocchio(
+def test_random_limbs_against_pinocchio(
     tmp_path_factory: pytest.TempPathFactory,
-    branch: list[int],
+    limb: list[int],
     count: int,
     seed: int,
     odd: bool,
     root: str,
     metric: str,
 ) -> None:
-    path = tmp_path_factory.mktemp("twins") / "twins.urdf"
-    path.write_text(twin_urdf(branch, count, seed, odd=odd))
+    path = tmp_path_factory.mktemp("limbs") / "limbs.urdf"
+    path.write_text(limbs_urdf(limb, count, seed, odd=odd))
     loaded = load_robot(str(path), LoadOptions(root=root))  # type: ignore[arg-type]
-    twins = RepeatedLimbs(loaded.model)
-    assert sorted(len(g) for g in twins.groups) == {2: [2], 3: [2], 4: [4], 5: [4]}[count]
-    generator = rng("twins", seed)
+    limbs = RepeatedLimbs(loaded.model)
+    assert sorted(len(g) for g in limbs.groups) == {2: [2], 3: [2], 4: [4], 5: [4]}[count]
+    generator = rng("limbs", seed)
     weights = tuple(generator.uniform(0.5, 2.0, loaded.nv)) if metric == "weighted" else None
-    supports = (Support(f"b1_{len(branch) - 1}"),) if seed % 3 == 0 else ()
-    contact = ImpactContact(f"b0_{len(branch) - 1}", (0.3, -0.4, 0.9), (0.05, 0.1, -0.02))
+    supports = (Support(f"b1_{len(limb) - 1}"),) if seed % 3 == 0 else ()
+    contact = ImpactContact(f"b0_{len(limb) - 1}", (0.3, -0.4, 0.9), (0.05, 0.1, -0.02))
     objective = ImpactObjective(loaded, contact, Metric(metric, weights), "speed", supports)  # type: ignore[arg-type]
-    found = library([objective], ["twins"])
-    graph = packed_of(found)
+    found = library([NamedObjective(objective, "limbs")])
+    graph = found.vector_graph()
     assert max(shares(graph)) == (4 if count > 3 else 2)
-    for q in random_configurations(loaded.model, 2, "twins", seed):
+    for q in random_configurations(loaded.model, 2, "limbs", seed):
         n = unit(generator)
         turned = replace(contact, normal=tuple(n))
         oracle = ImpactOracle(ImpactCase(loaded, turned, objective.metric, supports, objective.compliance))
@@ -167,14 +160,14 @@ def test_random_twins_against_pinocchio(
     ("name", "frame", "width", "most"),
     [("talos", "gripper_right_base_link", 2, 0.65), ("solo8", "base_link", 4, 0.45), ("romeo", "r_ankle", 2, 0.75)],
 )
-def test_robots_with_twins(name: str, frame: str, width: int, most: float) -> None:
+def test_robots_with_repeated_limbs(name: str, frame: str, width: int, most: float) -> None:
     objective = ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))
-    found = library([objective], [name])
-    graph = packed_of(found)
+    found = library([NamedObjective(objective, name)])
+    graph = found.vector_graph()
     counts = shares(graph)
     assert set(counts) == {1, width}
     # The same with numbers alone: vectors change the order of no sum.
-    plain = graph_of(found.function, {"constants": found.constants})
+    plain = found.graph()
     assert sum(counts.values()) < most * shares(plain)[1]
     for q in random_configurations(robot(name).model, 2, name):
         inputs = {"q": q, "n": unit(rng(name))}
@@ -194,8 +187,8 @@ def longest(graph: Graph) -> int:
 @pytest.mark.parametrize("name", ["solo8", "panda", "talos"])
 def test_sums_in_another_order_have_the_same_value_sooner(name: str) -> None:
     frame = robot(name).spec.contact.frame if robot(name).spec.contact else robot(name).model.frames[-1].name
-    found = library([ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))], [name])
-    graph = packed_of(found)
+    found = library([NamedObjective(ImpactObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8))), name)])
+    graph = found.vector_graph()
     other = rebuilt(graph)
     assert longest(other) < 0.95 * longest(graph)
     assert sum(shares(other).values()) <= 1.01 * sum(shares(graph).values())
@@ -211,14 +204,14 @@ def test_robots_without(name: str) -> None:
     assert RepeatedLimbs(robot(name).model).groups == ()
 
 
-def test_twins_are_outermost_and_disjoint() -> None:
+def test_limbs_are_outermost_and_disjoint() -> None:
     for name in ("talos", "solo12", "hyq", "g1"):
         model = robot(name).model
-        twins = RepeatedLimbs(model)
-        joints = [j for group in twins.groups for branch in group for j in branch]
+        limbs = RepeatedLimbs(model)
+        joints = [j for group in limbs.groups for limb in group for j in limb]
         assert len(joints) == len(set(joints)) > 0
-        for group in twins.groups:
-            roots = {int(model.parents[branch[0]]) for branch in group}
+        for group in limbs.groups:
+            roots = {int(model.parents[limb[0]]) for limb in group}
             assert len(roots) == 1
             for i, j in zip(group[0], group[1], strict=True):
                 assert model.joints[i].shortname() == model.joints[j].shortname()
@@ -226,43 +219,44 @@ def test_twins_are_outermost_and_disjoint() -> None:
 
 @pytest.mark.parametrize("flags", [(), ("-O3", "-march=native")], ids=["plain", "native"])
 @pytest.mark.parametrize("count", [2, 4, 5])
-def test_compiled_twins(tmp_path: Path, count: int, flags: tuple[str, ...]) -> None:
+def test_compiled_limbs(tmp_path: Path, count: int, flags: tuple[str, ...]) -> None:
     need_compiler()
-    (tmp_path / "t.urdf").write_text(twin_urdf([0, 4, 2], count, 7, odd=True))
+    (tmp_path / "t.urdf").write_text(limbs_urdf([0, 4, 2], count, 7, odd=True))
     loaded = load_robot(str(tmp_path / "t.urdf"), LoadOptions(root="free-flyer"))
     objective = ImpactObjective(loaded, ImpactContact("b1_2", (0.3, -0.4, 0.9)), kind="sticking")
     export(objective, tmp_path, prefix="t", check=False)
     strict = ("-Wall", "-Wextra", "-pedantic", "-Werror")
-    with compiled(tmp_path, "t", loaded.nq, loaded.nv, (*strict, *flags)) as built:
-        assert oracle_difference(built, objective, 5) <= 1e-10
+    with built(tmp_path, "t", (*strict, *flags)) as compiled:
+        assert largest_difference(compiled.gradient, objective, oracle_reference, 5) <= 1e-10
 
 
 def test_portable_has_no_vectors_and_the_same_numbers(tmp_path: Path) -> None:
     need_compiler()
     objective = ImpactObjective(robot("solo8"), ImpactContact("base_link", (0.0, 0.6, 0.8)))
-    text = build_code(variants([objective], "s"), "s", DOUBLE, portable=True)
-    assert "vector_size" not in text.vectors and "_r4" not in text.functions
-    assert "vector_size" in build_code(variants([objective], "s"), "s", DOUBLE).vectors
-    export(objective, tmp_path, prefix="s", portable=True, check=False)
-    with compiled(tmp_path, "s", objective.robot.nq, objective.robot.nv) as built:
-        assert oracle_difference(built, objective, 5) <= 1e-10
+    export(objective, tmp_path, prefix="s", check=False)
+    assert "vector_size" in (tmp_path / "s.c").read_text()
+    export(objective, tmp_path, prefix="s", portable=True, check=False, force=True)
+    text = (tmp_path / "s.c").read_text()
+    assert "vector_size" not in text and "__attribute__((unused))" not in text and "V4" not in text.split("#undef")[0]
+    with built(tmp_path, "s") as compiled:
+        assert largest_difference(compiled.gradient, objective, oracle_reference, 5) <= 1e-10
 
 
 @pytest.mark.parametrize("flags", [(), ("-O3", "-march=native")], ids=["plain", "native"])
 def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
     """H of two links depends on the angle between them alone: turned by whole turns it stays, near pi/2 and far."""
     need_compiler()
-    (tmp_path / "t.urdf").write_text(twin_urdf([0, 0], 2, 3, odd=False))
+    (tmp_path / "t.urdf").write_text(limbs_urdf([0, 0], 2, 3, odd=False))
     loaded = load_robot(str(tmp_path / "t.urdf"), LoadOptions(root="fixed"))
     objective = ImpactObjective(loaded, ImpactContact("b0_1", (0.3, -0.4, 0.9)))
     export(objective, tmp_path, prefix="t", check=False)
     n = np.array(objective.contact.normal)
-    with compiled(tmp_path, "t", loaded.nq, loaded.nv, flags) as built:
+    with built(tmp_path, "t", flags) as compiled:
         for angle in (0.0, 1e-9, math.pi / 4, math.pi / 2, 3.0, -2.5, 100.0, 1e4, 9.99e5, 1.01e6, 1e15, -1e20):
             q = np.full(loaded.nq, angle)
             reduced = np.full(loaded.nq, math.atan2(math.sin(angle), math.cos(angle)))
             expected = ImpactOracle(ImpactCase(loaded, objective.contact, objective.metric)).quantities(reduced)
-            code, H, _ = built.eval(q, n)
+            code, H, _ = compiled.eval(q, n)
             assert code == 0
             # An angle's own last digit is what is left of it.
             assert pytest.approx(expected.H, rel=1e-11) == H, angle
@@ -271,8 +265,8 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
 def test_blocks_are_shared() -> None:
     """What value needs is a part of what eval needs, computed by blocks that both call."""
     objective = ImpactObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
-    found = library([objective], ["t"])
-    layout = lay_out(packed_of(found), [f.outputs for f in found.functions])
+    found = library([NamedObjective(objective, "t")])
+    layout = lay_out(found.vector_graph(), [f.outputs for f in found.functions])
     names = [f.name for f in found.functions]
     calls = {
         name: {b for b, block in enumerate(layout.blocks) if k in block.functions} for k, name in enumerate(names)
@@ -284,7 +278,7 @@ def test_blocks_are_shared() -> None:
     assert len(nodes) == len(set(nodes))
 
 
-def test_a_branch_with_another_axis_is_no_twin() -> None:
+def test_a_limb_with_another_axis_is_not_repeated() -> None:
     model = pin.Model()
     inertia = pin.Inertia(1.0, np.array([0.1, 0, 0]), np.eye(3) * 0.1)
     for k, joint in enumerate((pin.JointModelRX(), pin.JointModelRY(), pin.JointModelRX())):

@@ -74,7 +74,7 @@ def test_an_aerial_draw_looks_at_its_surface_from_where_it_is_mounted(scenario: 
     place = data.oMi[model.getJointId("shoulder_pitch")].translation - setup.q[:3]
     np.testing.assert_allclose(place, [v["x"], 0.0, v["z"]], atol=1e-9)
     shipped = read_scenario(scenario)
-    own = load_robot(shipped.robot, shipped.load).model.armature[6:]
+    own = load_robot(shipped.robot, shipped).model.armature[6:]
     np.testing.assert_allclose(setup.robot.model.armature[6:], v["armature"] * own)
     assert setup.scenario.control.robust.gain == pytest.approx(v["gain"] * shipped.control.robust.gain)
     assert isinstance(setup.scenario.task, RepeatedContacts)
@@ -87,7 +87,7 @@ def test_a_standing_draw_stands_where_the_robot_stood(scenario: str) -> None:
     chosen = draw(scenario, 2)
     setup, shipped = prepare(chosen), set_up(read_scenario(scenario))
     here, there = (Numeric(s.robot.model).at(s.q) for s in (setup, shipped))
-    for shape in setup.scenario.scene.shapes:
+    for shape in setup.scenario.shapes:
         point = point_on(setup.robot, shape.frame, shape.center or (0.0, 0.0, 0.0))
         feet = [n.placement(point).translation for n in (here, there)]
         # A foot is held at the point under it: its center may roll by that.
@@ -109,8 +109,8 @@ def short(chosen: Draw) -> Setup:
     scenario = prepare(chosen).scenario
     assert isinstance(scenario.task, RepeatedContacts)
     brief = replace(scenario.task, count=1, settle=0.2, speed=0.5, dwell=0.3, pause=0.1)
-    surfaces = tuple(replace(s, gap=0.1) for s in scenario.scene.surfaces)
-    return set_up(replace(scenario, task=brief, scene=replace(scenario.scene, surfaces=surfaces)))
+    surfaces = tuple(replace(s, gap=0.1) for s in scenario.surfaces)
+    return set_up(replace(scenario, contacts=brief, surfaces=surfaces))
 
 
 def test_what_goes_wrong_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:

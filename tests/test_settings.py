@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
 from impact_posture.errors import ImpactPostureError, SpecError
 from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.settings import ProblemSettings, Setting
 from impact_posture.tables import validate
-from impact_posture_cli.app import app
+from impact_posture_cli.app import build
 from impact_posture_cli.option_names import as_options, option_of
 from impact_posture_cli.settings_options import _settings_of
 from tests.command import run
@@ -23,7 +22,7 @@ NO_OPTION = {"robot", "schema", "q", "support_compliance", "mounting"}
 
 
 def test_every_setting_is_an_option_of_optimize() -> None:
-    command = typer.main.get_command(app).commands["optimize"]  # type: ignore[attr-defined]
+    command = build("optimize")
     options = {parameter.name for parameter in command.params}
     assert {field.name for field in fields(ProblemSettings)} - NO_OPTION <= options
 

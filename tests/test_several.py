@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.library import build_library, library_path
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError, SpecError
 from impact_posture.impact.contact import ImpactContact, Support
@@ -25,6 +24,7 @@ from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses, corners
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.libraries import build_library, library_path
 from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.problem_settings import (

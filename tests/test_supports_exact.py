@@ -14,7 +14,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.codegen.build_check import CompiledExport, compiled
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError
@@ -27,6 +26,7 @@ from impact_posture.settings import ImpactSettings
 from impact_posture.verification.verification import verify
 from tests.exact import Exact, ExactImpact, digits, distance, exact, rounded
 from tests.exact_bounds import Bounded
+from tests.exported import Exported, built
 from tests.helpers import Vector, central_gradient, random_configurations, rng, robot, unit
 from tests.rigid import Rigid
 from tests.rounding import other_rounding
@@ -171,12 +171,12 @@ def test_the_kernel_loses_what_heavy_feet_must(name: str, label: str, relative_c
 def test_the_compiled_code_loses_no_more(tmp_path: Path, relative_compliance: float) -> None:
     made = objective("solo8", relative_compliance)
     export(made, tmp_path, prefix="feet", check=False)
-    with compiled(tmp_path, "feet", made.robot.nq, made.robot.nv) as library:
+    with built(tmp_path, "feet") as library:
         for label in SOLO8:
             _compiled(library, bounded("solo8", label, relative_compliance))
 
 
-def _compiled(library: CompiledExport, x: Bounded) -> None:
+def _compiled(library: Exported, x: Bounded) -> None:
     q, n = np.array(x.oracle.numeric.q), np.array(x.oracle.n)
     code, H, gradient = library.eval(q, n)
     code_too, jump, G, _ = library.jump(q, n)

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from impact_posture.codegen.build_check import deviation
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
@@ -26,7 +27,7 @@ from impact_posture.verification.differences import difference_gradient
 from impact_posture.verification.samples import Sample, random_samples
 from impact_posture.verification.sources import Numbers, casadi_source, pinocchio_numbers
 from impact_posture.verification.verification import CASADI, COMPILED, DIFFERENCES, MUJOCO, verify
-from impact_posture.verification.verification_report import Row, VerificationReport, deviation
+from impact_posture.verification.verification_report import Row, VerificationReport
 from tests.command import run
 from tests.helpers import NAMES, Vector, robot
 from tests.test_dynamics import write_urdf
@@ -291,6 +292,9 @@ def test_deviation() -> None:
     assert deviation(found, expected, scale=40).error == pytest.approx(0.005)
     assert deviation(np.zeros(2), np.zeros(2)).error == 0
     assert deviation(np.array([0.0, 1e-30]), np.zeros(2)).error == np.inf
+    for bad in (np.nan, np.inf):
+        for one, other in ((bad, 1.0), (1.0, bad), (bad, bad)):
+            assert deviation(np.array([1.0, one]), np.array([1.0, other])).error == np.inf
 
 
 @pytest.mark.parametrize(("samples", "seed"), [(0, 0), (1, -1)])

@@ -161,7 +161,7 @@ def test_the_default_law_rebounds_as_the_page_says() -> None:
     table = {tuple(float(re.sub(r"[^\d.]", "", cell)) for cell in row[:3]): row for row in rows[1:]}
     assert len(table) > 30
     for step, time, damping in ((0.25, 2, 1), (0.25, 2, 0.3), (1, 10, 0.5)):
-        bounce = measure_restitution(ContactLaw((time * 1e-3, damping)), timestep=step * 1e-3)
+        bounce = measure_restitution(ContactLaw(solref=(time * 1e-3, damping)), timestep=step * 1e-3)
         row = table[step, time, damping]
         assert f"{bounce.restitution:.3f}" == row[3].strip()
         assert f"{bounce.duration * 1e3:.1f} ms" == row[6].strip()
@@ -171,7 +171,7 @@ def test_the_default_law_rebounds_as_the_page_says() -> None:
 def test_restitution_comes_to_the_ideal_springs_as_steps_get_finer(damping: float) -> None:
     ideal, errors = ideal_restitution(damping), []
     for timestep in (4e-4, 1e-4):
-        law = ContactLaw((0.01, damping), (0.9999, 0.9999, 0.001))
+        law = ContactLaw(solref=(0.01, damping), solimp=(0.9999, 0.9999, 0.001))
         errors.append(abs(measure_restitution(law, timestep=timestep).restitution - ideal))
     assert errors[1] < 0.004
     assert errors[1] < errors[0]
@@ -193,7 +193,7 @@ def test_the_ideal_springs_restitution_is_that_of_its_equation() -> None:
 def test_laws_faster_than_the_time_step_are_refused(solref: tuple[float, float]) -> None:
     step = 1e-3 if solref[0] < 0.002 else 1.01e-3
     with pytest.raises(InputError, match="time step") as caught:
-        Scene((Surface("wall", (0, 0, 1), law=ContactLaw(solref)),), physics=Physics(step, stop_solref=(0.01, 1)))
+        Scene((Surface("wall", (0, 0, 1), solref=solref),), physics=Physics(step, stop_solref=(0.01, 1)))
     assert caught.value.where == "wall"
 
 
@@ -208,17 +208,18 @@ def one_line(error: ImpactPostureError) -> str:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: ContactLaw((0.002, -1.0)), "solref"),
+        (lambda: ContactLaw(solref=(0.002, -1.0)), "solref"),
         (lambda: ContactLaw(solimp=(0.99, 0.9, 0.001)), "solimp"),
         (lambda: ContactLaw(friction=-1.0), "friction"),
         (lambda: Surface("s", (0, 0, 0)), "no direction"),
-        (lambda: Surface("s", (0, 0, 1), point=(0, 0, np.nan)), "not finite"),
-        (lambda: Shape("ee", "sphere", (0.1, 0.1, 0.1)), "a radius"),
-        (lambda: Shape("ee", "box", (0.1, 0.1, -0.1)), "half extents"),
+        (lambda: Surface("s", (0, 0, 1), point=(0, 0, np.nan)), r"point\[2\] is nan; it should be a finite number"),
+        (lambda: Shape("ee", (0.1, 0.1, 0.1), "sphere"), "a radius"),
+        (lambda: Shape("ee", (0.1, 0.1, -0.1), "box"), r"size\[2\] is -0.1; it should be greater than 0"),
+        (lambda: Shape("ee", (0.1, 0.1), "box"), "half extents"),
         (lambda: Physics(0.0), "timestep"),
         (lambda: Sensors(joint_rate=-1.0), "joint_rate"),
         (lambda: Scene((Surface("s", (0, 0, 1)), Surface("s", (1, 0, 0)))), "two surfaces are called 's'"),
-        (lambda: Scene(shapes=(Shape("ee"), Shape("ee"))), "two shapes are at 'ee'"),
+        (lambda: Scene(shapes=(Shape("ee", (0.1,)), Shape("ee", (0.1,)))), "two shapes are at 'ee'"),
         (lambda: Scene(sensors=Sensors(force_frame="ee")), "carries no shape"),
     ],
 )
@@ -231,9 +232,9 @@ def test_scenes_that_make_no_sense_are_refused(make: Any, words: str) -> None:
 def test_what_does_not_fit_the_robot_is_refused() -> None:
     found = robot("panda")
     for scene, kind, words in (
-        (Scene((Surface("s", (0, 0, 1)),), (Shape("hand"),)), FrameNotFound, "panda_hand"),
-        (Scene((Surface("s", (0, 0, 1)),), (Shape("panda_link0"),)), ContactError, "welded"),
-        (Scene(shapes=(Shape("panda_hand_tcp"),)), InputError, "no center"),
+        (Scene((Surface("s", (0, 0, 1)),), (Shape("hand", (0.1,)),)), FrameNotFound, "panda_hand"),
+        (Scene((Surface("s", (0, 0, 1)),), (Shape("panda_link0", (0.1,)),)), ContactError, "welded"),
+        (Scene(shapes=(Shape("panda_hand_tcp", (0.1,)),)), InputError, "no center"),
         (Scene((Surface("s", (0, 0, 1)),)), InputError, "no shape"),
     ):
         with pytest.raises(kind, match=words) as caught:

@@ -1,34 +1,25 @@
-"""One thin file a command: options in, library call, output out.
+"""Subcommands of ``impact-posture``, one file each: read options, call the library, print the result.
 
-A new command is a file here and a line in ``COMMANDS``.  Nothing heavy is imported before a command runs.
+A new subcommand is a file here with a function of the same name, and a row of :data:`COMMANDS`.  It imports the
+library when it runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
-from impact_posture_cli.commands.codegen import codegen
-from impact_posture_cli.commands.compare import compare
-from impact_posture_cli.commands.evaluate import evaluate
-from impact_posture_cli.commands.inspect import inspect
-from impact_posture_cli.commands.optimize import optimize
-from impact_posture_cli.commands.plot import plot
-from impact_posture_cli.commands.reproduce import reproduce
-from impact_posture_cli.commands.robots import robots
-from impact_posture_cli.commands.simulate import simulate
-from impact_posture_cli.commands.verify import verify
-
-COMMANDS: Final[dict[str, Callable[..., None]]] = {
-    "robots": robots,
-    "inspect": inspect,
-    "evaluate": evaluate,
-    "optimize": optimize,
-    "plot": plot,
-    "codegen": codegen,
-    "verify": verify,
-    "simulate": simulate,
-    "compare": compare,
-    "reproduce": reproduce,
+COMMANDS: Final[dict[str, str]] = {
+    "robots": "List the robots known by name, and how else to name one.",
+    "inspect": "Show a robot: joints, frames, mass, limits, armature, postures, actuation.",
+    "evaluate": "Measure an impact at a posture: H, G, V, S, E, ellipsoid, gradient, predicted jump.",
+    "optimize": "Find the posture that takes the impact best; write posture, pictures and C code.",
+    "plot": "Draw a result again: ellipsoids, postures, jumps, the null-space path.",
+    "codegen": "Write the metric and its gradient as C code for a controller.",
+    "verify": "Compute H, G, Λ_c and ∇H in every way there is and compare: pass or fail.",
+    "simulate": "Run a controller through an experiment in MuJoCo; write metrics, time series and figures.",
+    "compare": "Run several controllers through an experiment, several seeds each: means with 95 % intervals.",
+    "reproduce": (
+        "Run the paper's experiments: its table beside ours, figures, a summary. Goes on where it was interrupted."
+    ),
 }
-"""Name to function, in the order of the help page."""
+"""Name and help text of each subcommand, in the order of the help page."""

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 from impact_posture.settings import ImpactSettings
 from impact_posture_cli import options
+from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.progress import progress
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
@@ -28,19 +30,17 @@ def codegen(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Write the metric and its gradient as C code for a controller."""
+    """Run ``impact-posture codegen``."""
     from_result = given.is_result(robot, {"prefix", "out", "float_", "portable", "compile", "force"})
     if not from_result:
         given.check_contact()
-    from impact_posture.codegen.export_folder import write_export
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_bar
+    from impact_posture.codegen.export import write_export
 
     posture = None
     objectives: list[ImpactObjective]
     warnings: tuple[str, ...] = ()
     if from_result:
-        from impact_posture.job import load_view
+        from impact_posture.result_folder import load_view
 
         view = load_view(Path(robot))
         objectives, posture = [view.objective], view.q_optimal
@@ -52,7 +52,7 @@ def codegen(
             impact = resolve(given.fill(ImpactSettings, robot=robot, frame=frame))
             objectives.append(impact.objective)
             warnings = impact.warnings
-    with progress_bar("writing and compiling" if compile else "writing", shown=not (quiet or json)):
+    with progress("writing and compiling" if compile else "writing", shown=not (quiet or json)):
         written = write_export(
             objectives,
             Path(out) if out else None,
@@ -75,8 +75,8 @@ def codegen(
             ("folder", str(written.out)),
             ("functions", ", ".join(written.functions)),
             ("posture", "the result's optimum" if posture is not None else "none"),
-            ("numbers", written.export.manifest["real"]),
-            ("stack", f"at most {written.export.manifest['stack_bytes']} bytes"),
+            ("numbers", written.manifest["real"]),
+            ("stack", f"at most {written.manifest['stack_bytes']} bytes"),
         ]
     )
     page.line(written.verdict)

@@ -10,6 +10,8 @@ import typer
 from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Processes, ScenarioName, Seeds, rows_table
+from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.progress import progress
 
 Controllers = Annotated[
     str,
@@ -38,35 +40,30 @@ def compare(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run several controllers through an experiment, several seeds each: means with 95 % intervals."""
+    """Run ``impact-posture compare``."""
     labels = [text.strip() for text in controllers.split(",") if text.strip()]
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
     from impact_posture.experiment.folders import FORMATS, store_beside, write_comparison
-    from impact_posture.experiment.reproduction import compare as run_all
-    from impact_posture.experiment.reproduction import comparison_document, jobs_of
+    from impact_posture.experiment.reproduction import reproduce
     from impact_posture.output_folder import check_output
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_line
 
-    labels = list(dict.fromkeys(labels))
+    plan = {scenario: list(dict.fromkeys(labels))}
     folder = None if out is None else Path(out)
     if folder is not None:
         check_output(folder, force=force, kind="comparison")
     store = None if folder is None else store_beside(folder)
-    with progress_line(shown=not (quiet or json)) as progress:
-        rows = run_all(scenario, labels, seeds=seeds, processes=jobs, store=store, progress=progress)
-        document = comparison_document(rows, seeds)
+    with progress("running", "runs", shown=not (quiet or json)) as advance:
+        found = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance)
         if folder is not None and store is not None:
-            formats = [f.value for f in format or ()] or FORMATS
-            write_comparison(folder, document, jobs_of(scenario, labels, seeds), store, force=force, formats=formats)
+            write_comparison(folder, found, plan, store, force=force, formats=format or FORMATS)
     if json:
-        print_json(document)
+        print_json(found.comparison())
         return
     page = Page(quiet=quiet)
     shown = "mean ± half of the 95 % interval" if seeds > 2 else "means (intervals from 3 seeds on)"
-    page.title(rows[0].scenario, f"{seeds} seeds, {shown}" if seeds > 1 else "1 seed")
-    rows_table(page, rows)
+    page.title(found.rows[0].scenario, f"{seeds} seeds, {shown}" if seeds > 1 else "1 seed")
+    rows_table(page, found.rows)
     if folder is not None:
         page.gap()
         page.line(f"written: {folder}")

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING
 
 from impact_posture.settings import ImpactSettings
 from impact_posture_cli import options
+from impact_posture_cli.output import Page, number, print_json, vector
 from impact_posture_cli.settings_options import Given, with_settings
+from impact_posture_cli.tables import alone_line, contact_names, impact_rows, quantities, worst_lines, worst_tables
 
 if TYPE_CHECKING:
     from impact_posture.impact.classical_ellipsoids import Ellipsoid
     from impact_posture.impact.evaluation import Evaluation
     from impact_posture.impact.resolved_impact import ResolvedImpact
-    from impact_posture_cli.output import Page
 
 
 @with_settings(ImpactSettings)
@@ -22,13 +23,11 @@ def evaluate(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Measure an impact at a posture: H, G, V, S, E, ellipsoid, gradient, predicted jump."""
+    """Run ``impact-posture evaluate``."""
     given.check_contact()
     from impact_posture.impact.classical_ellipsoids import classical_ellipsoids
     from impact_posture.impact.evaluation import evaluate as evaluate_impact
     from impact_posture.impact.resolved_impact import resolve
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.tables import alone_line, contact_names, contacts_table, impulses_line, variants_table
 
     impact = resolve(given.fill(ImpactSettings, robot=robot))
     found = evaluate_impact(impact.objective, impact.q, impact.speed, impact.restitution)
@@ -42,81 +41,36 @@ def evaluate(
         print_json(document)
         return
     page = Page(quiet=quiet)
-    frames = contact_names(impact.objective.contacts)
-    _asked(page, impact, found)
+    frames, block = contact_names(impact.objective.contacts), found.to_dict()
+    axes = "world, given in the contact frame" if impact.contact.normal_frame == "contact" else "world"
+    normals = [one.normal for one in found.contacts or (found,)]
+    page.title(f"{impact.robot.name} at {', '.join(c.frame for c in impact.objective.contacts)}")
+    page.pairs([("posture", impact.posture), *impact_rows(impact, normals, axes)])
     _scalars(page, impact, found)
-    if found.contacts:
-        alone_line(page, frames)
+    alone_line(page, frames, "H, G, V, S, E, ellipsoid, gradient and jumps")
     _ellipsoids(page, impact, {"impact Λ_c": found.ellipsoid, **classical})
     _gradient(page, impact, found)
     _jumps(page, impact, found)
-    block = found.to_dict()
-    if found.contacts:
-        contacts_table(page, frames, block["by_contact"])  # type: ignore[arg-type]
-    if found.model_variants:
-        variants_table(page, [block], ["value"])
+    worst_tables(page, frames, {"value": block})
     page.gap()
     page.line(found.dominance.line)
-    if found.impulses is not None:
-        page.line(f"worst impulses: {impulses_line(frames, found.impulses.to_dict())}")
-    for name, one in zip(frames, found.contacts or (found,), strict=True):
-        if one.contact_stability is not None:
-            page.line(f"feet{f' (impact at {name})' if found.contacts else ''}: {one.contact_stability.line}")
+    worst_lines(page, frames, {"value": block})
     page.warnings(warnings)
 
 
-def _asked(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
-    from impact_posture_cli.output import vector, worst_normal
-    from impact_posture_cli.tables import contact_names
-
-    contact, metric = impact.contact, impact.metric
-    turned = ", given in the contact frame" if contact.normal_frame == "contact" else ""
-    rows = [
-        ("posture", impact.posture),
-        *[
-            (f"normal at {name}" if found.contacts else "normal",
-             f"{vector(evaluation.normal)} (world{turned})"
-             + (f", up to {one.impulse:g} N·s" if found.contacts else ""))
-            for name, one, evaluation in zip(
-                contact_names(impact.objective.contacts), impact.objective.contacts,
-                found.contacts or (found,), strict=True,
-            )
-        ],
-    ]  # fmt: skip
-    if found.cone is not None:
-        rows.append(("worst normal", worst_normal(found.cone.to_dict(), found.worst_normal)))
-    if any(contact.offset):
-        offset = ", ".join(f"{v:g}" for v in contact.offset)
-        rows.append(("contact point", f"{offset} m from {contact.frame}, in its axes"))
-    if impact.supports:
-        feet = ", ".join(f"{s.frame} ({s.kind})" for s in impact.supports)
-        rows.append(("supports", f"{feet}; compliance {impact.objective.compliance:.3g} 1/kg"))
-    else:
-        rows.append(("supports", "none"))
-    rows.append(("metric", f"{metric.kind} ({metric.source})" if metric.source else metric.kind))
-    rows.append(("armature from", impact.robot.armature_source))
-    page.title(f"{impact.robot.name} at {', '.join(c.frame for c in impact.objective.contacts)}")
-    page.pairs(rows)
-
-
 def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
-    from impact_posture_cli.output import number
 
-    kinetic = impact.metric.kind == "kinetic"
-    per_impulse, per_speed = ("1/kg", "kg") if kinetic else ("jump²/(N·s)²", "jump²/(m/s)²")
-    meaning = (
-        ("H", per_impulse, "jump² per impulse²"),
-        ("G", "1/kg", "inverse effective mass along n"),
-        ("V", per_speed, "jump² per approach speed², no friction"),
-        ("S", per_speed, "the same when the contact sticks"),
-        ("E", "kg", "energy lost per approach speed², e = 0"),
+    mine, free = (
+        found.scalars.to_dict(),
+        found.without_supports.to_dict() if found.without_supports is not None else None,
     )
-    mine, other = found.scalars.to_dict(), found.without_supports
-    free = None if other is None else other.to_dict()
-    mass = (found.scalars.effective_mass, None if other is None else other.effective_mass)
+    mass = (
+        found.scalars.effective_mass,
+        None if found.without_supports is None else found.without_supports.effective_mass,
+    )
     rows = [
         (f"  {key}", number(mine[key]), *(() if free is None else (number(free[key]),)), unit, words)
-        for key, unit, words in meaning
+        for key, unit, words in quantities(impact)
     ]
     masses = [number(value, missing="unbounded") for value in (mass if free is not None else mass[:1])]
     rows.append(("  1/G", *masses, "kg", "effective mass along n"))
@@ -131,13 +85,12 @@ def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     if count := len(found.model_variants):
         worst += f", worst of {count} model variants"
     page.line(f"  objective {kind} ({letters[kind]}{worst}): {number(found.objective)}")
-    if not kinetic:
+    if impact.metric.kind != "kinetic":
         weighed = "weighted" if impact.metric.kind == "weighted" else "alike"
         page.line(f"  jump: ‖Δν‖, m/s and rad/s {weighed} in one norm", style="dim")
 
 
 def _ellipsoids(page: Page, impact: ResolvedImpact, ellipsoids: dict[str, Ellipsoid]) -> None:
-    from impact_posture_cli.output import number, vector
 
     units = {"velocity": "m/s of |ν| = 1", "force": "N of |τ| = 1"}
     kinetic = impact.metric.kind == "kinetic"
@@ -153,7 +106,6 @@ def _ellipsoids(page: Page, impact: ResolvedImpact, ellipsoids: dict[str, Ellips
 
 def _gradient(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     from impact_posture.impact.velocity_jump import largest_entries
-    from impact_posture_cli.output import number
 
     page.gap()
     rows = [
@@ -165,7 +117,6 @@ def _gradient(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
 
 def _jumps(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     from impact_posture.impact.velocity_jump import merged_entries
-    from impact_posture_cli.output import number
 
     jumps = (found.frictionless, found.sticking)
     rows = [

@@ -9,11 +9,12 @@ import typer
 
 from impact_posture.settings import OUTPUT, RobotSettings
 from impact_posture_cli import options
-from impact_posture_cli.settings_options import Given, UsageError, with_settings
+from impact_posture_cli.error_boundary import UsageError
+from impact_posture_cli.output import Page, number, print_json
+from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.settings import LoadOptions
-    from impact_posture_cli.output import Page
 
 
 WriteRobotToml = Annotated[
@@ -36,10 +37,9 @@ def inspect(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Show a robot: joints, frames, mass, limits, armature, postures, actuation."""
+    """Run ``impact-posture inspect``."""
     from impact_posture.robot.robot_loader import load_robot
     from impact_posture.robot.robot_summary import summarize
-    from impact_posture_cli.output import Page, print_json
 
     load = given.fill(RobotSettings, robot=robot)
     if write_robot_toml is not None:
@@ -62,9 +62,8 @@ def inspect(
 
 
 def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, quiet: bool) -> None:
-    """Draft the robot's robot.toml."""
+    """Draft a robot.toml."""
     from impact_posture.robot.draft import write_draft
-    from impact_posture_cli.output import Page, print_json
 
     path, draft = write_draft(robot, load, Path(out) if out else None, force=force)
     if json:
@@ -78,7 +77,7 @@ def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, 
         page.line("Then leave the options out that it answers, as in")
         beside = path.name == "robot.toml" and path.parent == Path(robot).parent
         config = "" if beside else f" --config {path}"
-        # Not broken at the terminal's edge: it is there to be copied.
+        # This line is not wrapped, because users copy it.
         page.console.print(f"  impact-posture optimize {robot}{config} --normal X Y Z", soft_wrap=True, markup=False)
 
 
@@ -122,7 +121,6 @@ def _constraints(constraints: dict[str, Any]) -> str:
 
 
 def _joints(page: Page, summary: dict[str, Any]) -> None:
-    from impact_posture_cli.output import number
 
     def limits(joint: dict[str, Any]) -> str:
         if joint["lower"] is None and joint["upper"] is None:
@@ -172,7 +170,6 @@ def _postures(page: Page, summary: dict[str, Any]) -> None:
 
 
 def _actuation(page: Page, actuation: dict[str, Any]) -> None:
-    from impact_posture_cli.output import number
 
     page.gap()
     condition = number(actuation["condition"], missing="infinite")

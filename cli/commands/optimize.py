@@ -9,13 +9,15 @@ import typer
 
 from impact_posture.settings import ProblemSettings
 from impact_posture_cli import options
+from impact_posture_cli.output import Page, number, print_json
+from impact_posture_cli.progress import progress
 from impact_posture_cli.settings_options import Given, with_settings
+from impact_posture_cli.tables import alone_line, contact_names, impact_rows, quantities, worst_lines, worst_tables
 
 if TYPE_CHECKING:
-    from impact_posture.job import Written
     from impact_posture.posture.problem_settings import Prepared
     from impact_posture.posture.solve import PostureSolution
-    from impact_posture_cli.output import Page
+    from impact_posture.result_folder import Written
 
 RobotOrProblem = Annotated[
     str,
@@ -38,16 +40,14 @@ def optimize(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Find the posture that takes the impact best; write posture, pictures and C code."""
+    """Run ``impact-posture optimize``."""
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
     from impact_posture.front_door import PostureProblem
     from impact_posture.front_door import optimize as solve
-    from impact_posture.job import FORMATS, default_out
     from impact_posture.output_folder import check_output
     from impact_posture.posture.problem_settings import prepare
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_bar
+    from impact_posture.result_folder import FORMATS, default_out
 
     page = Page(quiet=quiet or json)
     prepared = prepare(settings)
@@ -56,29 +56,29 @@ def optimize(
     if not json:
         _announce(page, prepared)
     shown = not (quiet or json)
-    with progress_bar("solving", "starts", shown=shown, first="building the expressions") as progress:
+    with progress("solving", "starts", shown=shown, first="building the expressions") as advance:
         result = solve(
             PostureProblem.of(prepared),
             starts=settings.starts,
             seed=settings.seed,
             jobs=jobs,
             compile=compile,
-            progress=progress,
+            progress=advance,
         )
     if settings.tradeoff:
-        with progress_bar("solving", "points", shown=shown) as progress:
-            result = result.trade_off(settings.tradeoff, compile=compile, progress=progress)
+        with progress("solving", "points", shown=shown) as advance:
+            result = result.trade_off(settings.tradeoff, compile=compile, progress=advance)
     if not json:
-        # Pictures and C code take longer than the answer: nobody waits for it because of them.
+        # The result comes first, because figures and C code take longer.
         _summarize(page, prepared, result.solution, result.document)
-    with progress_bar("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as progress:
+    with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
         written = result.save(
             folder,
             force=force,
             codegen=not no_codegen,
-            formats=[f.value for f in format or ()] or FORMATS,
+            formats=format or FORMATS,
             jobs=jobs,
-            progress=progress,
+            progress=advance,
         )
     if written.compiler_error:
         page.warnings([f"the C code in c/ is written but could not be built: {written.compiler_error}"])
@@ -101,7 +101,7 @@ def _settings(robot: str, given: Given) -> ProblemSettings:
 
 
 def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
-    """Refuse options that would do nothing beside the others."""
+    """Refuse options that have no effect without another option."""
     for name, used, hint in (
         ("box", settings.contact_pose == "box", "--contact-pose box"),
         ("base_box", settings.base == "box", "--base box"),
@@ -113,8 +113,6 @@ def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
 
 
 def _announce(page: Page, prepared: Prepared) -> None:
-    from impact_posture_cli.output import vector
-    from impact_posture_cli.tables import contact_names
 
     if page.quiet:
         return
@@ -122,28 +120,15 @@ def _announce(page: Page, prepared: Prepared) -> None:
     contacts = impact.objective.contacts
     page.title(f"{impact.robot.name} at {', '.join(c.frame for c in contacts)}", f"objective {impact.objective.kind}")
     axes = "world" if impact.contact.normal_frame == "world" else "contact frame"
-    degrees = impact.objective.normal_cone_deg
-    cone = f", the worst within {degrees:g}° of it" if degrees else ""
-    feet = ", ".join(s.frame for s in impact.supports) or "none"
-    page.pairs(
-        [
-            *[
-                (f"normal at {name}", f"{vector(c.normal)} ({axes}), up to {c.impulse:g} N·s")
-                if impact.objective.others
-                else ("normal", f"{vector(c.normal)} ({axes}){cone}")
-                for name, c in zip(contact_names(contacts), contacts, strict=True)
-            ],
-            *([("pull", "as well as push")] if impact.objective.bilateral else []),
-            *(
-                [("model variants", "; ".join(v.name for v in variants))]
-                if (variants := impact.objective.model_variants)
-                else []
-            ),
-            ("metric", impact.metric.kind),
-            ("supports", feet),
-            ("armature from", impact.robot.armature_source),
-        ]
-    )
+    degrees, variants = impact.objective.normal_cone_deg, impact.objective.model_variants
+    rows = impact_rows(impact, [c.normal for c in contacts], axes)
+    if degrees:
+        rows.append(("worst normal", f"within {degrees:g}° of the normal"))
+    if impact.objective.bilateral:
+        rows.append(("pull", "as well as push"))
+    if variants:
+        rows.append(("model variants", "; ".join(v.name for v in variants)))
+    page.pairs(rows)
     page.gap()
     page.line("constraints")
     for line in problem.describe():
@@ -156,36 +141,20 @@ def _announce(page: Page, prepared: Prepared) -> None:
 
 def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
     from impact_posture.posture.caveats import percent
-    from impact_posture_cli.output import number, worst_normal
-    from impact_posture_cli.tables import contact_names, contacts_table, impulses_line, variants_table
 
     initial, optimal = document["initial"], document["optimal"]
-    rows = []
-    for key, unit, words in (
-        ("objective", "", f"what was minimized ({prepared.impact.objective.kind})"),
-        ("H", "", "squared jump per squared impulse"),
-        ("G", "1/kg", "inverse effective mass along n"),
-        ("V", "", "squared jump per squared speed, no friction"),
-        ("S", "", "the same when the contact sticks"),
-        ("E", "kg", "energy lost per squared speed"),
-    ):
-        rows.append((f"  {key}", number(initial[key]), number(optimal[key]), unit, words))
-    page.table(("", "before", "after", "unit", "meaning"), rows, right=(1, 2))
-    frames = contact_names(prepared.impact.objective.contacts)
-    if len(frames) > 1:
-        page.line(f"  (H, G, V, S, E: of an impact at {frames[0]} alone)", style="dim")
-        contacts_table(page, frames, optimal["by_contact"])
-    if "by_scenario" in optimal:
-        variants_table(page, [initial, optimal], ["before", "after"])
+    impact, blocks = prepared.impact, {"before": initial, "after": optimal}
+    minimized = ("objective", "", f"what was minimized ({impact.objective.kind})")
+    rows = [
+        (f"  {key}", number(initial[key]), number(optimal[key]), unit, words)
+        for key, unit, words in (minimized, *quantities(impact))
+    ]
+    page.table(("", *blocks, "unit", "meaning"), rows, right=(1, 2))
+    frames = contact_names(impact.objective.contacts)
+    alone_line(page, frames, "H, G, V, S, E")
+    worst_tables(page, frames, blocks)
     page.gap()
-    for when, block in (("before", initial), ("after", optimal)):
-        if "cone" in block:
-            page.line(f"worst normal {when}: {worst_normal(block['cone'], block['worst_normal'])}")
-        if "worst_impulses" in block:
-            page.line(f"worst impulses {when}: {impulses_line(frames, block['worst_impulses'])}")
-    for when, block in (("before", initial), ("after", optimal)):
-        for name, feet in _footings(frames, block):
-            page.line(f"feet {when}{name}: {feet['verdict']}")
+    worst_lines(page, frames, blocks)
     page.line(f"reduction {percent(solution.reduction)}; {_redundancy(solution.redundancy)} left by the constraints")
     if "robustness" in document:
         page.line(document["robustness"]["line"])
@@ -208,22 +177,13 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     )
     if "tradeoff" in document:
         _tradeoff(page, document["tradeoff"], [n for n in document["notes"] if n.startswith("trade-off:")])
-    # Those of the robot stood above the solving.
+    # The warnings of the robot were printed before the solver started.
     page.warnings(document["warnings"][len(prepared.impact.warnings) :])
 
 
-def _footings(frames: list[str], block: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    """Whether the feet stay, under each of several impacts by name."""
-    if "by_contact" not in block:
-        return [("", block["footing"])] if "footing" in block else []
-    pairs = zip(frames, block["by_contact"], strict=True)
-    return [(f" (impact at {frame})", one["footing"]) for frame, one in pairs if "footing" in one]
-
-
 def _tradeoff(page: Page, points: list[dict[str, Any]], notes: list[str]) -> None:
-    """What a smaller change would buy."""
+    """Show the trade-off between the objective and the distance."""
     from impact_posture.posture.caveats import percent
-    from impact_posture_cli.output import number
 
     page.gap()
     page.line("trade-off: the best posture within a distance from the initial one (rad, mixed with m)")

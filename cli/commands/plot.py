@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from impact_posture_cli import options
+from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.progress import progress
 
 ResultFolder = Annotated[str, typer.Argument(metavar="RESULT_DIR", help="A folder that optimize wrote.")]
 Figures = Annotated[
@@ -31,19 +33,17 @@ def plot(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Draw a result again: ellipsoids, postures, jumps, the null-space path."""
-    from impact_posture.job import FORMATS, load_view
+    """Run ``impact-posture plot``."""
     from impact_posture.output_folder import add_to_record
     from impact_posture.plot import draw_all
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_bar
+    from impact_posture.result_folder import FORMATS, load_view
 
     folder = Path(result_dir)
     into = Path(out) if out else folder
-    formats = [f.value for f in format or ()] or FORMATS
-    with progress_bar("drawing", shown=not (quiet or json)):
+    formats = format or FORMATS
+    with progress("drawing", shown=not (quiet or json)):
         written = draw_all(load_view(folder), into, formats, figure)
-    # In a result's folder they are ours, too.
+    # A result folder records these files as its own.
     add_to_record(into, written)
     if json:
         print_json({"schema": "impact-posture/plot/1", "files": [str(path) for path in written]})

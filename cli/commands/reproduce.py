@@ -10,6 +10,8 @@ import typer
 from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Processes, Seeds, rows_table
+from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.progress import progress
 
 All = Annotated[
     bool,
@@ -38,16 +40,14 @@ def reproduce(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run the paper's experiments: its table beside ours, figures, a summary. Goes on where it was interrupted."""
+    """Run ``impact-posture reproduce``."""
     from impact_posture.errors import ScenarioNotFound
     from impact_posture.experiment.folders import FORMATS, store_beside, write_reproduction
     from impact_posture.experiment.paper import PAPER
-    from impact_posture.experiment.reproduction import controllers_of, jobs_of
+    from impact_posture.experiment.reproduction import controllers_of
     from impact_posture.experiment.reproduction import reproduce as reproduce_all
     from impact_posture.experiment.reproduction_summary import advice
     from impact_posture.output_folder import check_output
-    from impact_posture_cli.output import Page, print_json
-    from impact_posture_cli.progress import progress_line
 
     scenarios = list(dict.fromkeys(scenario)) if scenario else list(PAPER)
     for name in scenarios:
@@ -56,10 +56,10 @@ def reproduce(
     folder = Path(out)
     check_output(folder, force=force, kind="reproduction")
     store = store_beside(folder)
-    with progress_line(shown=not (quiet or json)) as progress:
-        found = reproduce_all(scenarios, seeds=seeds, everything=all_, processes=jobs, store=store, progress=progress)
-        plan = [job for name in scenarios for job in jobs_of(name, controllers_of(name, all_), seeds)]
-        formats = [f.value for f in format or ()] or FORMATS
+    with progress("running", "runs", shown=not (quiet or json)) as advance:
+        plan = {name: controllers_of(name, all_) for name in scenarios}
+        found = reproduce_all(plan, seeds=seeds, processes=jobs, store=store, progress=advance)
+        formats = format or FORMATS
         document = write_reproduction(folder, found, plan, store, force=force, formats=formats)
     if json:
         print_json(document)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from impact_posture_cli import options
+from impact_posture_cli.output import Page, print_json
 
 
 def robots(json: options.Json = False, quiet: options.Quiet = False) -> None:
-    """List the robots known by name, and how else to name one."""
+    """Run ``impact-posture robots``."""
     from impact_posture.robot.robot_summary import WAYS_TO_NAME, catalogue
-    from impact_posture_cli.output import Page, print_json
 
     entries = catalogue()
     if json:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Mode, ScenarioName
+from impact_posture_cli.output import Page, complain, number, print_json
+from impact_posture_cli.progress import progress
 from impact_posture_cli.settings_options import positive
 
-if TYPE_CHECKING:
-    from impact_posture_cli.output import Page
-
-# The exit code of a run that did not complete.
+# Exit code of a run that did not complete.
 _FAILED = 4
 
 Controller = Annotated[
@@ -71,7 +70,7 @@ def simulate(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run a controller through an experiment in MuJoCo; write metrics, time series and figures."""
+    """Run ``impact-posture simulate``."""
     from impact_posture.escape import file_name
     from impact_posture.experiment.folders import FORMATS, write_simulation
     from impact_posture.experiment.jobs import Job, execute
@@ -79,17 +78,15 @@ def simulate(
     from impact_posture.output_folder import check_output
     from impact_posture.posture.nlp import one_blas_thread
     from impact_posture.simulation.scenario_file import read_scenario
-    from impact_posture_cli.output import Page, complain, print_json
-    from impact_posture_cli.progress import progress_line
 
     name = read_scenario(scenario).name
     job = Job(scenario, controller, seed, mode, free, gain, None if sign is None else int(sign))
     folder = Path(out) if out else Path(file_name(f"{name}-{job.label.replace(':', '-')}"))
     check_output(folder, force=force, kind="run")
-    with progress_line(shown=not (quiet or json)):
+    with progress("running", shown=not (quiet or json)):
         with one_blas_thread():
             runs, document = execute(job)
-        formats = [f.value for f in format or ()] or FORMATS
+        formats = format or FORMATS
         write_simulation(folder, job, runs, document, force=force, formats=formats)
     if json:
         print_json(document)
@@ -102,7 +99,6 @@ def simulate(
 
 
 def _rigid(prediction: dict[str, Any]) -> str:
-    from impact_posture_cli.output import number
 
     if prediction["sticking"] is None:
         return f"{number(prediction['frictionless'], missing='–')} if nobody controlled"
@@ -110,7 +106,6 @@ def _rigid(prediction: dict[str, Any]) -> str:
 
 
 def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> None:
-    from impact_posture_cli.output import number
 
     page.title(f"{document['scenario']}, {label}", f"seed {document['seed']}")
     runs = document["runs"]
@@ -153,9 +148,7 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
 
 
 def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[str, str]]:
-    """What a run that completed is measured by."""
-    from impact_posture_cli.output import number
-
+    """Return the metrics of a completed run as rows."""
     saturation = metrics["saturation_s"]
     joints = f"base {number(metrics['q_total_impact_base'])}, joints {number(metrics['q_total_impact_joints'])}"
     rows = [("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints})")]

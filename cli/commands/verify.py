@@ -10,6 +10,8 @@ import typer
 
 from impact_posture.settings import CONTACT, OUTPUT, ImpactSettings, Vector3
 from impact_posture_cli import options
+from impact_posture_cli.output import Page, complain, print_json
+from impact_posture_cli.progress import progress
 from impact_posture_cli.settings_options import Given, check_direction, with_settings
 
 if TYPE_CHECKING:
@@ -44,19 +46,17 @@ def verify(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Compute H, G, Λ_c and ∇H in every way there is and compare: pass or fail."""
+    """Run ``impact-posture verify``."""
     from_result = given.is_result(robot, {"samples", "seed"})
     if "contact" in given.values:
         given.check_contact()
     from impact_posture.impact.resolved_impact import resolve
     from impact_posture.verification.verification import verify as verify_objective
-    from impact_posture_cli.output import Page, complain, print_json
-    from impact_posture_cli.progress import progress_bar
 
     normal = {} if "contact" in given.values else {"normal": given.values.get("normal", (0.0, 0.0, 1.0))}
     impact = _of_result(Path(robot)) if from_result else resolve(given.fill(ImpactSettings, robot=robot, **normal))
-    with progress_bar("comparing", shown=not (quiet or json)) as progress:
-        report = verify_objective(impact.objective.singles[0], samples, seed, progress)
+    with progress("comparing", shown=not (quiet or json)) as advance:
+        report = verify_objective(impact.objective.singles[0], samples, seed, advance)
     if json:
         asked = {key: value for key, value in impact.to_dict().items() if key != "metric"}
         measure = {"name": impact.metric.kind, "weights": impact.metric.weights}
@@ -82,9 +82,9 @@ def verify(
 
 
 def _of_result(folder: Path) -> ResolvedImpact:
-    """The impact that a result folder is about, at its optimum."""
+    """Return the impact of a result folder at the optimal posture."""
     from impact_posture.impact.resolved_impact import ResolvedImpact
-    from impact_posture.job import load_view
+    from impact_posture.result_folder import load_view
 
     view = load_view(folder)
     return ResolvedImpact(view.objective, view.q_optimal, "the result's optimum", view.speed, view.restitution)

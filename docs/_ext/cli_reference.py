@@ -39,9 +39,9 @@ class Parameter:
 
 def commands() -> dict[str, Callable[..., None]]:
     """The subcommands by name, in the order of ``--help``."""
-    from impact_posture_cli.app import app
+    from impact_posture_cli.app import COMMANDS, load
 
-    return {info.name or "": info.callback for info in app.registered_commands if info.callback}
+    return {name: load(name) for name in COMMANDS}
 
 
 def parameters(command: Callable[..., None]) -> list[Parameter]:
@@ -112,12 +112,14 @@ def _cell(text: str) -> str:
 
 def markdown() -> str:
     """One section a command: what it does, how to call it, a table of its options."""
+    from impact_posture_cli.app import COMMANDS
+
     parts = []
     for name, command in commands().items():
         every = parameters(command)
         arguments, options = [p for p in every if p.argument], [p for p in every if not p.argument]
         usage = " ".join([f"impact-posture {name}", *[a.names[0] for a in arguments], "[OPTIONS]"])
-        parts += [f"## {name}", "", " ".join((command.__doc__ or "").split()), "", "```text", usage, "```", ""]
+        parts += [f"## {name}", "", COMMANDS[name], "", "```text", usage, "```", ""]
         if arguments:
             parts += ["| argument | meaning |", "|---|---|"]
             parts += [f"| `{_cell(a.spelling)}` | {_cell(a.meaning)} |" for a in arguments] + [""]

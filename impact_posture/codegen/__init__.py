@@ -1,1 +1,1 @@
-"""The C export: emitter, source, manifest, compiler."""
+"""The C export of a metric and its gradient, and the loader of a built export."""

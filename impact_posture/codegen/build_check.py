@@ -1,129 +1,48 @@
-"""The user's C compiler, and the proof that what it makes of an export computes the right numbers."""
+"""Proof that what a compiler makes of an export computes the right numbers."""
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from impact_posture.codegen.emitter import DOUBLE, Real
-from impact_posture.codegen.functions import ellipsoid_fun, jump_fun, objective_fun
-from impact_posture.codegen.library import build_library, library_path
+from impact_posture.codegen.emitter import REALS, Real
+from impact_posture.codegen.functions import Reference, Vector, casadi_reference, named_objectives, oracle_reference
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest import sample_postures
-from impact_posture.codegen.naming import FUNCTIONS
-from impact_posture.codegen.variants import Variant, variants
+from impact_posture.codegen.reader import read_manifest
 from impact_posture.errors import CompilerError
 from impact_posture.impact.contact import heavy_feet_rounding
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.libraries import load_library
+from impact_posture.libraries import build_library, library_path, load_library
 from impact_posture.output_folder import scratch_folder
 
-Vector = NDArray[np.float64]
-
-# The oracle factorizes another matrix; feet at compliance ε cost digits there (condition about 1/ε).
+# The oracle factorizes another matrix.  Feet at compliance ε cost digits there (condition about 1/ε).
 _ORACLE_TOLERANCE = 1e-5
+# C function → the reference's names of its results.
+_RESULTS = {
+    "eval": ("H", "grad"),
+    "objective": ("objective", "objective_grad"),
+    "value": ("H",),
+    "jump": ("jump", "G", "V"),
+    "ellipsoid": ("ellipsoid",),
+}
+# An error of a gradient is relative to a thousandth of its value at least.
+_LEAST = {"grad": "H", "objective_grad": "objective"}
+_SHARE = 1e-3
 
 
 def self_test_tolerance(objective: ImpactObjective, real: Real) -> float:
-    """Largest relative difference from CasADi's numbers that is put down to rounding.
+    """Return the largest relative difference from the numbers of CasADi that rounding explains.
 
-    Divisions are by reciprocals, sums may be fused with products.  In float the model's own condition shows.
+    The C code divides by reciprocals, and a compiler may fuse sums with products.  In float the condition of the
+    model shows.
     """
     if real.name == "double":
         return 1e-9 * (heavy_feet_rounding(objective.robot, objective.compliance) if objective.supports else 1.0)
     return 0.05 if objective.supports else 2e-3
-
-
-class CompiledExport:
-    """The functions of one frame of a built export, with their codes.  For checks; it allocates on every call."""
-
-    def __init__(
-        self,
-        library: Path | ctypes.CDLL,
-        stem: str,
-        nq: int,
-        nv: int,
-        real: Real = DOUBLE,
-        names: Sequence[str] = FUNCTIONS,
-    ) -> None:
-        self._nq, self._nv, self._real = nq, nv, real.dtype
-        self.library = load_library(library) if isinstance(library, Path) else library
-        self.real = real
-        self._functions = {name: getattr(self.library, f"{stem}_{name}") for name in names}
-
-    def at(self, stem: str) -> CompiledExport:
-        """The same library's functions of another frame."""
-        return CompiledExport(self.library, stem, self._nq, self._nv, self.real)
-
-    def eval(self, q: Vector, n: Vector) -> tuple[int, float, Vector]:
-        """Code, H and its tangent gradient, shape (nv,)."""
-        value, gradient = self._empty(1), self._empty(self._nv)
-        code = self._call("eval", self._input(q), self._input(n), value, gradient)
-        return code, float(value[0]), gradient
-
-    def objective(self, q: Vector) -> tuple[int, float, Vector]:
-        """Code, the objective and its tangent gradient, shape (nv,)."""
-        value, gradient = self._empty(1), self._empty(self._nv)
-        code = self._call("objective", self._input(q), value, gradient)
-        return code, float(value[0]), gradient
-
-    def value(self, q: Vector, n: Vector) -> tuple[int, float]:
-        """Code and H."""
-        value = self._empty(1)
-        code = self._call("value", self._input(q), self._input(n), value)
-        return code, float(value[0])
-
-    def jump(self, q: Vector, n: Vector) -> tuple[int, Vector, float, float]:
-        """Code, a, shape (nv,), G and V."""
-        jump, G, V = self._empty(self._nv), self._empty(1), self._empty(1)
-        code = self._call("jump", self._input(q), self._input(n), jump, G, V)
-        return code, jump, float(G[0]), float(V[0])
-
-    def ellipsoid(self, q: Vector) -> tuple[int, Vector]:
-        """Code and Λ_c, shape (3, 3)."""
-        found = self._empty(9)
-        return self._call("ellipsoid", self._input(q), found), found.reshape(3, 3)
-
-    def eval_batch(self, q: Vector, n: Vector) -> tuple[int, Vector, Vector]:
-        """Code, H, shape (N,), and gradients, shape (N, nv), of configurations, shape (N, nq)."""
-        count = len(q)
-        H, gradients = self._empty(count), self._empty(count * self._nv)
-        code = self._call("eval_batch", self._input(q), self._input(n), count, H, gradients)
-        return code, H, gradients.reshape(count, self._nv)
-
-    def _call(self, name: str, *arguments: Any) -> int:
-        return int(
-            self._functions[name](
-                *[a if isinstance(a, int) else a.ctypes.data_as(ctypes.c_void_p) for a in arguments]
-            )
-        )
-
-    def _input(self, values: Vector) -> NDArray[Any]:
-        return np.ascontiguousarray(values, dtype=self._real)
-
-    def _empty(self, size: int) -> NDArray[Any]:
-        return np.full(size, np.nan, dtype=self._real)
-
-
-@contextmanager
-def compiled(
-    export_dir: Path, prefix: str, nq: int, nv: int, extra_flags: tuple[str, ...] = (), real: Real = DOUBLE
-) -> Iterator[CompiledExport]:
-    """Build an export of one frame as a shared library in a temporary folder and load it.
-
-    Raises:
-        CompilerError: No compiler, or it failed: its first error line and the command.
-    """
-    with scratch_folder() as folder:
-        library = build_library(export_dir, prefix, library_path(folder, prefix), extra_flags)
-        yield CompiledExport(library, prefix, nq, nv, real)
 
 
 def compile_and_check(
@@ -132,132 +51,105 @@ def compile_and_check(
     objective: ImpactObjective | Sequence[ImpactObjective],
     samples: int = 20,
     *,
-    real: Real = DOUBLE,
     keep: bool = False,
 ) -> float:
-    """Build an export and compare it at random postures and normals; return the largest relative difference.
-
-    Gradients are compared relative to their largest entry, or to a thousandth of the value where that is more.
+    """Build an export, compare it at random postures and normals, and return the largest relative difference.
 
     Args:
-        export_dir: The export's folder.
-        prefix: Its prefix.
-        objective: What it is an export of: one, or one for each frame.
-        samples: Postures.
-        real: The C type that it computes in.
-        keep: Leave the library in the export's folder, also one that did not pass.
+        export_dir: The folder of the export.
+        prefix: The prefix of the export.
+        objective: The exported objective, or one for each frame.
+        samples: The number of postures.
+        keep: Leave the library in the folder of the export, even if it fails.
 
     Raises:
-        CompilerError: No compiler, it failed, or what it made computes other numbers.
+        CompilerError: There is no compiler, it failed, or its code computes other numbers.
     """
     objectives = (objective,) if isinstance(objective, ImpactObjective) else tuple(objective)
-    worst = 0.0
+    manifest, _ = read_manifest(export_dir / f"{prefix}.json")
+    real, worst = REALS[manifest["real"]], 0.0
     with scratch_folder() as folder:
-        target = library_path(export_dir if keep else folder, prefix)
-        loaded = load_library(build_library(export_dir, prefix, target))
-        for variant in variants(objectives, prefix):
-            one = variant.objective
-            if variant.joint:
-                worst = max(worst, _checked(_joint_difference(loaded, variant, real, samples),
-                                            _oracle_tolerance(one, real), "Pinocchio's", prefix))  # fmt: skip
-                continue
-            functions = CompiledExport(loaded, variant.stem, one.robot.nq, one.robot.nv, real)
-            for found, tolerance, other in (
-                (casadi_difference(functions, one, samples), self_test_tolerance(one, real), "CasADi's"),
-                (oracle_difference(functions, one, samples), _oracle_tolerance(one, real), "Pinocchio's"),
-            ):
-                worst = max(worst, _checked(found, tolerance, other, prefix))
-    return worst
-
-
-def _oracle_tolerance(objective: ImpactObjective, real: Real) -> float:
-    return max(_ORACLE_TOLERANCE, self_test_tolerance(objective, real))
-
-
-def _checked(difference: float, tolerance: float, other: str, prefix: str) -> float:
-    # Not "> tolerance": that is false for a NaN.
-    if not difference <= tolerance:
-        raise CompilerError(
-            f"the compiled code differs from {other} numbers by {difference:.3g}, relative",
-            where=f"{prefix}.c",
-            hint="try another compiler (set CC) without -ffast-math, or double instead of float",
+        library = load_library(
+            build_library(export_dir, prefix, library_path(export_dir if keep else folder, prefix))
         )
-    return difference
-
-
-def casadi_difference(library: CompiledExport, objective: ImpactObjective, samples: int) -> float:
-    """Largest relative difference of all outputs from CasADi's interpreted functions."""
-    metric, own = objective.metric_fun(), objective_fun(objective)
-    jumps, ellipsoids = jump_fun(objective), ellipsoid_fun(objective)
-    worst = 0.0
-    for q, n in _samples(objective, samples, library.real):
-        H, gradient = (np.array(v, dtype=float).ravel() for v in metric(q, n))
-        value, objective_gradient = (np.array(v, dtype=float).ravel() for v in own(q))
-        jump, G = (np.array(v, dtype=float).ravel() for v in jumps(q, n)[:2])
-        worst = _worst(worst, library.eval(q, n), float(H[0]), gradient)
-        worst = _worst(worst, library.objective(q), float(value[0]), objective_gradient)
-        worst = _worst(worst, (*library.value(q, n), gradient), float(H[0]), gradient)
-        worst = _others(worst, library, (q, n), (jump, float(G[0]), float(H[0]), np.array(ellipsoids(q))))
+        for v in named_objectives(objectives, prefix):
+            own = v.objective
+            # Beside an objective of several contacts, each frame has one of its own.
+            block = manifest if v.joint else manifest | {"several": None}
+            gradient = ImpactGradient(library, block, own.contact.frame, free=v.free)
+            tolerance = self_test_tolerance(own, real)
+            for reference, allowed, name in (
+                (casadi_reference, tolerance, "CasADi"),
+                (oracle_reference, max(_ORACLE_TOLERANCE, tolerance), "Pinocchio"),
+            ):
+                found = largest_difference(gradient, own, reference, samples)
+                if found > allowed:
+                    raise CompilerError(
+                        f"the numbers of the compiled code differ from those of {name} by {found:.3g}, relative",
+                        where=f"{prefix}.c",
+                        hint="try another compiler (set CC) without -ffast-math, or double instead of float",
+                    )
+                worst = max(worst, found)
     return worst
 
 
-def oracle_difference(library: CompiledExport, objective: ImpactObjective, samples: int) -> float:
-    """Largest relative difference of all outputs from Pinocchio's numbers."""
-    contact, worst = objective.contact, 0.0
-    for q, n in _samples(objective, samples, library.real):
-        turned = replace(contact, normal=(float(n[0]), float(n[1]), float(n[2])))
-        oracle = ImpactOracle(replace(objective.case, contact=turned))
-        found, gradient = oracle.quantities(q), oracle.gradient_H(q)
-        worst = _worst(worst, library.eval(q, n), found.H, gradient)
-        worst = _worst(worst, library.objective(q), objective.value(q), objective.gradient(q))
-        worst = _worst(worst, (*library.value(q, n), gradient), found.H, gradient)
-        worst = _others(worst, library, (q, n), (found.jump, found.G, found.H, found.ellipsoid))
-    return worst
-
-
-def _joint_difference(library: ctypes.CDLL, variant: Variant, real: Real, samples: int) -> float:
-    """Largest relative difference of the objective of several contacts from CasADi's and Pinocchio's numbers."""
-    objective, worst = variant.objective, 0.0
-    functions = CompiledExport(library, variant.stem, objective.robot.nq, objective.robot.nv, real, ("objective",))
-    own = objective_fun(objective)
-    for q, _ in _samples(objective, samples, real):
-        value, gradient = (np.array(v, dtype=float).ravel() for v in own(q))
-        worst = _worst(worst, functions.objective(q), float(value[0]), gradient)
-        worst = _worst(worst, functions.objective(q), objective.value(q), objective.gradient(q))
-    return worst
-
-
-def _others(
-    so_far: float,
-    library: CompiledExport,
-    at: tuple[Vector, Vector],
-    expected: tuple[Vector, float, float, Vector],
+def largest_difference(
+    gradient: ImpactGradient,
+    objective: ImpactObjective,
+    build_reference: Callable[[ImpactObjective], Reference],
+    samples: int,
 ) -> float:
-    """Jump, G, V and ellipsoid, and a batch against single calls."""
-    (q, n), (a, G, H, ellipsoid) = at, expected
-    code, jump, found_G, found_V = library.jump(q, n)
-    so_far = _worst(so_far, (code, found_G, jump), G, a)
-    so_far = _worst(so_far, (code, found_V, jump), H / G**2, jump)
-    code, found_ellipsoid = library.ellipsoid(q)
-    so_far = _worst(so_far, (code, 0.0, found_ellipsoid), 0.0, ellipsoid)
-    single, twice = library.eval(q, n), library.eval_batch(np.stack([q, q]), np.stack([n, n]))
-    return _worst(so_far, (twice[0], twice[1][1], twice[2][1]), single[1], single[2])
+    """Return the largest relative difference of a compiled export from a reference; infinite where a call fails.
+
+    Args:
+        gradient: The export.
+        objective: The exported objective.
+        build_reference: :func:`~impact_posture.codegen.functions.casadi_reference` or ``oracle_reference``.
+        samples: The number of random postures and normals.
+    """
+    reference = build_reference(objective)
+    normals = np.random.default_rng(2).normal(size=(samples, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    worst = 0.0
+    for k, q in enumerate(sample_postures(objective.robot, samples, 1)):
+        # Rounded to the C type, so that the call changes nothing.
+        q, n = (np.array(v, dtype=gradient.dtype).astype(float) for v in (q, normals[k]))
+        expected = reference(q, n)
+        for name, quantities in _RESULTS.items():
+            if not set(quantities) <= set(expected):
+                continue
+            code, results = gradient.call(name, q, n)
+            if code != 0:
+                return float("inf")
+            for quantity, found in zip(quantities, results, strict=True):
+                least = _SHARE * abs(float(expected[_LEAST[quantity]][0])) if quantity in _LEAST else 0.0
+                worst = max(worst, deviation(found, expected[quantity], least).error)
+        if not objective.others:
+            H, rows = gradient.value_and_gradient_batch(np.stack([q, q]), np.stack([n, n]))
+            value, row = gradient.value_and_gradient(q, n)
+            worst = max(worst, deviation(H[1:], np.array([value])).error)
+            worst = max(worst, deviation(rows[1], row, _SHARE * abs(value)).error)
+    return worst
 
 
-def _samples(objective: ImpactObjective, count: int, real: Real) -> Iterator[tuple[Vector, Vector]]:
-    """Postures and unit normals, of the C type so that handing them over changes nothing."""
-    normals = np.random.default_rng(2).normal(size=(count, 3))
-    for q, n in zip(sample_postures(objective.robot, count, 1), normals, strict=True):
-        yield real.rounded(q), real.rounded(n / np.linalg.norm(n))
+@dataclass(frozen=True)
+class Deviation:
+    """The largest relative error of one quantity at one sample.
+
+    Attributes:
+        error: Largest ``|found − expected|`` over the scale; infinite where a number is not finite.
+        index: Index of the entry with that error.
+    """
+
+    error: float
+    index: tuple[int, ...]
 
 
-def _worst(so_far: float, result: tuple[int, float, Vector], value: float, gradient: Vector) -> float:
-    code, found, found_gradient = result
-    if code != 0:
-        return float("inf")
-    scale = max(float(np.abs(gradient).max(initial=0.0)), 1e-3 * abs(value))
-    difference = float(np.abs(found_gradient - gradient).max(initial=0.0))
-    relative = [abs(found - value) / abs(value) if found != value else 0.0]
-    relative.append(difference / scale if difference else 0.0)
-    # np.max keeps a NaN, which max() may drop.
-    return float(np.max([so_far, *relative]))
+def deviation(found: Vector, expected: Vector, scale: float = 0.0) -> Deviation:
+    """Return the largest deviation over the largest expected entry, or over ``scale`` if that is larger."""
+    with np.errstate(invalid="ignore"):
+        difference = np.abs(found - expected)
+    difference[~np.isfinite(difference)] = np.inf
+    index = tuple(int(k) for k in np.unravel_index(int(np.argmax(difference)), difference.shape))
+    largest, size = float(difference[index]), max(float(np.abs(expected).max()), scale)
+    return Deviation(largest / size if 0 < size < np.inf else (np.inf if largest > 0 else 0.0), index)

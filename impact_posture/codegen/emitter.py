@@ -1,15 +1,14 @@
-"""C99 from a laid-out graph: straight-line blocks of local variables, and work arrays for what blocks hand on.
+"""C99 from a laid-out graph: straight-line blocks of local variables, and work arrays for values that blocks hand on.
 
-Blocks are not for reading and written tersely: a humanoid has ten thousand operations.
-
-Vectors are the compiler's own (GCC's and Clang's extension): arithmetic is written as for numbers.
+Blocks are terse because a humanoid has ten thousand operations.  Vectors are the extension of GCC and Clang, so their
+arithmetic is written as that of numbers.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,14 +18,15 @@ from numpy.typing import ArrayLike, NDArray
 from impact_posture.codegen.graph import COSINE, Node
 from impact_posture.codegen.layout import Block, Layout, is_leaf
 
-# Characters of a constant's place, about.
+# Approximate number of characters in the place of a constant.
 _PLACE = 7
 SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
-"""Macros of the emitted text, for its end to take back."""
+"""Macros of the emitted text; its end undefines them."""
 
-# What a block may be handed, beside the inputs.
+# Arrays that a block may receive beside the inputs.
 _SHARED = ("s", "c", "w", "w2", "w4")
-# A vector wider than the processor's is made of parts: without optimization they and the whole each have a place.
+# The compiler splits a vector that is wider than the processor's.  Without optimization the parts and the whole have
+# a place each.
 _HALVES = 2
 _MATH = re.compile(r"\b(exp|log|pow|sqrt|a?sin|a?cos|a?tan|atan2|tanh|hypot|fabs|fmin|fmax)\(")
 
@@ -37,8 +37,8 @@ class Real:
 
     Attributes:
         name: ``double`` or ``float``.
-        size: Bytes of one.
-        unit_tolerance: How far the norm of a quaternion may be from one.
+        size: Bytes of a number.
+        unit_tolerance: Largest distance of the norm of a quaternion from one.
     """
 
     name: str
@@ -47,15 +47,15 @@ class Real:
 
     @property
     def dtype(self) -> np.dtype[np.floating[Any]]:
-        """The same type in numpy, whose ``float`` is a double."""
+        """The same type in numpy."""
         return np.dtype(np.float64 if self.name == "double" else np.float32)
 
     def rounded(self, values: ArrayLike) -> NDArray[np.float64]:
-        """The nearest numbers of this type, as doubles."""
+        """Return the nearest numbers of this type, as doubles."""
         return np.array(values, dtype=self.dtype).astype(np.float64)
 
     def literal(self, value: float) -> str:
-        """A literal that reads back as the nearest number of this type; negative ones in parentheses."""
+        """Return a literal that reads back as the nearest number; a negative one is in parentheses."""
         if self.name == "double" or not math.isfinite(value):
             return c_double(value)
         with np.errstate(over="ignore", under="ignore"):
@@ -66,7 +66,7 @@ class Real:
         return f"{text[:-1]}f)" if text.endswith(")") else f"{text}f"
 
     def spelled(self, operation: str) -> str:
-        """An operation's C, written for doubles, in this type: ``sinf`` for ``sin``, ``1.0f`` for ``1.0``."""
+        """Return the C of an operation on doubles in this type: ``sinf`` for ``sin``, ``1.0f`` for ``1.0``."""
         if self.name == "double":
             return operation
         text = _MATH.sub(r"\1f(", operation).replace("(double)", "(float)")
@@ -75,49 +75,26 @@ class Real:
 
 DOUBLE = Real("double", 8, 1e-6)
 FLOAT = Real("float", 4, 1e-5)
+REALS = {real.name: real for real in (DOUBLE, FLOAT)}
 
 
 def c_double(value: float) -> str:
-    """A double literal that reads back exactly; negative ones in parentheses."""
+    """Return a double literal that reads back exactly; a negative one is in parentheses."""
     if math.isnan(value):
         return "NAN"
     text = "INFINITY" if math.isinf(value) else repr(abs(value))
     return f"(-{text})" if math.copysign(1.0, value) < 0 else text
 
 
-def c_vector(values: Sequence[float], indent: str = "  ", real: Real = DOUBLE) -> str:
-    """A brace initializer, four numbers a line."""
-    texts = [real.literal(float(v)).strip("()") for v in values]
-    rows = [", ".join(texts[k : k + 4]) for k in range(0, len(texts), 4)]
-    return "{\n" + ",\n".join(f"{indent}  {row}" for row in rows) + f"\n{indent}}}"
-
-
-@dataclass(frozen=True)
-class Dialect:
-    """What the emitted text is about.
-
-    Attributes:
-        prefix: What C names begin with.
-        real: The type of literals.
-        types: Width → C type of such a number or vector.
-        work: What callers call the structure that holds inputs and work arrays; empty where inputs stand alone.
-    """
-
-    prefix: str
-    real: Real
-    types: dict[int, str]
-    work: str = ""
-
-
 @dataclass(frozen=True)
 class BlockText:
-    """A block's C.
+    """The C of a block.
 
     Attributes:
         text: The function.
-        call: Its call, with names of the caller's own: inputs, ``m.s``, ``m.w`` and so on.
-        local_bytes: What its variables take at most.
-        wide_bytes: What the parts of vectors that the processor does not have may take beside.
+        call: Its call with the caller's names: inputs, ``m.s``, ``m.w`` and so on.
+        local_bytes: Most bytes of its variables.
+        wide_bytes: Most bytes of the parts of vectors that are wider than the processor's.
     """
 
     text: str
@@ -127,10 +104,10 @@ class BlockText:
 
 
 class Constants:
-    """Tables of the numbers in a library's blocks: a number's place is shorter than its seventeen digits.
+    """Tables of the numbers in the blocks of a library.  The place of a number is shorter than its seventeen digits.
 
     Args:
-        prefix: What the tables' names begin with.
+        prefix: Beginning of the names of the tables.
         real: The type of the numbers.
     """
 
@@ -139,7 +116,7 @@ class Constants:
         self._tables: dict[int, dict[tuple[float, ...], int]] = {}
 
     def place(self, node: Node) -> str:
-        """C of a constant: short numbers as they are, others by their place."""
+        """Return the C of a constant: a short number as it is, another by its place."""
         if node.width == 1:
             text = self._real.literal(node.value[0])
             if len(text) < _PLACE:
@@ -147,8 +124,8 @@ class Constants:
         known = self._tables.setdefault(node.width, {})
         return f"{_short(node.width)}[{known.setdefault(node.value, len(known))}]"
 
-    def text(self, types: dict[int, str]) -> str:
-        """The tables, of the types for each width, and their short names."""
+    def text(self, types: Mapping[int, str]) -> str:
+        """Return the C of the tables, with the type of each width, and of their short names."""
         lines = []
         for width, known in sorted(self._tables.items()):
             rows = [", ".join(self._real.literal(v).strip("()") for v in value) for value in known]
@@ -169,17 +146,30 @@ class Emitter:
     """The C of one laid-out graph.
 
     Args:
-        layout: Blocks and what they hand on.
-        dialect: Names and types.
-        size: Bytes of the dialect's type of width one.
-        constants: Where its numbers go.
+        layout: Blocks and the values that they hand on.
+        prefix: Beginning of the names of the blocks.
+        real: The type of literals.
+        types: Width → C type of a number or vector of that width.
+        constants: Tables that receive the numbers.
+        size: Bytes of the type of width one, if it is not ``real``.
+        work: Name of the structure with inputs and work arrays; empty where inputs are arguments of their own.
     """
 
-    def __init__(self, layout: Layout, dialect: Dialect, size: int, constants: Constants) -> None:
-        self.layout, self.dialect, self._size, self._constants = layout, dialect, size, constants
+    def __init__(
+        self,
+        layout: Layout,
+        prefix: str,
+        real: Real,
+        types: Mapping[int, str],
+        constants: Constants,
+        size: int = 0,
+        work: str = "",
+    ) -> None:
+        self.layout, self._prefix, self._real, self._types = layout, prefix, real, types
+        self._constants, self._size, self._work = constants, size or real.size, work
         self._graph = layout.graph
         at = {k: number for number, block in enumerate(layout.blocks) for k in block.nodes}
-        # What its own block uses again, so that it needs a name there.
+        # Nodes that their own block uses again, so that they need a name there.
         self._reused: set[int] = set()
         for k, number in at.items():
             waiting = list(self._graph.nodes[k].operands)
@@ -193,14 +183,14 @@ class Emitter:
         self.blocks = [self._block(number, block) for number, block in enumerate(layout.blocks)]
 
     def output(self, k: int, work: str = "m.") -> str:
-        """An output's value after the blocks have run."""
+        """Return the C of an output after the calls of the blocks."""
         node = self._graph.nodes[k]
         if node.op == "const":
-            return self.dialect.real.literal(node.value[0])
+            return self._real.literal(node.value[0])
         if node.op == "lane":
             return f"{self.output(node.args[0], work)}[{node.args[1]}]"
         if node.op == "in":
-            return f"{work if self.dialect.work else ''}{self._graph.inputs[node.args[0]]}[{node.args[1]}]"
+            return f"{work if self._work else ''}{self._graph.inputs[node.args[0]]}[{node.args[1]}]"
         if k in self.layout.trig:
             return f"{work}{'c' if node.op == COSINE else 's'}[{self.layout.trig[k]}]"
         return f"{work}{self._slot(k)}"
@@ -218,26 +208,26 @@ class Emitter:
             if kept and k not in self._reused:
                 lines.append(f"{kept}{text};")
             elif node.op == "gather":
-                lines.append(f"{self.dialect.types[node.width]} {names[k]}={text};")
+                lines.append(f"{self._types[node.width]} {names[k]}={text};")
                 lines += [f"{kept}{names[k]};"] if kept else []
             else:
-                lines.append(f"{self.dialect.types[node.width]} {names[k]}={kept}{text};")
+                lines.append(f"{self._types[node.width]} {names[k]}={kept}{text};")
         body = "\n".join(lines)
         used = set(re.findall(r"\b([a-z]\w*)\[|\((\w) \+", body))
         present = {name for pair in used for name in pair if name}
-        scalar = self.dialect.types[1]
+        scalar = self._types[1]
         parameters, arguments = [], []
         for name in self._graph.inputs:
             if name in present:
                 parameters.append(f"const {scalar} *{name}")
-                arguments.append(f"{self.dialect.work}.{name}" if self.dialect.work else name)
+                arguments.append(f"{self._work}.{name}" if self._work else name)
         for name in _SHARED:
             if name in present:
                 constant = "const " if name in "sc" else ""
-                kind = self.dialect.types[int(name[1:] or 1)]
+                kind = self._types[int(name[1:] or 1)]
                 parameters.append(f"{constant}{kind} *{name}")
-                arguments.append(f"{self.dialect.work or 'm'}.{name}")
-        title = f"{self.dialect.prefix}_block{number}"
+                arguments.append(f"{self._work or 'm'}.{name}")
+        title = f"{self._prefix}_block{number}"
         local = sum(self._graph.nodes[k].width for k in names) * self._size
         return BlockText(
             f"APART static void {title}({', '.join(parameters)})\n{{\n{body}\n}}\n",
@@ -247,7 +237,7 @@ class Emitter:
         )
 
     def _vector_bytes(self, block: Block) -> int:
-        """Bytes of all results of a block that are vectors, those within statements too."""
+        """Bytes of all vectors that a block computes, also within statements."""
         total, waiting = 0, list(block.nodes)
         while waiting:
             node = self._graph.nodes[waiting.pop()]
@@ -256,7 +246,7 @@ class Emitter:
         return total
 
     def _expression(self, k: int, number: int, names: dict[int, str], lines: list[str], *, top: bool = False) -> str:
-        """C of a node: a name, a place in an array, or the operation itself, in parentheses unless on ``top``."""
+        """Return a name, a place in an array, or the operation itself, in parentheses unless on ``top``."""
         node = self._graph.nodes[k]
         if not top and k in names:
             return names[k]
@@ -267,14 +257,14 @@ class Emitter:
         operands = [self._expression(a, number, names, lines) for a in node.operands]
         if node.op == "gather":
             return "{" + ", ".join(operands) + "}"
-        if node.op in ("+", "-", "*", "/"):
+        if node.op in ("+", "-", "*"):
             text = f"{operands[0]}{node.op}{operands[1]}"
         elif node.op == "neg":
             text = f"-{operands[0]}"
         elif node.op == "inv":
-            text = self.dialect.real.spelled("1.0") + f"/{operands[0]}"
+            text = self._real.spelled("1.0") + f"/{operands[0]}"
         else:
-            return self.dialect.real.spelled(node.op).format(*operands)
+            return self._real.spelled(node.op).format(*operands)
         return text if top else f"({text})"
 
     def _leaf(self, k: int, node: Node, number: int, names: dict[int, str], lines: list[str]) -> str:
@@ -288,7 +278,7 @@ class Emitter:
         if node.width == 1:
             return f"{array}[{self.layout.trig[k]}]"
         names[k] = f"v{len(names)}"
-        kind = self.dialect.types[node.width]
+        kind = self._types[node.width]
         lines.append(f"const {kind} {names[k]} = *(const {kind}u *)({array} + {self.layout.trig[k]});")
         return names[k]
 

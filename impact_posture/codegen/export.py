@@ -1,12 +1,10 @@
-"""``H``, ``∇H`` and the problem's own objective as C code that a controller can link."""
+"""Export ``H``, ``∇H`` and the objective of a problem as C code that a controller can link."""
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +13,20 @@ from numpy.typing import NDArray
 
 from impact_posture.codegen.build_check import compile_and_check
 from impact_posture.codegen.code import build_code
-from impact_posture.codegen.emitter import DOUBLE, Real
+from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
+from impact_posture.codegen.functions import named_objectives
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest import build_manifest
-from impact_posture.codegen.naming import c_identifier, check_prefix
-from impact_posture.codegen.source import build_texts
-from impact_posture.codegen.variants import variants
-from impact_posture.errors import InputError, OutputError
+from impact_posture.codegen.naming import c_identifier, check_prefix, products
+from impact_posture.codegen.render import render
+from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.toolchain import find_compiler
+from impact_posture.libraries import library_path
+from impact_posture.output_folder import whole_folder, write_whole
+from impact_posture.robot.robot import Robot
+from impact_posture.toolchain import GET_ONE, find_compiler
+
+SCHEMA = "impact-posture/codegen-run/1"
 
 
 @dataclass(frozen=True)
@@ -30,19 +34,68 @@ class Export:
     """A written export.
 
     Attributes:
-        prefix: What its C names begin with.
-        files: The files that were written.
-        manifest: What ``<prefix>.json`` holds.
-        compiled: Whether a compiler was there, built it and it agreed.
-        agreement: Largest relative difference of the built code from CasADi's and Pinocchio's numbers; ``None``
+        out: The folder of the files.
+        robot: The robot.
+        files: The files.
+        manifest: The content of ``<prefix>.json``.
+        agreement: Largest relative difference of the built code from the numbers of CasADi and Pinocchio; ``None``
             where it was not built.
+        library: The shared library, where one stays in the folder.
+        requested: Whether a library was requested.
     """
 
-    prefix: str
+    out: Path
+    robot: Robot
     files: tuple[Path, ...]
     manifest: dict[str, Any]
-    compiled: bool
-    agreement: float | None
+    agreement: float | None = None
+    library: Path | None = None
+    requested: bool = False
+
+    @property
+    def prefix(self) -> str:
+        """Beginning of the C names."""
+        return str(self.manifest["prefix"])
+
+    @property
+    def compiled(self) -> bool:
+        """Whether a compiler built the code and the numbers agreed."""
+        return self.agreement is not None
+
+    def load(self, **options: Any) -> ImpactGradient:
+        """Load the library, which runs its code; the options are those of :meth:`ImpactGradient.load`."""
+        return ImpactGradient.load(self.out, robot=self.robot, **options)
+
+    @property
+    def functions(self) -> list[str]:
+        """Names of the C functions."""
+        blocks = [block for frame in self.manifest["frames"] for block in (frame, frame["free"])]
+        blocks.append(self.manifest["several"])
+        return [name for block in blocks if block is not None for name in block["symbols"].values()]
+
+    @property
+    def verdict(self) -> str:
+        """The outcome of the build, on one line."""
+        if self.library is not None:
+            return f"{self.library.name}: built, agrees to {self.agreement:.0e}"
+        if self.requested:
+            return f"not built, there is no C compiler: {GET_ONE}, then make shared in {self.out}"
+        return f"build and self-test: make -C {self.out} check (or codegen --compile)"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the document of ``codegen --json``."""
+        return {
+            "schema": SCHEMA,
+            "out": str(self.out),
+            "prefix": self.prefix,
+            "files": [path.name for path in self.files],
+            "functions": self.functions,
+            "library": None if self.library is None else self.library.name,
+            "agreement": self.agreement,
+            "real": self.manifest["real"],
+            "stack_bytes": self.manifest["stack_bytes"],
+            "verdict": self.verdict,
+        }
 
 
 def export(
@@ -56,26 +109,26 @@ def export(
     force: bool = False,
     check: bool = True,
 ) -> Export:
-    """Write the C export of an objective into the folder ``out`` and, where a compiler is there, prove it.
+    """Write the C export of an objective into an existing folder and, where a compiler is there, prove it.
 
-    Nothing is written before all of it is made, and each file appears whole or not at all.
+    The function writes nothing before it has made all texts, and each file appears whole or not at all.
 
     Args:
-        objective: What to export; several of one robot, each at a frame of its own, make one library with
+        objective: The objective.  Several objectives of one robot, each at a frame of its own, make one library with
             functions ``<prefix>_<frame>_eval`` and so on.
-        out: An existing folder.
-        prefix: What the C names begin with, a C identifier; robot and frame by default.
-        posture: A configuration to go along as a constant, shape (nq,).
+        out: The folder.
+        prefix: Beginning of the C names, a C identifier; robot and frame by default.
+        posture: A configuration that the code holds as a constant, shape (nq,).
         real: The C type to compute in.
-        portable: Plain C99, for compilers without the vectors of GCC and Clang.
-        force: Replace files that are there.
-        check: Build and compare; ``compiled`` is false without.
+        portable: Write plain C99, for compilers without the vectors of GCC and Clang.
+        force: Replace existing files.
+        check: Build and compare.
 
     Raises:
-        InputError: The prefix is no C identifier.
+        InputError: The prefix is no C identifier, or the objectives differ in more than the contact.
         PostureError: The posture has another length or is not finite.
-        OutputError: ``out`` is no folder, holds such files already, or cannot be written.
-        CompilerError: The compiler failed, or what it made computes other numbers; the files are there.
+        OutputError: ``out`` is no folder, holds the files already, or cannot be written.
+        CompilerError: The compiler failed, or its code computes other numbers.  The files stay.
     """
     objectives = _same_robot(objective)
     robot = objectives[0].robot
@@ -85,36 +138,84 @@ def export(
     if posture is not None:
         given = np.array(posture, dtype=float)
         posture = robot.check_posture(given, limits=False)
-        # Normalizing what is of unit norm already turns last digits: keep those that result.json has.
+        # Normalizing a configuration of unit norm changes its last digits.  Keep those that result.json has.
         posture = given if np.allclose(given, posture, rtol=0, atol=1e-9) else posture
-    exported = variants(objectives, prefix)
+    exported = named_objectives(objectives, prefix)
     code = build_code(exported, prefix, real, portable=portable)
     manifest = build_manifest(objectives, prefix, posture, real, code.stack_bytes)
-    texts = build_texts(exported, prefix, manifest, code, real)
+    texts = render(exported, prefix, manifest, code, real)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
-    _write(texts, out, force)
-    files = tuple(out / name for name in texts)
+    there = [name for name in texts if (out / name).exists()]
+    if there and not force:
+        raise OutputError(f"holds {there[0]} already", where=str(out), hint="give --force to replace it")
+    for name, text in texts.items():
+        write_whole(out / name, text)
+    made = Export(out, robot, tuple(out / name for name in texts), manifest)
     if not check or find_compiler() is None:
-        return Export(prefix, files, manifest, compiled=False, agreement=None)
-    agreement = compile_and_check(out, prefix, objectives, real=real)
-    return Export(prefix, files, manifest, compiled=True, agreement=agreement)
+        return made
+    return replace(made, agreement=compile_and_check(out, prefix, objectives))
+
+
+def write_export(
+    objectives: Sequence[ImpactObjective],
+    out: Path | None = None,
+    *,
+    prefix: str | None = None,
+    posture: NDArray[np.float64] | None = None,
+    single: bool = False,
+    portable: bool = False,
+    build: bool = False,
+    force: bool = False,
+) -> Export:
+    """Write an export into a folder of its own, whole or not at all, and build its library there on request.
+
+    Args:
+        objectives: One objective for each frame.
+        out: The folder; ``./<prefix>-c`` by default.
+        prefix: Beginning of the C names; robot and frame by default.
+        posture: A configuration that the code holds as a constant, shape (nq,).
+        single: Compute in ``float``.
+        portable: Write plain C99, for compilers without the vectors of GCC and Clang.
+        build: Leave ``lib<prefix>.so`` in the folder.  A machine without a compiler gets no library and no error.
+        force: Replace an earlier export.
+
+    Raises:
+        OutputError: The folder exists without ``force``, is no export, or cannot be written.
+        CompilerError: The compiler failed, or its code computes other numbers.  Nothing is written.
+        ImpactPostureError: As :func:`export`.
+    """
+    prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
+    out = Path(f"{prefix}-c") if out is None else out
+    real = FLOAT if single else DOUBLE
+    agreement = None
+    with whole_folder(out, force=force, kind="export", products=products(prefix)) as folder:
+        made = export(objectives, folder, prefix=prefix, posture=posture, real=real, portable=portable, check=False)
+        if build and find_compiler() is not None:
+            try:
+                agreement = compile_and_check(folder, prefix, objectives, keep=True)
+            except CompilerError as error:
+                hint = f"{error.hint}; without --compile the C code is written all the same"
+                raise CompilerError(error.what, where=error.where, hint=hint) from None
+    library = None if agreement is None else library_path(out, prefix)
+    files = tuple(out / path.name for path in made.files)
+    return replace(made, out=out, files=files, agreement=agreement, library=library, requested=build)
 
 
 def default_prefix(objectives: Sequence[ImpactObjective]) -> str:
-    """Robot and frame; the robot alone where there are several."""
+    """Return robot and frame as a prefix; the robot alone where there are several frames."""
     first = objectives[0]
     alone = len(objectives) == 1 and not first.others
     return c_identifier(first.robot.name, first.contact.frame if alone else "")
 
 
 def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple[ImpactObjective, ...]:
+    """Return the objectives as a tuple; refuse objectives that differ in more than the contact."""
     objectives = (objective,) if isinstance(objective, ImpactObjective) else tuple(objective)
     if not objectives:
         raise InputError("no objective is given", where="codegen", hint="give one for each frame")
     first = objectives[0]
-    shared = _what(first)
     for other in objectives[1:]:
-        if _what(other) != shared:
+        if _without_contact(other) != _without_contact(first):
             raise InputError(
                 f"'{other.contact.frame}' and '{first.contact.frame}' differ in more than the contact",
                 where="codegen",
@@ -123,24 +224,6 @@ def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple
     return objectives
 
 
-def _what(o: ImpactObjective) -> tuple[object, ...]:
-    """Everything but the contact."""
+def _without_contact(o: ImpactObjective) -> tuple[object, ...]:
     models = tuple(variant.robot.model_sha256 for variant in o.model_variants)
     return o.robot.model_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg, models
-
-
-def _write(texts: dict[str, str], out: Path, force: bool) -> None:
-    there = [name for name in texts if (out / name).exists()]
-    if there and not force:
-        raise OutputError(f"holds {there[0]} already", where=str(out), hint="give --force to replace it")
-    for name, text in texts.items():
-        beside = out / f".{name}.part"
-        try:
-            beside.write_text(text, encoding="utf-8", newline="\n")
-            os.replace(beside, out / name)
-        except OSError as error:
-            with suppress(OSError):
-                beside.unlink()
-            raise OutputError(
-                f"cannot be written ({error.strerror})", where=str(out / name), hint="check the disk and permissions"
-            ) from None

@@ -1,21 +1,19 @@
-"""CasADi's instruction list as a graph of operations that a C compiler can be given in any order and grouping."""
+"""The instructions of a CasADi function as a graph of operations, which C may compute in any order."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import casadi as ca
 
 from impact_posture.errors import CompilerError
 
-# Operations that vectors have in C.
-ARITHMETIC = frozenset({"+", "-", "*", "/", "neg", "inv"})
+# Operations that C has on vectors.  A division is a product with a reciprocal, which several divisions share.
+ARITHMETIC = frozenset({"+", "-", "*", "neg", "inv"})
 _COMMUTE = frozenset({"+", "*"})
-_BINARY = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
-# The rest, in C's terms: operands are names or stand in parentheses.
+# The C of the other operations.  Operands are names or stand in parentheses.
 CALLS = {
     ca.OP_EXP: "exp({0})",
     ca.OP_LOG: "log({0})",
@@ -52,10 +50,10 @@ class Node:
     """One operation.
 
     Attributes:
-        op: ``const``, ``in``, ``lane``, one of :data:`ARITHMETIC`, or a C expression out of :data:`CALLS`.
-        args: Numbers of the operands; of ``in`` its name's number and index; of ``lane`` the vector and which lane.
-        width: Numbers that it holds: 1, or the lanes of a vector.
-        value: Of ``const``: its numbers.
+        op: ``const``, ``in``, ``lane``, ``gather``, one of :data:`ARITHMETIC`, or a C expression of :data:`CALLS`.
+        args: Numbers of the operands.  ``in`` has the number of its name and an index, ``lane`` a node and an index.
+        width: Count of its numbers: 1, or the lanes of a vector.
+        value: The numbers of ``const``.
     """
 
     op: str
@@ -65,13 +63,13 @@ class Node:
 
     @property
     def operands(self) -> tuple[int, ...]:
-        """The nodes that it needs."""
+        """Numbers of the nodes that it needs."""
         return () if self.op in ("const", "in") else self.args[:1] if self.op == "lane" else self.args
 
 
 @dataclass
 class Graph:
-    """Operations in an order in which every operand comes first; equal ones exist once.
+    """Operations in an order in which every operand comes first.  Equal operations exist once.
 
     Attributes:
         inputs: Names of the inputs.
@@ -85,142 +83,83 @@ class Graph:
     _known: dict[Node, int] = field(default_factory=dict)
 
     def add(self, node: Node) -> int:
-        """Number of the node, simplified where its operands are constants."""
+        """Return the number of the node; arithmetic on constants becomes a constant."""
+        operands = [self.nodes[a] for a in node.operands]
+        if node.op in ARITHMETIC and all(o.op == "const" for o in operands):
+            width = max(o.width for o in operands)
+            lanes = [[o.value[k if o.width > 1 else 0] for o in operands] for k in range(width)]
+            return self.constant(*[_COMPUTE[node.op](*numbers) for numbers in lanes])
         if node.op in _COMMUTE:
             node = Node(node.op, tuple(sorted(node.args)), node.width)
-        simpler = self._simplified(node) if node.op in ARITHMETIC else None
-        if isinstance(simpler, int):
-            return simpler
-        node = node if simpler is None else simpler
         if node not in self._known:
             self._known[node] = len(self.nodes)
             self.nodes.append(node)
         return self._known[node]
 
     def constant(self, *value: float) -> int:
-        """A number, or a vector of them; a vector of equal numbers is the number."""
+        """Return the node of a number or of a vector; a vector of equal numbers is the number."""
         same = len(set(value)) == 1
         return self.add(Node("const", (), 1 if same else len(value), value[:1] if same else value))
 
     def element(self, node: int, lane: int) -> int:
-        """One number of a vector."""
+        """Return the node of one number of a vector."""
         found = self.nodes[node]
         if found.op == "const":
             return self.constant(found.value[lane if found.width > 1 else 0])
         return node if found.width == 1 else self.add(Node("lane", (node, lane)))
-
-    def _simplified(self, node: Node) -> Node | int | None:
-        operands = [self.nodes[a] for a in node.args]
-        if all(o.op == "const" for o in operands):
-            width = max(o.width for o in operands)
-            lanes = [[o.value[k if o.width > 1 else 0] for o in operands] for k in range(width)]
-            return self.constant(*[_COMPUTE[node.op](*numbers) for numbers in lanes])
-        values = [o.value[0] if o.op == "const" and o.width == 1 else None for o in operands]
-        if len(operands) == 1:
-            return operands[0].args[0] if node.op == "neg" and operands[0].op == "neg" else None
-        (a, b), (x, y) = node.args, values
-        fits = {k: self.nodes[k].width == node.width for k in (a, b)}
-        if node.op == "*" and 0.0 in (x, y):
-            return self.constant(0.0)
-        rules: list[tuple[bool, Node | int]] = [
-            (node.op in "+*" and x == (0.0 if node.op == "+" else 1.0) and fits[b], b),
-            (node.op in "+-" and y == 0.0 and fits[a], a),
-            (node.op in "*/" and y == 1.0 and fits[a], a),
-            (node.op == "-" and x == 0.0, Node("neg", (b,), node.width)),
-            (node.op == "*" and x == -1.0, Node("neg", (b,), node.width)),
-            (node.op == "*" and y == -1.0, Node("neg", (a,), node.width)),
-        ]
-        return next((self.add(found) if isinstance(found, Node) else found for holds, found in rules if holds), None)
 
 
 _COMPUTE: dict[str, Callable[..., float]] = {
     "+": lambda a, b: a + b,
     "-": lambda a, b: a - b,
     "*": lambda a, b: a * b,
-    "/": lambda a, b: a / b if b else math.copysign(math.inf, b) * a,
     "neg": lambda a: -a,
     "inv": lambda a: 1.0 / a if a else math.copysign(math.inf, a),
 }
 
 
-def graph_of(function: ca.Function, parameters: Mapping[str, Sequence[float]] | None = None) -> Graph:
-    """The operations of an SX function, one reciprocal for each number that several are divided by.
-
-    Args:
-        function: An SX function; its sparse outputs are taken as dense.
-        parameters: Inputs that are constants, by name.
+def graph_of(function: ca.Function) -> Graph:
+    """Return the operations of an SX function.  Sparse outputs become dense.
 
     Raises:
-        CompilerError: An operation that has no C here.
+        CompilerError: An operation has no C form.
     """
-    function = _dense(function)
-    names, constants = function.name_in(), dict(parameters or {})
-    graph = Graph(tuple(names))
-    divisors = _divisors(function)
+    inputs = function.sx_in()
+    outputs = [ca.densify(value) for value in function.call(inputs)]
+    function = ca.Function("dense", inputs, outputs, function.name_in(), function.name_out())
+    graph = Graph(tuple(function.name_in()))
+    graph.outputs = {name: [graph.constant(0.0)] * function.numel_out(name) for name in function.name_out()}
     held: dict[int, int] = {}
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
         source, target = function.instruction_input(k), function.instruction_output(k)
         if operation == ca.OP_OUTPUT:
-            name = function.name_out(target[0])
-            entries = graph.outputs.setdefault(name, [graph.constant(0.0)] * function.numel_out(name))
-            entries[target[1]] = held[source[0]]
-            continue
-        if operation == ca.OP_CONST:
-            found = graph.constant(function.instruction_constant(k))
+            graph.outputs[function.name_out(target[0])][target[1]] = held[source[0]]
+        elif operation == ca.OP_CONST:
+            held[target[0]] = graph.constant(function.instruction_constant(k))
         elif operation == ca.OP_INPUT:
-            name = names[source[0]]
-            known = constants.get(name)
-            found = (
-                graph.add(Node("in", (source[0], source[1]))) if known is None else graph.constant(known[source[1]])
-            )
+            held[target[0]] = graph.add(Node("in", (source[0], source[1])))
         else:
-            found = _operation(graph, operation, [held[s] for s in source], divisors[k])
-        held[target[0]] = found
-    for name in function.name_out():
-        graph.outputs.setdefault(name, [graph.constant(0.0)] * function.numel_out(name))
+            held[target[0]] = _operation(graph, operation, [held[s] for s in source])
     return graph
 
 
-def _operation(graph: Graph, operation: int, operands: list[int], divided: int) -> int:
-    first = operands[0]
+def _operation(graph: Graph, operation: int, operands: list[int]) -> int:
+    a, b = operands[0], operands[-1]
     if operation == ca.OP_ASSIGN:
-        return first
-    if operation == ca.OP_DIV and divided > 1:
-        return graph.add(Node("*", (first, graph.add(Node("inv", (operands[1],))))))
-    if operation in _BINARY:
-        return graph.add(Node(_BINARY[operation], (first, operands[1])))
-    unary = {
-        ca.OP_NEG: Node("neg", (first,)),
-        ca.OP_INV: Node("inv", (first,)),
-        ca.OP_SQ: Node("*", (first, first)),
-        ca.OP_TWICE: Node("+", (first, first)),
-    }
-    if operation in unary:
-        return graph.add(unary[operation])
+        return a
+    if operation == ca.OP_DIV:
+        return graph.add(Node("*", (a, graph.add(Node("inv", (b,))))))
+    arithmetic = {
+        ca.OP_ADD: Node("+", (a, b)), ca.OP_SUB: Node("-", (a, b)), ca.OP_MUL: Node("*", (a, b)),
+        ca.OP_NEG: Node("neg", (a,)), ca.OP_INV: Node("inv", (a,)),
+        ca.OP_SQ: Node("*", (a, a)), ca.OP_TWICE: Node("+", (a, a)),
+    }  # fmt: skip
+    if operation in arithmetic:
+        return graph.add(arithmetic[operation])
     if operation in CALLS:
         text = CALLS[operation]
-        return graph.add(Node(text, tuple(operands[: 2 if "{1}" in text else 1])))
+        return graph.add(Node(text, (a, b) if "{1}" in text else (a,)))
     raise CompilerError(
         f"CasADi operation {operation} has no C form", where="codegen", hint="add it to codegen/graph.py"
     )
-
-
-def _divisors(function: ca.Function) -> list[int]:
-    """For each instruction that divides, how many divide by the same number."""
-    made: dict[int, int] = {}
-    by: dict[int, int] = {}
-    for k in range(function.n_instructions()):
-        operation, source = function.instruction_id(k), function.instruction_input(k)
-        if operation in (ca.OP_DIV, ca.OP_INV):
-            by[k] = made[source[1 if operation == ca.OP_DIV else 0]]
-        if operation != ca.OP_OUTPUT:
-            made[function.instruction_output(k)[0]] = k
-    counts = Counter(by.values())
-    return [counts[by[k]] if k in by else 0 for k in range(function.n_instructions())]
-
-
-def _dense(function: ca.Function) -> ca.Function:
-    inputs = function.sx_in()
-    outputs = [ca.densify(value) for value in function.call(inputs)]
-    return ca.Function("dense", inputs, outputs, function.name_in(), function.name_out())

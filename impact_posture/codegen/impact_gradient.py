@@ -1,19 +1,20 @@
-"""A built export as Python functions for a control loop.  Needs numpy and the library, no CasADi."""
+"""A built export as Python functions for a control loop.  This module needs numpy and the library, no CasADi."""
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.codegen.library import build_library, library_path
+from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.reader import check_library, check_robot, frame_block, read_manifest
 from impact_posture.errors import InputError, ManifestMismatch, MetricError, PostureError, SpecError
-from impact_posture.libraries import load_library
+from impact_posture.libraries import build_library, library_path, load_library
 
 if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot
@@ -21,24 +22,25 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 _TYPES: dict[str, Any] = {"double": ctypes.c_double, "float": ctypes.c_float}
-# What the library must reproduce of its manifest's reference: the compiler's rounding; in float, what is left of
-# seven digits after feet at compliance ε (condition about 1/ε).
+# A library reproduces the reference of its manifest up to the rounding of the compiler.  In float, feet at compliance
+# ε leave few of the seven digits (condition about 1/ε).
 _SELF_TEST = {"double": 1e-7, "float": 0.1}
 
 
 class ImpactGradient:
-    """``H``, its tangent gradient and their relatives from a compiled export.
+    """``H``, its tangent gradient and related quantities from a compiled export.
 
-    Inputs are copied into buffers that were allocated once; **array results are views on such buffers, overwritten by
-    the next call** of the same method: copy what must last.  One object serves one thread; :meth:`copy` makes
-    another on the same library for another thread (calls release Python's lock).
+    Every method copies its inputs into buffers that were allocated once.  **Array results are views of buffers, which
+    the next call of the same method overwrites**, so copy a result that must last.  One object serves one thread.
+    :meth:`copy` makes another object on the same library for another thread (calls release the lock of Python).
 
     Attributes:
         manifest: The content of ``<prefix>.json``.
-        frame: The contact frame that this object is about.
-        free: Whether it leaves the supports away.
-        nq: Numbers in a configuration.
-        nv: Numbers in a gradient.
+        frame: The contact frame of this object.
+        free: Whether this object leaves out the supports.
+        nq: Length of a configuration.
+        nv: Length of a gradient.
+        dtype: The number type of the library.
     """
 
     manifest: Mapping[str, Any]
@@ -54,50 +56,47 @@ class ImpactGradient:
         block = frame_block(manifest, frame)
         self.manifest, self.frame, self.free = manifest, str(block["frame"]), free
         self.nq, self.nv = int(manifest["nq"]), int(manifest["nv"])
-        # A robot without supports is free as it is.
-        self._block = (block.get("free") if free else None) or block
-        self._library, self._symbols = library, dict(self._block["symbols"])
+        # A robot without supports has no second set of functions.
+        block = (block.get("free") if free else None) or block
+        symbols = dict(block["symbols"])
         if manifest.get("several") and not free:
-            # The problem's own objective is that of all contacts at once, whichever frame is asked about.
-            self._symbols |= manifest["several"]["symbols"]
-        self._real = _TYPES[manifest["real"]]
-        self.dtype = np.dtype(self._real)
-        buffers = {"q": self.nq, "n": 3, "grad": self.nv, "own": self.nv, "jump": self.nv, "L": 9}
-        kept = {name: (self._real * size)() for name, size in buffers.items()}
-        views = {name: np.frombuffer(buffer, dtype=self.dtype) for name, buffer in kept.items()}
-        self._q, self._n, self._L = views["q"], views["n"], views["L"].reshape(3, 3)
-        self._grad, self._own, self._jump = views["grad"], views["own"], views["jump"]
-        self._H, self._value, self._G, self._V = (self._real() for _ in range(4))
-        q, n, grad, own, jump, L = (ctypes.byref(kept[name]) for name in ("q", "n", "grad", "own", "jump", "L"))
-        H, value, G, V = (ctypes.byref(v) for v in (self._H, self._value, self._G, self._V))
-        self._eval, self._eval_arguments = self._function("eval"), (q, n, H, grad)
-        self._objective, self._objective_arguments = self._function("objective"), (q, value, own)
-        self._alone, self._alone_arguments = self._function("value"), (q, n, H)
-        self._jumps, self._jump_arguments = self._function("jump"), (q, n, jump, G, V)
-        self._ellipsoid, self._ellipsoid_arguments = self._function("ellipsoid"), (q, L)
-        self._batch = self._function("eval_batch")
+            # At every frame the objective of the problem is that of all contacts together.
+            symbols |= manifest["several"]["symbols"]
+        self._library, self._reference = library, block["self_test"]
+        real = _TYPES[manifest["real"]]
+        self.dtype = np.dtype(real)
+        sizes = lengths(self.nq, self.nv)
+        inputs = {name: (real * sizes[name])() for name in ("q", "n")}
+        self._q, self._n = (np.frombuffer(buffer, dtype=self.dtype) for buffer in inputs.values())
+        self._functions: dict[str, tuple[Callable[[], int], tuple[Array, ...]]] = {}
+        for name, (given, results) in SIGNATURES.items():
+            buffers = [(real * sizes.get(result, 1))() for result in results]
+            arguments = [ctypes.byref(buffer) for buffer in (*[inputs[one] for one in given], *buffers)]
+            views = tuple(np.frombuffer(buffer, dtype=self.dtype) for buffer in buffers)
+            self._functions[name] = partial(getattr(library, symbols[name]), *arguments), views
+        self._batch = getattr(library, symbols["eval_batch"])
 
     @classmethod
     def load(
         cls, path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
     ) -> ImpactGradient:
-        """Load an export.  **This runs its code**: load an export of others only if you would run their programs.
+        """Load an export.  **This runs its code**, so load a foreign export only if you would run a foreign program.
 
-        ``lib<prefix>.so`` beside the manifest is used; where there is none **it is built there** with the user's
-        compiler (``$CC``, cc, gcc or clang).  A library that was built by this package must be that very file (its
-        SHA-256 lies beside it); any library must be whole, name this very manifest, and reproduce its numbers.
+        The method uses ``lib<prefix>.so`` beside the manifest.  Where there is none, it **builds the library there**
+        with the user's compiler (``$CC``, cc, gcc or clang).  A library that this package built must have the SHA-256
+        that lies beside it.  Any library must be whole, name this manifest, and reproduce its numbers.
 
         Args:
-            path: The export's folder, or its ``<prefix>.json``.
-            robot: The robot in hand; the export must be of this very model.
-            frame: Which contact frame of an export with several; the first by default.
-            free: The robot without its supports, where the export has some.
+            path: The folder of the export, or its ``<prefix>.json``.
+            robot: The robot in hand; the export must be of this model.
+            frame: The contact frame of an export with several; the first by default.
+            free: Leave out the supports, where the export has some.
 
         Raises:
-            SpecError: No export there, or a broken one.
-            ManifestMismatch: The export is of another robot, joint order, or convention, or the library is not the
-                manifest's; names the difference.
-            FrameNotFound: With the frames that it has.
+            SpecError: There is no export, or it is broken.
+            ManifestMismatch: The export is of another robot, joint order or convention, or the library belongs to
+                another manifest; names the difference.
+            FrameNotFound: The export has no such frame; lists its frames.
             CompilerError: There is no library, and none can be built.
         """
         manifest, folder = read_manifest(Path(path))
@@ -118,97 +117,106 @@ class ImpactGradient:
         return found
 
     def copy(self) -> ImpactGradient:
-        """The same functions with buffers of their own, for another thread."""
+        """Return the same functions with buffers of their own, for another thread."""
         return ImpactGradient(self._library, self.manifest, self.frame, free=self.free)
 
     # ---- one configuration ------------------------------------------------------------------------------------
 
+    def call(self, name: str, q: ArrayLike, n: ArrayLike | None = None) -> tuple[int, tuple[Array, ...]]:
+        """Call a C function and return its code and views of its results, also when the code is not zero.
+
+        Args:
+            name: A function of :data:`~impact_posture.codegen.naming.SIGNATURES`.
+            q: Configuration, shape (nq,).
+            n: Unit normal out of the surface, in the manifest's ``normal_frame``, shape (3,).
+
+        Raises:
+            ValueError: An input has another shape.
+        """
+        function, results = self._functions[name]
+        self._q[:] = q
+        if n is not None:
+            self._n[:] = n
+        return function(), results
+
     def value_and_gradient(self, q: ArrayLike, n: ArrayLike) -> tuple[float, Array]:
-        """``H`` and its tangent gradient, a view of shape (nv,).
+        """Return ``H`` and its tangent gradient, a view of shape (nv,).
 
         Args:
             q: Configuration, shape (nq,).
             n: Unit normal out of the surface, in the manifest's ``normal_frame``, shape (3,).
 
         Raises:
-            InputError: A number that is not finite.
-            PostureError: A quaternion or cosine-sine pair that is not of unit norm.
-            MetricError: The result is not finite: the quantity does not exist there.
-            ValueError: Another shape.
+            InputError: A number is not finite.
+            PostureError: A quaternion or cosine-sine pair is not of unit norm.
+            MetricError: The result is not finite, because the quantity does not exist there.
+            ValueError: An input has another shape.
         """
-        self._q[:] = q
-        self._n[:] = n
-        code = self._eval(*self._eval_arguments)
+        code, (H, gradient) = self.call("eval", q, n)
         if code:
             raise _failure(code)
-        return self._H.value, self._grad
+        return H.item(), gradient
 
     def objective(self, q: ArrayLike) -> tuple[float, Array]:
-        """The exported problem's own objective at its own normal, and its tangent gradient, a view of shape (nv,).
+        """Return the exported objective at its own normal, and its tangent gradient, a view of shape (nv,).
 
         Raises:
             InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
         """
-        self._q[:] = q
-        code = self._objective(*self._objective_arguments)
+        code, (value, gradient) = self.call("objective", q)
         if code:
             raise _failure(code)
-        return self._value.value, self._own
+        return value.item(), gradient
 
     def value(self, q: ArrayLike, n: ArrayLike) -> float:
-        """``H`` alone.
+        """Return ``H`` alone.
 
         Raises:
             InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
         """
-        self._q[:] = q
-        self._n[:] = n
-        code = self._alone(*self._alone_arguments)
+        code, (H,) = self.call("value", q, n)
         if code:
             raise _failure(code)
-        return float(self._H.value)
+        return float(H.item())
 
     def jump(self, q: ArrayLike, n: ArrayLike) -> tuple[Array, float, float]:
-        """``a = M⁻¹Jᵀn``, a view of shape (nv,), ``G = nᵀJa`` (1/kg) and ``V = H/G²``.
+        """Return ``a = M⁻¹Jᵀn``, a view of shape (nv,), ``G = nᵀJa`` (1/kg) and ``V = H/G²``.
 
         Raises:
             InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
         """
-        self._q[:] = q
-        self._n[:] = n
-        code = self._jumps(*self._jump_arguments)
+        code, (a, G, V) = self.call("jump", q, n)
         if code:
             raise _failure(code)
-        return self._jump, self._G.value, self._V.value
+        return a, G.item(), V.item()
 
     def ellipsoid(self, q: ArrayLike) -> Array:
-        """``Λ_c`` in world axes, a view of shape (3, 3).
+        """Return ``Λ_c`` in world axes, a view of shape (3, 3).
 
         Raises:
             InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
         """
-        self._q[:] = q
-        code = self._ellipsoid(*self._ellipsoid_arguments)
+        code, (ellipsoid,) = self.call("ellipsoid", q)
         if code:
             raise _failure(code)
-        return self._L
+        return ellipsoid.reshape(3, 3)
 
     # ---- many configurations ----------------------------------------------------------------------------------
 
     def value_and_gradient_batch(
         self, q: ArrayLike, n: ArrayLike, out: tuple[Array, Array] | None = None
     ) -> tuple[Array, Array]:
-        """``H``, shape (N,), and tangent gradients, shape (N, nv), of many configurations; fresh arrays.
+        """Return ``H``, shape (N,), and tangent gradients, shape (N, nv), of many configurations in fresh arrays.
 
-        Rows that cannot be computed (see :meth:`value_and_gradient`) are NaN; no other row suffers.
+        Rows that cannot be computed (see :meth:`value_and_gradient`) are NaN.  They change no other row.
 
         Args:
             q: Configurations, shape (N, nq).
-            n: Unit normals, shape (N, 3), or one for all, shape (3,).
+            n: Unit normals, shape (N, 3), or one normal for all, shape (3,).
             out: Contiguous arrays of the library's type to write into, instead of fresh ones.
 
         Raises:
-            InputError: Shapes or types that do not fit.
+            InputError: A shape or a type does not fit.
         """
         q = np.ascontiguousarray(q, dtype=self.dtype)
         if q.ndim != 2 or q.shape[1] != self.nq:
@@ -232,16 +240,12 @@ class ImpactGradient:
 
     # ---- parts ------------------------------------------------------------------------------------------------
 
-    def _function(self, name: str) -> Callable[..., int]:
-        function: Callable[..., int] = getattr(self._library, self._symbols[name])
-        return function
-
     def _self_test(self, where: str) -> None:
-        test = self._block["self_test"]
+        test = self._reference
         H, grad = self.value_and_gradient(test["q"], test["n"])
         found, expected = np.array([H, *grad]), np.array([test["H"], *test["grad"]])
         difference = float(np.abs(found - expected).max() / np.abs(expected).max())
-        # Not ">": that is false for a NaN.
+        # A comparison by ">" would accept a NaN.
         if not difference <= _SELF_TEST[self.manifest["real"]]:
             raise ManifestMismatch(
                 "reference value of H", test["H"], H, where=where, hint="delete the library: it is built again"

@@ -1,4 +1,4 @@
-"""Divide a graph among C functions: what several exported functions need is computed by blocks that they share."""
+"""Divide a graph among C functions: blocks that compute a part each, and exported functions that call them."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from dataclasses import dataclass
 
 from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph
 
-# Statements a block: compilers take more than proportionally longer on long functions.
+# Most statements of a block.  The time of a compiler grows faster than the length of a function.
 _BLOCK = 300
-# Operations that one statement may hold.
+# Most operations in one statement.
 _STATEMENT = 12
 
 
 @dataclass(frozen=True)
 class Block:
-    """One C function's part of the work.
+    """A C function that computes a part of the graph.
 
     Attributes:
-        functions: The exported functions that need it, by number.
-        nodes: What it computes, in order, each a statement of its own.
+        functions: Numbers of the exported functions that need it.
+        nodes: The nodes that it computes, in order, each by a statement of its own.
     """
 
     functions: frozenset[int]
@@ -30,15 +30,15 @@ class Block:
 
 @dataclass(frozen=True)
 class Layout:
-    """Blocks in the order in which they are called, and what they hand on.
+    """Blocks in the order of their calls, and the values that they hand on.
 
     Attributes:
         graph: The operations.
-        blocks: Where each is computed.
-        inlined: Nodes that are computed within the statement that uses them.
+        blocks: The blocks.
+        inlined: Nodes that the statement of their only user computes.
         slots: Node → its place in the work array of its width.
         sizes: Width → length of the work array.
-        angles: Inputs whose sine and cosine are taken, in the order of the sines' array.
+        angles: Inputs whose sine and cosine are taken, in the order of the array of sines.
         trig: Sine or cosine node → its first place in that array.
     """
 
@@ -52,7 +52,7 @@ class Layout:
 
 
 def is_leaf(graph: Graph, trig: Mapping[int, int], k: int) -> bool:
-    """Whether a node needs no statement of its own: it is at hand in every block."""
+    """Return whether every block has a node at hand, so that it needs no statement."""
     return graph.nodes[k].op in ("const", "in", "lane") or k in trig
 
 
@@ -61,13 +61,13 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
 
     Args:
         graph: The operations.
-        functions: For each exported function the outputs that it gives.
-        block: Statements that a block has at most.
+        functions: For each exported function the outputs that it returns.
+        block: Most statements of a block.
     """
     order = _depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
     angles, trig = _trig(graph, order)
     needed = _needed(graph, functions, trig)
-    # What only the sines' array is made of has no statement.
+    # A node that only the array of sines uses has no statement.
     order = [k for k in order if k in needed]
     users: dict[int, list[int]] = {}
     for k in order:
@@ -87,7 +87,7 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
     at = {k: number for number, part in enumerate(blocks) for k in part.nodes}
 
     def home(k: int) -> int:
-        """The block of the statement that node k is part of."""
+        """The block of the statement that computes node k."""
         while k in inlined:
             (k,) = users[k]
         return at[k]
@@ -98,9 +98,9 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
 
 
 def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
-    """Places in the work arrays for what later blocks use, until the ``last`` that does; and the arrays' lengths.
+    """Places in the work arrays for values that later blocks use, and the lengths of the arrays.
 
-    Every function calls its blocks in one order, so a place is free for the blocks after its value's last.
+    Every function calls its blocks in one order.  So a place is free after the ``last`` block that uses its value.
     """
     slots: dict[int, int] = {}
     sizes: dict[int, int] = {}
@@ -123,7 +123,7 @@ def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tu
 
 
 def _source(graph: Graph, k: int) -> int:
-    """The node that is computed for the sake of k."""
+    """Return the vector of a lane, and any other node itself."""
     return graph.nodes[k].args[0] if graph.nodes[k].op == "lane" else k
 
 
@@ -132,9 +132,9 @@ def _sources(graph: Graph, trig: Mapping[int, int], k: int) -> list[int]:
 
 
 def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
-    """What the roots need, operands first, close to where it is used.
+    """The nodes that the roots need, operands first, close to where they are used.
 
-    Of an operation's operands the one that takes the longest chain comes first: the others wait for less time.
+    The operand with the longest chain comes first, so that the other operands wait for less time.
     """
     depth: list[int] = []
     for node in graph.nodes:
@@ -151,14 +151,13 @@ def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
             elif k not in seen:
                 seen.add(k)
                 stack.append((k, True))
-                stack += [
-                    (a, False) for a in sorted(graph.nodes[k].operands, key=lambda a: -depth[a]) if a not in seen
-                ]
+                operands = sorted(graph.nodes[k].operands, key=lambda a: -depth[a])
+                stack += [(a, False) for a in operands if a not in seen]
     return order
 
 
 def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
-    """Sines and cosines of inputs, vectors first, so that each stands at a multiple of its width."""
+    """Sines and cosines of inputs, vectors first, so that each vector starts at a multiple of its width."""
     found = [k for k in order if graph.nodes[k].op in (SINE, COSINE)]
     starts: dict[int, int] = {}
     angles: list[int] = []
@@ -175,6 +174,7 @@ def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int
 
 
 def _needed(graph: Graph, functions: Sequence[Sequence[str]], trig: Mapping[int, int]) -> dict[int, frozenset[int]]:
+    """Node → numbers of the exported functions that need it."""
     found: dict[int, set[int]] = {}
     for number, names in enumerate(functions):
         waiting = [_source(graph, k) for name in names for k in graph.outputs[name]]
@@ -198,15 +198,14 @@ def _inlined(
     size: dict[int, int] = {}
     inlined: set[int] = set()
     for k in order:
-        node = graph.nodes[k]
+        node, own = graph.nodes[k], users.get(k, ())
         if is_leaf(graph, trig, k):
             continue
         size[k] = 1 + sum(size[a] for a in node.operands if a in inlined)
-        own = users.get(k, ())
         if len(own) != 1 or k in outputs or node.op not in ARITHMETIC or size[k] >= _STATEMENT:
             continue
-        times = Counter(_source(graph, a) for a in graph.nodes[own[0]].operands)[k]
-        direct = k in graph.nodes[own[0]].operands
-        if times == 1 and direct and needed[own[0]] == needed[k] and graph.nodes[own[0]].op in ARITHMETIC:
+        user = graph.nodes[own[0]]
+        times = Counter(_source(graph, a) for a in user.operands)[k]
+        if times == 1 and k in user.operands and needed[own[0]] == needed[k] and user.op in ARITHMETIC:
             inlined.add(k)
     return inlined

@@ -1,4 +1,4 @@
-"""An export's manifest read back, and held against the robot in hand.  Needs no CasADi."""
+"""Read the manifest of an export and compare it with the robot in hand.  This module needs no CasADi."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Numbers = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 
 
 class _Loose(BaseModel):
-    """Keys that nobody here reads may be there or not."""
+    """A block whose other keys may be there or not."""
 
     model_config = ConfigDict(strict=True)
 
@@ -49,7 +49,7 @@ class _Several(_Loose):
 
 
 class _Manifest(_Loose):
-    """What a loader relies on; that the rest is what codegen wrote says the library (:func:`check_library`)."""
+    """The keys that a loader needs; the library vouches for all of them (:func:`check_library`)."""
 
     prefix: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
     real: Literal["double", "float"]
@@ -70,7 +70,7 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
         path: The folder, or the manifest itself.
 
     Raises:
-        SpecError: There is none, several, or it is broken.
+        SpecError: There is no manifest, there are several, or it is broken.
     """
     files = [path] if not path.is_dir() else sorted(p for p in path.glob("*.json") if is_manifest(p))
     if len(files) != 1:
@@ -92,9 +92,9 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
 
 
 def _fault(manifest: dict[str, Any]) -> str:
-    """The first thing that is wrong with a manifest; empty for none."""
+    """Return the first fault of a manifest; empty for none."""
     try:
-        # As JSON: a list is a tuple there, and nothing else is taken for anything.
+        # From JSON, because strict validation takes a list for a tuple there and converts nothing else.
         found = _Manifest.model_validate_json(json.dumps(manifest, allow_nan=False))
     except ValidationError as error:
         first = error.errors()[0]
@@ -111,18 +111,18 @@ def _fault(manifest: dict[str, Any]) -> str:
 
 
 def identity(manifest: Mapping[str, Any]) -> str:
-    """What a library says of its manifest: sizes, number type and the hash of all of it, ``key=value`` each."""
+    """Return the words of a library about its manifest: sizes, number type and hash, ``key=value`` each."""
     content = json.dumps(manifest, sort_keys=True, separators=(",", ":"), allow_nan=False)
     digest = hashlib.sha256(content.encode()).hexdigest()
     return f"nq={manifest['nq']} nv={manifest['nv']} real={manifest['real']} sha256={digest}"
 
 
 def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: str) -> None:
-    """Refuse a library that was made with another manifest, before any of its functions is called.
+    """Refuse a library that belongs to another manifest, before any call of its functions.
 
     Raises:
-        SpecError: It does not say which manifest is its own.
-        ManifestMismatch: Sizes, number type or anything else of the manifest.
+        SpecError: The library names no manifest.
+        ManifestMismatch: Sizes, number type or another part of the manifest differ.
     """
     symbol = f"{manifest['prefix']}_manifest"
     try:
@@ -146,7 +146,7 @@ def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: s
 
 
 def is_manifest(path: Path) -> bool:
-    """Whether a file is the manifest of an export."""
+    """Return whether a file is the manifest of an export."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -155,10 +155,10 @@ def is_manifest(path: Path) -> bool:
 
 
 def check_robot(manifest: Mapping[str, Any], robot: Robot, *, where: str = "manifest") -> None:
-    """Refuse an export of another robot, naming the first difference.
+    """Refuse an export of another robot and name the first difference.
 
     Raises:
-        ManifestMismatch: Joint order, convention, armature, or anything else of the model.
+        ManifestMismatch: Joint order, convention, armature, or another part of the model differs.
     """
     joints = list(manifest["joint_names"])
     if joints != list(robot.joint_names):
@@ -178,10 +178,10 @@ def check_robot(manifest: Mapping[str, Any], robot: Robot, *, where: str = "mani
 
 
 def frame_block(manifest: Mapping[str, Any], frame: str | None) -> Mapping[str, Any]:
-    """What a manifest says of one frame; of the first without a name.
+    """Return the block of one frame; without a name, that of the first.
 
     Raises:
-        FrameNotFound: With the frames that it has.
+        FrameNotFound: The manifest has no such frame; lists its frames.
     """
     blocks: dict[str, Mapping[str, Any]] = {str(block["frame"]): block for block in manifest["frames"]}
     if frame is None:

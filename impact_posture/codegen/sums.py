@@ -1,4 +1,4 @@
-"""Sums rebuilt so that what is ready first is added first: a chain of additions waits for its last term only."""
+"""Rebuild sums so that they add first the terms that are ready first, and wait for their last term only."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Callable
 
 from impact_posture.codegen.graph import Graph, Node
 
-# Cycles until a result can be used, about the same on today's processors; and for a sine and cosine.
-_LATENCY = {"+": 4, "-": 4, "*": 4, "inv": 15, "/": 15, "neg": 1, "lane": 2, "const": 0, "in": 0, "gather": 1}
+# Approximate cycles until a result can be used, on current processors; and those of a sine or cosine.
+_LATENCY = {"+": 4, "-": 4, "*": 4, "inv": 15, "neg": 1, "lane": 2, "const": 0, "in": 0, "gather": 1}
 _TRIG = 40
-# A pair apart costs an addition that no product can take over: it must save so many cycles.
+# A pair that is added apart costs an addition that no product can absorb.  It must save so many cycles.
 _WORTH = 8
 
 
 def rebuilt(graph: Graph) -> Graph:
-    """The same computation with every sum in the order in which its terms become ready."""
+    """Return the same computation with every sum in the order in which its terms become ready."""
     found = Graph(graph.inputs)
     ready: list[int] = []
     made: dict[int, int] = {}
@@ -43,7 +43,7 @@ def rebuilt(graph: Graph) -> Graph:
 
 
 def _inner(graph: Graph) -> set[int]:
-    """Sums that are a term of one other sum of their width, and nothing else."""
+    """Return the sums whose only use is as a term of one other sum of their width."""
     users: dict[int, set[int]] = {}
     times: Counter[int] = Counter()
     for k, node in enumerate(graph.nodes):
@@ -63,7 +63,7 @@ def _inner(graph: Graph) -> set[int]:
 
 
 def _terms(graph: Graph, root: int, inner: set[int]) -> list[tuple[int, int]]:
-    """Sign and node of all that a sum adds."""
+    """Return sign and node of each term of a sum."""
     terms: list[tuple[int, int]] = []
     waiting = [(1, root)]
     while waiting:
@@ -78,11 +78,11 @@ def _terms(graph: Graph, root: int, inner: set[int]) -> list[tuple[int, int]]:
 
 
 def _sum(found: Graph, add: Callable[[Node], int], ready: list[int], terms: list[tuple[int, int]]) -> int:
-    """The sum of signed nodes, the latest last."""
+    """Return the sum of signed nodes, the latest last."""
     queue = sorted(terms, key=lambda term: (ready[term[1]], term[1]))
 
     def plus(one: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
-        # Numbers that all lanes add stay numbers until a vector joins them.
+        # A single number that all lanes add stays single until a vector joins it.
         width = max(found.nodes[one[1]].width, found.nodes[other[1]].width)
         if one[0] == other[0]:
             return one[0], add(Node("+", (one[1], other[1]), width))

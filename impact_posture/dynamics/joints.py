@@ -1,4 +1,4 @@
-"""The joints that Pinocchio's URDF parser makes: placement, orientation and motion subspace as expressions."""
+"""Joints that the URDF parser of Pinocchio makes: placement, orientation and motion subspace as expressions."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, skew
 from impact_posture.errors import UnsupportedJoint
 
-_AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
-# Short names after "JointModel": what moves, and by which coordinates.
-_REVOLUTE = {"RX": "X", "RY": "Y", "RZ": "Z", "RevoluteUnaligned": None}
-_CONTINUOUS = {"RUBX": "X", "RUBY": "Y", "RUBZ": "Z", "RevoluteUnboundedUnaligned": None}
-_PRISMATIC = {"PX": "X", "PY": "Y", "PZ": "Z", "PrismaticUnaligned": None}
+# Short name of a joint model without "JointModel" → its family.
+_FAMILIES = {
+    **dict.fromkeys(("RX", "RY", "RZ", "RevoluteUnaligned"), "revolute"),
+    **dict.fromkeys(("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned"), "continuous"),
+    **dict.fromkeys(("PX", "PY", "PZ", "PrismaticUnaligned"), "prismatic"),
+    **{"FreeFlyer": "free-flyer", "Planar": "planar", "Spherical": "spherical", "Translation": "translation"},
+}
 
 
 @dataclass(frozen=True)
 class JointKind:
-    """What a joint is, read off a ``pin.JointModel``.
+    """Kind of a ``pin.JointModel``.
 
     Attributes:
         family: ``revolute``, ``continuous``, ``prismatic``, ``free-flyer``, ``planar``, ``spherical`` or
             ``translation``.
         axis: Unit axis in the joint frame, shape (3,); zeros where it has none.
-        subspace: Motion subspace ``S`` in the joint frame, shape (6, nv); constant for all of these.
-        nq: Numbers in the configuration.
+        subspace: Motion subspace ``S`` in the joint frame, shape (6, nv); it is constant for all families.
+        nq: Length of the configuration.
     """
 
     family: str
@@ -46,44 +48,27 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
     """Classify a Pinocchio joint.
 
     Raises:
-        UnsupportedJoint: A joint that no URDF makes (composite, universal, helical, ...).
+        UnsupportedJoint: No URDF makes such a joint (composite, universal, helical, ...).
     """
     short = joint.shortname().removeprefix("JointModel")
-    for family, table in (("revolute", _REVOLUTE), ("continuous", _CONTINUOUS), ("prismatic", _PRISMATIC)):
-        if short in table:
-            axis = _axis(joint, table[short], linear=family == "prismatic")
-            subspace = np.zeros((6, 1))
-            subspace[0 if family == "prismatic" else 3 :][:3, 0] = axis
-            return JointKind(family, axis, subspace, int(joint.nq))
-    eye, none = np.eye(6), np.zeros(3)
-    others = {
-        "FreeFlyer": JointKind("free-flyer", none, eye, 7),
-        "Planar": JointKind("planar", np.array(_AXES["Z"]), eye[:, [0, 1, 5]], 4),
-        "Spherical": JointKind("spherical", none, eye[:, 3:], 4),
-        "Translation": JointKind("translation", none, eye[:, :3], 3),
-    }
-    if short in others:
-        return others[short]
-    raise UnsupportedJoint(
-        f"joint '{name}' is of type {short}",
-        where="symbolic dynamics",
-        hint="lock it (`lock`) or model it by revolute and prismatic joints",
-    )
-
-
-def _axis(joint: pin.JointModel, letter: str | None, *, linear: bool) -> NDArray[np.float64]:
-    if letter is not None:
-        return np.array(_AXES[letter])
-    alone = pin.Model()
-    alone.addJoint(0, joint, pin.SE3.Identity(), "joint")
-    data = alone.createData()
-    pin.computeJointJacobians(alone, data, pin.neutral(alone))
-    column = np.asarray(pin.getJointJacobian(alone, data, 1, pin.LOCAL)).reshape(6)
-    return np.asarray(column[:3] if linear else column[3:])
+    family = _FAMILIES.get(short)
+    if family is None:
+        raise UnsupportedJoint(
+            f"joint '{name}' is of type {short}",
+            where="symbolic dynamics",
+            hint="lock it (`lock`) or model it by revolute and prismatic joints",
+        )
+    # S is the same at every configuration.
+    data = joint.createData()
+    joint.calc(data, np.full(joint.idx_q + joint.nq, 0.5))
+    subspace = np.array(data.S, dtype=float).reshape(6, -1)
+    axes = {"revolute": subspace[3:, 0], "prismatic": subspace[:3, 0], "planar": subspace[3:, -1]}
+    axis = axes.get("revolute" if family == "continuous" else family, np.zeros(3))
+    return JointKind(family, axis, subspace, int(joint.nq))
 
 
 def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Rotation (3, 3) and translation (3,) of the moved frame in the joint's rest frame."""
+    """Return rotation (3, 3) and translation (3,) of the moved frame in the rest frame of the joint."""
     zero = ca.SX(3, 1)
     if kind.family == "revolute":
         return axis_rotation(kind.axis, ca.cos(q[0]), ca.sin(q[0])), zero
@@ -101,7 +86,7 @@ def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
-    """The joint's rotation as a turn about a coordinate axis; ``None`` where it is none."""
+    """Return the rotation of a joint about a coordinate axis; ``None`` for another joint."""
     axis = int(np.argmax(np.abs(kind.axis)))
     if kind.family not in ("revolute", "continuous") or abs(kind.axis[axis]) < 1 - 1e-15:
         return None
@@ -111,16 +96,16 @@ def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
 
 
 def axis_rotation(axis: NDArray[np.float64], cosine: ca.SX, sine: ca.SX) -> ca.SX:
-    """Rodrigues' rotation ``aaᵀ + cos (I − aaᵀ) + sin [a]×``."""
+    """Return the rotation ``aaᵀ + cos (I − aaᵀ) + sin [a]×`` (Rodrigues)."""
     outer = np.outer(axis, axis)
     return ca.sparsify(constant(outer) + cosine * constant(np.eye(3) - outer) + sine * skew(constant(axis)))
 
 
 def joint_quaternion(kind: JointKind, x: ca.SX) -> ca.SX:
-    """Unit quaternion ``x y z w`` of the joint's rotation, smooth everywhere, from its chart coordinates.
+    """Return the unit quaternion ``x y z w`` of a joint's rotation, smooth everywhere, from its chart coordinates.
 
-    Continuous and planar joints enter by their angle (see :class:`~impact_posture.dynamics.chart.Chart`): a half
-    angle is no smooth function of its cosine and sine.
+    Continuous and planar joints enter by their angle (see :class:`~impact_posture.dynamics.chart.Chart`), because a
+    half angle is no smooth function of its cosine and sine.
     """
     if kind.family in ("revolute", "continuous"):
         return _half(kind.axis, x[0])

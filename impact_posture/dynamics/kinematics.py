@@ -1,6 +1,6 @@
 """The kinematic tree at one symbolic configuration: placements of links, points and frames.
 
-Everything is in link coordinates; world placements are computed only where they are asked for.
+Everything is in link coordinates.  World placements are computed on demand.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ ByJoint = dict[int, ca.SX]
 
 @dataclass(frozen=True)
 class PointOnLink:
-    """A point (and the axes of its frame) fixed to the link of joint ``joint``.
+    """A point and the axes of its frame, fixed to a link.
 
     Attributes:
-        joint: Index of the moving joint that carries it.
+        joint: Index of the joint that moves the link.
         position: The point in link coordinates, meters, shape (3,).
-        rotation: The frame's axes in link coordinates, shape (3, 3).
+        rotation: The axes of the frame in link coordinates, shape (3, 3).
     """
 
     joint: int
@@ -42,12 +42,12 @@ class Kinematics:
     """A ``pin.Model`` at the configuration ``q`` (``SX``), with optional extra inertias on its links.
 
     Args:
-        model: The model; every joint type of Pinocchio's URDF parser.
+        model: The model, with joints of every type that the URDF parser of Pinocchio makes.
         q: Configuration, shape (nq, 1).
-        chart_x: The chart coordinates that ``q`` was made of; only :attr:`quaternions` needs them.
-        extra_inertia: Constant 6×6 matrices in link coordinates added to links in ``M`` (not in ``pin.Model``'s own):
-            a foot held with compliance ε is a foot with the point mass 1/ε.
-        repeated_limbs: Branches whose constants become parameters, so that their expressions are alike.
+        chart_x: The chart coordinates of ``q``; only :attr:`quaternions` needs them.
+        extra_inertia: Constant 6×6 matrices in link coordinates that ``M`` has beside the inertias of the model.  A
+            foot held with compliance ε is a foot with the point mass 1/ε.
+        limbs: Repeated limbs whose constants become parameters, so that their expressions are alike.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Kinematics:
         q: ca.SX,
         chart_x: ca.SX | None = None,
         extra_inertia: Mapping[int, NDArray[np.float64]] | None = None,
-        repeated_limbs: RepeatedLimbs | None = None,
+        limbs: RepeatedLimbs | None = None,
     ) -> None:
         self.model, self.q = model, q
         self.chart = Chart(model)
@@ -70,7 +70,7 @@ class Kinematics:
         self._spin: dict[int, Spin | None] = {}
         self._S: ByJoint = {}
         self._inertia: ByJoint = {}
-        self.repeated_limbs = repeated_limbs
+        self.limbs = limbs
         for slot in self.chart.slots:
             i = slot.index
             R, p = joint_transform(slot.kind, q[slot.q])
@@ -87,11 +87,11 @@ class Kinematics:
         self._armature = self.by_joint("armature", np.array(model.armature, dtype=float))
 
     def _constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
-        """What a joint has of a kind of constant: numbers, or parameters where its twins have others."""
-        return constant(of(joint)) if self.repeated_limbs is None else self.repeated_limbs.constant(joint, tag, of)
+        """Return a constant of a joint as numbers, or as parameters where its counterparts have others."""
+        return constant(of(joint)) if self.limbs is None else self.limbs.constant(joint, tag, of)
 
     def by_joint(self, tag: str, values: NDArray[np.float64]) -> ca.SX:
-        """Constants of the degrees of freedom, shape (nv,), as an expression."""
+        """Return constants of the degrees of freedom, shape (nv,), as an expression."""
         slots = self.chart.slots
         parts = [self._constant(s.index, tag, lambda j: values[slots[j - 1].v]) for s in slots]
         return ca.densify(ca.vertcat(*parts))
@@ -106,7 +106,7 @@ class Kinematics:
 
     @cached_property
     def origins(self) -> ByJoint:
-        """World position of every link's origin."""
+        """World position of the origin of every link."""
         found: ByJoint = {0: ca.SX.zeros(3)}
         for i in self._R:
             parent = self._parents[i]
@@ -127,19 +127,19 @@ class Kinematics:
         return found
 
     def position(self, point: PointOnLink) -> ca.SX:
-        """World position of a point, shape (3,)."""
+        """Return the world position of a point, shape (3,)."""
         return self.origins[point.joint] + self.rotations[point.joint] @ ca.SX(point.position)
 
     def rotation(self, point: PointOnLink) -> ca.SX:
-        """World axes of a point's frame, shape (3, 3)."""
+        """Return the world axes of the frame of a point, shape (3, 3)."""
         return self.rotations[point.joint] @ constant(point.rotation)
 
     def quaternion(self, point: PointOnLink) -> ca.SX:
-        """World orientation of a point's frame, x y z w; its sign is not unique."""
+        """Return the world orientation of the frame of a point, x y z w; its sign is not unique."""
         return quaternion_product(self.quaternions[point.joint], constant_quaternion(point.rotation))
 
     def center_of_mass(self) -> ca.SX:
-        """World position of the center of mass, shape (3,)."""
+        """Return the world position of the center of mass, shape (3,)."""
         total, weighted = 0.0, ca.SX.zeros(3)
         for i in self._R:
             body = self.model.inertias[i]
@@ -158,5 +158,5 @@ class Kinematics:
 
 
 def constant_quaternion(rotation: NDArray[np.float64]) -> ca.SX:
-    """Quaternion x y z w of a constant rotation."""
+    """Return the quaternion x y z w of a constant rotation."""
     return constant(pin.Quaternion(np.asarray(rotation)).coeffs())

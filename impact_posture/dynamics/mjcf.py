@@ -1,15 +1,14 @@
-"""MuJoCo's model written out of a ``pin.Model``: the same bodies, joints, inertias and armature, nothing read twice.
+"""Build a MuJoCo model from a ``pin.Model``, with the same bodies, joints, inertias and armature.
 
-A URDF read by MuJoCo itself would lose package paths, the floating base and the armature, and order joints its own
-way.  The model has no geometry: who simulates contact adds it (:mod:`impact_posture.dynamics.mjcf_scene`).
+A URDF that MuJoCo reads itself loses package paths, the floating base and the armature, and gets another order of
+joints.  The model has no geometry.  A simulation adds it with :meth:`Mjcf.add_geom` and :meth:`Mjcf.add_plane`.
 """
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -17,60 +16,86 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart, JointSlot
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
-from impact_posture.dynamics.mjcf_text import numbers, pose
 from impact_posture.errors import InputError, UnsupportedJoint
 from impact_posture.escape import xml_name
 
 Vector = NDArray[np.float64]
+Geom = Literal["sphere", "box", "plane"]
 
+# Joint index that stands for the world.
+WORLD = 0
 # MuJoCo refuses a moving body with less mass (kg) or moment (kg m²) than this.
 _LEAST = 1e-15
 # Pinocchio writes "no limit" as the largest double.
 _ENDLESS = 1e10
-
+# MuJoCo takes every inertia as it is.  It derives none, raises none, and merges or turns no body.
 _COMPILER = {
-    "angle": "radian",
-    "autolimits": "true",
-    # Every inertia is written as it is: none derived, none raised, no body merged or turned.
-    "inertiafromgeom": "false",
-    "balanceinertia": "false",
-    "boundmass": "0",
-    "boundinertia": "0",
-    "fusestatic": "false",
-    "alignfree": "false",
+    "degree": False,
+    "autolimits": True,
+    "inertiafromgeom": 0,
+    "balanceinertia": False,
+    "boundmass": 0.0,
+    "boundinertia": 0.0,
+    "fusestatic": False,
+    "alignfree": False,
 }
 
 
 @dataclass(frozen=True, eq=False)
 class Mjcf:
-    """A ``pin.Model`` in MuJoCo's words.
+    """A ``pin.Model`` as an editable MuJoCo model.
 
     Attributes:
-        xml: The MJCF document.
+        spec: The ``mujoco.MjSpec``, which :meth:`compile` compiles.
         layout: Conversions of coordinates.
-        bodies: Name of the body of each joint of Pinocchio's, by joint index.
-        joints: Names of the joints that make up each joint of Pinocchio's, by joint index.
-        sites: Name of the site of each frame, by frame index; a frame whose name another one has is left out.
-        moments: Principal moments, kg·m², shape (3,), by body, that break the triangle inequality and so cannot stand
-            in the XML: it has the nearest moments that hold it, and :meth:`compile` sets these.
+        bodies: Name of the body that each Pinocchio joint moves, by joint index.
+        joints: Names of the MuJoCo joints that make up each Pinocchio joint, by joint index.
+        sites: Name of the site of each frame, by frame index.  Of frames with the same name, only the first has one.
+        moments: Principal moments, kg·m², shape (3,), by body, that break the triangle inequality.  MuJoCo refuses
+            them, so the spec has the nearest moments that fulfill it, and :meth:`compile` sets the exact ones.
     """
 
-    xml: str
+    spec: Any
     layout: MjcfLayout
     bodies: dict[int, str]
     joints: dict[int, tuple[str, ...]]
     sites: dict[int, str]
     moments: dict[str, Vector]
 
+    def body(self, joint: int) -> Any:
+        """Return the ``MjsBody`` that a Pinocchio joint moves, or the world for :data:`WORLD`."""
+        return self.spec.worldbody if joint == WORLD else self.spec.body(self.bodies[joint])
+
+    def add_geom(self, joint: int, name: str, kind: Geom, size: Sequence[float], placement: pin.SE3) -> None:
+        """Add a massless shape, which only touches what a contact pair names.
+
+        Args:
+            joint: Index of the Pinocchio joint that moves it, or :data:`WORLD`.
+            name: Name of the geom.
+            kind: ``sphere``, ``box`` or ``plane`` (endless, normal to its z axis).
+            size: Radius, or three half extents, m.
+            placement: Pose in the frame of the joint.
+        """
+        type_ = getattr(import_mujoco().mjtGeom, f"mjGEOM_{kind.upper()}")
+        size = (*size, 0.0, 0.0)[:3]
+        self.body(joint).add_geom(
+            name=name, type=type_, size=size, mass=0.0, contype=0, conaffinity=0, **pose(placement)
+        )
+
+    def add_plane(self, name: str, point: Vector, normal: Vector) -> None:
+        """Add an endless plane through a point to the world, with a unit normal, each world, shape (3,)."""
+        upright = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(normal)).matrix()
+        self.add_geom(WORLD, name, "plane", (1.0, 1.0, 1.0), pin.SE3(upright, np.array(point)))
+
     def compile(self) -> Any:
         """Build the ``mujoco.MjModel``.
 
         Raises:
-            InputError: MuJoCo is not installed, or refuses the model.
+            InputError: MuJoCo refuses the model.
         """
         mujoco = import_mujoco()
         try:
-            model = mujoco.MjModel.from_xml_string(self.xml)
+            model = self.spec.compile()
         except ValueError as error:
             raise InputError(f"MuJoCo refuses the model ({error})", where="MJCF", hint="correct the URDF") from None
         for name, moments in self.moments.items():
@@ -81,7 +106,7 @@ class Mjcf:
 
 
 def import_mujoco() -> Any:
-    """The ``mujoco`` module.
+    """Return the ``mujoco`` module.
 
     Raises:
         InputError: It is not installed.
@@ -95,71 +120,69 @@ def import_mujoco() -> Any:
     return mujoco
 
 
-def write_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
-    """Write a model as MJCF.
+def pose(placement: pin.SE3) -> dict[str, Vector]:
+    """Return ``pos`` (m) and ``quat`` (w x y z, unit) of a placement."""
+    quaternion = pin.Quaternion(np.array(placement.rotation)).normalized()
+    return {"pos": np.array(placement.translation), "quat": np.array(quaternion.coeffs()[[3, 0, 1, 2]])}
 
-    Bodies are named after the link at their origin, else after their joint; every frame becomes a site of its name
-    (that of a link where a joint has the same).  A free-flyer is a free joint, or three slides and a ball where it
-    does not hang on the world; planar joints are two slides and a hinge, translations three slides.  A massless body
-    gets the least mass and moments that MuJoCo takes, 1e-15.  Friction, damping and effort limits are left out, as
-    Pinocchio's dynamics leaves them out.
+
+def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
+    """Build the MuJoCo model of a Pinocchio model.
+
+    Each body has the name of the link at its origin, or else of its joint.  Every frame becomes a site of its name
+    (the frame of a link, where a joint has the same name).  A free-flyer on the world becomes a free joint, any
+    other free-flyer three slides and a ball.  A planar joint becomes two slides and a hinge, a translation three
+    slides.  A massless body gets the least mass and moments that MuJoCo takes, 1e-15.  The model has no friction,
+    damping and effort limits, because the dynamics of Pinocchio have none.
 
     Args:
-        model: The model; treated as read-only.
-        name: What the MJCF calls it.
+        model: The model, which is only read.
+        name: Name of the MuJoCo model.
 
     Raises:
-        UnsupportedJoint: A joint that no URDF makes.
-        InputError: An armature that differs between the axes of one joint and that MuJoCo has no place for.
+        UnsupportedJoint: MuJoCo has no form for a joint.
+        InputError: MuJoCo is not installed, or has no place for an armature that differs between axes of a joint.
     """
     order = _depth_first(model)
     slots = {slot.index: slot for slot in Chart(model).slots}
     free = frozenset(i for i in order if _is_free(model, slots[i]))
-    root = ET.Element("mujoco", model=xml_name(name))
-    ET.SubElement(root, "compiler", _COMPILER)
-    ET.SubElement(root, "option", gravity=numbers(model.gravity.linear))
-    elements = {0: ET.SubElement(root, "worldbody")}
-    bodies, joints, moments = {}, {}, {}
+    spec = import_mujoco().MjSpec()
+    spec.modelname = xml_name(name)
+    for key, value in _COMPILER.items():
+        setattr(spec.compiler, key, value)
+    spec.option.gravity = np.array(model.gravity.linear)
+    elements = {WORLD: spec.worldbody}
+    names, joints, moments = {}, {}, {}
     taken, joint_names = {"world"}, set[str]()
     for i in order:
-        place = model.jointPlacements[i]
-        bodies[i] = _unique(_link_name(model, i), taken)
-        body = ET.SubElement(elements[int(model.parents[i])], "body", {"name": bodies[i], **pose(place)})
-        _add_joint(body, model, slots[i], i in free, joint_names)
-        joints[i] = tuple(str(joint.get("name")) for joint in body.findall("joint"))
-        exact = _add_inertia(body, model.inertias[i])
+        names[i] = _unique(_link_name(model, i), taken)
+        inertia, exact = _inertia(model.inertias[i])
+        body = elements[int(model.parents[i])].add_body(name=names[i], **pose(model.jointPlacements[i]), **inertia)
+        joints[i] = _add_joints(body, model, slots[i], i in free, joint_names)
         if exact is not None:
-            moments[bodies[i]] = exact
+            moments[names[i]] = exact
         elements[i] = body
-    sites = _add_sites(elements, model)
-    ET.indent(root)
-    xml = ET.tostring(root, encoding="unicode") + "\n"
-    return Mjcf(xml, MjcfLayout(model, order, free), bodies, joints, sites, moments)
+    return Mjcf(spec, MjcfLayout(model, order, free), names, joints, _add_sites(elements, model), moments)
 
 
 def _depth_first(model: pin.Model) -> list[int]:
-    """Joint indices in the order in which MuJoCo numbers bodies."""
-    children: dict[int, list[int]] = {}
-    for i in range(1, model.njoints):
-        children.setdefault(int(model.parents[i]), []).append(i)
-    order: list[int] = []
-    waiting = children.get(0, [])[::-1]
+    """Return the joint indices in the order in which MuJoCo numbers bodies."""
+    order, waiting = [], [WORLD]
     while waiting:
-        i = waiting.pop()
-        order.append(i)
-        waiting += children.get(i, [])[::-1]
-    return order
+        order.append(waiting.pop())
+        waiting += list(model.children[order[-1]])[::-1]
+    return order[1:]
 
 
 def _is_free(model: pin.Model, slot: JointSlot) -> bool:
-    """Whether a free-flyer can be MuJoCo's: only on the world, with one armature for all six."""
+    """Whether a free-flyer can be a free joint, which hangs on the world and has one armature for all six axes."""
     if slot.kind.family != "free-flyer" or model.parents[slot.index] != 0:
         return False
     return bool(np.ptp(np.asarray(model.armature)[slot.v]) == 0)
 
 
 def _link_name(model: pin.Model, joint: int) -> str:
-    """The link whose frame is the joint's own, else the joint."""
+    """Return the name of the link whose frame is that of the joint, or else of the joint."""
     for frame in model.frames:
         if frame.parentJoint == joint and frame.type == pin.FrameType.BODY and frame.placement.isIdentity(1e-12):
             return str(frame.name)
@@ -179,85 +202,81 @@ def _unique(name: str, taken: set[str]) -> str:
 # ---- joints -----------------------------------------------------------------------------------------------------
 
 
-def _add_joint(body: ET.Element, model: pin.Model, slot: JointSlot, free: bool, taken: set[str]) -> None:
-    family, armature = slot.kind.family, np.asarray(model.armature)[slot.v]
+def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken: set[str]) -> tuple[str, ...]:
+    """Add the MuJoCo joints of a Pinocchio joint to its body and return their names."""
+    family, armature, types = slot.kind.family, np.asarray(model.armature)[slot.v], import_mujoco().mjtJoint
+    names = []
 
-    def add(kind: str, suffix: str, value: float, axis: Iterable[float] = (), limits: bool = False) -> None:
-        joint = ET.SubElement(body, "joint", name=_unique(slot.name + suffix, taken), type=kind)
-        if axis:
-            joint.set("axis", numbers(axis))
-        if value:
-            joint.set("armature", repr(float(value)))
-        if limits:
-            k = slot.q.start + "xyz".find(suffix[1:]) if suffix else slot.q.start
-            low, high = float(model.lowerPositionLimit[k]), float(model.upperPositionLimit[k])
+    def add(kind: str, suffix: str, value: float, axis: Vector | None = None, limit: int | None = None) -> None:
+        names.append(_unique(slot.name + suffix, taken))
+        joint = body.add_joint(name=names[-1], type=getattr(types, f"mjJNT_{kind}"), armature=value)
+        if axis is not None:
+            joint.axis = axis
+        if limit is not None:
+            low, high = float(model.lowerPositionLimit[limit]), float(model.upperPositionLimit[limit])
             if low < high and max(-low, high) < _ENDLESS:
-                joint.set("range", numbers((low, high)))
+                joint.range = (low, high)
 
-    eye = np.eye(3)
-    slides = [(f".{letter}", tuple(eye[k])) for k, letter in enumerate("xyz")]
+    def add_slides(count: int, values: Vector, limited: bool = False) -> None:
+        for k, (letter, axis) in enumerate(zip("xyz"[:count], np.eye(3), strict=False)):
+            add("SLIDE", f".{letter}", values[k], axis, slot.q.start + k if limited else None)
+
     if family in ("revolute", "continuous", "prismatic"):
-        kind = "slide" if family == "prismatic" else "hinge"
-        add(kind, "", armature[0], tuple(slot.kind.axis), limits=family != "continuous")
+        kind = "SLIDE" if family == "prismatic" else "HINGE"
+        add(kind, "", armature[0], np.array(slot.kind.axis), None if family == "continuous" else slot.q.start)
     elif family == "translation":
-        for k, (suffix, axis) in enumerate(slides):
-            add("slide", suffix, armature[k], axis, limits=True)
+        add_slides(3, armature, limited=True)
     elif family == "planar":
-        value = _alike(armature[:2], slot)
-        for suffix, axis in slides[:2]:
-            add("slide", suffix, value, axis)
-        add("hinge", ".turn", armature[2], tuple(eye[2]))
+        add_slides(2, _alike(armature[:2], slot))
+        add("HINGE", ".turn", armature[2], np.array([0.0, 0.0, 1.0]))
     elif family == "spherical":
-        add("ball", "", _alike(armature, slot))
+        add("BALL", "", _alike(armature, slot)[0])
     elif family == "free-flyer" and free:
-        add("free", "", armature[0])
+        add("FREE", "", armature[0])
     elif family == "free-flyer":
-        value = _alike(armature[:3], slot)
-        for suffix, axis in slides:
-            add("slide", suffix, value, axis)
-        add("ball", ".turn", _alike(armature[3:], slot))
+        add_slides(3, _alike(armature[:3], slot))
+        add("BALL", ".turn", _alike(armature[3:], slot)[0])
     else:
         raise UnsupportedJoint(
             f"joint '{slot.name}' of family {family} has no form in MJCF", where="MJCF", hint="lock it (--lock)"
         )
+    return tuple(names)
 
 
-def _alike(armature: Vector, slot: JointSlot) -> float:
-    """The one armature of axes that turn against each other, or of a ball."""
+def _alike(armature: Vector, slot: JointSlot) -> Vector:
+    """Return the armature of a ball, or of axes that turn against each other, which must all be equal."""
     if np.ptp(armature) > 0:
         raise InputError(
             f"the armature of joint '{slot.name}' differs between its axes", where="MJCF", hint="give it one value"
         )
-    return float(armature[0])
+    return armature
 
 
 # ---- inertias and sites -----------------------------------------------------------------------------------------
 
 
-def _add_inertia(body: ET.Element, inertia: pin.Inertia) -> Vector | None:
-    """Write a body's inertia by its principal axes; returns the moments where the XML may not have them exactly."""
+def _inertia(inertia: pin.Inertia) -> tuple[dict[str, Any], Vector | None]:
+    """Return the arguments of ``add_body`` for an inertia, and its exact moments where MuJoCo refuses them."""
     moments, axes = np.linalg.eigh(np.array(inertia.inertia))
     if np.linalg.det(axes) < 0:
         axes[:, 0] = -axes[:, 0]
-    written = np.maximum(moments, _LEAST)
+    accepted = np.maximum(moments, _LEAST)
     # MuJoCo refuses a largest moment above the sum of the others.
-    written[2] = max(min(written[2], written[0] + written[1]), written[1])
-    placement = pin.SE3(axes, np.array(inertia.lever))
-    mass = repr(max(float(inertia.mass), _LEAST))
-    ET.SubElement(body, "inertial", {**pose(placement, always=True), "mass": mass, "diaginertia": numbers(written)})
-    return moments if np.abs(written - moments).max() > 2 * _LEAST else None
+    accepted[2] = max(min(accepted[2], accepted[0] + accepted[1]), accepted[1])
+    principal = {f"i{key}": value for key, value in pose(pin.SE3(axes, np.array(inertia.lever))).items()}
+    mass = max(float(inertia.mass), _LEAST)
+    exact = moments if np.abs(accepted - moments).max() > 2 * _LEAST else None
+    return {**principal, "mass": mass, "inertia": accepted, "explicitinertial": True}, exact
 
 
-def _add_sites(elements: dict[int, ET.Element], model: pin.Model) -> dict[int, str]:
+def _add_sites(elements: dict[int, Any], model: pin.Model) -> dict[int, str]:
     links_first = sorted(range(model.nframes), key=lambda k: (model.frames[k].type != pin.FrameType.BODY, k))
     sites: dict[int, str] = {}
-    there, taken = {"universe"}, set[str]()
+    seen, taken = {"universe"}, set[str]()
     for k in links_first:
         frame = model.frames[k]
-        if frame.name in there:
-            continue
-        there.add(str(frame.name))
-        sites[k] = _unique(str(frame.name), taken)
-        element = elements[int(frame.parentJoint)]
-        ET.SubElement(element, "site", {"name": sites[k], **pose(frame.placement)})
+        if frame.name not in seen:
+            seen.add(str(frame.name))
+            sites[k] = _unique(str(frame.name), taken)
+            elements[int(frame.parentJoint)].add_site(name=sites[k], **pose(frame.placement))
     return sites

@@ -1,9 +1,12 @@
-"""Pinocchio's ``q, v`` and MuJoCo's ``qpos, qvel`` of the same tree, and the maps between them.
+"""Conversions between ``q, v`` of Pinocchio and ``qpos, qvel`` of MuJoCo, for the same tree.
 
-What differs: the order of quaternions (x y z w here, w x y z there), continuous joints (cosine and sine here, an
-angle there), the axes of linear velocities (the body's here, the world's or the rest frame's there), the pose of a
-base (in its joint's rest frame here, in the world there), and, where a model is not numbered depth first, the order
-of joints.
+The two differ in these points:
+
+- A quaternion is x y z w in Pinocchio and w x y z in MuJoCo.
+- A continuous joint is a cosine and a sine in Pinocchio and an angle in MuJoCo.
+- A linear velocity is in body axes in Pinocchio, and in the axes of the world or of the rest frame in MuJoCo.
+- The pose of a base is relative to the rest frame of its joint in Pinocchio and to the world in MuJoCo.
+- MuJoCo numbers joints depth first, Pinocchio may not.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from impact_posture.dynamics.chart import Chart, JointSlot
 
 Vector = NDArray[np.float64]
 
-# Numbers in qpos; velocities are as many as in Pinocchio.
+# How many numbers of qpos a joint has.  It has as many velocities as in Pinocchio.
 _WIDTH = {
     "revolute": 1,
     "continuous": 1,
@@ -30,19 +33,21 @@ _WIDTH = {
     "translation": 3,
     "free-flyer": 7,
 }
+# Families with the same single number in Pinocchio and MuJoCo.
+_PLAIN = ("revolute", "prismatic")
 
 
 @dataclass(frozen=True)
 class MjcfSlot:
-    """Where one joint of Pinocchio's sits in MuJoCo's vectors.
+    """Place of one Pinocchio joint in the MuJoCo vectors.
 
     Attributes:
-        joint: Where it sits in Pinocchio's, and what it is.
-        qpos: Its numbers in ``qpos``.
-        qvel: Its numbers in ``qvel``.
-        free: A free joint of MuJoCo's, whose pose and linear velocity are the world's.  A free-flyer that is none is
-            three slides and a ball, in the joint's rest frame.
-        placement: The joint's rest frame in its parent.
+        joint: Type of the joint, and its place in the Pinocchio vectors.
+        qpos: Its entries of ``qpos``.
+        qvel: Its entries of ``qvel``.
+        free: Whether it is a MuJoCo free joint, whose pose and linear velocity are in world axes.  Any other
+            free-flyer is three slides and a ball in the rest frame of the joint.
+        placement: Rest frame of the joint in its parent.
     """
 
     joint: JointSlot
@@ -53,18 +58,18 @@ class MjcfSlot:
 
     @cached_property
     def moved(self) -> bool:
-        """Whether the rest frame is not its parent's."""
+        """Whether the rest frame differs from the parent frame."""
         return not self.placement.isIdentity(0.0)
 
 
 class MjcfLayout:
-    """Conversions between Pinocchio's and MuJoCo's coordinates of one model.
+    """Conversions between Pinocchio and MuJoCo coordinates of one model.
 
-    The velocity map ``T(q)``, ``qvel = T v``, is orthogonal: rotations of linear parts, and a permutation.
+    The velocity map ``T(q)``, ``qvel = T v``, is orthogonal, because it rotates linear parts and permutes entries.
 
     Args:
-        model: The model.
-        order: Joint indices in the order of MuJoCo's bodies: depth first.
+        model: The Pinocchio model.
+        order: Joint indices in the order of the MuJoCo bodies, which is depth first.
         free: Indices of the joints that are free joints in MuJoCo.
     """
 
@@ -79,20 +84,19 @@ class MjcfLayout:
             self.slots.append(MjcfSlot(joint, slice(q, q + width), slice(v, v + rates), i in free, place))
             q, v = q + width, v + rates
         self.nqpos, self.nv, self.nq = q, v, int(model.nq)
-        # A simulation converts at every tick: what is one number on both sides goes by index, all at once.
-        plain = [slot for slot in self.slots if slot.joint.kind.family in ("revolute", "prismatic")]
+        # A simulation converts in every tick.  Joints with one number on both sides are copied by index, all at once.
+        plain = [slot for slot in self.slots if slot.joint.kind.family in _PLAIN]
         self._plain_q = np.array([slot.joint.q.start for slot in plain], dtype=int)
         self._plain_qpos = np.array([slot.qpos.start for slot in plain], dtype=int)
-        self._others = [slot for slot in self.slots if slot.joint.kind.family not in ("revolute", "prismatic")]
+        self._others = [slot for slot in self.slots if slot.joint.kind.family not in _PLAIN]
         self._turning = [slot for slot in self.slots if slot.joint.kind.family in ("free-flyer", "planar")]
-        # qvel[k] = v[_from[k]], turned where something turns.
-        self._from = np.concatenate(
-            [np.arange(s.joint.v.start, s.joint.v.stop) for s in self.slots] or [np.arange(0)]
-        )
-        self._back = np.argsort(self._from)
+        # The velocity map before the linear parts are rotated.
+        self._permutation = np.zeros((self.nv, self.nv))
+        for slot in self.slots:
+            self._permutation[slot.qvel, slot.joint.v] = np.eye(slot.joint.kind.nv)
 
     def qpos(self, q: Vector) -> Vector:
-        """MuJoCo's ``qpos``, shape (nqpos,), of a configuration, shape (nq,)."""
+        """Return ``qpos``, shape (nqpos,), of a configuration, shape (nq,)."""
         found = np.zeros(self.nqpos)
         found[self._plain_qpos] = q[self._plain_q]
         for slot in self._others:
@@ -104,19 +108,16 @@ class MjcfLayout:
             elif family == "spherical":
                 value = _scalar_first(piece)
             elif family == "free-flyer":
-                pose = pin.XYZQUATToSE3(piece)
-                position, quaternion = piece[:3], pin.Quaternion(np.array(piece[3:]))
-                if slot.free:
-                    position = (slot.placement * pose).translation
-                    quaternion = pin.Quaternion(slot.placement.rotation) * quaternion
-                value = np.concatenate([position, _scalar_first(quaternion.coeffs())])
+                if slot.free and slot.moved:
+                    piece = pin.SE3ToXYZQUAT(slot.placement * pin.XYZQUATToSE3(piece))
+                value = np.concatenate([piece[:3], _scalar_first(piece[3:])])
             else:
                 value = piece
             found[slot.qpos] = value
         return found
 
     def q(self, qpos: Vector) -> Vector:
-        """Pinocchio's configuration, shape (nq,), of a ``qpos``; quaternions normalized."""
+        """Return the configuration, shape (nq,), of a ``qpos``, shape (nqpos,), with quaternions normalized."""
         found = np.zeros(self.nq)
         found[self._plain_q] = qpos[self._plain_qpos]
         for slot in self._others:
@@ -138,61 +139,33 @@ class MjcfLayout:
         return found
 
     def velocity_map(self, q: Vector) -> Vector:
-        """``T(q)``, orthogonal, shape (nv, nv): ``qvel = T v``.
+        """Return ``T(q)`` of ``qvel = T v``, orthogonal, shape (nv, nv).
 
-        So ``M = Tᵀ M_mj T``, ``J = J_mj T`` and ``τ = Tᵀ τ_mj``.
+        It follows that ``M = Tᵀ M_mj T``, ``J = J_mj T`` and ``τ = Tᵀ τ_mj``.
         """
-        found = np.zeros((self.nv, self.nv))
-        for slot in self.slots:
-            block = np.eye(slot.joint.kind.nv)
+        found = self._permutation.copy()
+        for slot in self._turning:
             turn = _turn(slot, q[slot.joint.q])
-            block[: len(turn), : len(turn)] = turn
-            found[slot.qvel, slot.joint.v] = block
+            row, column, size = slot.qvel.start, slot.joint.v.start, len(turn)
+            found[row : row + size, column : column + size] = turn
         return found
 
     def qvel(self, q: Vector, v: Vector) -> Vector:
-        """MuJoCo's ``qvel`` of a velocity, shape (nv,)."""
-        found: Vector = np.asarray(v, dtype=float)[self._from]
-        for slot in self._turning:
-            turn = _turn(slot, q[slot.joint.q])
-            rows = slice(slot.qvel.start, slot.qvel.start + len(turn))
-            found[rows] = turn @ found[rows]
-        return found
-
-    def v(self, qpos: Vector, qvel: Vector) -> Vector:
-        """Pinocchio's velocity of a ``qvel``, shape (nv,)."""
-        return self.state(qpos, qvel)[1]
+        """Return ``qvel`` of a velocity, shape (nv,)."""
+        return np.asarray(self.velocity_map(q) @ v)
 
     def state(self, qpos: Vector, qvel: Vector) -> tuple[Vector, Vector]:
-        """Pinocchio's configuration and velocity, shapes (nq,) and (nv,), together."""
-        q, found = self.q(qpos), np.array(qvel, dtype=float)
-        for slot in self._turning:
-            turn = _turn(slot, q[slot.joint.q])
-            rows = slice(slot.qvel.start, slot.qvel.start + len(turn))
-            found[rows] = turn.T @ found[rows]
-        return q, np.asarray(found[self._back])
-
-    def qacc(self, q: Vector, v: Vector, a: Vector) -> Vector:
-        """MuJoCo's ``qacc = T a + Ṫ v``, shape (nv,): linear parts turn with their body."""
-        turning = np.zeros(self.nv)
-        for slot in self.slots:
-            piece = v[slot.joint.v]
-            if slot.joint.kind.family == "free-flyer":
-                turning[slot.joint.v.start : slot.joint.v.start + 3] = np.cross(piece[3:], piece[:3])
-            elif slot.joint.kind.family == "planar":
-                turning[slot.joint.v.start : slot.joint.v.start + 2] = -piece[2] * piece[1], piece[2] * piece[0]
-        return self.qvel(q, a + turning)
+        """Return the Pinocchio configuration, shape (nq,), and velocity, shape (nv,)."""
+        q = self.q(qpos)
+        return q, np.asarray(self.velocity_map(q).T @ qvel)
 
 
 def _turn(slot: MjcfSlot, piece: Vector) -> Vector:
-    """What turns the first entries of a joint's velocity; empty where nothing does."""
-    family = slot.joint.kind.family
-    if family == "free-flyer":
-        R = pin.Quaternion(np.array(piece[3:])).matrix()
-        return np.asarray(slot.placement.rotation @ R if slot.free and slot.moved else R)
-    if family == "planar":
+    """Return the rotation of the linear velocity of a free-flyer or planar joint."""
+    if slot.joint.kind.family == "planar":
         return np.array([[piece[2], -piece[3]], [piece[3], piece[2]]])
-    return np.zeros((0, 0))
+    R = pin.Quaternion(np.array(piece[3:])).matrix()
+    return np.asarray(slot.placement.rotation @ R if slot.free and slot.moved else R)
 
 
 def _scalar_first(xyzw: Vector) -> Vector:

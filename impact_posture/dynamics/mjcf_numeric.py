@@ -1,4 +1,4 @@
-"""MuJoCo's mass matrix and Jacobians in Pinocchio's coordinates: an opinion that shares no code with Pinocchio."""
+"""Mass matrix and Jacobians from MuJoCo in Pinocchio coordinates, to check Pinocchio with independent code."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.dynamics.mjcf import import_mujoco, write_mjcf
+from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco
 
 Vector = NDArray[np.float64]
 
@@ -14,8 +14,8 @@ Vector = NDArray[np.float64]
 class MujocoNumeric:
     """A ``pin.Model`` in MuJoCo, at one configuration at a time.
 
-    Call :meth:`at` first; the other methods speak of that configuration.  All vectors and matrices are Pinocchio's:
-    its order, its tangent space.
+    Call :meth:`at` first, because the other methods use that configuration.  All vectors and matrices have the order
+    and the tangent space of Pinocchio.
 
     Raises:
         InputError: MuJoCo is not installed.
@@ -23,7 +23,7 @@ class MujocoNumeric:
 
     def __init__(self, model: pin.Model) -> None:
         self._mujoco = import_mujoco()
-        self.mjcf = write_mjcf(model)
+        self.mjcf = build_mjcf(model)
         self.model = self.mjcf.compile()
         self.data = self._mujoco.MjData(self.model)
         self._map = np.eye(model.nv)
@@ -36,17 +36,22 @@ class MujocoNumeric:
         return self
 
     def mass_matrix(self) -> Vector:
-        """``M(q)``, shape (nv, nv), armature included."""
+        """Return ``M(q)``, shape (nv, nv), including armature."""
         found = np.zeros((self.model.nv, self.model.nv))
         self._mujoco.mj_fullM(self.model, self.data, found)
         return np.asarray(self._map.T @ found @ self._map)
 
     def rotation(self, site: str) -> Vector:
-        """World axes of a frame, shape (3, 3)."""
+        """Return the rotation of a frame in the world, shape (3, 3)."""
         return np.array(self.data.site(site).xmat).reshape(3, 3)
 
     def jacobian(self, site: str, offset: ArrayLike = (0.0, 0.0, 0.0)) -> Vector:
-        """``J``, shape (6, nv): world linear and angular velocity of a point given in a frame's axes, meters."""
+        """Return ``J``, shape (6, nv), of the linear and angular velocity of a point in world axes.
+
+        Args:
+            site: The frame that carries the point.
+            offset: The point from the origin of the frame, in the axes of the frame, m, shape (3,).
+        """
         linear, angular = np.zeros((3, self.model.nv)), np.zeros((3, self.model.nv))
         point = np.array(self.data.site(site).xpos) + self.rotation(site) @ np.asarray(offset, dtype=float)
         body = int(self.model.site(site).bodyid[0])

@@ -1,4 +1,4 @@
-"""Pinocchio's numbers for the same model: the oracle that symbolic results are checked against."""
+"""Numbers of Pinocchio for the same model, an oracle for the symbolic results."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Vector = NDArray[np.float64]
 class Numeric:
     """Kinematics, mass matrix and their tangent derivatives at one configuration at a time.
 
-    Call :meth:`at` first; the other methods speak of that configuration.
+    Call :meth:`at` first, because the other methods use its configuration.
     """
 
     def __init__(self, model: pin.Model) -> None:
-        # Gravity has no part in an impact: RNEA then is exactly M(q) a.
+        # An impact has no gravity.  Without it, RNEA is exactly M(q) a.
         self.model = model.copy()
         self.model.gravity = pin.Motion.Zero()
         self.data = self.model.createData()
@@ -32,16 +32,16 @@ class Numeric:
         return self
 
     def mass_matrix(self) -> Vector:
-        """``M(q)``, shape (nv, nv), armature included."""
+        """Return ``M(q)``, shape (nv, nv), armature included."""
         upper = np.triu(pin.crba(self.model, self.data, self.q))
         return np.asarray(upper + np.triu(upper, 1).T)
 
     def placement(self, point: PointOnLink) -> pin.SE3:
-        """World placement of a point's frame."""
+        """Return the world placement of the frame of a point."""
         return self.data.oMi[point.joint] * pin.SE3(point.rotation, point.position)
 
     def jacobian(self, point: PointOnLink) -> Vector:
-        """``J``, shape (6, nv): world linear and angular velocity of the point (LOCAL_WORLD_ALIGNED)."""
+        """Return ``J``, shape (6, nv), of the world linear and angular velocity (LOCAL_WORLD_ALIGNED)."""
         local = pin.getJointJacobian(self.model, self.data, point.joint, pin.LOCAL)
         local = np.asarray(local).reshape(6, -1)
         R = self.data.oMi[point.joint].rotation
@@ -49,22 +49,22 @@ class Numeric:
         return np.vstack([R @ linear, R @ local[3:]])
 
     def center_of_mass(self) -> tuple[Vector, Vector]:
-        """World center of mass, shape (3,), and its Jacobian, shape (3, nv)."""
+        """Return the world center of mass, shape (3,), and its Jacobian, shape (3, nv)."""
         J = np.array(pin.jacobianCenterOfMass(self.model, self.data, self.q)).reshape(3, -1)
         return np.array(self.data.com[0]), J
 
     def inertial_gradient(self, left: Vector, right: Vector) -> Vector:
-        """Tangent gradient of ``leftᵀ M(q) right``, shape (nv,), by Pinocchio's RNEA derivatives."""
+        """Return the tangent gradient of ``leftᵀ M(q) right``, shape (nv,), by the RNEA derivatives of Pinocchio."""
         dtau_dq = pin.computeRNEADerivatives(self.model, self.data, self.q, self._zero, right)[0]
         gradient = np.asarray(dtau_dq).reshape(self.model.nv, -1).T @ left
-        self.at(self.q)  # the derivatives' sweep leaves its own state in data
+        self.at(self.q)  # the sweep of the derivatives has changed data
         return np.asarray(gradient)
 
     def coupling_gradient(self, point: PointOnLink, wrench: Vector, v: Vector, *, in_frame: bool = False) -> Vector:
-        """Tangent gradient of ``wᵀ J(q) v``, shape (nv,), with ``w`` constant in the world or in the frame.
+        """Return the tangent gradient of ``wᵀ J(q) v``, shape (nv,), with ``w`` constant in the world or the frame.
 
-        Pinocchio's LOCAL velocity derivatives are true derivatives of the local velocity; the world's follow by
-        turning them (its LOCAL_WORLD_ALIGNED ones leave the turning out).
+        The LOCAL velocity derivatives of Pinocchio are true derivatives of the local velocity.  Those in the world
+        follow by rotation, because its LOCAL_WORLD_ALIGNED derivatives leave the rotation of the frame out.
         """
         pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
         dv_dq = np.asarray(pin.getJointVelocityDerivatives(self.model, self.data, point.joint, pin.LOCAL)[0]).reshape(
@@ -86,10 +86,10 @@ class Numeric:
         return np.asarray(gradient)
 
     def turning_gradient(self, point: PointOnLink, direction: Vector, covector: Vector) -> Vector:
-        """Tangent gradient of ``cᵀ d(q)`` where the world direction ``d`` turns with the point's link: (nv,)."""
+        """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), of a world direction that turns with the link."""
         return np.asarray(self.jacobian(point)[3:].T @ _cross(direction, covector))
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
-    """``a × b``; numpy's own takes twenty times as long on three numbers."""
+    """Return ``a × b``; ``numpy.cross`` takes twenty times as long on three numbers."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

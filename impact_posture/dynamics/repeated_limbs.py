@@ -1,7 +1,7 @@
-"""Branches of a robot that have the same joints: the two legs of a humanoid, the four of a quadruped.
+"""Repeated limbs of a robot, which have the same joints: the two legs of a humanoid, the four legs of a quadruped.
 
-Their expressions differ in constants only.  With those constants as parameters, equal for every lane in name and
-different in value, the dynamics of all twins are the same instructions, which a processor can do at once.
+Their expressions differ in constants only.  With parameters for those constants, named alike in every limb, all limbs
+have the same instructions, and a processor does them at once in its SIMD lanes.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from numpy.typing import ArrayLike, NDArray
 from impact_posture.dynamics.joints import joint_kind
 from impact_posture.dynamics.spatial import constant
 
-# A lane whose constants have zeros that another lacks computes with them: so much is worth it.
+# A limb computes with zeros where another limb has other constants.  So much more work is worth it.
 _FILL = 1.25
 _WIDTHS = (4, 2)
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a joint stands among its twins.
+    """Place of a joint in repeated limbs.
 
     Attributes:
-        group: Number of the group of branches.
-        lane: Which branch of it.
-        position: Which joint of the branch, the same for its twins.
+        group: Number of the group of limbs.
+        lane: Number of the limb in the group.
+        position: Number of the joint in the limb.
     """
 
     group: int
@@ -38,43 +38,43 @@ class Place:
 
 
 class RepeatedLimbs:
-    """The twin branches of a model, and the parameters that stand for what they differ in.
+    """The repeated limbs of a model, and parameters for the constants in which they differ.
 
     Attributes:
-        groups: For each group, its branches; for each branch its joints, twins at equal positions.
-        places: Joint index → where it stands; joints without a twin are missing.
-        parameters: Symbols that have been handed out, in order.
-        values: Their values.
-        keys: For each, its group, lane and a name that it shares with its twins.
+        groups: For each group its limbs, and for each limb its joints in one order.
+        places: Joint index → its place; joints outside repeated limbs are missing.
+        parameters: Symbols of the parameters, in order.
+        values: Values of the parameters.
+        keys: For each parameter its group, its lane and a name that all lanes share.
     """
 
     def __init__(self, model: pin.Model) -> None:
         self.groups = _groups(model)
         self.places = {
             joint: Place(g, lane, position)
-            for g, branches in enumerate(self.groups)
-            for lane, branch in enumerate(branches)
-            for position, joint in enumerate(branch)
+            for g, limbs in enumerate(self.groups)
+            for lane, limb in enumerate(limbs)
+            for position, joint in enumerate(limb)
         }
         self.parameters: list[ca.SX] = []
         self.values: list[float] = []
         self.keys: list[tuple[int, int, str]] = []
         self._known: dict[tuple[int, int, str], ca.SX] = {}
 
-    def of(self, joint: int) -> list[int]:
-        """The joint's twins in the order of their lanes, itself among them; the joint alone where it has none."""
+    def counterparts(self, joint: int) -> list[int]:
+        """Return the joints at the same position of all limbs, by lane; the joint alone outside repeated limbs."""
         place = self.places.get(joint)
-        return [joint] if place is None else [branch[place.position] for branch in self.groups[place.group]]
+        return [joint] if place is None else [limb[place.position] for limb in self.groups[place.group]]
 
     def constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
-        """``of(joint)`` as an expression: parameters where its twins differ, numbers elsewhere.
+        """Return ``of(joint)`` as an expression, with parameters where the counterparts of the joint differ.
 
         Args:
             joint: The joint.
-            tag: What it is, one name for each kind of constant.
-            of: The numbers of a joint: a vector, or a matrix (symmetric ones stay symmetric).
+            tag: A name for the kind of constant.
+            of: The numbers of a joint: a vector, or a matrix (a symmetric one stays symmetric).
         """
-        lanes = [constant(of(twin)) for twin in self.of(joint)]
+        lanes = [constant(of(other)) for other in self.counterparts(joint)]
         place = self.places.get(joint)
         if place is None:
             return lanes[0]
@@ -82,20 +82,19 @@ class RepeatedLimbs:
         own = dense[place.lane]
         symmetric = own.shape[0] == own.shape[1] and all(np.array_equal(d, d.T) for d in dense)
         found = ca.SX(*own.shape)
-        for i in range(own.shape[0]):
-            for j in range(own.shape[1]):
-                entries = [d[i, j] for d in dense]
-                if len(set(entries)) > 1:
-                    row, column = (min(i, j), max(i, j)) if symmetric else (i, j)
-                    # With all values: another kernel's constants of the same kind may be others.
-                    name = f"{place.position}.{tag}.{row}.{column}.{entries}"
-                    found[i, j] = self._parameter(place, name, float(own[i, j]))
-                elif entries[0] != 0.0:
-                    found[i, j] = entries[0]
+        for i, j in np.ndindex(own.shape):
+            entries = [d[i, j] for d in dense]
+            if len(set(entries)) > 1:
+                row, column = (min(i, j), max(i, j)) if symmetric else (i, j)
+                # The name has all values, because a constant of the same kind may differ in another kernel.
+                name = f"{place.position}.{tag}.{row}.{column}.{entries}"
+                found[i, j] = self._parameter(place, name, float(own[i, j]))
+            elif entries[0] != 0.0:
+                found[i, j] = entries[0]
         return found
 
     def indicator(self, joint: int, of: int) -> ca.SX:
-        """One for the joint ``of`` and zero for its twins: what makes their expressions alike."""
+        """Return one for the joint ``of`` and zero for its counterparts, which makes their expressions alike."""
         place = self.places[of]
         return self._parameter(self.places[joint], f"{place.position}.on.{place.lane}", float(joint == of))
 
@@ -110,36 +109,34 @@ class RepeatedLimbs:
 
 
 def _groups(model: pin.Model) -> tuple[tuple[tuple[int, ...], ...], ...]:
-    """Outermost twins first: what hangs from a twin branch is part of it."""
+    """Return the outermost repeated limbs; what hangs from a limb is a part of it."""
     found: list[tuple[tuple[int, ...], ...]] = []
     waiting = [0]
     while waiting:
-        joint = waiting.pop(0)
+        children = [int(c) for c in model.children[waiting.pop(0)]]
         taken: set[int] = set()
-        children = [int(c) for c in model.children[joint]]
         for child in children:
             if child in taken:
                 continue
-            alike = [child]
-            branch = _branch(model, child)
-            for other in children:
-                if other > child and other not in taken and _alike(model, branch, _branch(model, other)):
-                    alike.append(other)
+            limb = _limb(model, child)
+            others = [c for c in children if c > child and c not in taken and _alike(model, limb, _limb(model, c))]
+            alike = [child, *others]
             for width in _WIDTHS:
                 while len(alike) >= width:
-                    found.append(tuple(_branch(model, c) for c in alike[:width]))
+                    found.append(tuple(_limb(model, c) for c in alike[:width]))
                     taken.update(alike[:width])
                     alike = alike[width:]
         waiting += [c for c in children if c not in taken]
     return tuple(found)
 
 
-def _branch(model: pin.Model, root: int) -> tuple[int, ...]:
-    """The joints of a subtree, depth first."""
-    return (root, *[joint for child in model.children[root] for joint in _branch(model, int(child))])
+def _limb(model: pin.Model, root: int) -> tuple[int, ...]:
+    """Return the joints of a subtree, depth first."""
+    return (root, *[joint for child in model.children[root] for joint in _limb(model, int(child))])
 
 
 def _alike(model: pin.Model, one: tuple[int, ...], other: tuple[int, ...]) -> bool:
+    """Return whether two limbs have the same joints in the same order, and nearly the same zeros."""
     if len(one) != len(other):
         return False
     for i, j in zip(one, other, strict=True):

@@ -1,7 +1,7 @@
-"""Spatial algebra on CasADi expressions, in Pinocchio's order: linear part first.
+"""Spatial algebra on CasADi expressions, with the linear part first as in Pinocchio.
 
 A motion ``[v; w]`` and a force ``[f; m]`` are 6-vectors of ``SX``.  ``R`` and ``p`` place a child frame in its
-parent: ``x_parent = R x_child + p``.  Structural zeros are kept, so that CasADi never multiplies by a constant zero.
+parent by ``x_parent = R x_child + p``.  Structural zeros stay, so that CasADi never multiplies by a constant zero.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ def constant(value: ArrayLike) -> ca.SX:
 
 
 def skew(p: ca.SX) -> ca.SX:
-    """``[p]×``, shape (3, 3)."""
+    """Return ``[p]×``, shape (3, 3)."""
     return ca.sparsify(ca.skew(ca.densify(p)))
 
 
 def cross(a: ca.SX, b: ca.SX) -> ca.SX:
-    """``a × b`` for two 3-vectors."""
+    """Return ``a × b`` of two 3-vectors."""
     return ca.cross(ca.densify(a), ca.densify(b))
 
 
@@ -45,16 +45,16 @@ def force_to_parent(R: ca.SX, p: ca.SX, force: ca.SX) -> ca.SX:
 
 
 def motion_cross_force(motion: ca.SX, force: ca.SX) -> ca.SX:
-    """``motion ×* force = [w × f; w × m + v × f]`` (Featherstone 2008, eq. 2.32)."""
+    """Return ``motion ×* force = [w × f; w × m + v × f]`` (Featherstone 2008, eq. 2.32)."""
     linear, angular = motion[:3], motion[3:]
     return ca.vertcat(cross(angular, force[:3]), cross(angular, force[3:]) + cross(linear, force[:3]))
 
 
 @dataclass(frozen=True)
 class Spin:
-    """A turn about a coordinate axis: ``axis`` 0, 1 or 2, and the angle's cosine and sine.
+    """Rotation about the coordinate ``axis`` 0, 1 or 2, with the cosine and sine of its angle.
 
-    ``sense`` is −1 where the joint's axis points the other way; the sine has it already.
+    ``sense`` is −1 where the axis of the joint points the other way; the sine contains it already.
     """
 
     axis: int
@@ -64,11 +64,11 @@ class Spin:
 
     @cached_property
     def double(self) -> tuple[ca.SX, ca.SX]:
-        """Cosine and sine of twice the angle: what a symmetric matrix turns by."""
+        """Cosine and sine of twice the angle, by which a symmetric matrix turns."""
         return (self.cosine - self.sine) * (self.cosine + self.sine), 2 * self.sine * self.cosine
 
     def matrix(self, M: ca.SX) -> ca.SX:
-        """``R M Rᵀ`` of a 3×3 matrix by plane rotations: 16 products, and 12 if ``M`` is symmetric."""
+        """Return ``R M Rᵀ`` of a 3×3 matrix by plane rotations, with 16 products, or 12 if ``M`` is symmetric."""
         i, j, k = (self.axis + 1) % 3, (self.axis + 2) % 3, self.axis
         c2, s2 = self.double
         mean, half = (M[i, i] + M[j, j]) / 2, (M[i, i] - M[j, j]) / 2
@@ -82,7 +82,7 @@ class Spin:
         return ca.sparsify(out)
 
     def rate(self, inertia: ca.SX) -> ca.SX:
-        """``K = (S×)ᵀ I + I (S×)`` of a symmetric 6×6 inertia and the axis' motion ``S``: symmetric, 6×6."""
+        """Return the symmetric ``K = (S×)ᵀ I + I (S×)`` of a 6×6 inertia ``I`` and the motion ``S`` of the axis."""
         i, j, k = (self.axis + 1) % 3, (self.axis + 2) % 3, self.axis
         out = ca.SX(6, 6)
         for rows, columns in ((0, 0), (0, 3), (3, 3)):
@@ -100,7 +100,7 @@ class Spin:
 
 
 def rotate_inertia(inertia: ca.SX, R: ca.SX, spin: Spin | None) -> ca.SX:
-    """Turn a symmetric 6×6 inertia by ``spin`` and then by ``R``; ``R`` alone where there is no spin."""
+    """Rotate a symmetric 6×6 inertia by ``spin`` and then by ``R``; by ``R`` alone without a spin."""
     blocks = [symmetric(inertia[:3, :3]), inertia[:3, 3:], symmetric(inertia[3:, 3:])]
     if spin is not None:
         blocks = [spin.matrix(block) for block in blocks]
@@ -111,7 +111,7 @@ def rotate_inertia(inertia: ca.SX, R: ca.SX, spin: Spin | None) -> ca.SX:
 
 
 def shift_inertia(inertia: ca.SX, p: ca.SX) -> ca.SX:
-    """Move a symmetric 6×6 inertia to the origin at ``−p``: ``B' = B − A[p]×, D' = D + [p]×B + B'ᵀ[p]×ᵀ``."""
+    """Move a symmetric 6×6 inertia to the origin at ``−p`` by ``B' = B − A[p]×, D' = D + [p]×B + B'ᵀ[p]×ᵀ``."""
     P = skew(p)
     A, B, D = inertia[:3, :3], inertia[:3, 3:], inertia[3:, 3:]
     shifted = B - A @ P
@@ -120,50 +120,25 @@ def shift_inertia(inertia: ca.SX, p: ca.SX) -> ca.SX:
 
 
 def symmetric(matrix: ca.SX) -> ca.SX:
-    """Copy the upper triangle onto the lower: equal in value, and half of the expressions never get computed."""
+    """Copy the upper triangle onto the lower, so that half of the expressions are never computed."""
     return ca.triu2symm(ca.triu(matrix))
 
 
 def ldl_solve(matrix: ca.SX, rhs: ca.SX) -> ca.SX:
-    """Solve ``matrix x = rhs`` for a small symmetric positive definite matrix by ``LDLᵀ``, without pivots.
-
-    Right-looking, and with ``L⁻¹`` written out: of all orders the one in which an operation waits for the fewest
-    others.
-    """
-    n = matrix.shape[0]
-    rest = [[matrix[i, j] for j in range(i + 1)] for i in range(n)]
-    L = [[ca.SX(0)] * n for _ in range(n)]
-    inverse = [ca.SX(0)] * n
-    for j in range(n):
-        inverse[j] = 1 / rest[j][j]
-        for i in range(j + 1, n):
-            L[i][j] = rest[i][j] * inverse[j]
-        for i in range(j + 1, n):
-            for k in range(j + 1, i + 1):
-                rest[i][k] = rest[i][k] - L[i][j] * rest[k][j]
-    # -L⁻¹, row by row: its rows need those above.
-    N = [[ca.SX(0)] * n for _ in range(n)]
-    for i in range(n):
-        for j in range(i):
-            N[i][j] = sum((L[i][k] * N[k][j] for k in range(j + 1, i)), L[i][j])
-            N[i][j] = -N[i][j]
-    columns = []
-    for c in range(rhs.shape[1]):
-        y = [rhs[i, c] + sum((N[i][k] * rhs[k, c] for k in range(i)), ca.SX(0)) for i in range(n)]
-        y = [y[i] * inverse[i] for i in range(n)]
-        x = [y[i] + sum((N[k][i] * y[k] for k in range(i + 1, n)), ca.SX(0)) for i in range(n)]
-        columns.append(ca.vertcat(*x))
-    return ca.horzcat(*columns)
+    """Solve ``matrix x = rhs`` for a small symmetric positive definite matrix by ``LDLᵀ``, without pivots."""
+    D, LT, order = ca.ldl(ca.densify(matrix), False)
+    found: ca.SX = ca.ldl_solve(ca.densify(rhs), D, LT, order)
+    return found
 
 
 def quaternion_product(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Hamilton product of two quaternions in ``x y z w`` order."""
+    """Return the Hamilton product of two quaternions in ``x y z w`` order."""
     va, wa, vb, wb = a[:3], a[3], b[:3], b[3]
     return ca.vertcat(wa * vb + wb * va + cross(va, vb), wa * wb - ca.dot(va, vb))
 
 
 def quaternion_matrix(q: ca.SX) -> ca.SX:
-    """Rotation matrix of a unit quaternion in ``x y z w`` order; quadratic in its entries."""
+    """Return the rotation matrix of a unit quaternion in ``x y z w`` order; it is quadratic in its entries."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     return ca.blockcat(
         [

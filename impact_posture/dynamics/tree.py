@@ -1,8 +1,8 @@
 """Dynamics of the kinematic tree at one symbolic configuration: sweeps and an O(n) articulated-body factorization.
 
-Everything is in link coordinates, and the base's own pose enters only where a world direction is rotated into it:
-``M`` does not depend on it.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms* (2008), in
-Pinocchio's order (linear part first).
+Everything is in link coordinates.  ``M`` does not depend on the pose of the base, which only rotates world directions
+into links.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms* (2008), with the linear part
+first as in Pinocchio.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from impact_posture.dynamics.spatial import (
     symmetric,
 )
 
-__all__ = ["ByJoint", "Coupling", "PointOnLink", "Product", "Response", "Tree", "Wrench"]
+__all__ = ["ByJoint", "PointOnLink", "Response", "Tree", "Wrench"]
 
 
 @dataclass(frozen=True)
 class Wrench:
-    """A force and a moment, constant in the world (or in the frame), applied at a point of a link.
+    """A force and a moment at a point of a link, constant in the world or in the frame.
 
     Attributes:
-        point: Where it acts.
-        force: Shape (3,), in world axes; in the frame's axes if ``in_frame``.
-        moment: About the point, same axes.
-        in_frame: Whether it turns with the link.
+        point: The point.
+        force: The force, shape (3,), in world axes; in the axes of the frame if ``in_frame``.
+        moment: The moment about the point, shape (3,), in the same axes.
+        in_frame: Whether the wrench turns with the link.
     """
 
     point: PointOnLink
@@ -46,36 +46,17 @@ class Wrench:
     in_frame: bool = False
 
 
-@dataclass(frozen=True)
-class Coupling:
-    """``scale · wᵀ J v`` of a wrench and a set of link velocities."""
-
-    wrench: Wrench
-    velocities: ByJoint
-    scale: float | ca.SX = 1.0
-
-
-@dataclass(frozen=True)
-class Product:
-    """``scale · leftᵀ M right`` of two sets of link velocities; ``extra``: with the extra inertias."""
-
-    left: ByJoint
-    right: ByJoint
-    scale: float | ca.SX = 1.0
-    extra: bool = True
-
-
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What the robot answers to a generalized force and wrenches.
+    """The response of the robot to a generalized force and wrenches.
 
     Attributes:
         a: ``M⁻¹(τ + Σ Jᵀ w)``, shape (nv,).
-        velocities: Spatial velocity of every link under ``a``, link coordinates.
-        before: The same without the link's own joint, for joints with a parent joint.
+        velocities: Spatial velocity of every link under ``a``, in link coordinates.
+        before: The same without the motion of the link's own joint, for joints with a parent joint.
         forces: Spatial force through every joint with a parent joint, on its link.
-        passed: The part of it that does not depend on the parent's motion.
-        wrenches: What acted.
+        passed: The part of that force that does not depend on the motion of the parent.
+        wrenches: The wrenches.
     """
 
     a: ca.SX
@@ -105,7 +86,7 @@ class Tree(Kinematics):
     # ---- sweeps -----------------------------------------------------------------------------------------------
 
     def velocities(self, v: ca.SX) -> ByJoint:
-        """Spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
+        """Return the spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
         found: ByJoint = {}
         for slot in self.chart.slots:
             i, parent = slot.index, self._parents[slot.index]
@@ -113,10 +94,6 @@ class Tree(Kinematics):
             moved = motion_to_child(self._R[i], self._p[i], found[parent]) if parent else ca.SX(6, 1)
             found[i] = moved + own
         return found
-
-    def momenta(self, velocities: ByJoint) -> ByJoint:
-        """Momentum of each link's whole subtree, in link coordinates, for the given link velocities."""
-        return self._accumulate({i: self._inertia[i] @ velocities[i] for i in velocities})
 
     def _accumulate(self, forces: ByJoint) -> ByJoint:
         total = dict(forces)
@@ -126,16 +103,25 @@ class Tree(Kinematics):
                 total[parent] = total[parent] + force_to_parent(self._R[i], self._p[i], total[i])
         return total
 
-    def mass_times(self, v: ca.SX) -> ca.SX:
-        """``M(q) v`` in O(n), armature included."""
-        return self._project(self.momenta(self.velocities(v))) + self._armature * v
+    def mass_times(self, v: ca.SX, velocities: ByJoint | None = None, *, extra: bool = True) -> ca.SX:
+        """Return ``M(q) v`` in O(n), armature included, shape (nv,).
+
+        Args:
+            v: Generalized velocity, shape (nv,).
+            velocities: Spatial velocity of every link under ``v``, if it is known already.
+            extra: Include the extra inertias.
+        """
+        velocities = self.velocities(v) if velocities is None else velocities
+        inertia = self._inertia if extra else self._own_inertia
+        momenta = self._accumulate({i: inertia[i] @ velocity for i, velocity in velocities.items()})
+        return self._project(momenta) + self._armature * v
 
     def _project(self, forces: ByJoint) -> ca.SX:
         rows = [self._S[slot.index].T @ forces[slot.index] for slot in self.chart.slots]
         return ca.densify(ca.vertcat(*rows))
 
     def mass_matrix(self) -> ca.SX:
-        """``M(q)`` by composite rigid bodies (Featherstone 2008, §6.2), shape (nv, nv), armature included."""
+        """Return ``M(q)`` by composite rigid bodies (Featherstone 2008, §6.2), shape (nv, nv), armature included."""
         composite = dict(self._inertia)
         M = ca.SX.zeros(self.nv, self.nv)
         for slot in reversed(self.chart.slots):
@@ -156,7 +142,7 @@ class Tree(Kinematics):
         return M + ca.diag(self._armature)
 
     def link_force(self, wrench: Wrench) -> ca.SX:
-        """The wrench as a spatial force on its link, in link coordinates about the link's origin, shape (6,)."""
+        """Return a wrench as a spatial force in link coordinates about the origin of its link, shape (6,)."""
         joint, position = wrench.point.joint, ca.SX(wrench.point.position)
         if wrench.in_frame:
             axes = constant(wrench.point.rotation)
@@ -166,14 +152,14 @@ class Tree(Kinematics):
         return ca.vertcat(force, moment + cross(position, force))
 
     def generalized_force(self, wrenches: Sequence[Wrench]) -> ca.SX:
-        """``Σ Jᵀ [force; moment]`` of the wrenches, shape (nv,)."""
+        """Return ``Σ Jᵀ [force; moment]`` of the wrenches, shape (nv,)."""
         forces: ByJoint = {i: ca.SX(6, 1) for i in self._R}
         for wrench in wrenches:
             forces[wrench.point.joint] = forces[wrench.point.joint] + self.link_force(wrench)
         return self._project(self._accumulate(forces))
 
     def point_velocity(self, point: PointOnLink, velocities: ByJoint) -> ca.SX:
-        """World linear and angular velocity of a point, shape (6,): ``J v`` in LOCAL_WORLD_ALIGNED."""
+        """Return the world linear and angular velocity of a point, ``J v`` in LOCAL_WORLD_ALIGNED, shape (6,)."""
         motion = velocities[point.joint]
         linear = motion[:3] + cross(motion[3:], ca.SX(point.position))
         R = self.rotations[point.joint]
@@ -182,7 +168,7 @@ class Tree(Kinematics):
     # ---- articulated body -------------------------------------------------------------------------------------
 
     def _inertia_to_parent(self, i: int, inertia: ca.SX) -> ca.SX:
-        """Congruence of link i's symmetric 6×6 (articulated) inertia to its parent's coordinates."""
+        """Return the symmetric 6×6 (articulated) inertia of link i in the coordinates of its parent."""
         spin = self._spin[i]
         turned = rotate_inertia(inertia, self._R[i] if spin is None else self._rest[i], spin)
         return shift_inertia(turned, self._p[i])
@@ -204,16 +190,11 @@ class Tree(Kinematics):
                 articulated[parent] = articulated[parent] + self._inertia_to_parent(i, reduced[i])
         return _Factor(U, D, gain, reduced)
 
-    def solve(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> tuple[ca.SX, ByJoint]:
-        """``a = M⁻¹(τ + Σ Jᵀ w)``, shape (nv,), and the spatial velocity of every link under it."""
-        found = self.respond(tau, wrenches)
-        return found.a, found.velocities
-
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
-        """Answer ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization, in O(n) and without forming ``M``.
+        """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization, in O(n) and without forming ``M``.
 
-        The force through joint i is ``f_i = I^a_i v_i⁻ + p^a_i``: the factorization knows the momentum of the whole
-        subtree, so that no sweep has to gather it.
+        The force through joint i is ``f_i = I^a_i v_i⁻ + p^a_i``.  The factorization knows the momentum of the whole
+        subtree, so no sweep has to gather it.
         """
         factor = self._factor
         bias: ByJoint = {i: ca.SX(6, 1) for i in self._R}
@@ -246,17 +227,16 @@ class Tree(Kinematics):
         return Response(ca.densify(ca.vertcat(*parts)), velocities, before, forces, passed, tuple(wrenches))
 
     def pair_gradient(self, x: Response, y: Response) -> ca.SX:
-        """Tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` with all four letters held fixed, shape (nv,).
+        """Return the tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` with all four letters held fixed, shape (nv,).
 
-        ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)`` and the turning of wrenches that stay in the world: all of it from what
-        the two solutions already know.  With ``f = I^a v⁻ + p^a`` and a joint that turns about a coordinate axis, the
-        part of ``I^a`` is ``v_y⁻ᵀ K v_x⁻``, where ``K`` is how fast ``I^a`` changes as it turns: one product in
-        place of two.
+        It is ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)`` and the turning of wrenches that stay in the world.  The two responses
+        know all of this.  With ``f = I^a v⁻ + p^a`` and a joint that turns about a coordinate axis, the part of
+        ``I^a`` is the one product ``v_y⁻ᵀ K v_x⁻`` in place of two, where ``K`` is the rate of ``I^a`` as it turns.
         """
-        turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
+        turning: ByJoint = {}
         for one, other in ((x, y), (y, x)):
             for wrench in one.wrenches:
-                self._turn(turning, Coupling(wrench, other.velocities))
+                self._turn(turning, wrench, other.velocities)
         rows: ByJoint = {}
         forces = [dict(x.forces), dict(y.forces)]
         for i in x.forces:
@@ -269,42 +249,21 @@ class Tree(Kinematics):
 
     # ---- tangent gradients by adjoints ------------------------------------------------------------------------
 
-    def bracket_gradient(self, couplings: Sequence[Coupling] = (), products: Sequence[Product] = ()) -> ca.SX:
-        """Tangent gradient of ``Σ scale wᵀJ(q)v + Σ scale bᵀM(q)a`` with ``w, v, a, b`` held fixed, shape (nv,).
+    def energy_gradient(self, velocities: ByJoint) -> ca.SX:
+        """Return the tangent gradient of ``vᵀM(q)v`` with ``v`` held fixed, without extra inertias, shape (nv,).
 
-        Moving joint j by ``S_j δ`` turns every velocity beyond it by ``−S_j δ ×``.  With ``F_j`` the force that the
-        subtree of j puts against a velocity set ``v``, that is ``−S_jᵀ (v_j⁻ ×* F_j)``, where ``v_j⁻`` is the
-        velocity before joint j's own.  A wrench constant in the world turns back relative to the link; its part is
-        ``−ω_jᵀ (f × u + m × ω)`` on every joint below it.
+        Moving joint j by ``S_j δ`` turns every velocity beyond it by ``−S_j δ ×``.  With ``F_j`` the momentum of the
+        subtree of j, that changes the value by ``−2 S_jᵀ (v_j⁻ ×* F_j)``, where ``v_j⁻`` is the velocity of the link
+        without the motion of joint j.
         """
-        sets: list[ByJoint] = []
-        forces: list[ByJoint] = []
-
-        def against(velocities: ByJoint) -> ByJoint:
-            for known, force in zip(sets, forces, strict=True):
-                if known is velocities:
-                    return force
-            sets.append(velocities)
-            forces.append({i: ca.SX(6, 1) for i in self._R})
-            return forces[-1]
-
-        turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
-        for coupling in couplings:
-            joint = coupling.wrench.point.joint
-            acting = against(coupling.velocities)
-            acting[joint] = acting[joint] - coupling.scale * self.link_force(coupling.wrench)
-            self._turn(turning, coupling)
-        for product in products:
-            inertia = self._inertia if product.extra else self._own_inertia
-            for one, other in ((product.left, product.right), (product.right, product.left)):
-                acting = against(one)
-                for i in acting:
-                    acting[i] = acting[i] - product.scale * (inertia[i] @ other[i])
-        pairs = [(self._before(v), self._accumulate(f)) for v, f in zip(sets, forces, strict=True)]
-        return self._gather(pairs, turning)
+        forces = {i: -2 * (self._own_inertia[i] @ velocity) for i, velocity in velocities.items()}
+        return self._gather([(self._before(velocities), self._accumulate(forces))], {})
 
     def _before(self, velocities: ByJoint) -> ByJoint:
-        """Velocity of every link without its own joint's part; joints with one axis have none along it to lose."""
+        """Return the velocity of every link without the motion of its own joint.
+
+        A joint with one axis keeps that motion, because ``Sᵀ(S ×* F)`` is zero.
+        """
         return {
             slot.index: velocities[slot.index]
             if slot.kind.nv == 1
@@ -313,25 +272,24 @@ class Tree(Kinematics):
             if self._parents[slot.index]
         }
 
-    def _turn(self, turning: ByJoint, coupling: Coupling) -> None:
-        """Add ``f × u + m × ω`` of a wrench that stays in the world while its link turns."""
-        wrench, joint = coupling.wrench, coupling.wrench.point.joint
+    def _turn(self, turning: ByJoint, wrench: Wrench, velocities: ByJoint) -> None:
+        """Add ``f × u + m × ω`` of a wrench that stays in the world while its link moves with ``(u, ω)``.
+
+        The wrench turns back relative to the link, which adds ``−ω_jᵀ (f × u + m × ω)`` on every joint below.
+        """
+        joint = wrench.point.joint
         if wrench.in_frame:
             return
-        force, motion, position = self.link_force(wrench), coupling.velocities[joint], ca.SX(wrench.point.position)
+        force, motion, position = self.link_force(wrench), velocities[joint], ca.SX(wrench.point.position)
         linear = motion[:3] + cross(motion[3:], position)
         moment = force[3:] - cross(position, force[:3])
-        added = cross(force[:3], linear) + cross(moment, motion[3:])
-        turning[joint] = turning[joint] + coupling.scale * added
+        turning[joint] = turning.get(joint, ca.SX(3, 1)) + cross(force[:3], linear) + cross(moment, motion[3:])
 
     def _gather(
         self, pairs: Sequence[tuple[ByJoint, ByJoint]], turning: ByJoint, known: ByJoint | None = None
     ) -> ca.SX:
-        """``Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning``, with ``F`` what the subtree takes away from the bracket.
-
-        ``known`` is added to the joints' rows.
-        """
-        turning = dict(turning)
+        """Return ``Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning`` for pairs ``(v⁻, F)``, plus the ``known`` rows of joints."""
+        turning = {i: turning.get(i, ca.SX(3, 1)) for i in self._R}
         rows: ByJoint = {}
         for slot in reversed(self.chart.slots):
             i, parent = slot.index, self._parents[slot.index]
@@ -345,16 +303,10 @@ class Tree(Kinematics):
         return ca.densify(ca.vertcat(*[rows[slot.index] for slot in self.chart.slots]))
 
     def turning_gradient(self, point: PointOnLink, direction: ca.SX, covector: ca.SX) -> ca.SX:
-        """Tangent gradient of ``cᵀ d(q)`` where the world direction ``d`` turns with the point's link: (nv,)."""
-        turning: ByJoint = {i: ca.SX(3, 1) for i in self._R}
-        turning[point.joint] = -self.to_link(point.joint, cross(direction, covector))
+        """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), of a world direction that turns with the link."""
+        turning = {point.joint: -self.to_link(point.joint, cross(direction, covector))}
         return self._gather([], turning)
 
     @cached_property
     def _own_inertia(self) -> ByJoint:
         return {i: self._constant(i, "own inertia", lambda j: self.model.inertias[j].matrix()) for i in self._R}
-
-    def own_mass_times(self, v: ca.SX, velocities: ByJoint) -> ca.SX:
-        """``M v`` of the robot alone, without the extra inertias."""
-        momenta = self._accumulate({i: self._own_inertia[i] @ velocities[i] for i in velocities})
-        return self._project(momenta) + self._armature * v

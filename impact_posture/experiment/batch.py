@@ -1,4 +1,4 @@
-"""Many jobs on several processes, each kept when it is done, so that what was interrupted goes on."""
+"""Many jobs in several processes.  Each is kept when it is done, so that an interrupted batch can go on."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from typing import Any
 
 from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError, SpecError
 from impact_posture.experiment.jobs import SCHEMA, Job, controller_factory, execute
+from impact_posture.libraries import source_key
 from impact_posture.output_folder import is_ours, write_record
-from impact_posture.posture.compiled import own_source
 from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.processes import fork_map
 from impact_posture.simulation.controller_factory import CONTROLLERS
@@ -32,28 +32,28 @@ _PARTS = ("robot", "dynamics", "impact", "posture", "codegen", "tsid", "simulati
 class Store:
     """A folder of finished jobs.
 
-    What it holds counts only for the very scenario, robot and program that it was made by.
+    A stored job only counts for the same scenario, robot and source code.
 
     Args:
-        folder: Made when first written to.
+        folder: The folder, which is made when it is first written to.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def make(self) -> None:
-        """Make the folder where there is none."""
+        """Make the folder if it does not exist."""
         with suppress(FileExistsError):
             self.folder.mkdir(parents=True)
             write_record(self.folder, "runs")
 
     def remove(self) -> None:
-        """Remove the folder, if it was made by :meth:`make`."""
+        """Remove the folder, if :meth:`make` made it."""
         if is_ours(self.folder, "runs"):
             shutil.rmtree(self.folder, ignore_errors=True)
 
     def find(self, job: Job) -> Document | None:
-        """The document of a job that is done; a file that is not whole, or another's, is none."""
+        """Return the document of a finished job, or ``None`` for no file, a damaged file, or that of another job."""
         try:
             seal, _, text = self._path(job).read_text(encoding="utf-8").partition("\n")
         except (OSError, UnicodeDecodeError):
@@ -64,11 +64,20 @@ class Store:
         return document
 
     def series(self, job: Job, sign: int) -> Path:
-        """Where the time series of a run is kept."""
+        """Return the path of the time series of a run."""
         return self.folder / f"{job.name}{'' if sign > 0 else '-minus'}.npz"
 
+    def has_series(self, job: Job, document: Document) -> bool:
+        """Whether all time series of a job are there and undamaged."""
+        try:
+            for part in document["runs"]:
+                Series.load(self.series(job, part["sign"]))
+        except SpecError:
+            return False
+        return True
+
     def keep(self, job: Job, document: Document) -> None:
-        """Keep a document, whole or not at all.
+        """Write a document, completely or not at all.
 
         Raises:
             OutputError: It cannot be written.
@@ -91,24 +100,24 @@ class Store:
 
 
 def _seal(job: Job, text: str) -> str:
-    """What a kept document begins with: no other text, and no other job, has it."""
+    """Return the first line of a stored document, which only this text of this job has."""
     return hashlib.sha256(f"{key_of(job)}\0{text}".encode()).hexdigest()
 
 
 def key_of(job: Job) -> str:
-    """Hash of everything that a job's result depends on."""
-    content = [__version__, _program(), repr(asdict(job)), _scenario(job.scenario)]
+    """Return a hash of everything that the result of a job depends on."""
+    content = [__version__, _source(), repr(asdict(job)), _scenario(job.scenario)]
     return hashlib.sha256("\0".join(content).encode()).hexdigest()
 
 
 @cache
-def _program() -> str:
-    return own_source(*_PARTS)
+def _source() -> str:
+    return source_key((), *_PARTS)
 
 
 @cache
 def _scenario(scenario: str) -> str:
-    """The file, and the robot that it leads to."""
+    """Return the text of the file, and the hash of its robot."""
     model = controller_factory(scenario).setup.robot.model_sha256
     return f"{scenario_path(scenario).read_text(encoding='utf-8')}\0{model}"
 
@@ -121,39 +130,37 @@ def run_batch(
     keep_series: Callable[[Job], bool] = lambda job: False,
     progress: Progress | None = None,
 ) -> list[Document]:
-    """Run jobs, those first that are not done yet; documents in the jobs' order.
+    """Run the jobs that are not stored yet, and return all documents in the order of the jobs.
 
-    A job that fails on its own (a metric that does not exist where it went) has a document without runs, of the
+    A job that fails on its own (a metric does not exist where the robot went) has a document without runs, with the
     status ``control lost``.
 
     Args:
-        jobs: What to run.
-        processes: How many at once.
-        store: Where finished ones are kept and found.
-        keep_series: Whose time series are kept beside; needs a store.
-        progress: Told of (done, all).
+        jobs: The jobs.
+        processes: Number of processes.
+        store: Folder where finished jobs are kept and found.
+        keep_series: Whether the store keeps the time series of a job, too.
+        progress: Callback with (done, all).
 
     Raises:
-        ImpactPostureError: A scenario that cannot be set up, or no such controller.
+        ImpactPostureError: A scenario cannot be set up, or there is no such controller.
     """
     done: dict[int, Document] = {}
     for k, job in enumerate(jobs):
+        # Every wrong scenario or controller is refused here, before hours of runs.
+        factory = controller_factory(job.scenario, job.free)
         if job.controller not in CONTROLLERS:
-            # Refused here, before hours of other runs: the factory says what is wrong.
-            controller_factory(job.scenario).driver(job.controller)
+            factory.driver(job.controller)
         found = None if store is None else store.find(job)
-        if found is not None and (store is None or not keep_series(job) or _has_series(store, job, found)):
+        if found is not None and store is not None and (not keep_series(job) or store.has_series(job, found)):
             done[k] = found
     waiting = [k for k in range(len(jobs)) if k not in done]
     if progress:
         progress(len(done), len(jobs))
-    for job in jobs:
-        # Everything that can be wrong with a scenario is said before the first run.
-        controller_factory(job.scenario, job.free)
 
     def work(index: int) -> Document:
         job = jobs[waiting[index]]
-        return _one(job, store if keep_series(job) else None)
+        return _run(job, store if keep_series(job) else None)
 
     with one_blas_thread(), fork_map(work, len(waiting), processes) as results:
         for index, document in results:
@@ -166,12 +173,12 @@ def run_batch(
     return [done[k] for k in range(len(jobs))]
 
 
-def _one(job: Job, store: Store | None) -> Document:
+def _run(job: Job, store: Store | None) -> Document:
     try:
         runs, document = execute(job)
     except ImpactPostureError as error:
         if isinstance(error, InputError) and not isinstance(error, MetricError):
-            # The user's, and the same for all seeds: not a result.
+            # A mistake of the user is the same for all seeds, and no result.
             raise
         event = {"status": "control lost", "time": getattr(error, "time", None), "what": str(error), "sign": None}
         return {"schema": SCHEMA, "scenario": job.scenario, "controller": job.controller, "mode": job.mode,
@@ -182,12 +189,3 @@ def _one(job: Job, store: Store | None) -> Document:
         for one in runs:
             one.series.save(store.series(job, one.sign))
     return document
-
-
-def _has_series(store: Store, job: Job, document: Document) -> bool:
-    try:
-        for part in document["runs"]:
-            Series.load(store.series(job, part["sign"]))
-    except SpecError:
-        return False
-    return True

@@ -1,4 +1,4 @@
-"""From runs to the pictures of :mod:`impact_posture.plot`."""
+"""Figures of runs, drawn by :mod:`impact_posture.plot`."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ from impact_posture.experiment.reproduction import Reproduction
 from impact_posture.plot import Bar, RunView, Span, draw_bars, draw_comparison, draw_run, draw_snapshots
 from impact_posture.progress import tell
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.scenario import RepeatedContacts
 from impact_posture.simulation.series import Series, Window
+
+_COLUMNS = (
+    "t", "q", "v", "torque", "rotor_command", "rotor_speed", "force", "peak", "objective", "level", "at_stop",
+)  # fmt: skip
 
 
 def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:
-    """Figures of one job; those of a push the other way in ``minus/``."""
+    """Draw the figures of a job.  Those of the push with sign -1 are in ``minus/``."""
     for one, part in zip(runs, document["runs"], strict=True):
         into = folder if one is runs[0] else folder / "minus"
         tell("drawing")
@@ -29,9 +32,9 @@ def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, f
 
 
 def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]) -> None:
-    """Figures of several controllers in one scenario; of pushes, those the first way."""
+    """Draw several controllers in one scenario, with the first sign of a push."""
     tell("drawing")
-    views = [view for job in jobs if (view := _kept(job, store)) is not None]
+    views = [view for job in jobs if (view := _stored_view(job, store)) is not None]
     if views:
         draw_comparison(views, folder, formats)
         draw_snapshots(views, folder, formats)
@@ -40,14 +43,14 @@ def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: 
 def draw_reproduction(
     found: Reproduction, jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]
 ) -> None:
-    """``bars``, and a folder for each scenario: nominal, robust and the best controller side by side."""
+    """Draw ``bars``, and for each scenario a folder with nominal, robust and the best controller side by side."""
     bars = []
     for row in found.rows:
         paper, total = PAPER.get(row.scenario), row.metrics.get("q_total_impact")
-        printed = {} if paper is None else {"nominal": paper.nominal, "robust": paper.robust}
         half = np.nan if total is None or total.half_width is None else total.half_width
         mean = np.nan if total is None else total.mean
-        bars.append(Bar(row.scenario, row.controller, mean, half, printed.get(row.controller)))
+        # The paper has the nominal and the robust controller.
+        bars.append(Bar(row.scenario, row.controller, mean, half, getattr(paper, row.controller, None)))
     draw_bars(bars, folder, formats)
     for scenario in found.scenarios:
         best = found.best(scenario)
@@ -57,38 +60,26 @@ def draw_reproduction(
 
 
 def run_view(job: Job, series: Series, windows: Sequence[Window], sign: int, status: str) -> RunView:
-    """What is drawn of a run; one that did not complete says so wherever its name stands."""
+    """Return the view of a run, with a label that says if the run did not complete."""
     factory = controller_factory(job.scenario, job.free)
-    setup, scenario = factory.setup, factory.setup.scenario
-    objective = factory.objective()
-    hits = isinstance(scenario.task, RepeatedContacts)
+    setup, scenario, objective = factory.setup, factory.setup.scenario, factory.objective()
     return RunView(
         scenario=scenario.name,
         controller=job.controller,
         robot=setup.robot,
         contact=objective.contact,
-        t=series.t,
-        q=series.q,
-        v=series.v,
-        torque=series.torque,
-        rotor_command=series.rotor_command,
-        rotor_speed=series.rotor_speed,
-        force=series.force,
-        peak=series.peak,
-        objective=series.objective,
-        level=series.level,
-        at_stop=series.at_stop,
+        **{name: getattr(series, name) for name in _COLUMNS},
         windows=tuple(Span(w.kind, w.begin, w.end, w.contact, w.touched) for w in windows if w.kind != "recovery"),
-        surface=np.array(setup.world.built.points[scenario.surface.name]) if hits else None,
+        surface=np.array(setup.world.built.points[scenario.surface.name]) if scenario.contacts else None,
         supports=objective.supports,
         label=job.label if status == "completed" else f"{job.label} ({status})",
-        facts=(f"seed {job.seed}", *(() if hits else (f"push {sign:+d}",))),
+        facts=(f"seed {job.seed}", *(() if scenario.contacts else (f"push {sign:+d}",))),
     )
 
 
-def _kept(job: Job, store: Store) -> RunView | None:
-    """The first run of a job whose series was kept; ``None`` where it came to no end."""
-    document: Document | None = store.find(job)
+def _stored_view(job: Job, store: Store) -> RunView | None:
+    """Return the view of the first run of a stored job, or ``None`` if it has no runs."""
+    document = store.find(job)
     if document is None or not document["runs"]:
         return None
     part = document["runs"][0]

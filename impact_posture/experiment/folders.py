@@ -1,4 +1,4 @@
-"""What runs, comparisons and reproductions leave on disk; every folder whole or not at all."""
+"""Output folders of runs, comparisons and reproductions.  Each is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from impact_posture.experiment.batch import Store
 from impact_posture.experiment.figures import draw_reproduction, draw_runs, draw_side_by_side
 from impact_posture.experiment.jobs import Job
-from impact_posture.experiment.reproduction import Reproduction
+from impact_posture.experiment.reproduction import Plan, Reproduction, jobs_of
 from impact_posture.experiment.reproduction_summary import summary
 from impact_posture.output_folder import whole_folder
 from impact_posture.simulation.run import Run
@@ -28,7 +28,7 @@ def write_simulation(
     force: bool = False,
     formats: Sequence[str] = FORMATS,
 ) -> None:
-    """``run.json``, ``series.npz`` (``series-minus.npz`` for the push the other way), figures.
+    """Write ``run.json``, ``series.npz`` (``series-minus.npz`` for a push with sign -1), and figures.
 
     Raises:
         OutputError: The folder exists without ``force``, is not ours, or cannot be written.
@@ -41,35 +41,23 @@ def write_simulation(
 
 
 def write_comparison(
-    out: Path,
-    document: dict[str, Any],
-    jobs: Sequence[Job],
-    store: Store,
-    *,
-    force: bool = False,
-    formats: Sequence[str] = FORMATS,
+    out: Path, found: Reproduction, plan: Plan, store: Store, *, force: bool = False, formats: Sequence[str] = FORMATS
 ) -> None:
-    """``comparison.json`` and figures of the first seed, controllers side by side; the store goes.
+    """Write ``comparison.json`` and figures of the first seed, and remove the store.
 
     Raises:
         OutputError: As :func:`write_simulation`.
     """
     with whole_folder(out, force=force, kind="comparison") as folder:
-        _write_json(folder / COMPARISON, document)
-        draw_side_by_side([job for job in jobs if job.seed == 0], store, folder, formats)
+        _write_json(folder / COMPARISON, found.comparison())
+        draw_side_by_side(jobs_of(plan, seeds=1), store, folder, formats)
     store.remove()
 
 
 def write_reproduction(
-    out: Path,
-    found: Reproduction,
-    jobs: Sequence[Job],
-    store: Store,
-    *,
-    force: bool = False,
-    formats: Sequence[str] = FORMATS,
+    out: Path, found: Reproduction, plan: Plan, store: Store, *, force: bool = False, formats: Sequence[str] = FORMATS
 ) -> dict[str, Any]:
-    """``reproduction.json``, ``SUMMARY.md``, ``runs/`` (every run's document) and figures; the store goes.
+    """Write ``reproduction.json``, ``SUMMARY.md``, all documents in ``runs/``, and figures, and remove the store.
 
     Returns:
         The content of ``reproduction.json``.
@@ -80,17 +68,17 @@ def write_reproduction(
     document = {**found.to_dict(), "summary": summary(found)}
     with whole_folder(out, force=force, kind="reproduction") as folder:
         _write_json(folder / REPRODUCTION, document)
-        (folder / "SUMMARY.md").write_text(summary(found), encoding="utf-8")
+        (folder / "SUMMARY.md").write_text(document["summary"], encoding="utf-8")
         (folder / "runs").mkdir()
-        for job in jobs:
+        for job in jobs_of(plan, found.seeds):
             _write_json(folder / "runs" / f"{job.name}.json", store.find(job))
-        draw_reproduction(found, [job for job in jobs if job.seed == 0], store, folder, formats)
+        draw_reproduction(found, jobs_of(plan, seeds=1), store, folder, formats)
     store.remove()
     return document
 
 
 def store_beside(out: Path) -> Store:
-    """Where the runs of an output folder are kept until it is written."""
+    """Return the store that keeps the runs of an output folder until it is written."""
     return Store(out.absolute().parent / f".{out.name}.runs")
 
 

@@ -1,12 +1,14 @@
-"""One run as a job: what is asked, and the document that answers it."""
+"""A run as a job, and the document with its results."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from functools import lru_cache
+from importlib import metadata
 from typing import Any
 
 import numpy as np
+from pydantic_core import to_jsonable_python
 
 from impact_posture.errors import InputError
 from impact_posture.escape import file_name
@@ -24,16 +26,16 @@ SCHEMA = "impact-posture/simulation/3"
 
 @dataclass(frozen=True)
 class Job:
-    """One run; both signs of a push are one.
+    """A run, or both runs of a push.
 
     Attributes:
-        scenario: Name or file.
-        controller: Name.
-        seed: Of the sensors' noise.
+        scenario: Name or file of the scenario.
+        controller: Name of the controller.
+        seed: Seed of the sensor noise.
         mode: ``live`` or ``held``.
-        free: Gradients and offline optimum without the feet.
-        gain: K instead of the scenario's, 1/s².
-        sign: That sign of the push alone.
+        free: Whether gradients and the offline optimum ignore the feet.
+        gain: K instead of that of the scenario, 1/s².
+        sign: The only sign of the push to run.
     """
 
     scenario: str
@@ -46,20 +48,20 @@ class Job:
 
     @property
     def label(self) -> str:
-        """Controller, with what is not usual about it."""
+        """Name of the controller and its variant, such as ``robust:held``."""
         return self.controller + (":held" if self.mode == "held" else "") + (":free" if self.free else "")
 
     @property
     def name(self) -> str:
-        """For files."""
+        """Name of its files."""
         return f"{file_name(self.scenario)}-{file_name(self.label.replace(':', '-'))}-{self.seed}"
 
 
 def parse_controller(text: str) -> tuple[str, Mode, bool]:
-    """``robust``, ``robust:held``, ``robust:free``, ``robust:held:free``.
+    """Parse ``robust``, ``robust:held``, ``robust:free`` or ``robust:held:free``.
 
     Raises:
-        InputError: Another word behind a colon.
+        InputError: There is no such variant.
     """
     name, *words = text.strip().split(":")
     for word in words:
@@ -70,7 +72,7 @@ def parse_controller(text: str) -> tuple[str, Mode, bool]:
 
 @lru_cache(maxsize=8)
 def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
-    """A scenario ready to run, kept for the next job.
+    """Return a scenario that is ready to run, and keep it for the next job.
 
     Raises:
         ImpactPostureError: The scenario cannot be read or set up.
@@ -79,20 +81,20 @@ def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
 
 
 def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
-    """Run a job: its runs, and its document.
+    """Run a job and return its runs and its document.
 
     Raises:
         ImpactPostureError: As :func:`impact_posture.simulation.run.run`, or the scenario cannot be set up.
     """
     factory = controller_factory(job.scenario, job.free)
     scenario = factory.setup.scenario
-    if job.sign is not None and job.sign not in getattr(scenario.task, "signs", ()):
+    if job.sign is not None and not (scenario.push and job.sign in scenario.push.signs):
         raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, hint="leave --sign out")
     runs = run(factory, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
-    metrics, found = [measure(factory.setup, one) for one in runs], []
-    for one, measured in zip(runs, metrics, strict=True):
-        found.append(_of_run(factory, one, measured))
-    status = gravest(part["status"] for part in found)
+    metrics = [measure(factory.setup, one) for one in runs]
+    parts = [_run_document(factory, one, measured) for one, measured in zip(runs, metrics, strict=True)]
+    status = gravest(part["status"] for part in parts)
+    completed = status == "completed"
     document = {
         "schema": SCHEMA,
         "scenario": scenario.name,
@@ -103,33 +105,25 @@ def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
         "gain": scenario.control.robust.gain if job.gain is None else job.gain,
         "seed": job.seed,
         "status": status,
-        "events": [{**event, "sign": part["sign"]} for part in found for event in part["events"]],
-        "metrics": together(metrics).to_dict() if status == "completed" else None,
-        "windows": [{**window, "sign": part["sign"]} for part in found for window in part["windows"]],
-        "prediction": (
-            _mean_prediction([p for part in found for p in part["prediction"]]) if status == "completed" else None
-        ),
-        "runs": found,
-        "offline": _offline(factory) if job.controller == "posture" else None,
+        "events": [{**event, "sign": part["sign"]} for part in parts for event in part["events"]],
+        "metrics": together(metrics).to_dict() if completed else None,
+        "windows": [{**window, "sign": part["sign"]} for part in parts for window in part["windows"]],
+        "prediction": _mean_prediction([p for part in parts for p in part["prediction"]]) if completed else None,
+        "runs": parts,
+        "offline": factory.offline if job.controller == "posture" else None,
         "model_sha256": factory.setup.robot.model_sha256,
-        "versions": versions() | {"mujoco": _mujoco_version()},
+        "versions": versions() | {"mujoco": metadata.version("mujoco")},
     }
-    return runs, finite(document)
+    return runs, jsonable(document)
 
 
-def finite(content: Any) -> Any:
-    """The same document with ``None`` for what is not finite: JSON has no word for it."""
-    if isinstance(content, dict):
-        return {key: finite(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [finite(value) for value in content]
-    if isinstance(content, float) and not np.isfinite(content):
-        return None
-    return content
+def jsonable(content: object) -> Any:
+    """Return JSON content: a dataclass becomes an object, an array a list, a number that is not finite ``None``."""
+    return to_jsonable_python(content, inf_nan_mode="null", fallback=lambda array: array.tolist())
 
 
 def together(metrics: list[Metrics]) -> Metrics:
-    """Of several runs: means; ticks summed, stops united, the largest of what is a largest."""
+    """Combine several runs: sums of ticks, the largest of what is a largest, all stops, and means of the others."""
     first = metrics[0]
     if len(metrics) == 1:
         return first
@@ -141,35 +135,25 @@ def together(metrics: list[Metrics]) -> Metrics:
     return Metrics(**{**values, **ticks, **largest, "stops": stops, "rested": all(m.rested for m in metrics)})
 
 
-def _of_run(factory: ControllerFactory, one: Run, metrics: Metrics) -> dict[str, Any]:
+def _run_document(factory: ControllerFactory, one: Run, metrics: Metrics) -> dict[str, Any]:
     events = judge(factory.setup, one)
-    return {
+    content = {
         "sign": one.sign,
-        "waited": None if np.isnan(one.waited) else one.waited,
+        "waited": one.waited,
         "status": gravest(event.status for event in events),
-        "events": [event.to_dict() for event in events],
-        "ticks": int(one.series.t.size),
+        "events": events,
+        "ticks": one.series.t.size,
         "metrics": metrics.to_dict(),
-        "windows": [window.to_dict() for window in one.windows],
-        "prediction": [p.to_dict() for p in predict(factory.setup, factory.objective(), one)],
+        "windows": one.windows,
+        "prediction": predict(factory.setup, factory.objective(), one),
     }
+    return dict(jsonable(content))
 
 
 def _mean_prediction(impacts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Means over the impacts; ``None`` where one is undefined."""
+    """Return means over the impacts, and ``None`` where a value is undefined for one of them."""
     found: dict[str, Any] = {"impacts": len(impacts)}
     for key in ("H", "G", "V", "S", "approach", "frictionless", "sticking", "measured", "ratio"):
         values = [impact[key] for impact in impacts]
         found[key] = None if not values or None in values else float(np.mean(values))
     return found
-
-
-def _offline(factory: ControllerFactory) -> dict[str, Any]:
-    found = factory.offline
-    return {**asdict(found), "q": [float(value) for value in found.q]}
-
-
-def _mujoco_version() -> str:
-    from impact_posture.dynamics.mjcf import import_mujoco
-
-    return str(import_mujoco().__version__)

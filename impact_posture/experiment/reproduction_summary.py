@@ -1,4 +1,4 @@
-"""A reproduction in words and tables, as Markdown; every number comes out of the rows."""
+"""Sentences and Markdown tables about a reproduction.  Every number comes from its rows."""
 
 from __future__ import annotations
 
@@ -12,90 +12,81 @@ from impact_posture.experiment.reproduction import Reproduction, targets_of
 from impact_posture.experiment.statistics import Interval, Row
 from impact_posture.simulation.controller_factory import MEANING
 
-# Of numbers that are nearly zero.
+# Most decimals of a number that is nearly zero.
 _DECIMALS = 4
-_MISSED = {
-    "reduction": "less than the paper's reduction",
-    "recovery": "less than the paper's reduction over the recovery",
-    "peak_jump": "a higher peak jump than nominal",
-    "peak_recovery": "a higher peak than nominal in the recovery",
-    "saturation": "more saturation in the windows than nominal",
-    "stops": "a joint on its stop",
-    "rested": "not at rest before the push",
-}
-# What a table's columns mean, below every one of them.
+# Metrics in the table of a scenario, with their significant digits.
+_COLUMNS = {
+    "peak_jump": 3, "peak_recovery": 3, "peak_force": 3, "saturation_inside": 2, "saturation_outside": 2,
+    "relaxed_ticks": 2,
+}  # fmt: skip
+# What the columns of the tables mean.
 LEGEND = (
-    "Recovery: the same integral and peak until 1 s after each impact began. Relaxed ticks: limits made a task give "
-    "way. Status: `completed`, or how many runs did; there is no reduction where a run did not."
+    "Recovery is the same integral and peak until 1 s after each impact began. In a relaxed tick, limits made a task "
+    "give way. The status is `completed`, or how many runs completed. There is no reduction if a run did not "
+    "complete."
 )
 
 
 def table_one(found: Reproduction) -> str:
-    """The paper's Table I beside ours: ``q_total_impact`` of nominal, robust and the best controller."""
-    lines = [
-        "| scenario | paper: nominal | robust | reduction | ours: nominal | robust | reduction | best | reduction |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    """Return Table I of the paper beside ours: ``q_total_impact`` of nominal, robust and the best controller."""
+    head = "scenario|paper: nominal|robust|reduction|ours: nominal|robust|reduction|best|reduction"
+    lines = []
     for scenario in found.scenarios:
-        paper, rows = PAPER.get(scenario), {row.controller: row for row in found.of(scenario)}
+        paper, best = PAPER.get(scenario), found.best(scenario)
+        nominal, robust = found.row(scenario, "nominal"), found.row(scenario, "robust")
         printed = ["–"] * 3
         if paper is not None:
             printed = [f"{paper.nominal:g}", f"{paper.robust:g}", f"{100 * paper.reduction:.1f} %"]
-        nominal, robust, best = rows.get("nominal"), rows.get("robust"), found.best(scenario)
-        ours = [
-            _q(nominal), _q(robust), reduction_text(robust), "–" if best is None else best.controller,
-            reduction_text(best),
-        ]  # fmt: skip
-        lines.append("| " + " | ".join([markdown(scenario), *printed, *ours]) + " |")
-    return "\n".join(lines)
+        name = "–" if best is None else best.controller
+        ours = [_total(nominal), _total(robust), reduction_text(robust), name, reduction_text(best)]
+        lines.append([markdown(scenario), *printed, *ours])
+    return _table(head, lines)
 
 
 def scenario_table(rows: Sequence[Row]) -> str:
-    """Every controller of a scenario."""
-    lines = [
-        "| controller | status | q_total_impact | reduction | over the recovery | peak jump | in the recovery | "
-        "peak force, N | saturated inside, s | outside, s | relaxed ticks | H before | measured / predicted jump | "
-        "targets |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    """Return the table of all controllers of a scenario."""
+    head = (
+        "controller|status|q_total_impact|reduction|over the recovery|peak jump|in the recovery|peak force, N|"
+        "saturated inside, s|outside, s|relaxed ticks|H before|measured / predicted jump|targets"
+    )
+    lines = []
     for row in rows:
-        if not row.metrics:
-            lines.append(f"| {row.controller} | {markdown(status_text(row))} |" + " |" * 12)
-            continue
-        cells = [
-            row.controller,
-            status_text(row),
-            interval_text(row.metrics["q_total_impact"]),
-            reduction_text(row),
-            percent(row.recovery) if row.controller != "nominal" else "–",
-            interval_text(row.metrics["peak_jump"]),
-            interval_text(row.metrics["peak_recovery"]),
-            interval_text(row.metrics["peak_force"], 3),
-            interval_text(row.metrics["saturation_inside"], 2),
-            interval_text(row.metrics["saturation_outside"], 2),
-            interval_text(row.metrics["relaxed_ticks"], 2),
-            "–" if row.H is None else f"{row.H:.3g}",
-            "–" if row.ratio is None else f"{row.ratio:.2f}",
-            targets_text(row),
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        cells = [row.controller, markdown(status_text(row))]
+        if row.metrics:
+            cells += [
+                _total(row),
+                reduction_text(row),
+                percent(row.recovery) if row.controller != "nominal" else "–",
+                *(interval_text(row.metrics[name], digits) for name, digits in _COLUMNS.items()),
+                "–" if row.H is None else f"{row.H:.3g}",
+                "–" if row.ratio is None else f"{row.ratio:.2f}",
+                targets_text(row),
+            ]
+        lines.append(cells)
+    return _table(head, lines)
+
+
+def _table(head: str, rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table.  Cells that are missing at the end of a row are empty."""
+    columns = head.split("|")
+    lines = [f"| {' | '.join([*cells, *[''] * (len(columns) - len(cells))])} |" for cells in (columns, *rows)]
+    return "\n".join([lines[0], "|---" * len(columns) + "|", *lines[1:]])
 
 
 def summary(found: Reproduction) -> str:
-    """The whole document."""
+    """Return the content of ``SUMMARY.md``."""
     many = f"{found.seeds} seeds" if found.seeds > 1 else "one seed"
-    shown = ", with 95 % confidence intervals." if found.seeds > 2 else ": no intervals."
+    shown = ", with 95 % confidence intervals." if found.seeds > 2 else ", so there are no intervals."
     parts = [
-        "# The paper's experiments, simulated anew",
+        "# The experiments of the paper, simulated again",
         f"Means over {many}{shown}",
         "## What to choose",
         "\n".join(f"- {line}" for line in advice(found)),
         "## Table I of Afifi et al. 2026, and ours",
         table_one(found),
-        "The paper's robots, gains, contact models and windows are others than here, and it prints few of them: "
-        "compare reductions, not values. `q_total_impact` is the integral of ‖ν‖ over fixed windows, the same for "
-        "every controller; contacts are summed, pushes are the mean of both signs.",
+        "The paper has other robots, gains, contact models and windows, and prints few of them. Compare reductions, "
+        "not values. `q_total_impact` is the integral of ‖ν‖ over fixed windows, which are the same for every "
+        "controller. Contacts are summed, and pushes are the mean of both signs.",
         LEGEND,
     ]
     for scenario in found.scenarios:
@@ -104,79 +95,80 @@ def summary(found: Reproduction) -> str:
 
 
 def advice(found: Reproduction, beside: Reproduction | None = None) -> list[str]:
-    """One line a scenario: which controller, what it gives, what it costs.
+    """Return one line for each scenario: the best controller, its reduction, and its disadvantages.
 
     Args:
-        found: The rows that count.
-        beside: Rows of more controllers, where the held variant of the best one is looked for.
+        found: Rows of the controllers that may be best.
+        beside: Rows of more controllers, which may have the held variant of the best one.
     """
     lines = []
     for scenario in found.scenarios:
-        best, robust = found.best(scenario), next((r for r in found.of(scenario) if r.controller == "robust"), None)
+        best, robust = found.best(scenario), found.row(scenario, "robust")
         if best is None or best.reduction is None:
             lines.append(f"**{markdown(scenario)}**: nothing was better than nominal.")
             continue
-        targets = targets_of(best)
-        met = targets is not None and targets.met
+        missed = _missed(best)
         line = (
             f"**{markdown(scenario)}**: `{best.controller}` ({MEANING[best.controller.partition(':')[0]]}) moves "
             f"{reduction_text(best)} less than nominal, over the recovery {percent(best.recovery)}"
         )
-        line += ", every target met." if met or targets is None else f", but with {_misses(targets.missed)}."
-        line += _force(best, found.of(scenario)) + _held((beside or found).of(scenario), best)
+        line += f", but with {missed}." if missed else ", every target met."
+        line += _force(best, found.row(scenario, "nominal"))
+        line += _held(best, (beside or found).row(scenario, f"{best.controller}:held"))
         if robust is not None and robust is not best and robust.reduction is not None:
-            line += f" The paper's term: {reduction_text(robust)}"
-            missed = targets_of(robust)
-            line += "." if missed is None or missed.met else f", with {_misses(missed.missed)}."
+            missed = _missed(robust)
+            line += f" The paper's term: {reduction_text(robust)}" + (f", with {missed}." if missed else ".")
         lines.append(line)
     return lines
 
 
-def _force(best: Row, rows: Sequence[Row]) -> str:
-    """What the contact has to bear for it."""
-    nominal = next((row for row in rows if row.controller == "nominal"), None)
+def _force(best: Row, nominal: Row | None) -> str:
+    """Return how much more force the contact has to bear."""
     if nominal is None:
         return ""
     before, after = (row.metrics["peak_force"].mean for row in (nominal, best))
     return f" The contact bears up to {after:.0f} N instead of {before:.0f} N." if after > 1.1 * before else ""
 
 
-def _held(rows: Sequence[Row], best: Row) -> str:
-    """Whether a live term's gain is its posture."""
-    held = next((row for row in rows if row.controller == f"{best.controller}:held"), None)
-    if held is None or held.reduction is None or best.reduction is None:
-        return ""
-    if held.reduction.mean > best.reduction.mean / 2:
+def _held(best: Row, held: Row | None) -> str:
+    """Return a warning if the reduction of a term is not due to its posture."""
+    share = _share(held, best)
+    if share is None or share > 0.5:
         return ""
     return (
-        f" Not its posture does it: held before the impact, that gives {reduction_text(held)}; a stiffer nominal "
-        "controller is the simpler way."
+        f" This is not due to its posture. Held before the impact, the posture gives {reduction_text(held)}. "
+        "A stiffer nominal controller is the simpler way."
     )
 
 
+def _share(part: Row | None, whole: Row | None) -> float | None:
+    """Return one reduction over another, 0 if the other is not positive, or ``None`` if there are not both."""
+    if part is None or whole is None or part.reduction is None or whole.reduction is None:
+        return None
+    return part.reduction.mean / whole.reduction.mean if whole.reduction.mean > 0 else 0.0
+
+
 def remarks(found: Reproduction, scenario: str) -> list[str]:
-    """What a reader of a scenario's table must know."""
-    rows = {row.controller: row for row in found.of(scenario)}
+    """Return notes for the reader of the table of a scenario."""
     lines = []
-    live, stiff = rows.get("robust"), rows.get("stiff")
     for name in ("robust", "walker"):
-        held, whole = rows.get(f"{name}:held"), rows.get(name)
-        if held is None or whole is None or held.reduction is None or whole.reduction is None:
-            continue
-        share = held.reduction.mean / whole.reduction.mean if whole.reduction.mean > 0 else float("nan")
-        lines.append(
-            f"`{name}`: with the reached posture held before the impact {reduction_text(held)} remain of "
-            f"{reduction_text(whole)}: "
-            + ("most of it is posture." if share > 0.5 else "most of it is the term's stiffness, not the posture.")
-        )
+        held, whole = found.row(scenario, f"{name}:held"), found.row(scenario, name)
+        share = _share(held, whole)
+        if share is not None:
+            why = "posture" if share > 0.5 else "the stiffness of the term, not the posture"
+            lines.append(
+                f"`{name}`: with the reached posture held before the impact, {reduction_text(held)} remain of "
+                f"{reduction_text(whole)}. Most of it is {why}."
+            )
+    live, stiff = found.row(scenario, "robust"), found.row(scenario, "stiff")
     if stiff is not None and live is not None and stiff.reduction is not None and live.reduction is not None:
         more = "more" if stiff.reduction.mean > live.reduction.mean else "less"
         lines.append(
-            f"A nominal controller as stiff as the term, `stiff`, gives {reduction_text(stiff)}, {more} than it."
+            f"`stiff`, a nominal controller as stiff as the term, gives {reduction_text(stiff)}, which is {more}."
         )
-    for row in rows.values():
+    for row in found.of(scenario):
         if not row.rested:
-            lines.append(f"`{row.controller}` does not come to rest: its own motion is in what is measured.")
+            lines.append(f"`{row.controller}` does not come to rest, so the metrics contain its own motion.")
         if row.stops:
             lines.append(f"`{row.controller}` reaches the stops of {markdown(', '.join(row.stops))}.")
         if row.failed:
@@ -185,46 +177,50 @@ def remarks(found: Reproduction, scenario: str) -> list[str]:
 
 
 def interval_text(value: Interval, digits: int = 3) -> str:
-    """``mean ± half width``, the mean with so many digits and the half width with its decimals.
+    """Return ``mean ± half width`` with a number of significant digits of the mean.
 
-    From fewer than three samples no half width is shown: it would say more of Student's t than of them.
+    There is no half width for fewer than three samples, because it would say more about Student's t than about them.
     """
     decimals = max(0, digits - 1 - int(np.floor(np.log10(abs(value.mean))))) if value.mean else 0
-    decimals = min(decimals, _DECIMALS)
-    text = f"{value.mean:.{decimals}f}"
-    return text if value.half_width is None or value.samples < 3 else f"{text} ± {value.half_width:.{decimals}f}"
-
-
-def reduction_text(row: Row | None) -> str:
-    """A reduction in percent."""
-    return percent(None if row is None or row.controller == "nominal" else row.reduction)
+    return _plus_minus(value, min(decimals, _DECIMALS))
 
 
 def percent(value: Interval | None, unit: str = " %") -> str:
-    """A share in percent."""
-    if value is None:
-        return "–"
-    half = value.half_width if value.samples > 2 else None
+    """Return a share in percent."""
+    return "–" if value is None else _plus_minus(value, 1, 100) + unit
+
+
+def _plus_minus(value: Interval, decimals: int, factor: int = 1) -> str:
     # Adding zero turns -0.0 into 0.0.
-    return f"{round(100 * value.mean, 1) + 0.0:.1f}" + ("" if half is None else f" ± {100 * half:.1f}") + unit
+    text = f"{round(factor * value.mean, decimals) + 0.0:.{decimals}f}"
+    if value.half_width is None or value.samples < 3:
+        return text
+    return f"{text} ± {factor * value.half_width:.{decimals}f}"
+
+
+def reduction_text(row: Row | None) -> str:
+    """Return the reduction of a row in percent."""
+    return percent(None if row is None or row.controller == "nominal" else row.reduction)
 
 
 def status_text(row: Row) -> str:
-    """``completed``, or the gravest status and how many runs completed."""
+    """Return ``completed``, or the gravest status and how many runs completed."""
     return row.status if row.completed == row.runs else f"{row.status}, {row.completed} of {row.runs} completed"
 
 
 def targets_text(row: Row) -> str:
-    """Whether the targets are met, and which are not."""
+    """Return whether the targets are met, or which are not."""
     targets = targets_of(row)
     if targets is None:
         return ""
     return "met" if targets.met else "missed: " + ", ".join(targets.missed)
 
 
-def _misses(names: Sequence[str]) -> str:
-    return ", ".join(_MISSED[name] for name in names)
+def _missed(row: Row) -> str:
+    """Return the missed targets in words."""
+    targets = targets_of(row)
+    return "" if targets is None else targets.words
 
 
-def _q(row: Row | None) -> str:
+def _total(row: Row | None) -> str:
     return "–" if row is None or not row.metrics else interval_text(row.metrics["q_total_impact"])

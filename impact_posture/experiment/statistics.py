@@ -1,33 +1,30 @@
-"""Means over seeds with intervals, and reductions against the nominal controller, seed by seed."""
+"""Means over seeds with confidence intervals, and reductions against the nominal controller, seed by seed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
+from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.outcome import Outcome, gravest
 
 Document = dict[str, Any]
-# What a table shows of each controller.
-QUANTITIES = (
-    "q_total_impact", "q_total_impact_base", "q_total_impact_joints", "q_total_dwell", "q_total_recovery",
-    "peak_jump", "peak_jump_max", "peak_recovery", "peak_force", "saturation_inside", "saturation_outside",
-    "saturation_rotors", "relaxed_ticks", "failed_ticks", "slip",
-)  # fmt: skip
+# The metrics that have a mean and an interval.
+QUANTITIES = tuple(f.name for f in fields(Metrics) if f.name not in ("stops", "contacts", "contacts_asked", "rested"))
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with its 95 % confidence interval, Student's t.
+    """Mean with its 95 % confidence interval (Student's t).
 
     Attributes:
-        mean: Of the samples.
-        half_width: Of the interval; ``None`` from one sample.
-        samples: How many.
+        mean: Mean of the samples.
+        half_width: Half width of the interval, ``None`` for one sample.
+        samples: Number of samples.
     """
 
     mean: float
@@ -36,38 +33,32 @@ class Interval:
 
     @staticmethod
     def of(values: Sequence[float]) -> Interval:
-        """Of at least one sample."""
+        """Return the interval of at least one sample."""
         n = len(values)
-        mean = float(np.mean(values))
-        if n < 2:
-            return Interval(mean, None, n)
-        return Interval(mean, float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / np.sqrt(n)), n)
-
-    def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        return {"mean": self.mean, "half_width": self.half_width, "samples": self.samples}
+        half_width = float(stats.t.ppf(0.975, n - 1) * stats.sem(values)) if n > 1 else None
+        return Interval(float(np.mean(values)), half_width, n)
 
 
 @dataclass(frozen=True)
 class Row:
-    """A controller in a scenario, over all seeds.
+    """Results of a controller in a scenario, over all seeds.
 
     Attributes:
-        scenario: Name.
-        controller: Label.
-        status: The gravest of its runs'; ``completed`` if all are.
-        runs: How many there are.
-        completed: How many of them completed.
-        failed: What became of the others, a line each.
-        metrics: Of the completed runs, by name of :data:`QUANTITIES`; empty if there is none.
-        reduction: Of ``q_total_impact`` against nominal with the same seed, a share; ``None`` without one, or where
-            not every run of both completed.
-        recovery: The same of ``q_total_recovery``.
-        change: Of the other quantities likewise, as differences to nominal.
-        stops: Joints that reached a position limit within an impact window in any run.
+        scenario: Name of the scenario.
+        controller: Label of the controller.
+        status: ``completed`` if all runs completed, else the gravest status.
+        runs: Number of runs.
+        completed: Number of runs that completed.
+        failed: Reason why a run did not complete, one line each.
+        metrics: Means of the completed runs, by name of :data:`QUANTITIES`.  Empty if no run completed.
+        reduction: Reduction of ``q_total_impact`` against nominal with the same seed, a share.  ``None`` for no
+            nominal runs, or if a run of either controller did not complete.
+        recovery: Reduction of ``q_total_recovery``.
+        change: Differences of all quantities to nominal, under the same conditions.
+        stops: Joints that reached a position limit within an impact window of any run.
         rested: Whether the robot was at rest before every push.
-        H: Just before the impacts, mean.
-        ratio: Measured jump over the rigid model's frictionless one, mean.
+        H: Mean of H just before the impacts.
+        ratio: Mean ratio of the measured jump to the frictionless jump of the rigid model.
     """
 
     scenario: str
@@ -85,28 +76,9 @@ class Row:
     H: float | None
     ratio: float | None
 
-    def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        return {
-            "scenario": self.scenario,
-            "controller": self.controller,
-            "status": self.status,
-            "runs": self.runs,
-            "completed": self.completed,
-            "failed": list(self.failed),
-            "metrics": {name: value.to_dict() for name, value in self.metrics.items()},
-            "reduction": None if self.reduction is None else self.reduction.to_dict(),
-            "recovery": None if self.recovery is None else self.recovery.to_dict(),
-            "change": {name: value.to_dict() for name, value in self.change.items()},
-            "stops": list(self.stops),
-            "rested": self.rested,
-            "H": self.H,
-            "ratio": self.ratio,
-        }
-
 
 def value_of(document: Document, quantity: str) -> float:
-    """A quantity of a run's document."""
+    """Return a quantity of the document of a run."""
     metrics = document["metrics"]
     if quantity.startswith("saturation_"):
         return float(metrics["saturation_s"][quantity.removeprefix("saturation_")])
@@ -114,7 +86,7 @@ def value_of(document: Document, quantity: str) -> float:
 
 
 def fate(document: Document) -> str:
-    """What became of a run that did not complete, and when, in words: the first event of the gravest kind."""
+    """Return the first event of the gravest kind in a run that did not complete, with its time."""
     status = str(document["status"])
     first = next(event for event in document["events"] if event["status"] == status)
     sign = f" (push {first['sign']:+d})" if len(document["runs"]) > 1 else ""
@@ -123,25 +95,26 @@ def fate(document: Document) -> str:
 
 
 def row_of(scenario: str, controller: str, own: Sequence[Document], nominal: Sequence[Document]) -> Row:
-    """Gather the runs of one controller.
+    """Summarize the runs of a controller.
 
     Args:
-        scenario: Name.
-        controller: Label.
-        own: Its documents.
-        nominal: Those of the nominal controller, paired by seed; empty: no comparison.
+        scenario: Name of the scenario.
+        controller: Label of the controller.
+        own: Documents of its runs.
+        nominal: Documents of the nominal controller, paired by seed.  Without them there is no comparison.
     """
     good = [d for d in own if d["status"] == "completed"]
     base = {d["seed"]: d for d in nominal}
     pairs = [(d, base[d["seed"]]) for d in own if d["seed"] in base]
-    reduction, recovery, change = None, None, {}
-    # The seeds that are left where others fell are no fair sample.
-    if pairs and len(good) == len(own) and all(n["status"] == "completed" for _, n in pairs):
-        reduction, recovery = (
-            Interval.of([1 - value_of(d, name) / value_of(n, name) for d, n in pairs])
-            for name in ("q_total_impact", "q_total_recovery")
-        )
-        change = {name: Interval.of([value_of(d, name) - value_of(n, name) for d, n in pairs]) for name in QUANTITIES}
+    # The seeds that are left after some runs failed are no fair sample.
+    fair = bool(pairs) and len(good) == len(own) and all(n["status"] == "completed" for _, n in pairs)
+
+    def paired(name: str, compare: Callable[[float, float], float]) -> Interval:
+        return Interval.of([compare(value_of(d, name), value_of(n, name)) for d, n in pairs])
+
+    def reduction(name: str) -> Interval | None:
+        return paired(name, lambda mine, nominal: 1 - mine / nominal) if fair else None
+
     return Row(
         scenario=scenario,
         controller=controller,
@@ -150,9 +123,9 @@ def row_of(scenario: str, controller: str, own: Sequence[Document], nominal: Seq
         completed=len(good),
         failed=tuple(f"seed {d['seed']}: {fate(d)}" for d in own if d["status"] != "completed"),
         metrics={name: Interval.of([value_of(d, name) for d in good]) for name in QUANTITIES} if good else {},
-        reduction=reduction,
-        recovery=recovery,
-        change=change,
+        reduction=reduction("q_total_impact"),
+        recovery=reduction("q_total_recovery"),
+        change={name: paired(name, lambda mine, nominal: mine - nominal) for name in QUANTITIES} if fair else {},
         stops=tuple(dict.fromkeys(stop for d in good for stop in d["metrics"]["stops"])),
         rested=all(d["metrics"]["rested"] for d in good),
         H=_mean([d["prediction"]["H"] for d in good]),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
-from impact_posture.dynamics.tree import ByJoint, PointOnLink, Product, Response, Tree, Wrench
+from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Wrench
 from impact_posture.impact.contact import support_inertia
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.robot.robot import Robot
@@ -32,14 +32,14 @@ class ImpactKernel:
         case: Robot, contact, metric and supports.
         q: Configuration symbols, shape (nq, 1).
         n: Normal symbols, shape (3, 1), in the axes of the contact's normal.
-        repeated_limbs: Branches whose expressions get one form
+        limbs: Repeated limbs whose expressions get one form
             (:class:`~impact_posture.dynamics.repeated_limbs.RepeatedLimbs`).
     """
 
-    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, repeated_limbs: RepeatedLimbs | None = None) -> None:
+    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:
         self.case, self.metric, self.q, self.n = case, case.metric, q, n
         extra = support_inertia(case.robot, case.supports, case.compliance)
-        self.tree = Tree(case.robot.model, q, extra_inertia=extra, repeated_limbs=repeated_limbs)
+        self.tree = Tree(case.robot.model, q, extra_inertia=extra, limbs=limbs)
         self.point = case.point
         self._supported = bool(case.supports)
 
@@ -60,7 +60,7 @@ class ImpactKernel:
 
     def _alike(self, wrench: Wrench) -> list[Wrench]:
         """Return the wrench, or for a repeated limb a wrench on each limb of the group, zero on all but its own."""
-        limbs, joint = self.tree.repeated_limbs, wrench.point.joint
+        limbs, joint = self.tree.limbs, wrench.point.joint
         if limbs is None or joint not in limbs.places:
             return [wrench]
         point = wrench.point
@@ -71,7 +71,7 @@ class ImpactKernel:
                 wrench.moment * on,
                 wrench.in_frame,
             )
-            for link in limbs.of(joint)
+            for link in limbs.counterparts(joint)
         ]
 
     # ---- H, G and what follows from them ----------------------------------------------------------------------
@@ -189,7 +189,7 @@ class ImpactKernel:
 
     def _weigh(self, a: ca.SX, velocities: ByJoint) -> ca.SX:
         if self.metric.kind == "kinetic":
-            return self.tree.own_mass_times(a, velocities)
+            return self.tree.mass_times(a, velocities, extra=False)
         if self.metric.weights is None:
             return a
         return self.tree.by_joint("weight", self.metric.diagonal(self.tree.nv)) * a
@@ -198,7 +198,7 @@ class ImpactKernel:
         """``∂_q aᵀWa`` with ``a`` held fixed: zero unless W = M."""
         if self.metric.kind != "kinetic":
             return ca.SX.zeros(self.tree.nv)
-        return self.tree.bracket_gradient(products=[Product(velocities, velocities, extra=False)])
+        return self.tree.energy_gradient(velocities)
 
     def _force(self, impulse: ca.SX) -> Wrench:
         return Wrench(self.point, impulse, ca.SX.zeros(3))

@@ -127,7 +127,7 @@ class NormalCone:
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Return the expressions of a single impact along the worst normal, which is held fixed (Danskin)."""
-        worst = ImpactKernel(k.case, k.q, self.worst_normal_expression(k), k.tree.repeated_limbs)
+        worst = ImpactKernel(k.case, k.q, self.worst_normal_expression(k), k.tree.limbs)
         return self.kind.expressions(worst)
 
     def worst_normal_expression(self, k: ImpactKernel) -> ca.SX:

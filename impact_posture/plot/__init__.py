@@ -1,9 +1,8 @@
-"""Pictures of a result: :func:`draw_all` writes them, the ``*_figure`` functions return matplotlib figures.
+"""Figures of a result: :func:`draw_all` writes them, the ``*_figure`` functions return matplotlib figures.
 
-Of simulated runs: :func:`draw_run`, :func:`draw_comparison`, :func:`draw_snapshots` and :func:`draw_bars`, from a
-:class:`RunView` of each run.
+Figures of simulated runs: :func:`draw_run`, :func:`draw_comparison`, :func:`draw_snapshots` and :func:`draw_bars`.
 
-Nothing here touches pyplot's global state or shows a window.
+The package does not change the global state of pyplot and shows no window.
 """
 
 from __future__ import annotations
@@ -14,11 +13,18 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from impact_posture.errors import NameNotFound
-from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, path_figure, tradeoff_figure
+from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, path_figures
 from impact_posture.plot.bars import Bar, bars_figure, draw_bars
-from impact_posture.plot.comparison import comparison_figure, controls_comparison_figure, draw_comparison
 from impact_posture.plot.robot_drawing import postures_figure
-from impact_posture.plot.run_figures import controls_figure, draw_run, joints_figure, metric_figure
+from impact_posture.plot.run_figures import (
+    comparison_figure,
+    controls_comparison_figure,
+    controls_figure,
+    draw_comparison,
+    draw_run,
+    joints_figure,
+    metric_figure,
+)
 from impact_posture.plot.run_view import RunView, Span
 from impact_posture.plot.snapshots import draw_snapshots, snapshots_figure
 from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save
@@ -56,20 +62,23 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "ellipsoid": ellipsoid_figure.ellipsoid_figure,
     "postures": postures_figure,
     "jump": jump_figure.jump_figure,
-    "nullspace": path_figure.path_figure,
+    "nullspace": path_figures.path_figure,
     "classical": classical_figure.classical_figure,
-    "tradeoff": tradeoff_figure.tradeoff_figure,
+    "tradeoff": path_figures.tradeoff_figure,
 }
 
 
 def drawable(view: ResultView) -> list[str]:
-    """Names of :data:`FIGURES` that the view has data for (``nullspace``: a path; ``tradeoff``: a trade-off)."""
+    """Return the names of the figures that the view has data for.
+
+    ``nullspace`` needs a path, ``tradeoff`` needs a trade-off.
+    """
     lacking = {"nullspace": view.path is None, "tradeoff": view.tradeoff is None}
     return [name for name in FIGURES if not lacking.get(name)]
 
 
 class FigureNotFound(NameNotFound):
-    """There is no figure of that name."""
+    """The name of a figure is unknown."""
 
     kind = "figure"
 
@@ -85,12 +94,12 @@ def draw_all(
     Args:
         view: The result.
         out: Folder, made if missing; files of the same name are replaced.
-        formats: Of ``png``, ``svg`` and ``pdf``.
+        formats: Some of ``png``, ``svg`` and ``pdf``.
         only: Names of :data:`FIGURES` to draw; all of :func:`drawable` if ``None``.
 
     Raises:
         FigureNotFound: An unknown name in ``only``.
-        InputError: An unknown format, or a figure asked for that the view has no data for.
+        InputError: An unknown format, or a figure in ``only`` that the view has no data for.
         OutputError: The folder or a file cannot be written.
     """
     wanted = check_formats(formats)

@@ -1,4 +1,4 @@
-"""Figure ``bars``: motion during impacts of every controller, a panel a scenario, beside the paper's numbers."""
+"""Figure ``bars``: motion during impacts for each controller and scenario, beside the numbers of the paper."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from matplotlib.patches import Patch
 
 from impact_posture.errors import InputError
 from impact_posture.escape import plot_label
-from impact_posture.plot.run_axes import subplots
 from impact_posture.plot.style import (
     AFTER_BAR,
     BEFORE_BAR,
@@ -25,15 +24,14 @@ from impact_posture.plot.style import (
     framed,
     save,
     shared_legend,
-    style,
 )
 from impact_posture.plot.view import number
 
 NOTES = (
     "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper prints "
-    "no gains: its numbers are to be compared with each other.",
+    "no gains. Compare its numbers with each other only.",
 )
-# The paper's number is on the axis if it is at most so many times our largest.
+# Largest ratio of a number of the paper to the largest mean, at which the axis includes it.
 _FAR = 2.0
 
 
@@ -42,11 +40,11 @@ class Bar:
     """``q_total_impact`` of a controller in a scenario.
 
     Attributes:
-        scenario: Name of the scenario: rows of one scenario share a panel.
+        scenario: Name of the scenario. Rows of the same scenario share a panel.
         controller: Name of the controller.
-        mean: ``∫‖ν‖dt`` over the impact windows, mean over the runs; NaN where no run came to its end.
-        half_width: Of the 95 % interval; NaN or 0 where there is none (one run).
-        paper: The paper's number for the same controller, if it has one.
+        mean: ``∫‖ν‖dt`` over the impact windows, mean over the runs; NaN where no run completed.
+        half_width: Half of the 95 % interval; NaN or 0 for a single run.
+        paper: Number of the paper for the same controller, if there is one.
     """
 
     scenario: str
@@ -67,7 +65,9 @@ def draw_bars(rows: Sequence[Bar], out_dir: Path, formats: Iterable[str] = DEFAU
 
 
 def bars_figure(rows: Sequence[Bar]) -> Figure:
-    """Draw lying bars with intervals in the order given, two panels a line; marks show the paper's numbers.
+    """Draw horizontal bars with intervals in the given order, in rows of two panels.
+
+    Marks show the numbers of the paper.
 
     Raises:
         InputError: No rows.
@@ -81,9 +81,8 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
     heights = [0.55 + 0.3 * max(len(group) for group in line) for line in lines]
     lead = "Motion during impacts, ∫‖ν‖dt over the impact windows"
     facts = ["less is better", "the same windows for every controller", "bars: ours, mean and 95 % interval"]
-    with style():
-        figure, body = framed(lead, ["  ·  ".join(facts)], sum(heights) + 0.4, NOTES)
-        panels = subplots(body, len(lines), columns, height_ratios=heights)
+    with framed(lead, ["  ·  ".join(facts)], sum(heights) + 0.4, NOTES) as (figure, body):
+        panels = body.subplots(len(lines), columns, squeeze=False, height_ratios=heights)
         for axes in panels.flat[len(groups) :]:
             axes.set_visible(False)
         for axes, name, group in zip(panels.flat, scenarios, groups, strict=False):
@@ -95,7 +94,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
 def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
     ours = max((row.mean + _wide(row) for row in group if np.isfinite(row.mean)), default=0.0)
     papers = [row.paper for row in group if row.paper is not None]
-    # The paper's robot is another one: its numbers must not press ours together.
+    # The robot of the paper differs. Its numbers must not shorten the bars.
     near = [paper for paper in papers if paper <= _FAR * ours or ours == 0]
     end = 1.08 * (max([ours, *near]) or 1.0)
     for place, row in enumerate(group):
@@ -105,7 +104,7 @@ def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
                 axes.errorbar(row.mean, place, xerr=_wide(row), color=INK, linewidth=1.0, capsize=2.5, zorder=4)
         if row.paper is not None:
             axes.plot(min(row.paper, 0.975 * end), place, **(_PAPER if row.paper in near else _BEYOND))
-        # The numbers right of the panel, clear of the bars.
+        # The numbers stand right of the panel, clear of the bars.
         look = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "va": "center", "fontsize": 7}
         axes.annotate(_words(row), (1.0, place), (5, 0), **look)
     axes.set_xlim(0.0, end)
@@ -126,12 +125,12 @@ _BEYOND = _PAPER | {"marker": ">", "markersize": 6}
 
 
 def _wide(row: Bar) -> float:
-    """Half of the interval; 0 where there is none."""
+    """Return half of the interval, 0 without an interval."""
     return row.half_width if np.isfinite(row.half_width) else 0.0
 
 
 def _words(row: Bar) -> str:
-    """Mean and interval with the digits that the interval supports, and the paper's number."""
+    """Format mean and interval with the digits that the interval supports, and the number of the paper."""
     paper = f"\npaper {number(row.paper)}" if row.paper is not None else ""
     if not np.isfinite(row.mean):
         return "no run ended" + paper

@@ -1,7 +1,8 @@
-"""Figure ``classical``: the velocity, force and impact ellipsoids over each other, each in its own stated unit."""
+"""Figure ``classical``: velocity, force and impact ellipsoids in the same panels, each in its own unit."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from impact_posture.plot.ellipsoid_figure import draw_normals, normal_label, normals, square_panel
 from impact_posture.plot.shapes import COORDINATE_PLANES, Plane, Vector, polar, shadow
-from impact_posture.plot.style import BLUE, GREEN, INK, VERMILLION, framed, shared_legend, style
+from impact_posture.plot.style import BLUE, GREEN, INK, VERMILLION, framed, shared_legend
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
 NOTES = (
@@ -26,72 +27,68 @@ _LOOKS: dict[str, dict[str, Any]] = {
     "force": {"color": VERMILLION, "linestyle": (0, (1, 1.2)), "linewidth": 1.6, "zorder": 3.6},
     "impact": {"color": BLUE, "linestyle": "-", "linewidth": 1.8, "zorder": 3.0},
 }
-# How far an ellipsoid without end is drawn, in units of the panel.
+# Half-length of an unbounded ellipsoid as drawn, in units of the panel.
 _ENDLESS = 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """One kind of ellipsoid in both postures.
+    """Kind of ellipsoid in both postures.
 
     Attributes:
         name: ``velocity``, ``force`` or ``impact``.
-        formula: Of its matrix.
+        formula: Formula of its matrix.
         unit: Unit of its semi-axes.
-        scale: What it is divided by: its longest semi-axis before (of those that end).
-        matrices: Before and after, divided by ``scale²``; cut far outside of the panel where they have no end.
-        finite: The same without the directions that have no end.
-        endless: Directions without end, columns, before and after.
+        scale: Its longest finite semi-axis before, by which it is divided.
+        matrices: Before and after, divided by ``scale²``, cut far outside of the panel where unbounded.
+        finite: The same without the unbounded directions.
+        endless: Unbounded directions as columns, before and after.
     """
 
     name: str
     formula: str
     unit: str
     scale: float
-    matrices: tuple[Vector, Vector]
-    finite: tuple[Vector, Vector]
-    endless: tuple[Vector, Vector]
+    matrices: Sequence[Vector]
+    finite: Sequence[Vector]
+    endless: Sequence[Vector]
 
     @property
     def label(self) -> str:
-        """Legend entry, scale included."""
+        """Legend entry with the scale."""
         return f"{self.name}  {self.formula}:  1 = {number(self.scale)} {self.unit}"
 
 
 def kinds_of(view: ResultView) -> list[Kind]:
-    """The three kinds, scaled to be compared."""
+    """Return the three kinds of ellipsoids, scaled for comparison."""
     products = [J @ J.T for J in (view.jacobian(view.q_initial), view.jacobian(view.q_optimal))]
     impact = [view.before.ellipsoid, view.after.ellipsoid]
-    none = (np.zeros((3, 0)), np.zeros((3, 0)))
+    bounded = np.zeros((3, 0))
     found = []
     for name, formula, unit, matrices, dual in (
         ("velocity", "J Jᵀ", "m/s", products, False),
         ("force", "(J Jᵀ)⁻¹", "N", products, True),
         ("impact", "Λ$_c$", f"{jump_unit(view)}/(N·s)", impact, False),
     ):
-        finite = [polar(matrix, 0.0)[0] for matrix in matrices] if dual else matrices
+        finite = [polar(matrix, 0.0)[0] if dual else matrix for matrix in matrices]
         scale = _longest(finite[0]) or _longest(finite[1]) or 1.0
-        drawn, endless = finite, none
-        if dual:
-            cut = [polar(matrix, _ENDLESS * scale) for matrix in matrices]
-            drawn, endless = [matrix for matrix, _ in cut], (cut[0][1], cut[1][1])
-        one, two = (matrix / scale**2 for matrix in drawn)
-        first, second = (matrix / scale**2 for matrix in finite)
-        found.append(Kind(name, formula, unit, scale, (one, two), (first, second), endless))
+        cut = [polar(matrix, _ENDLESS * scale) if dual else (matrix, bounded) for matrix in matrices]
+        drawn = [matrix / scale**2 for matrix, _ in cut]
+        shown = [matrix / scale**2 for matrix in finite]
+        found.append(Kind(name, formula, unit, scale, drawn, shown, [endless for _, endless in cut]))
     return found
 
 
 def classical_figure(view: ResultView) -> Figure:
     """Draw the shadows of ``JJᵀ``, ``(JJᵀ)⁻¹`` and ``Λ_c`` on the coordinate planes: before above, after below.
 
-    One scale for all panels, and one unit for each kind.  Where ``JJᵀ`` is singular the force ellipsoid has no end in
-    some direction: it runs off the panel, which says so.
+    All panels share a scale, and each kind has its own unit.  Where ``JJᵀ`` is singular the force ellipsoid is
+    unbounded: it leaves the panel, whose label says so.
     """
     kinds = kinds_of(view)
     limit = 1.18 * max(1.0, *(_longest(matrix) for kind in kinds for matrix in kind.finite))
     named = normals(view.before, view.after)
-    with style():
-        figure, body = framed(*header_lines(view), 5.2, NOTES)
+    with framed(*header_lines(view), 5.2, NOTES) as (figure, body):
         panels = body.subplots(2, 3)
         for row, word, which in ((panels[0], "before", 0), (panels[1], "after", 1)):
             own = named[min(which, len(named) - 1)]
@@ -114,7 +111,7 @@ def _longest(matrix: Vector) -> float:
 
 
 def _unbounded(plane: Plane, kind: Kind, which: int) -> str:
-    """A line where a kind has no end in the plane."""
+    """Return a line that says where a kind is unbounded in the plane."""
     directions = kind.endless[which]
     seen = np.linalg.svd(plane.axes @ directions, compute_uv=False) if directions.shape[1] else np.zeros(0)
     rank = int((seen > 1e-6).sum())

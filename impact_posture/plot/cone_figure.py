@@ -1,28 +1,30 @@
-"""The cone of an uncertain normal and the worst normals in it, as shadows and in space."""
+"""Cone of an uncertain normal and its worst normals, as shadows and in 3-D."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from impact_posture.impact.cone import WorstNormal
+from impact_posture.plot.labels import draw_arrow
 from impact_posture.plot.shapes import Plane, Vector, cone_rim, cone_shadow, half_width
 from impact_posture.plot.style import GRAY, PALE, WORST_AFTER, WORST_BEFORE
 from impact_posture.plot.view import ResultView, number
 
-# How far arrows reach, as a part of the panel's limit; a worst normal on the cone's edge ends on the rim.
+# Length of arrows as a part of the limit of the panel. A worst normal on the edge of the cone ends on the rim.
 REACH = 0.92
 
 
 def has_cone(view: ResultView) -> bool:
-    """Whether the view's normal is uncertain."""
+    """Return whether the normal is uncertain."""
     return view.objective.normal_cone_deg > 0
 
 
 def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) -> None:
-    """Draw the shadow of the cone (of each of two, where n turned) and the worst normals before and after."""
+    """Draw the shadow of the cone (two cones where n turned) and the worst normals before and after."""
     if not has_cone(view):
         return
     for n in _axes_of_cones(view):
@@ -31,14 +33,13 @@ def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) ->
         axes.plot(*outline, color=GRAY, linewidth=0.6, zorder=0.6)
     for word, found, _, line in _worst(view):
         for normal in found.normals:
-            tip = plane.axes @ normal * REACH * limit
-            arrow = {"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8, **line}
-            # The dashes on top, as with the ellipsoids.
-            axes.annotate("", tuple(tip), (0, 0), arrowprops=arrow, zorder=4.6 if word == "before" else 4.5)
+            # The dashes lie on top, as with the ellipsoids.
+            zorder = 4.6 if word == "before" else 4.5
+            draw_arrow(axes, np.zeros(2), plane.axes @ normal * REACH * limit, zorder, mutation_scale=8, **line)
 
 
 def draw_uncertainty_3d(axes: Any, view: ResultView, limit: float) -> None:
-    """Draw the cone's surface and rim, and the worst normals."""
+    """Draw the surface and rim of the cone, and the worst normals."""
     if not has_cone(view):
         return
     for n in _axes_of_cones(view):
@@ -52,7 +53,7 @@ def draw_uncertainty_3d(axes: Any, view: ResultView, limit: float) -> None:
 
 
 def uncertainty_handles(view: ResultView) -> list[Any]:
-    """Legend entries: the cone, and the worst normals with the half-width of Λ_c along them."""
+    """Return the legend entries of the cone and of the worst normals with the half-width of Λ_c along them."""
     if not has_cone(view):
         return []
     cone = f"cone of {view.objective.normal_cone_deg:g}° about n"
@@ -66,15 +67,15 @@ def uncertainty_handles(view: ResultView) -> list[Any]:
 
 
 def _axes_of_cones(view: ResultView) -> list[Vector]:
-    """World axis of the cone, or both where it turned with the contact frame."""
+    """Return the world axis of the cone, or both axes where it turned with the contact frame."""
     before, after = view.before.normal, view.after.normal
     return [after] if abs(before - after).max() < 1e-3 else [before, after]
 
 
 def _worst(view: ResultView) -> list[tuple[str, WorstNormal, Vector, dict[str, Any]]]:
-    """Name, worst normals, ellipsoid and line of each posture that has them."""
+    """Return name, worst normals, ellipsoid and line of each posture that has worst normals."""
     found = [
-        ("before", view.worst_before, view.before.ellipsoid, WORST_BEFORE),
-        ("after", view.worst_after, view.after.ellipsoid, WORST_AFTER),
+        ("before", view.worst[0], view.before.ellipsoid, WORST_BEFORE),
+        ("after", view.worst[1], view.after.ellipsoid, WORST_AFTER),
     ]
     return [(word, worst, ellipsoid, line) for word, worst, ellipsoid, line in found if worst is not None]

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.plot.cone_figure import draw_uncertainty, draw_uncertainty_3d, has_cone, uncertainty_handles
-from impact_posture.plot.labels import Label, draw_end_on
+from impact_posture.plot.labels import Label, draw_arrow, draw_end_on
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
     Plane,
@@ -24,11 +24,11 @@ from impact_posture.plot.shapes import (
     upright_plane,
 )
 from impact_posture.plot.space import Space, frame_space
-from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, framed, style
+from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, framed
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
-_FREE = "Free (thin): the same robot as if its feet were not held."
-_CONE = "The objective counts the worst normal of the cone; equally bad ones are all drawn."
+_FREE = "Free (thin): the same robot with feet that are not held."
+_CONE = "The objective counts the worst normal of the cone. All equally bad normals are drawn."
 NOTES = (
     "The half-width of Λ$_c$ along any direction is the size ‖Δν‖ of the velocity jump that an impulse of 1 N·s "
     "along it causes. Planes show shadows (projections), not slices; √H is the distance of the tangent planes along "
@@ -38,7 +38,7 @@ NOTES = (
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """One posture's curve: its name in the legend, quantities, line, and whether the feet stay."""
+    """Curve of a posture: name in the legend, quantities, line, and whether the feet are free."""
 
     word: str
     found: ImpactQuantities
@@ -55,15 +55,13 @@ def ellipsoid_figure(view: ResultView) -> Figure:
     normals in it.
     """
     states = [_State("before", view.before, BEFORE), _State("after", view.after, AFTER)]
-    for word, found, line in (("before", view.free_before, FREE_BEFORE), ("after", view.free_after, FREE_AFTER)):
-        if found is not None:
-            states.append(_State(f"{word}, free", found, line, free=True))
+    for word, found, line in zip(("before", "after"), view.free, (FREE_BEFORE, FREE_AFTER), strict=False):
+        states.append(_State(f"{word}, free", found, line, free=True))
     unit = f"{jump_unit(view)}/(N·s)"
     limit = common_limit([state.found.ellipsoid for state in states])
     n = view.after.normal
-    notes = " ".join([*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if has_cone(view) else [])])
-    with style():
-        figure, body = framed(*header_lines(view), 5.8, [notes])
+    notes = [*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if has_cone(view) else [])]
+    with framed(*header_lines(view), 5.8, notes) as (figure, body):
         grid = body.add_gridspec(2, 3, height_ratios=[1, 1.4])
         oblique = not any(plane.contains(n) for plane in COORDINATE_PLANES)
         panels = [(grid[0, column], plane) for column, plane in enumerate(COORDINATE_PLANES)]
@@ -81,7 +79,7 @@ def ellipsoid_figure(view: ResultView) -> Figure:
 
 
 def common_limit(matrices: list[Vector]) -> float:
-    """Half the side of a cube in which all the ellipsoids lie, with some air; 1 if they are all points."""
+    """Return half the side of a cube that holds all ellipsoids with a margin; 1 if all are points."""
     widest = max(float(np.linalg.eigvalsh(matrix)[-1]) for matrix in matrices)
     return 1.18 * float(np.sqrt(widest)) if widest > 0 else 1.0
 
@@ -100,15 +98,14 @@ def square_panel(axes: Any, plane: Plane, limit: float, unit: str) -> None:
 
 
 def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Vector]], limit: float) -> None:
-    """Draw each normal's projection as an arrow, or a dot (towards the reader) or cross (away) where it has none."""
+    """Draw the projection of each normal as an arrow, or as a dot (towards the reader) or cross (away)."""
     for name, n in named:
         flat = plane.axes @ n
         if np.linalg.norm(flat) < 0.05:
             draw_end_on(axes, name, plane, n, np.zeros(2))
             continue
         tip = flat * limit * 0.92
-        arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0}
-        axes.annotate("", tuple(tip), (0, 0), arrowprops=arrow, zorder=5)
+        draw_arrow(axes, np.zeros(2), tip, 5, color=INK, linewidth=1.1)
         axes.add_artist(Label(name, tip, (flat[0], flat[1])))
 
 
@@ -121,7 +118,7 @@ def _panel(axes: Any, plane: Plane, states: list[_State], limit: float, unit: st
 
 
 def _tangents(axes: Any, plane: Plane, state: ImpactQuantities, line: dict[str, Any], limit: float) -> None:
-    """The two lines on which the shadow ends along n."""
+    """Draw the two tangent lines of the shadow across n."""
     flat = plane.axes @ state.normal
     flat = flat / np.linalg.norm(flat)
     along = np.array([-flat[1], flat[0]]) * 3 * limit
@@ -132,14 +129,14 @@ def _tangents(axes: Any, plane: Plane, state: ImpactQuantities, line: dict[str, 
 
 
 def normals(before: ImpactQuantities, after: ImpactQuantities) -> list[tuple[str, Vector]]:
-    """Name and direction of n: one, or two where it turned with the contact frame."""
+    """Return name and direction of n, or of both normals where n turned with the contact frame."""
     if np.linalg.norm(before.normal - after.normal) < 1e-3:
         return [("n", after.normal)]
     return [("n₀", before.normal), ("n₁", after.normal)]
 
 
 def normal_label(named: list[tuple[str, Vector]]) -> str:
-    """What the legend says of :func:`normals`."""
+    """Return the legend entry of :func:`normals`."""
     return "n, out of the surface" if len(named) == 1 else "n₀ before, n₁ after"
 
 
@@ -183,6 +180,6 @@ def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> Non
         radii = np.sqrt(np.maximum(np.linalg.eigvalsh(state.found.ellipsoid)[::-1], 0.0))
         largest = max(float(radii[0]), 1e-300)
         rows.append(f"{state.word}  " + "  ".join(number(r if r > 1e-7 * largest else 0.0) for r in radii))
-    # Below the legend, however long that is.
+    # Below the legend, whatever its length.
     look = {"xycoords": legend, "textcoords": "offset points", "va": "top", "fontsize": 7.0, "linespacing": 1.4}
     axes.annotate("\n".join(rows), (0, 0), (0, -8), **look)

@@ -11,9 +11,10 @@ from matplotlib.patches import Patch
 
 from impact_posture.escape import plot_label
 from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.plot.shapes import Vector
-from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, BLUE, INK, VERMILLION, framed, shared_legend, style
-from impact_posture.plot.view import ResultView, header_lines, jump_unit, number, velocity_units
+from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, BLUE, INK, VERMILLION, framed, shared_legend
+from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
 _ROW = 0.17
 
@@ -39,8 +40,7 @@ def jump_figure(view: ResultView) -> Figure:
         ),
     ]
     heights = [0.42 + _ROW * len(indices) for _, indices, _ in groups]
-    with style():
-        figure, body = framed(*header_lines(view), sum(heights) + 0.75, _notes(view, stuck))
+    with framed(*header_lines(view), sum(heights) + 0.75, _notes(view, stuck)) as (figure, body):
         panels: Any = body.subplots(len(groups), 2, squeeze=False, sharey="row", height_ratios=heights)
         for row, (name, indices, unit) in zip(panels, groups, strict=True):
             names = [view.robot.tangent_names[k].removeprefix("base ") for k in indices]
@@ -58,8 +58,8 @@ def jump_figure(view: ResultView) -> Figure:
 
 
 def groups_of(view: ResultView) -> list[tuple[str, list[int], str]]:
-    """Entries of ν that share a panel: name, indices and unit."""
-    units = velocity_units(view.robot)
+    """Return the groups of entries of ν that share a panel: name, indices and unit."""
+    units = tangent_units(view.robot)
     base = 6 if view.robot.floating else 0
     groups = [("base,\nlinear", [0, 1, 2], "m/s"), ("base,\nangular", [3, 4, 5], "rad/s")] if base else []
     for name, unit in (("joints", "rad/s"), ("sliding\njoints", "m/s")):

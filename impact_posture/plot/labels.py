@@ -1,27 +1,29 @@
-"""Letters beside points: each goes to the nearest place around its point where nothing else is drawn."""
+"""Letters beside points, each at the nearest place around its point where nothing else is drawn."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 from mpl_toolkits.mplot3d import proj3d
 
 from impact_posture.plot.shapes import Plane, Vector
 
-# Distances from the point to try, points; directions to try; how far a letter stays from what is drawn, pixels.
+# Distances from the point (points) and directions to try; least distance of a letter from lines, pixels.
 _GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0, 36.0)
 _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
 _CLEAR = 2.0
+# Grids are lighter than ink, 0 (black) to 255. Thin lines between two pixels are gray.
+_INK = 205
 
 
 class Label(Annotation):
-    """A letter at a point of an axes, in data coordinates, shape (2,) or (3,); :func:`place_labels` finds its place.
+    """Letter at a point of an axes, in data coordinates, shape (2,) or (3,).
 
-    ``toward`` is the direction in the picture in which it stands best.
+    :func:`place_labels` finds its place.  ``toward`` is the preferred direction in the figure.
     """
 
     def __init__(
@@ -33,12 +35,18 @@ class Label(Annotation):
         )  # fmt: skip
         self.point = np.asarray(point, dtype=float)
         self.toward = toward
-        # Where it will stand is not known yet: the layout must not make room for it.
+        # Its place is not known yet, so that the layout must not make room for it.
         self.set_in_layout(False)
 
 
+def draw_arrow(axes: Any, tail: Vector, tip: Vector, zorder: float, **look: Any) -> None:
+    """Draw an arrow between two points of a panel, each of shape (2,)."""
+    look = {"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0} | look
+    axes.annotate("", tuple(tip), tuple(tail), arrowprops=look, zorder=zorder)
+
+
 def draw_end_on(axes: Any, name: str, plane: Plane, n: Vector, at: Vector, color: str = "black") -> None:
-    """Draw a normal across the picture plane as a dot (towards the reader) or a cross (away) in a ring."""
+    """Draw a normal across the plane of the figure as a dot (towards the reader) or a cross (away) in a ring."""
     toward = float(np.cross(plane.axes[0], plane.axes[1]) @ n)
     look = {"linestyle": "", "markeredgecolor": color, "zorder": 6.5}
     axes.plot(*at[:, None], marker="o", markersize=8, markerfacecolor="white", markeredgewidth=1, **look)
@@ -47,18 +55,22 @@ def draw_end_on(axes: Any, name: str, plane: Plane, n: Vector, at: Vector, color
 
 
 def place_labels(figure: Figure) -> None:
-    """Move the letters of a figure, which has its layout and has been drawn, to where nothing else is."""
-    for axes in figure.axes:
-        labels = [text for text in axes.texts if isinstance(text, Label)]
-        if not labels:
-            continue
-        ink = np.vstack([np.zeros((0, 2)), *_ink(axes)])
-        for label in labels:
-            ink = np.vstack([ink, _place(axes, label, ink)])
+    """Move the letters of a figure to places where nothing else is. The figure has been laid out."""
+    labels = [(axes, text) for axes in figure.axes for text in axes.texts if isinstance(text, Label)]
+    for _, label in labels:
+        label.set_visible(False)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    # Rows of the image count from the top. Grids and faint fills are lighter than ink.
+    image = np.asarray(canvas.buffer_rgba())[::-1, :, :3].min(axis=2)
+    ink: Vector = np.argwhere(image < _INK)[:, ::-1].astype(np.float64) + 0.5
+    for axes, label in labels:
+        label.set_visible(True)
+        ink = np.vstack([ink, _place(axes, label, ink)])
 
 
 def _place(axes: Any, label: Label, ink: Vector) -> Vector:
-    """Move one letter; return points of the place that it takes."""
+    """Move a letter; return points of the place that it takes."""
     point = label.point
     if len(point) == 3:
         point = np.array(proj3d.proj_transform(*point, axes.get_proj())[:2])
@@ -82,43 +94,7 @@ def _place(axes: Any, label: Label, ink: Vector) -> Vector:
     return _filled(place - half, place + half)
 
 
-def _ink(axes: Any) -> Iterator[Vector]:
-    """Points in pixels, at most a few apart, of all that is drawn in an axes but its grid and its letters."""
-    scale = axes.figure.dpi / 72
-    for line in axes.lines:
-        drawn = line.get_transform().transform(line.get_path().vertices)
-        if line.get_linestyle() not in ("None", " ", ""):
-            yield _along(drawn)
-        if line.get_marker() not in ("None", " ", "", None):
-            reach = line.get_markersize() * scale / 2
-            for center in drawn[np.isfinite(drawn).all(axis=1)]:
-                yield _filled(center - reach, center + reach)
-    arrows = [text.arrow_patch for text in axes.texts if getattr(text, "arrow_patch", None) is not None]
-    for patch in (*axes.patches, *arrows):
-        yield _along(patch.get_transform().transform_path(patch.get_path()).interpolated(8).vertices)
-    for collection in axes.collections:
-        transform = collection.get_transform()
-        for path in collection.get_paths():
-            yield _along(transform.transform(path.vertices))
-    for text in axes.texts:
-        if text.get_text() and not isinstance(text, Label):
-            box = text.get_window_extent()
-            yield _filled(box.min, box.max)
-
-
-def _along(points: Vector) -> Vector:
-    """Points at most two pixels apart along a line through ``points``, shape (n, 2)."""
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < 2:
-        return points
-    # Far outside of every panel is far enough.
-    points = np.clip(points, -1e4, 1e4)
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    s = np.linspace(0.0, way[-1], 2 + int(way[-1] / 2))
-    return np.stack([np.interp(s, way, points[:, k]) for k in (0, 1)], axis=1)
-
-
 def _filled(low: Vector, high: Vector) -> Vector:
-    """Points two pixels apart in a rectangle."""
+    """Return points two pixels apart in a rectangle."""
     x, y = (np.linspace(a, b, 2 + int((b - a) / 2)) for a, b in zip(low, high, strict=True))
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

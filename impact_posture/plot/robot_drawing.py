@@ -1,4 +1,4 @@
-"""Figure ``postures``: the robot's links in both postures, with the contact planes and the normals."""
+"""Figure ``postures``: the links of the robot in both postures, with the contact planes and the normals."""
 
 from __future__ import annotations
 
@@ -12,33 +12,32 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from impact_posture.plot.labels import Label, draw_end_on
+from impact_posture.plot.labels import Label, draw_arrow, draw_end_on
 from impact_posture.plot.shapes import COORDINATE_PLANES, XY, XZ, YZ, Plane, Vector, square, upright_plane
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.space import Space, frame_space
-from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, VERMILLION, framed, shared_legend, style
+from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, VERMILLION, framed, shared_legend
 from impact_posture.plot.view import ResultView, contact_letters, header_lines
 
-NOTES = (
-    "Sticks join joint origins and the last frame of each link (its center of mass where it has no other frame); "
-    "they are not the links' shapes. n points out of the surface, towards the robot."
-)
-BODY = "Body: the box between the hips; its height is not the robot's."
+STICKS = "Sticks join joint origins. They do not show the shapes of the links."
+_ENDS = "The last stick of a chain ends at the last frame of its link, or at the center of mass of the link."
+_NORMAL = "n points out of the surface, towards the robot."
+_BODY = "The body is the box between the hips, of no true height."
 HATCH = "/////"
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A contact plane to draw.
+    """Contact plane to draw.
 
     Attributes:
-        point: Its middle, shape (3,).
+        point: Middle of the plane, shape (3,).
         normal: Unit normal, shape (3,).
-        side: Of the square, m.
+        side: Side of the square, m.
         contact: Where n begins, shape (3,).
         reach: Length of n, m.
-        name: Of n.
-        color: Of the posture that it belongs to; gray of one that belongs to both.
+        name: Name of n.
+        color: Color of its posture; gray for a plane of both postures.
     """
 
     point: Vector
@@ -51,11 +50,11 @@ class Surface:
 
     @property
     def tip(self) -> Vector:
-        """Where n ends, shape (3,)."""
+        """Tip of n, shape (3,)."""
         return np.asarray(self.contact + self.reach * self.normal)
 
     def outline(self, plane: Plane) -> Vector:
-        """Corners of the strip of matter below it as seen from the side, shape (4, 2)."""
+        """Return the corners of the strip of matter below the plane as seen from the side, shape (4, 2)."""
         middle, n = plane.axes @ self.point, plane.axes @ self.normal
         along, deep = np.array([-n[1], n[0]]) * self.side / 2, -0.22 * self.side * n
         return np.array([middle + along, middle - along, middle - along + deep, middle + along + deep])
@@ -75,12 +74,11 @@ def postures_figure(view: ResultView) -> Figure:
     surfaces = surfaces_of(first, second, contact_letters(view), 0.3 * max(float(np.ptp(points, axis=0).max()), 1e-3))
     plane = side_plane(first, second)
     states = ((first, BEFORE), (second, AFTER))
-    notes = [f"{NOTES} {BODY}" if len(first.body) else NOTES]
-    with style():
-        low, high = _window([first, second], plane, surfaces)
-        # As high as the view from the side needs, within a page's reason.
-        height = float(np.clip(3.1 * (high - low)[1] / (high - low)[0], 2.3, 3.6)) + 1.0
-        figure, body = framed(*header_lines(view), height, notes)
+    notes = [*stick_notes(first), _ENDS, _NORMAL]
+    low, high = _window([first, second], plane, surfaces)
+    # As high as the view from the side needs, within the limits of a page.
+    height = float(np.clip(3.1 * (high - low)[1] / (high - low)[0], 2.3, 3.6)) + 1.0
+    with framed(*header_lines(view), height, notes) as (figure, body):
         grid = body.add_gridspec(1, 2)
         space, flat = body.add_subplot(grid[0, 0], axes_class=Space), body.add_subplot(grid[0, 1])
         _box(space, np.vstack([points, *[np.vstack([square(s.point, s.normal, s.side).T, s.tip]) for s in surfaces]]))
@@ -90,13 +88,20 @@ def postures_figure(view: ResultView) -> Figure:
         for state, line in states:
             draw_sticks(space, state, line, None)
             draw_sticks(flat, state, line, plane)
-        _frame_2d(flat, plane, low, high)
+        frame_flat(flat, low, high, 6)
+        flat.grid(True)
+        flat.set(xlabel=f"{plane.right}  [m]", ylabel=f"{plane.up}  [m]", title="seen along " + depth_of(plane))
         shared_legend(body, _handles(second, surfaces), "lower")
     return figure
 
 
+def stick_notes(state: Skeleton) -> list[str]:
+    """Return the notes on sticks and body."""
+    return [STICKS, *([_BODY] if len(state.body) else [])]
+
+
 def side_plane(first: Skeleton, second: Skeleton) -> Plane:
-    """The coordinate plane that contains n and shows most of the motion; else the upright plane of n."""
+    """Return the coordinate plane that contains n and shows most of the motion; else the upright plane of n."""
     n = second.normal
     candidates = [plane for plane in (XZ, YZ, XY) if plane.contains(n)]
     if not candidates:
@@ -105,22 +110,22 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
     size = second.points - second.points.mean(axis=0)
 
     def shown(plane: Plane) -> float:
-        # The robot's own spread decides where there is little motion.
+        # The size of the robot decides where there is little motion.
         seen = float(np.linalg.norm(motion @ plane.axes.T) + 0.2 * np.linalg.norm(size @ plane.axes.T))
-        # A plan is harder to read than an elevation: it has to show much more.
+        # A view from above is harder to read, so that it has to show much more.
         return seen / 2 if plane is XY else seen
 
     return max(candidates, key=shown)
 
 
 def surfaces_of(first: Skeleton, second: Skeleton, letters: list[str], side: float) -> list[Surface]:
-    """The planes of each contact: one if it is the same before and after, two if it moves along n or turns."""
+    """Return the planes of each contact; both where the plane moves along n or turns."""
     found = []
     pairs = zip(first.contacts, second.contacts, first.normals, second.normals, letters, strict=True)
     for before, after, n_before, n_after, letter in pairs:
         way, turned = after - before, float(np.linalg.norm(n_before - n_after)) > 0.01
         if not turned and abs(float(way @ n_after)) < 0.03 * side:
-            # The same surface, touched at another place of it: wide enough for both.
+            # The same surface, touched at another place, is wide enough for both places.
             wide = side + float(np.linalg.norm(way))
             found.append(Surface((before + after) / 2, n_after, wide, after, 0.8 * side, f"n{letter}", GRAY))
             continue
@@ -131,39 +136,39 @@ def surfaces_of(first: Skeleton, second: Skeleton, letters: list[str], side: flo
 
 
 def _box(axes: Any, points: Vector) -> None:
-    """Equal 3-D axes around the points: a box whose edges have the lengths that they show."""
+    """Give 3-D axes equal scales around the points."""
     low, high = points.min(axis=0), points.max(axis=0)
-    # A planar robot's box keeps some depth.
+    # The box of a planar robot keeps some depth.
     half = np.maximum(0.54 * (high - low), 0.2 * float((high - low).max()))
     middle = (low + high) / 2
     frame_space(axes, middle - half, middle + half, "m", 5, azimuth=-60)
 
 
 def _window(states: list[Skeleton], plane: Plane, surfaces: list[Surface]) -> tuple[Vector, Vector]:
-    """Lower left and upper right corner of what the side view shows: everything drawn, with a margin."""
+    """Return the lower left and upper right corner of the side view, with a margin around all that is drawn."""
     drawn = [plane.axes @ state.points.T for state in states]
     for s in surfaces:
         drawn += [s.outline(plane).T, plane.axes @ s.tip[:, None]]
     low, high = np.hstack(drawn).min(axis=1), np.hstack(drawn).max(axis=1)
-    # Never a narrow strip: the shorter side shows at least 0.6 of the longer.
-    longest = float((high - low).max())
+    return padded(low, high)
+
+
+def padded(low: Vector, high: Vector) -> tuple[Vector, Vector]:
+    """Return the corners of a picture with a margin, whose shorter side is at least 0.6 of the longer."""
+    longest = float((high - low).max()) or 1.0
     middle, half = (low + high) / 2, np.maximum(high - low, 0.6 * longest) / 2 + 0.05 * longest
     return middle - half, middle + half
 
 
-def _frame_2d(axes: Any, plane: Plane, low: Vector, high: Vector) -> None:
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
+def frame_flat(axes: Any, low: Vector, high: Vector, bins: int) -> None:
+    """Give a panel the corners ``low`` and ``high``, shape (2,), equal axes and few ticks."""
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect("equal", adjustable="box")
-    axes.grid(True)
-    axes.locator_params(nbins=6)
-    axes.set_xlabel(f"{plane.right}  [m]")
-    axes.set_ylabel(f"{plane.up}  [m]")
-    axes.set_title("seen along " + depth_of(plane))
+    axes.locator_params(nbins=bins)
 
 
 def depth_of(plane: Plane) -> str:
-    """The direction that a reader of the plane looks in."""
+    """Return the viewing direction of a plane."""
     if plane in COORDINATE_PLANES:
         return {"xz": "+y", "yz": "−x", "xy": "−z"}[plane.name]
     return "the horizontal across n"
@@ -193,7 +198,7 @@ def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane |
     for circle, arm in zip(state.rotors, state.arms, strict=True):
         _fill(axes, [circle], plane, color, 1.5)
         _draw(axes, np.hstack([circle, circle[:, :1]]), plane, **thin)
-        # One straight line each, thinner than a link: seen from the side they lie on each other.
+        # Straight lines, thinner than a link, because they lie on each other in the side view.
         _draw(axes, arm.T, plane, **(thin | {"linestyle": "-"}))
     _draw(axes, state.joints.T, plane, linestyle="", marker="o", markersize=2.6, color=color, zorder=4)
     look = {"linestyle": "", "markeredgecolor": "white", "color": color}
@@ -237,30 +242,28 @@ def _plane_2d(axes: Any, surface: Surface, plane: Plane) -> None:
     outline = surface.outline(plane)
     axes.fill(*outline.T, facecolor="none", edgecolor=surface.color, hatch=HATCH, linewidth=0, zorder=1)
     axes.plot(*outline[:2].T, color=color, linewidth=1.0, zorder=1)
-    contact, tip = plane.axes @ surface.contact, plane.axes @ surface.tip
-    arrow = {"arrowstyle": "-|>", "color": color, "linewidth": 1.2, "shrinkA": 0, "shrinkB": 0}
-    axes.annotate("", tuple(tip), tuple(contact), arrowprops=arrow, zorder=7)
+    tip = plane.axes @ surface.tip
+    draw_arrow(axes, plane.axes @ surface.contact, tip, 7, color=color, linewidth=1.2)
     axes.add_artist(Label(surface.name, tip, tuple(plane.axes @ surface.normal), color))
 
 
-def _handles(state: Skeleton, surfaces: list[Surface]) -> list[Any]:
-    def mark(label: str, marker: str, **look: Any) -> Line2D:
-        return Line2D([], [], linestyle="", marker=marker, color=GRAY, label=label, **look)
-
-    words = {GRAY: "surface", VERMILLION: "surface before", BLUE: "surface after"}
-    handles: list[Any] = [
-        Line2D([], [], label="before", **BEFORE),
-        Line2D([], [], label="after", **AFTER),
-        mark("base", "P", markersize=7),
-        mark("contact point", "o", markersize=5.5),
-        *[
-            Patch(facecolor="none", edgecolor=color, hatch=HATCH, linewidth=0, label=word)
-            for color, word in words.items()
-            if any(s.color == color for s in surfaces)
-        ],
+def robot_handles(state: Skeleton, lines: dict[str, dict[str, Any]], color: str) -> list[Any]:
+    """Return the legend entries of sticks: lines by name, and the marks of base, contact points and feet."""
+    marks: list[tuple[str, dict[str, Any]]] = [
+        ("base", {"marker": "P", "markersize": 7}),
+        ("contact point", {"marker": "o", "markersize": 5.5}),
     ]
     if len(state.feet):
-        handles.append(mark("foot that stays", "^", markersize=6, markerfacecolor="white"))
+        marks.append(("foot that stays", {"marker": "^", "markersize": 6, "markerfacecolor": "white"}))
+    looks = [*lines.items(), *((word, {"linestyle": "", "color": color} | look) for word, look in marks)]
+    return [Line2D([], [], label=word, **look) for word, look in looks]
+
+
+def _handles(state: Skeleton, surfaces: list[Surface]) -> list[Any]:
+    handles = robot_handles(state, {"before": BEFORE, "after": AFTER}, GRAY)
+    for color, word in {GRAY: "surface", VERMILLION: "surface before", BLUE: "surface after"}.items():
+        if any(s.color == color for s in surfaces):
+            handles.append(Patch(facecolor="none", edgecolor=color, hatch=HATCH, linewidth=0, label=word))
     if len(state.body):
         handles.append(Patch(facecolor=BLUE, alpha=0.12, label="body"))
     if len(state.rotors):

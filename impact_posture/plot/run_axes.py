@@ -1,23 +1,25 @@
-"""Axes over time, for the pictures of runs: shaded windows, curves thinned to what can be seen, one legend."""
+"""Axes over time of the figures of runs: shaded windows, limits, curves, a legend."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
 
 from impact_posture.escape import plot_label
-from impact_posture.plot.path_figure import log_axis, spreads
-from impact_posture.plot.run_panels import LINES, Clip, Panel, first_impact, whole
-from impact_posture.plot.run_view import RunView
+from impact_posture.plot.path_figures import log_axis, spreads
+from impact_posture.plot.run_panels import LINES, RUNS, Clip, Panel
+from impact_posture.plot.run_view import RunView, run_header
 from impact_posture.plot.shapes import Vector
-from impact_posture.plot.style import GRAY, INK, shared_legend
+from impact_posture.plot.style import GRAY, INK, framed, shared_legend
 
-# Pink and light gray: far enough apart in a gray print, too.
+# Pink and light gray differ in a gray print as well.
 SHADES: dict[str, dict[str, Any]] = {
     "dwell": {"facecolor": "#f0f0f0", "edgecolor": "none", "zorder": 0.1},
     "impact": {"facecolor": "#edc3d6", "edgecolor": "none", "zorder": 0.2},
@@ -29,61 +31,141 @@ AT_LIMIT: dict[str, Any] = {
     "markeredgewidth": 0.4, "zorder": 5,
 }  # fmt: skip
 BAND: dict[str, Any] = {"facecolor": "#dcdcdc", "edgecolor": "none", "zorder": 1.2}
-# Points across a page's width; each shows the lowest and the highest value in it.
+# Bins across the width of a page.
 _BINS = 1000
 
 
-def draw_panel(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) -> None:
-    """Draw run ``which`` of a panel: shaded windows, limits, curves."""
-    frame_time(axes, view, clip)
+@dataclass(frozen=True)
+class Cell:
+    """Panel in a place of a figure.
+
+    Attributes:
+        panel: Its curves.
+        clips: Stretch of time that is drawn of each run, by the index of the run.
+        frame: The run whose windows are shaded, and the stretch of time of the axis.
+        title: Line above it.
+    """
+
+    panel: Panel
+    clips: Mapping[int, Clip]
+    frame: tuple[int, Clip]
+    title: str = ""
+
+    @classmethod
+    def of(cls, panel: Panel, which: int, clip: Clip, title: str = "") -> Cell:
+        """Cell of a single run."""
+        return cls(panel, {which: clip}, (which, clip), title)
+
+
+def time_figure(
+    views: Sequence[RunView],
+    cells: Sequence[Sequence[Cell | None]],
+    height: float,
+    notes: Sequence[str],
+    *,
+    widths: Sequence[float] = (),
+    title_at: str = "center",
+    air: float = 0.75,
+) -> Figure:
+    """Draw rows of cells with the header of the runs above and the only legend beside them.
+
+    Cells of the same panel share their upright axis.  An axis of time is named where the next cell below has another.
+
+    Args:
+        views: The runs.
+        cells: Rows of equal length; ``None`` leaves a place blank.
+        height: Height of a row, inches.
+        notes: Sentences below the figure.
+        widths: Ratios of the widths of the columns; equal if empty.
+        title_at: Where titles stand: ``center`` or ``left``.
+        air: Additional height, inches.
+    """
+    columns = len(cells[0])
+    shown: dict[Panel, list[Any]] = {}
+    with framed(*run_header(views), height * len(cells) + air, notes) as (figure, body):
+        ratios = list(widths[:columns]) or None
+        axes = body.subplots(len(cells), columns, squeeze=False, width_ratios=ratios)
+        for row, column in np.ndindex(*axes.shape):
+            cell, own = cells[row][column], axes[row, column]
+            if cell is None:
+                # The place stays free for the legend.
+                own.set_axis_off()
+                continue
+            _draw(own, cell, views)
+            shown.setdefault(cell.panel, []).append(own)
+            own.set_title(cell.title, loc=title_at, fontweight="bold")
+            below = cells[row + 1][column] if row + 1 < len(cells) else None
+            if below is None or below.frame != cell.frame:
+                own.set_xlabel(cell.frame[1].label)
+            else:
+                own.tick_params(labelbottom=False)
+            if column == 0:
+                own.set_ylabel(cell.panel.label)
+            else:
+                own.tick_params(labelleft=False)
+        for same in shown.values():
+            limits = np.array([own.get_ylim() for own in same])
+            for own in same:
+                own.set_ylim(limits.min(), limits.max())
+        body.align_ylabels(list(axes[:, 0]))
+        heads = [(panel.label.split("  [")[0] + ":", same[0]) for panel, same in shown.items()]
+        _legend(body, _common_handles(views, list(shown)), heads)
+    return figure
+
+
+def _draw(axes: Any, cell: Cell, views: Sequence[RunView]) -> None:
+    """Draw the shaded windows, limits and curves of a cell."""
+    panel, (shown, frame) = cell.panel, cell.frame
+    _shade(axes, views[shown], frame)
+    axes.set_xlim(frame.x(frame.begin), frame.x(frame.end))
+    axes.grid(True, axis="y")
     for limit in panel.limits:
         axes.axhline(limit, **LIMIT)
-    _saturation(axes, panel, which, view, clip)
-    if panel.ranges is not None:
-        _band(axes, view, panel.ranges[which], clip)
-    for k, name in enumerate(panel.names):
-        # Commands carry the sensors' noise: dashes of it are a blot.
-        look = LINES[k % len(LINES)] | ({"linestyle": "-", "linewidth": 0.7} if panel.noisy else {})
-        curve(axes, view, panel.values[which][:, k], clip, label=plot_label(name), **look)
-        if panel.stopped is not None and panel.stopped[which][:, k].any():
-            at_stop = np.where(panel.stopped[which][:, k], panel.values[which][:, k], np.nan)
-            axes.plot(clip.x(view.t), at_stop, **STOP)
+    for which, clip in cell.clips.items():
+        view = views[which]
+        _saturation(axes, panel, which, view, clip)
+        if panel.ranges is not None:
+            _band(axes, view, panel.ranges[which], clip)
+        for k, values in enumerate(panel.values[which].T):
+            looks, entry = (RUNS, which) if panel.overlay else (LINES, k)
+            # Commands carry the noise of the sensors, of which dashes make a blot.
+            look = looks[entry % len(looks)] | ({"linestyle": "-", "linewidth": 0.7} if panel.noisy else {})
+            name = panel.names[entry] if panel.names else ""
+            _curve(axes, view, values, clip, label=plot_label(name) if name else None, **look)
+            if panel.stopped is not None and panel.stopped[which][:, k].any():
+                axes.plot(clip.x(view.t), np.where(panel.stopped[which][:, k], values, np.nan), **STOP)
+    if panel.scale == "metric":
+        _scale_metric(axes, panel.values)
+    elif panel.scale == "from zero":
+        axes.set_ylim(bottom=0.0)
 
 
-def frame_time(axes: Any, view: RunView, clip: Clip) -> None:
-    """Shade the windows and set the axis of time."""
-    shade(axes, view, clip)
-    axes.set_xlim(clip.x(clip.begin), clip.x(clip.end))
-    axes.grid(True, axis="y")
-
-
-def shade(axes: Any, view: RunView, clip: Clip) -> None:
-    """Shade the windows that begin or end within a clip; impacts over dwells."""
+def _shade(axes: Any, view: RunView, clip: Clip) -> None:
+    """Shade the windows that overlap a clip, impacts over dwells."""
     for kind, look in SHADES.items():
         for span in view.windows:
             if span.kind == kind and span.end > clip.begin and span.begin < clip.end:
                 axes.axvspan(clip.x(span.begin), clip.x(span.end), **look)
 
 
-def curve(axes: Any, view: RunView, values: Vector, clip: Clip, **look: Any) -> None:
-    """Draw a curve within a clip; where it has no values (NaN) it goes straight on."""
+def _curve(axes: Any, view: RunView, values: Vector, clip: Clip, **look: Any) -> None:
+    """Draw a curve within a clip, straight across gaps (NaN)."""
     inside = (view.t >= clip.begin) & (view.t <= clip.end) & np.isfinite(values)
-    t, y = thin(view.t[inside], values[inside])
-    axes.plot(clip.x(t), y, **look)
+    axes.plot(clip.x(view.t[inside]), values[inside], **look)
 
 
 def _saturation(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) -> None:
-    """Mark on a limit when a command was at it: a tick of a controller is too short to be seen."""
+    """Mark on a limit when a command was at it, because a single tick is too short to be seen."""
     for limit, flags in zip(panel.limits, panel.saturated(which), strict=True):
         times = view.t[flags & (view.t >= clip.begin) & (view.t <= clip.end)]
-        # Not closer than can be seen.
+        # Closer marks would cover each other.
         places = np.floor(_BINS / 8 * (times - clip.begin) / (clip.end - clip.begin))
         seen = times[np.unique(places, return_index=True)[1]]
         axes.plot(clip.x(seen), np.full(len(seen), limit), **AT_LIMIT)
 
 
 def _band(axes: Any, view: RunView, bounds: Vector, clip: Clip) -> None:
-    """Fill between the lower and the upper bound; of each bin of ticks the lowest and the highest."""
+    """Fill between the lowest lower bound and the highest upper bound of each bin of ticks."""
     inside = (view.t >= clip.begin) & (view.t <= clip.end)
     t, bounds = view.t[inside], bounds[inside]
     starts = np.arange(0, len(t), max(len(t) // _BINS, 1))
@@ -91,22 +173,8 @@ def _band(axes: Any, view: RunView, bounds: Vector, clip: Clip) -> None:
     axes.fill_between(clip.x(t[starts]), low, high, **BAND)
 
 
-def thin(t: Vector, values: Vector) -> tuple[Vector, Vector]:
-    """Keep of each bin of ticks the lowest and the highest value, both at their own times: no peak is lost."""
-    step = len(t) // _BINS
-    if step < 4:
-        return t, values
-    starts = np.arange(0, len(t), step)
-    kept = {0, len(t) - 1}
-    for start in starts:
-        part = values[start : start + step]
-        kept |= {int(start + part.argmin()), int(start + part.argmax())}
-    order = np.array(sorted(kept))
-    return t[order], values[order]
-
-
-def scale_metric(axes: Any, values: Sequence[Vector]) -> None:
-    """Make H's axis logarithmic where it spans more than a decade; else let it begin at zero."""
+def _scale_metric(axes: Any, values: Sequence[Vector]) -> None:
+    """Make the axis of H logarithmic where H spans more than a decade; else let it begin at zero."""
     every = np.concatenate([value[np.isfinite(value)] for value in values])
     if every.size and (every > 0).all() and spreads(every, 10.0):
         log_axis(axes)
@@ -118,8 +186,8 @@ def scale_metric(axes: Any, values: Sequence[Vector]) -> None:
         axes.text(0.5, 0.5, "H was not evaluated", ha="center", va="center", transform=axes.transAxes, color=GRAY)
 
 
-def common_handles(views: Sequence[RunView], panels: Sequence[Panel] = ()) -> list[Any]:
-    """Legend entries of what all panels share: shades, limits, stops."""
+def _common_handles(views: Sequence[RunView], panels: Sequence[Panel]) -> list[Any]:
+    """Return the legend entries of what all panels share: shades, limits, stops."""
     words = {"impact": "impact window" if not views[0].pushed else "push", "dwell": "dwell"}
     kinds = {span.kind for view in views for span in view.windows}
     handles: list[Any] = [Patch(label=words[kind], **SHADES[kind]) for kind in words if kind in kinds]
@@ -135,58 +203,23 @@ def common_handles(views: Sequence[RunView], panels: Sequence[Panel] = ()) -> li
     return handles
 
 
-def subplots(body: Any, rows: int, columns: int, **more: Any) -> Any:
-    """Panels as an array of shape (rows, columns)."""
-    return np.array(body.subplots(rows, columns, squeeze=False, **more))
-
-
-def grid(body: Any, view: RunView, rows: int) -> tuple[Any, list[Clip]]:
-    """Rows of panels: the whole run, wide, and beside it the first impact, where there is one; and their clips."""
-    clips = [clip for clip in (whole(view), first_impact(view)) if clip is not None]
-    ratios = [1.7, 1.0][: len(clips)]
-    return subplots(body, rows, len(clips), sharey="row", sharex="col", width_ratios=ratios), clips
-
-
-def name_time(panels: Any, clips: Sequence[Clip]) -> None:
-    """Label a row of panels' axes of time."""
-    for axes, clip in zip(panels, clips, strict=False):
-        axes.set_xlabel(clip.label)
-
-
-def share_height(panels: Sequence[Any]) -> None:
-    """Give all panels the same upright limits, those of the widest."""
-    low = min(axes.get_ylim()[0] for axes in panels)
-    high = max(axes.get_ylim()[1] for axes in panels)
-    for axes in panels:
-        axes.set_ylim(low, high)
-
-
-def headed(rows: Sequence[Panel], axes: Sequence[Any]) -> list[tuple[str, Any]]:
-    """For :func:`finish`: what each row's curves are, and a panel that has them."""
-    return [(row.label.split("  [")[0] + ":", own) for row, own in zip(rows, axes, strict=False)]
-
-
-def finish(body: Any, left: Sequence[Any], shared: Sequence[Any], named: Sequence[tuple[str, Any]] = ()) -> None:
-    """Align the labels on the left, and put the one legend right of the panels, or below where no curve has a name.
+def _legend(body: Any, shared: Sequence[Any], named: Sequence[tuple[str, Any]]) -> None:
+    """Put the only legend right of the panels, or below them where no curve has a name.
 
     Args:
         body: The part of the figure that the panels are in.
-        left: The panels at its left edge.
         shared: Legend entries of what all panels share.
-        named: What curves are, and a panel that has them; as there are several kinds, each has its heading.
+        named: Heading of curves, and axes that have them; a single kind of curves needs no heading.
     """
-    body.align_ylabels(left)
-    groups = [(what, axes.get_legend_handles_labels()[0]) for what, axes in named]
-    groups = [(what, handles) for what, handles in groups if handles]
+    groups = [(what, handles) for what, axes in named if (handles := axes.get_legend_handles_labels()[0])]
+    if not groups:
+        if shared:
+            shared_legend(body, shared, "lower")
+        return
     entries: list[Any] = []
-    for what, handles in groups:
-        entries += [_heading(what), *handles] if what and len(groups) > 1 else handles
-    if entries:
-        entries += [_heading(""), *shared] if len(groups) > 1 else shared
-        body.legend(handles=entries, loc="outside right center", handlelength=2.6, fontsize=7)
-    elif shared:
-        shared_legend(body, shared, "lower")
-
-
-def _heading(text: str) -> Line2D:
-    return Line2D([], [], linestyle="", label=text or " ")
+    if len(groups) == 1:
+        entries = [*groups[0][1], *shared]
+    else:
+        for what, handles in [*groups, ("", shared)]:
+            entries += [Line2D([], [], linestyle="", label=what or " "), *handles]
+    body.legend(handles=entries, loc="outside right center", handlelength=2.6, fontsize=7)

@@ -1,42 +1,41 @@
-"""Pictures of a run over time: the metric, the commands, the joints."""
+"""Figures of runs over time: the metric, the commands and the joints, of a single run or of several controllers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from impact_posture.escape import plot_label
-from impact_posture.plot.run_axes import (
-    common_handles,
-    curve,
-    draw_panel,
-    finish,
-    frame_time,
-    grid,
-    headed,
-    name_time,
-    scale_metric,
-    share_height,
-    subplots,
+from impact_posture.plot.run_axes import Cell, time_figure
+from impact_posture.plot.run_panels import (
+    Clip,
+    Panel,
+    control_panels,
+    first_impact,
+    impacts,
+    joint_panels,
+    metric_panels,
+    speed_panel,
+    whole,
 )
-from impact_posture.plot.run_panels import LINES, control_panels, first_impact, joint_panels, whole
-from impact_posture.plot.run_view import RunView, check_same, run_header
-from impact_posture.plot.style import DEFAULT_FORMATS, check_formats, framed, save, style
-from impact_posture.plot.view import mixed_unit
+from impact_posture.plot.run_view import RunView, check_same
+from impact_posture.plot.style import DEFAULT_FORMATS, check_formats, save
 
-METRIC = "H  [‖Δν‖²/(N·s)²]"
 HINT = "Less H is better: it is the squared velocity jump of an impulse of 1 N·s along n."
-LEFT = "Left: the whole run; right: the first impact."
+LEFT = "Left: the whole run. Right: the first impact."
+# Controllers side by side.
+COLUMNS = 3
+# Widths of the whole run and of the first impact beside it.
+_WIDTHS = (1.7, 1.0)
 
 
 def draw_run(view: RunView, out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write the pictures of one run, ``metric``, ``controls`` and ``joints``, into ``out_dir``; return the paths.
+    """Write the figures ``metric``, ``controls`` and ``joints`` of a run into ``out_dir``; return the paths.
 
-    Those that the robot has nothing for (no actuators, no joints) are left out.
+    A robot without actuators has no ``controls``, a robot without joints has no ``joints``.
 
     Raises:
         InputError: An unknown format.
@@ -48,61 +47,52 @@ def draw_run(view: RunView, out_dir: Path, formats: Iterable[str] = DEFAULT_FORM
         figures["controls"] = controls_figure(view)
     if joint_panels([view]):
         figures["joints"] = joints_figure([view])
-    return [path for name, figure in figures.items() for path in save(figure, out_dir, name, wanted)]
+    return _write(figures, out_dir, wanted)
+
+
+def draw_comparison(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
+    """Write the figures of several controllers in a scenario into ``out_dir``; return the paths.
+
+    They are ``comparison-metric``, ``comparison-controls`` and ``comparison-joints``.
+
+    Args:
+        views: A run of each controller (of a push: with the same sign). The nominal controller is drawn first.
+        out_dir: Folder, made if missing; files of the same name are replaced.
+        formats: Some of ``png``, ``svg`` and ``pdf``.
+
+    Raises:
+        InputError: No view, views of different scenarios or robots, an unknown format.
+        OutputError: The folder or a file cannot be written.
+    """
+    wanted = check_formats(formats)
+    figures = {"comparison-metric": comparison_figure(views)}
+    if control_panels(views):
+        figures["comparison-controls"] = controls_comparison_figure(views)
+    if joint_panels(views):
+        figures["comparison-joints"] = joints_figure(views)
+    return _write(figures, out_dir, wanted)
+
+
+def _write(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str]) -> list[Path]:
+    return [path for name, figure in figures.items() for path in save(figure, out_dir, name, formats)]
 
 
 def metric_figure(view: RunView) -> Figure:
-    """Draw H, ``‖ν‖``, the contact's force, and the level of the term where it changes, over time."""
-    unit = mixed_unit(view.robot)
-    n = np.array(view.contact.normal)
-    normal = view.force @ n
-    across = np.linalg.norm(view.force - normal[:, None] * n, axis=1)
-    force = [(normal, "", LINES[0])] if view.pushed else [(view.peak, "force: normal, peak", LINES[0])]
-    if not view.pushed:
-        force.append((across, "force: friction", LINES[1]))
-    rows: list[tuple[str, list[tuple[Any, str, dict[str, Any]]]]] = [
-        (METRIC, [(view.objective, "", LINES[0])]),
-        (f"‖ν‖  [{unit.strip('()')}]", [(view.speed, "", LINES[0])]),
-        ("push  [N]" if view.pushed else "force  [N]", force),
-    ]
-    if np.ptp(view.level) > 1e-9:
-        rows.append(("level of\nthe term  [1]", [(view.level, "", LINES[0])]))
-    notes = [HINT] if view.pushed else [HINT, "Normal: the largest within each tick of the controller."]
-    notes = [" ".join([*notes, *([LEFT] if view.impacts else [])])]
-    with style():
-        figure, body = framed(*run_header([view]), 1.25 * len(rows) + 0.75, notes)
-        panels, clips = grid(body, view, len(rows))
-        for axes_row, (label, curves) in zip(panels, rows, strict=True):
-            for axes, clip in zip(axes_row, clips, strict=True):
-                frame_time(axes, view, clip)
-                for values, name, look in curves:
-                    curve(axes, view, values, clip, label=name or None, **look)
-            axes_row[0].set_ylabel(label)
-        for axes in panels[0]:
-            scale_metric(axes, [view.objective])
-        name_time(panels[-1], clips)
-        finish(body, list(panels[:, 0]), common_handles([view]), [("", panels[2, 0])])
-    return figure
+    """Draw H, ``‖ν‖``, the contact force, and the level of the impact-robust term where it changes, over time."""
+    panels = metric_panels(view)
+    cells = [_beside(panel, 0, view) for panel in panels]
+    return time_figure([view], cells, 1.25, [HINT, *_notes(panels, cells)], widths=_WIDTHS)
 
 
 def controls_figure(view: RunView) -> Figure:
-    """Draw the rotor speeds and commanded joint torques of a run, which has some, with their limits (dashed)."""
-    rows = control_panels([view])
-    notes = [" ".join([*[panel.note for panel in rows if panel.note], LEFT * bool(view.impacts)])]
-    with style():
-        figure, body = framed(*run_header([view]), 1.9 * len(rows) + 0.75, notes)
-        panels, clips = grid(body, view, len(rows))
-        for axes_row, panel in zip(panels, rows, strict=True):
-            for axes, clip in zip(axes_row, clips, strict=True):
-                draw_panel(axes, panel, 0, view, clip)
-            axes_row[0].set_ylabel(panel.label)
-        name_time(panels[-1], clips)
-        finish(body, list(panels[:, 0]), common_handles([view], rows), headed(rows, panels[:, 0]))
-    return figure
+    """Draw the rotor speeds and commanded joint torques of a run with actuators, and their limits (dashed)."""
+    panels = control_panels([view])
+    cells = [_beside(panel, 0, view) for panel in panels]
+    return time_figure([view], cells, 1.9, _notes(panels, cells), widths=_WIDTHS)
 
 
 def joints_figure(views: Sequence[RunView]) -> Figure:
-    """Draw the joints' positions with shaded windows, the controllers one below the other (nominal first).
+    """Draw the joint positions with shaded windows, the controllers below each other (nominal first).
 
     The robot has joints of one degree of freedom.
 
@@ -110,27 +100,79 @@ def joints_figure(views: Sequence[RunView]) -> Figure:
         InputError: No view, or views of different scenarios or robots.
     """
     views = check_same(views, "figure joints")
-    rows = joint_panels(views)
-    clips = [[clip for clip in (whole(view), first_impact(view)) if clip is not None] for view in views]
-    columns = min(len(pair) for pair in clips)
-    notes = " ".join([*dict.fromkeys(panel.note for panel in rows if panel.note), LEFT * (columns == 2)])
-    with style():
-        count = len(views) * len(rows)
-        figure, body = framed(*run_header(views), (1.6 if count > 1 else 2.6) * count + 0.75, [notes])
-        panels = subplots(body, count, columns, sharey="row", width_ratios=[1.7, 1.0][:columns])
-        for index, axes_row in enumerate(panels):
-            panel, which = rows[index % len(rows)], index // len(rows)
-            for axes, clip in zip(axes_row, clips[which], strict=False):
-                draw_panel(axes, panel, which, views[which], clip)
-            axes_row[0].set_ylabel(panel.label)
-            if len(views) > 1:
-                axes_row[0].set_title(plot_label(views[which].name), loc="left", fontweight="bold")
-            if panel is rows[-1]:
-                name_time(axes_row, clips[which])
-            else:
-                for axes in axes_row:
-                    axes.tick_params(labelbottom=False)
-        finish(body, list(panels[:, 0]), common_handles(views, rows), headed(rows, panels[:, 0]))
-        for k in range(len(rows)):
-            share_height(list(panels[k :: len(rows)].flat))
-    return figure
+    panels = joint_panels(views)
+    cells = [_beside(panel, k, view) for k, view in enumerate(views) for panel in panels]
+    columns = min(len(row) for row in cells)
+    cells = [row[:columns] for row in cells]
+    titles = {row: view.name for row, view in zip(range(0, len(cells), len(panels)), views, strict=True)}
+    for row, name in titles.items() if len(views) > 1 else ():
+        cells[row][0] = replace(cells[row][0], title=plot_label(name))
+    notes, height = _notes(panels, cells), 1.6 if len(cells) > 1 else 2.6
+    return time_figure(views, cells, height, notes, widths=_WIDTHS, title_at="left")
+
+
+def comparison_figure(views: Sequence[RunView]) -> Figure:
+    """Draw H over time of all controllers, and below it ``‖ν‖`` around the first impact.
+
+    Below, and for pushes above, time counts from each controller's own impact.
+
+    Raises:
+        InputError: No view, or views of different scenarios or robots.
+    """
+    views = check_same(views, "figure comparison-metric")
+    spans = [_since_impact(view) for view in views]
+    names = [plot_label(view.name) for view in views]
+    every = replace(
+        spans[0],
+        begin=spans[0].origin + min(span.begin - span.origin for span in spans),
+        end=spans[0].origin + max(span.end - span.origin for span in spans),
+    )
+    values = [view.objective[:, None] for view in views]
+    panel = replace(metric_panels(views[0])[0], names=names, values=values, overlay=True)
+    # The shaded windows are those of the first run, on the axis of all.
+    cells = [[Cell(panel, dict(enumerate(spans)), (0, every))]]
+    notes, clips = [HINT], {k: clip for k, view in enumerate(views) if (clip := first_impact(view)) is not None}
+    if len(clips) == len(views):
+        longest = max(clips.items(), key=lambda item: item[1].end - item[1].begin)
+        cells.append([Cell(speed_panel(views), clips, longest)])
+        if not views[0].pushed:
+            notes.append(f"Windows above: those of {names[0]}. Below, time counts from the own touch of each run.")
+    return time_figure(views, cells, 2.3 if len(cells) > 1 else 2.6, notes, air=0.0)
+
+
+def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
+    """Draw the commands around the impacts with their limits (dashed), a column for each controller, nominal left.
+
+    Raises:
+        InputError: No view, or views of different scenarios or robots.
+    """
+    views = check_same(views, "figure comparison-controls")
+    panels = control_panels(views)
+    columns = min(len(views), COLUMNS)
+    cells: list[list[Cell | None]] = []
+    for first in range(0, len(views), columns):
+        block = list(enumerate(views))[first : first + columns]
+        for panel in panels:
+            titles = [plot_label(view.name) if panel is panels[0] else "" for _, view in block]
+            row = [Cell.of(panel, k, impacts(view), title) for (k, view), title in zip(block, titles, strict=True)]
+            cells.append([*row, *[None] * (columns - len(row))])
+    return time_figure(views, cells, 1.7, _notes(panels, cells))
+
+
+def _beside(panel: Panel, which: int, view: RunView) -> list[Cell]:
+    """Cells of the whole run and, where there is an impact, of the first impact."""
+    return [Cell.of(panel, which, clip) for clip in (whole(view), first_impact(view)) if clip is not None]
+
+
+def _notes(panels: Sequence[Panel], cells: Sequence[Sequence[Cell | None]]) -> list[str]:
+    """Notes of the panels, and what the columns are where the first impact stands beside the whole run."""
+    left = any(cell is not None and cell.frame[1].scale != 1.0 for cell in cells[0])
+    return [*dict.fromkeys(panel.note for panel in panels if panel.note), *[LEFT] * left]
+
+
+def _since_impact(view: RunView) -> Clip:
+    """Clip of a whole run; for a push in seconds from its begin, because runs wait for rest differently long."""
+    clip = whole(view)
+    if not (view.pushed and view.impacts):
+        return clip
+    return replace(clip, origin=view.impacts[0].begin, label="time since push  [s]")

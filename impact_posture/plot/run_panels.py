@@ -1,9 +1,9 @@
-"""What the panels over time of the pictures of runs show: which stretch of time, which curves, which limits."""
+"""Content of the panels over time: stretches of time, curves and limits."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,11 @@ import numpy as np
 from impact_posture.plot.run_view import Flags, RunView
 from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILLION
-from impact_posture.plot.view import number
+from impact_posture.plot.view import mixed_unit, number
 
-# Of that many joints a panel shows the curves.
+# Most joints that a panel shows.
 SHOWN = 8
-# Curves of one panel: they differ by color and dashes.
+# Looks of the curves of a panel, which differ by color and dashes.
 LINES: tuple[dict[str, Any], ...] = (
     {"color": BLUE, "linestyle": "-", "linewidth": 1.3},
     {"color": VERMILLION, "linestyle": (0, (4, 1.5)), "linewidth": 1.3},
@@ -26,7 +26,7 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": ORANGE, "linestyle": (0, (3, 1, 1, 1, 1, 1)), "linewidth": 1.3},
     {"color": GRAY, "linestyle": (0, (2, 2)), "linewidth": 1.0},
 )
-# Runs beside each other: the first is what the others are compared with, as before and after elsewhere.
+# Looks of runs in a panel. The others are compared with the first, as after is with before elsewhere.
 RUNS: tuple[dict[str, Any], ...] = (LINES[1] | {"zorder": 3.5}, LINES[0] | {"linewidth": 1.6}, *LINES[2:])
 # A limit farther away than this many times the largest value is named, not drawn.
 _FAR = 4.0
@@ -36,14 +36,14 @@ _NEAR = 1e-3
 
 @dataclass(frozen=True)
 class Clip:
-    """A stretch of a run's time as an axis shows it: ``scale (t − origin)`` from ``begin`` to ``end``.
+    """Stretch of time of a run on an axis, which shows ``scale (t − origin)`` from ``begin`` to ``end``.
 
     Attributes:
-        begin: s.
-        end: s.
-        origin: What is zero on the axis, s.
-        scale: Of the axis' unit in seconds: 1, or 1000 for milliseconds.
-        label: Of the axis.
+        begin: First time, s.
+        end: Last time, s.
+        origin: Time at the zero of the axis, s.
+        scale: Units of the axis per second: 1, or 1000 for milliseconds.
+        label: Name of the axis.
     """
 
     begin: float
@@ -53,17 +53,17 @@ class Clip:
     label: str = "time  [s]"
 
     def x(self, t: Any) -> Any:
-        """Times on the axis."""
+        """Return times as the axis counts them."""
         return self.scale * (t - self.origin)
 
 
 def whole(view: RunView) -> Clip:
-    """All of a run."""
+    """Return the clip of a whole run."""
     return Clip(float(view.t[0]), float(view.t[-1]))
 
 
 def first_impact(view: RunView) -> Clip | None:
-    """The first impact window with some air, in ms from its begin; ``None`` without one."""
+    """Return the clip of the first impact window with a margin, in ms from its begin; ``None`` without impact."""
     if not view.impacts:
         return None
     span = view.impacts[0]
@@ -76,7 +76,7 @@ def first_impact(view: RunView) -> Clip | None:
 
 
 def impacts(view: RunView) -> Clip:
-    """From a second before the first impact window to a second after the last; all of a run without any."""
+    """Return the clip of all impact windows with a margin; the whole run without impact."""
     if not view.impacts:
         return whole(view)
     air = 0.2 if view.pushed else 0.5
@@ -86,17 +86,19 @@ def impacts(view: RunView) -> Clip:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """What a row of panels shows, of several runs.
+    """Curves over time of several runs.
 
     Attributes:
-        label: Of the upright axis.
-        names: Of the curves.
+        label: Name of the upright axis.
+        names: Names of the curves, of the runs where they are overlaid, or none.
         values: Curves of each run, shape (n, curves).
-        limits: Lower and upper limit of the commands: dashed lines; empty for none.
-        ranges: Of each run, a lower and an upper bound to shade between, shape (n, 2).
-        stopped: When a curve's joint was at its stop, of each run, shape (n, curves).
-        note: To be said below the picture.
-        noisy: Whether the curves carry noise, as those of robots that fly.
+        limits: Lower and upper limit of the commands, drawn as dashed lines; empty for none.
+        ranges: Lower and upper bound to shade between, for each run, shape (n, 2).
+        stopped: Whether the joint of a curve was at its stop, for each run, shape (n, curves).
+        note: Sentence below the figure.
+        noisy: Whether the curves carry noise, as those of flying robots do.
+        scale: Scale of the upright axis: ``auto``, ``from zero``, or ``metric`` (logarithmic where it spreads).
+        overlay: Whether all runs are drawn in the same panel, in looks of their own.
     """
 
     label: str
@@ -107,9 +109,11 @@ class Panel:
     stopped: Sequence[Flags] | None = None
     note: str = ""
     noisy: bool = False
+    scale: str = "auto"
+    overlay: bool = False
 
     def saturated(self, which: int) -> list[Flags]:
-        """For each limit when a command of run ``which`` was at it, up to a thousandth of the range, shape (n,)."""
+        """Return for each limit when a command of run ``which`` was at it, up to 1/1000 of the range, shape (n,)."""
         if not self.limits:
             return []
         commands = self.values[which] if self.ranges is None else self.ranges[which]
@@ -118,17 +122,41 @@ class Panel:
         return [np.any(commands <= low + near, axis=1), np.any(commands >= high - near, axis=1)]
 
 
+def metric_panels(view: RunView) -> list[Panel]:
+    """H, ``‖ν‖``, the contact force, and the level of the impact-robust term where it changes."""
+    n = np.array(view.contact.normal)
+    normal = view.force @ n
+    if view.pushed:
+        force = Panel("push  [N]", (), [normal[:, None]])
+    else:
+        friction = np.linalg.norm(view.force - normal[:, None] * n, axis=1)
+        names = ("force: normal, peak", "force: friction")
+        note = "Normal: the largest within each tick of the controller."
+        force = Panel("force  [N]", names, [np.stack([view.peak, friction], axis=1)], note=note)
+    panels = [Panel("H  [‖Δν‖²/(N·s)²]", (), [view.objective[:, None]], scale="metric")]
+    panels += [replace(speed_panel([view]), scale="auto", overlay=False), force]
+    if np.ptp(view.level) > 1e-9:
+        panels.append(Panel("level of\nthe term  [1]", (), [view.level[:, None]]))
+    return panels
+
+
+def speed_panel(views: Sequence[RunView]) -> Panel:
+    """``‖ν‖`` of all runs in the same panel."""
+    label = f"‖ν‖  [{mixed_unit(views[0].robot).strip('()')}]"
+    return Panel(label, (), [view.speed[:, None] for view in views], scale="from zero", overlay=True)
+
+
 def rotor_panel(views: Sequence[RunView]) -> Panel | None:
     """Rotor speeds, the range of their commands, and the limits, as shares of the highest speed.
 
-    ``None`` of a robot without rotors.
-    Commands carry the sensors' noise: six of them over each other cannot be told apart.
+    ``None`` for a robot without rotors.  Commands carry the noise of the sensors. Six noisy curves could not
+    be told apart.
     """
     one = views[0]
     count = one.rotor_command.shape[1]
     if not count:
         return None
-    # A robot.toml does not name the unit of its rotors' speeds.
+    # A robot.toml does not name the unit of rotor speeds.
     low, high = one.rotor_limits or (0.0, 1.0)
     names = [f"rotor {k + 1}" for k in range(count)]
     commands = [view.rotor_command / high for view in views]
@@ -139,22 +167,22 @@ def rotor_panel(views: Sequence[RunView]) -> Panel | None:
 
 
 def control_panels(views: Sequence[RunView]) -> list[Panel]:
-    """Commands, with their limits: of the rotors, of the joints."""
+    """Panels of the rotor and joint commands with their limits."""
     return [panel for panel in (rotor_panel(views), torque_panel(views)) if panel is not None]
 
 
 def torque_panel(views: Sequence[RunView]) -> Panel | None:
-    """Commanded joint torques: of the joints that come closest to their limits, where there are many.
+    """Commanded joint torques; of many joints, those that come closest to their limits.
 
-    In N·m where all that are shown have the same limit or none, else as shares of each joint's own.
-    ``None`` of a robot without joints.
+    They are in N·m where all shown joints have the same limit or none, else shares of the limit of each joint.
+    ``None`` for a robot without joints.
     """
     one, limits = views[0], views[0].torque_limits
     if not limits.size:
         return None
     largest = np.max([np.abs(view.torque).max(axis=0) for view in views], axis=0)
     bounded = np.flatnonzero(np.isfinite(limits))
-    # Joints without a limit cannot come close to it: they are shown only where no joint has one.
+    # Joints without a limit cannot come close to it. They are shown only where no joint has a limit.
     eligible = bounded if bounded.size else np.arange(limits.size)
     shown = eligible[_largest((largest / limits if bounded.size else largest)[eligible])]
     notes = []
@@ -188,7 +216,7 @@ def torque_panel(views: Sequence[RunView]) -> Panel | None:
 
 
 def joint_panels(views: Sequence[RunView]) -> list[Panel]:
-    """Positions of the joints that move most, those in rad and those in m apart."""
+    """Panels of the positions of the joints that move most: those in rad, and those in m."""
     one = views[0]
     moved = np.max([np.ptp(view.positions, axis=0) for view in views], axis=0)
     single = np.flatnonzero(np.isfinite(moved))
@@ -210,5 +238,5 @@ def joint_panels(views: Sequence[RunView]) -> list[Panel]:
 
 
 def _largest(size: Vector) -> Any:
-    """Indices of the largest, as many as are shown, in the order of the robot."""
+    """Return the indices of the :data:`SHOWN` largest entries, in the order of the robot."""
     return np.sort(np.argsort(-size, kind="stable")[:SHOWN])

@@ -1,4 +1,4 @@
-"""What the pictures of a simulated run are drawn from: the robot, the impact, and plain arrays, one row a tick."""
+"""Data of the figures of a simulated run: the robot, the impact, and arrays with a row for each tick."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.plot.shapes import Vector
-from impact_posture.plot.view import number, velocity_units
+from impact_posture.plot.view import number
 from impact_posture.robot.robot import Robot
 
 Flags = NDArray[np.bool_]
@@ -21,14 +22,14 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Span:
-    """A time that is shaded.
+    """Shaded stretch of time.
 
     Attributes:
-        kind: ``impact``: what counts as the impact; ``dwell``: while a contact is asked for (drawn lighter).
-        begin: s.
-        end: s.
-        contact: Which contact, or push, it belongs to, from 0.
-        touched: Whether the impact came; else the span begins where it was expected.
+        kind: ``impact`` for an impact window; ``dwell`` for the time of a requested contact (drawn lighter).
+        begin: Begin, s.
+        end: End, s.
+        contact: Index of its contact or push, from 0.
+        touched: Whether the impact came; else the span begins at the expected time.
     """
 
     kind: str
@@ -40,32 +41,32 @@ class Span:
 
 @dataclass(frozen=True, eq=False)
 class RunView:
-    """One run: a controller that lives through a scenario.  n ticks; states are those at a tick's end.
+    """Run of a controller in a scenario, with n ticks and the states at the end of each tick.
 
-    What limits a command has is the robot's to say: ``model.effortLimit`` and its propulsion's speeds.
+    The robot holds the limits of the commands: ``model.effortLimit`` and the rotor speeds of its propulsion.
 
     Attributes:
         scenario: Name of the scenario.
         controller: Name of the controller.
         robot: The robot.
-        contact: Where the impact comes: frame, offset, and the world normal out of the surface (or along the push).
+        contact: Impact contact: frame, offset, and the world normal out of the surface (or along the push).
         t: s, increasing, shape (n,).
         q: Configuration, shape (n, nq).
         v: ν, shape (n, nv).
         torque: Joint torques as commanded, N·m (N for sliding joints), shape (n, joints).
         rotor_command: Rotor speeds as commanded, shape (n, rotors).
-        rotor_speed: As they turn, shape (n, rotors).
-        force: Of the surface on the robot, or of the push, world, N, shape (n, 3).
+        rotor_speed: Rotor speeds as measured, shape (n, rotors).
+        force: Force of the surface on the robot, or of the push, world, N, shape (n, 3).
         peak: Largest normal force within each tick, N, shape (n,).
         objective: H of the impact, shape (n,); NaN where it was not evaluated.
-        level: Of the term that prepares for the impact, 0 to 1, shape (n,).
+        level: Level of the impact-robust term, 0 to 1, shape (n,).
         at_stop: Whether a joint is at a position limit, shape (n, nv).
-        windows: What to shade; the first of kind ``impact`` is the first impact.
+        windows: Shaded spans; the first span of kind ``impact`` is the first impact.
         surface: A point on the surface that is hit, world, m, shape (3,); ``None`` for a push.
         supports: Feet that stay.
-        label: What the run is called beside others; the controller's name if empty.
-        title: First line of its pictures; scenario and controller if empty.
-        facts: For the small print below the title: seed, sign of the push, metrics.
+        label: Name of the run beside others; the name of the controller if empty.
+        title: First line of its figures; scenario and controller if empty.
+        facts: Facts for the small print below the title, for example the seed and the sign of the push.
     """
 
     scenario: str
@@ -107,29 +108,29 @@ class RunView:
             if np.shape(getattr(self, name)) != shape:
                 raise self._wrong(f"{name} has the shape {np.shape(getattr(self, name))}", f"give {shape}")
         if len(rotors) != 1 or n < 2 or not (np.diff(self.t) > 0).all():
-            raise self._wrong("there is no course of time", "give at least two ticks, later ones later")
+            raise self._wrong("there is no course of time", "give at least two ticks at increasing times")
 
     def _wrong(self, what: str, hint: str) -> InputError:
         return InputError(what, where=f"run view {self.scenario}, {self.controller}", hint=hint)
 
     @property
     def name(self) -> str:
-        """What the run is called beside others."""
+        """Name of the run beside others."""
         return self.label or self.controller
 
     @property
     def first_joint(self) -> int:
-        """Index of the first joint's entry in ν."""
+        """Index of the first joint in ν."""
         return 6 if self.robot.floating else 0
 
     @property
     def impacts(self) -> tuple[Span, ...]:
-        """The spans that count as impact, the first impact first."""
+        """Impact windows in the order of time."""
         return tuple(sorted((w for w in self.windows if w.kind == "impact"), key=lambda w: w.begin))
 
     @property
     def pushed(self) -> bool:
-        """Whether the impact is a push: there is no surface."""
+        """Whether the impact is a push, without a surface."""
         return self.surface is None
 
     @cached_property
@@ -139,13 +140,13 @@ class RunView:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the entries of ν that are joints'."""
+        """Names of the entries of ν that belong to joints."""
         return self.robot.tangent_names[self.first_joint :]
 
     @cached_property
     def joint_units(self) -> tuple[str, ...]:
-        """``rad`` or ``m`` of each."""
-        return tuple(unit.removesuffix("/s") for unit in velocity_units(self.robot)[self.first_joint :])
+        """Unit of each joint position, ``rad`` or ``m``."""
+        return tuple(unit.removesuffix("/s") for unit in tangent_units(self.robot)[self.first_joint :])
 
     @cached_property
     def positions(self) -> Vector:
@@ -159,13 +160,13 @@ class RunView:
             at, size, entry = int(model.idx_qs[joint]), int(model.nqs[joint]), int(model.idx_vs[joint])
             if int(model.nvs[joint]) != 1:
                 continue
-            # Pinocchio's endless joints: cosine and sine.
+            # Pinocchio stores cosine and sine of an endless joint.
             found[:, entry] = q[:, at] if size == 1 else np.unwrap(np.arctan2(q[:, at + 1], q[:, at]))
         return found[:, self.first_joint :]
 
     @property
     def torque_limits(self) -> Vector:
-        """Of each joint, N·m (N), shape (joints,); infinite where there is none."""
+        """Torque limit of each joint, N·m (N), shape (joints,); infinite without a limit."""
         effort = np.array(self.robot.model.effortLimit, dtype=float)[self.first_joint :]
         return np.where(effort > 0, effort, np.inf)
 
@@ -176,12 +177,12 @@ class RunView:
         return None if propulsion is None else (propulsion.speed_min, propulsion.speed_max)
 
     def index(self, time: float) -> int:
-        """The last tick that has ended by ``time`` (s); the first tick before that."""
+        """Return the last tick that has ended by ``time`` (s), or the first tick."""
         return max(int(np.searchsorted(self.t, time, side="right")) - 1, 0)
 
 
 def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
-    """Title and small print of a picture of runs of one scenario."""
+    """Return title and small print of a figure of runs of a scenario."""
     one = views[0]
     names = ", ".join(view.name for view in views) if len(views) < 5 else f"{len(views)} controllers"
     title = one.title if one.title and len(views) == 1 else f"{one.scenario}: {names}"
@@ -199,10 +200,10 @@ def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
 
 
 def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
-    """Return the views of one scenario and robot, the nominal one first.
+    """Return the views of a scenario and robot, the nominal controller first.
 
     Raises:
-        InputError: No view, or views that have nothing to do with each other.
+        InputError: No view, or views of different scenarios or robots.
     """
     if not views:
         raise InputError("there is no run to draw", where=where, hint="give at least one view")
@@ -219,6 +220,6 @@ def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
                 raise InputError(
                     f"the {what} of {view.name} is {own}, of {first.name} {theirs}",
                     where=where,
-                    hint="compare runs of one scenario",
+                    hint="compare runs of the same scenario",
                 )
     return tuple(sorted(views, key=lambda view: view.controller != "nominal"))

@@ -36,7 +36,7 @@ class Plane:
         return f"{self.right}{self.up}" if len(self.right + self.up) == 2 else "plane of n and z"
 
     def contains(self, direction: Vector) -> bool:
-        """Whether a unit direction lies in the plane, up to a degree."""
+        """Return whether a unit direction lies in the plane, up to a degree."""
         return bool(np.linalg.norm(self.axes @ direction) >= IN_PLANE)
 
 
@@ -48,20 +48,20 @@ COORDINATE_PLANES = (XY, XZ, YZ)
 
 
 def upright_plane(n: Vector) -> Plane:
-    """The plane of the vertical and a unit vector that is not vertical."""
+    """Return the plane of the vertical and a unit vector that is not vertical."""
     across = np.array([n[0], n[1], 0.0]) / np.hypot(n[0], n[1])
     name = f"along ({across[0]:.2f}, {across[1]:.2f}, 0)".replace("-", "−")
     return Plane(np.array([across, _Z]), name, "z")
 
 
 def root(matrix: Vector) -> Vector:
-    """The symmetric square root of a positive semidefinite matrix; a tiny negative eigenvalue counts as zero."""
+    """Return the symmetric square root of a positive semidefinite matrix, with negative eigenvalues set to zero."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
 def half_width(matrix: Vector, direction: Vector) -> float:
-    """Half-width ``√(dᵀΛd)`` of ``{x: xᵀΛ⁻¹x ≤ 1}`` along a unit ``d``: to its tangent planes, not its edge."""
+    """Half-width ``√(dᵀΛd)`` of ``{x: xᵀΛ⁻¹x ≤ 1}`` along a unit ``d``, the distance of its tangent planes."""
     return float(np.sqrt(max(float(direction @ matrix @ direction), 0.0)))
 
 
@@ -74,18 +74,18 @@ def shadow(matrix: Vector, axes: Vector, points: int = 181) -> Vector:
 
 
 def surface(matrix: Vector, rings: int = 25) -> Vector:
-    """Points of the ellipsoid's surface on a grid, shape (3, rings, 2·rings)."""
+    """Return points of the surface of the ellipsoid on a grid, shape (3, rings, 2·rings)."""
     across, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
     sphere = np.array([np.sin(across) * np.cos(around), np.sin(across) * np.sin(around), np.cos(across)])
     return np.asarray(np.einsum("ij,jkl->ikl", root(matrix), sphere))
 
 
 def principal_sections(matrix: Vector, points: int = 121) -> list[Vector]:
-    """The ellipses through two principal axes each, shape (3, points); those that are only a point left out."""
+    """Return the ellipses through two principal axes each, shape (3, points), without those that are a point."""
     axes = _semi_axes(matrix)
     flat = _NEGLIGIBLE * np.linalg.norm(axes[:, 2])
     pairs = [pair for pair in ([0, 1], [0, 2], [1, 2]) if np.linalg.norm(axes[:, pair[1]]) > flat]
-    # A rod's two long sections are the same segment.
+    # The two long sections of a rod are the same segment.
     pairs = pairs[1:] if len(pairs) == 2 and np.linalg.norm(axes[:, 1]) <= flat else pairs
     return [_ring(axes[:, pair], points) for pair in pairs]
 
@@ -141,7 +141,7 @@ def cone_shadow(axis: Vector, degrees: float, length: float, axes: Vector) -> Ve
 
 def square(center: Vector, n: Vector, side: float) -> Vector:
     """Corners of a square perpendicular to the unit vector ``n``, closed, shape (3, 5)."""
-    # The square's edges lean on the world axis that n is farthest from.
+    # The edges follow the world axis that n is farthest from.
     first = np.eye(3)[int(np.argmin(np.abs(n)))]
     first = first - (first @ n) * n
     first = first / np.linalg.norm(first)

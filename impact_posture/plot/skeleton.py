@@ -1,4 +1,4 @@
-"""The robot as sticks: which points to join, from the model alone (no mesh)."""
+"""Sticks of the robot from the model alone, without meshes."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.plot.shapes import Vector
 from impact_posture.robot.robot import Robot
 
-# Of a body, as a part of its shorter side.
+# Least height of a body, as a part of its shorter side.
 _LEAST_HEIGHT = 0.35
 _AROUND = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A robot's sticks in one posture, world, meters.
+    """Sticks of a robot in a posture, world, meters.
 
     Attributes:
         bones: Pairs of points to join, shape (k, 2, 3).
         joints: Origins of the moving joints, shape (j, 3).
         base: Placement of the base: the free-flyer, or the world for a fixed root.
-        body: Corners of the box between a base's hips, low ones first, around; shape (8, 3), or (0, 3) without.
+        body: Corners of the box between the hips, low corners first, shape (8, 3); (0, 3) without a box.
         contacts: The contact points, shape (c, 3).
         normals: World unit normals, shape (c, 3).
         feet: Contact points of the supports, shape (f, 3).
@@ -49,18 +49,18 @@ class Skeleton:
 
     @property
     def normal(self) -> Vector:
-        """The first contact's normal, shape (3,)."""
+        """Normal of the first contact, shape (3,)."""
         return np.asarray(self.normals[0])
 
     @property
     def arms(self) -> Vector:
-        """From the base to the rotors' centers, shape (r, 2, 3)."""
+        """Lines from the base to the centers of the rotors, shape (r, 2, 3)."""
         centers = self.rotors.mean(axis=2)
         return np.stack([np.broadcast_to(np.asarray(self.base.translation), centers.shape), centers], axis=1)
 
     @property
     def points(self) -> Vector:
-        """Everything that has to be in the picture, shape (m, 3)."""
+        """All points that the figure has to show, shape (m, 3)."""
         circles = self.rotors.transpose(0, 2, 1).reshape(-1, 3)
         origin = np.asarray(self.base.translation)[None]
         return np.vstack([self.bones.reshape(-1, 3), origin, self.body, self.contacts, self.feet, circles])
@@ -101,7 +101,7 @@ def build_skeleton(
         for point, end in zip(hanging, ends, strict=True)
         if point.joint >= first or not len(body)
     ]
-    # A link that already goes on to its foot or contact needs no other tip.
+    # A link with a stick to its foot or contact needs no other tip.
     done = {int(model.parents[i]) for i in range(1, model.njoints)}
     done |= {point.joint for point in hanging if np.linalg.norm(point.position) > 1e-3}
     for leaf in range(first, model.njoints):
@@ -120,12 +120,12 @@ def build_skeleton(
 
 
 def _body(model: pin.Model, base: pin.SE3) -> Vector:
-    """Corners of the box between the joints on the base, in its axes; none for fewer than four joints."""
+    """Return the corners of the box between the joints on the base; none for fewer than four joints."""
     hips = np.array([model.jointPlacements[i].translation for i in range(2, model.njoints) if model.parents[i] == 1])
     if len(hips) < 4:
         return np.zeros((0, 3))
     low, high = hips.min(axis=0), hips.max(axis=0)
-    # Hips at one height span no box: a model knows nothing of the body's height.
+    # Hips at the same height span no box, and the model does not contain the height of the body.
     lacking = max(_LEAST_HEIGHT * float((high - low)[:2].min()) - float((high - low)[2]), 0.0)
     low[2], high[2] = low[2] - lacking / 2, high[2] + lacking / 2
     corners = [(x, y, z) for z in (low[2], high[2]) for x, y in _AROUND * (high - low)[:2] + low[:2]]
@@ -133,19 +133,19 @@ def _body(model: pin.Model, base: pin.SE3) -> Vector:
 
 
 def _placed(places: Sequence[pin.SE3], point: PointOnLink) -> pin.SE3:
-    """World placement of a point's frame."""
+    """Return the world placement of the frame of a point."""
     return places[point.joint] * pin.SE3(point.rotation, point.position)
 
 
 def _tip(model: pin.Model, joint: int) -> Vector:
-    """The frame of a link that is farthest from its joint, in the joint's axes; else its center of mass."""
+    """Return the frame of a link that is farthest from its joint, in joint axes; else the center of mass."""
     places = [np.array(f.placement.translation) for f in model.frames if f.parentJoint == joint]
     tip = max(places, key=lambda place: float(np.linalg.norm(place)), default=np.zeros(3))
     return tip if np.linalg.norm(tip) > 1e-3 else np.array(model.inertias[joint].lever)
 
 
 def _rotors(robot: Robot, places: list[pin.SE3]) -> Vector:
-    """Circles across the thrust directions, as large as the rotors' spacing allows."""
+    """Return circles across the thrust directions, as large as the spacing of the rotors allows."""
     propulsion = robot.spec.propulsion
     if propulsion is None:
         return np.zeros((0, 3, 24))
@@ -158,7 +158,7 @@ def _rotors(robot: Robot, places: list[pin.SE3]) -> Vector:
     circles = []
     for center, rotor in zip(centers, propulsion.rotors, strict=True):
         thrust = np.array(rotor.direction) / np.linalg.norm(rotor.direction)
-        # Two directions across the thrust: the null space of its row.
+        # Two directions across the thrust span the null space of its row.
         across = np.linalg.svd(thrust[None])[2][1:]
         ring = center[:, None] + radius * across.T @ np.array([np.cos(angle), np.sin(angle)])
         circles.append(np.asarray(place.rotation) @ ring + np.asarray(place.translation)[:, None])

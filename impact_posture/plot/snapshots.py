@@ -1,4 +1,4 @@
-"""Figure ``snapshots``: the robot as sticks at three instants of a run, a row for each controller."""
+"""Figure ``snapshots``: sticks of the robot at three instants of a run, a row for each controller."""
 
 from __future__ import annotations
 
@@ -12,8 +12,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from impact_posture.escape import plot_label
-from impact_posture.plot.robot_drawing import BODY, depth_of, draw_sticks, side_plane
-from impact_posture.plot.run_axes import subplots
+from impact_posture.plot.labels import draw_arrow
+from impact_posture.plot.robot_drawing import (
+    HATCH,
+    depth_of,
+    draw_sticks,
+    frame_flat,
+    padded,
+    robot_handles,
+    side_plane,
+    stick_notes,
+)
 from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.shapes import Plane, Vector
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
@@ -28,18 +37,17 @@ from impact_posture.plot.style import (
     framed,
     save,
     shared_legend,
-    style,
 )
 
-NOTES = "Sticks join joint origins; they are not the links' shapes. Gray: where the robot was when the run began."
+_START_NOTE = "Gray sticks show the robot at the start of the run."
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
 _START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
-# Just before the impact: a tick that it has no part in, s.
+# Time before the impact at which no tick contains it, s.
 _BEFORE = 0.005
 
 
 def draw_snapshots(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write ``snapshots`` of one run of each controller (nominal first) into ``out_dir``; return the paths.
+    """Write ``snapshots`` of a run of each controller (nominal first) into ``out_dir``; return the paths.
 
     Raises:
         InputError: No view, views of different scenarios or robots, an unknown format.
@@ -83,14 +91,14 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
             tails = np.stack([plane.axes @ state.contact - arrow, plane.axes @ state.contact], axis=1)
             low, high = np.minimum(low, tails.min(axis=1)), np.maximum(high, tails.max(axis=1))
     low, high = _window(low, high, views[0], plane)
-    # As high as the robot needs, within a page's reason.
+    # As high as the robot needs, within the limits of a page.
     highest = float(np.clip(8.5 / len(views), 1.2, 3.0))
     height = float(np.clip(2.1 * (high - low)[1] / (high - low)[0], 1.2, highest)) + 0.2
-    with style():
-        figure, body = framed(
-            *run_header(views), height * len(views) + 0.85, [f"{NOTES} {BODY}" if len(rows[0][0].body) else NOTES]
-        )
-        panels = subplots(body, len(views), 3, sharex=True, sharey=True)
+    with framed(*run_header(views), height * len(views) + 0.85, [*stick_notes(rows[0][0]), _START_NOTE]) as (
+        figure,
+        body,
+    ):
+        panels = body.subplots(len(views), 3, squeeze=False, sharex=True, sharey=True)
         for axes_row, row, view, arrow in zip(panels, rows, views, arrows, strict=True):
             for column, (axes, state, (word, time)) in enumerate(zip(axes_row, row, instants(view), strict=True)):
                 _surface(axes, view, plane, low, high)
@@ -99,16 +107,13 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
                 draw_sticks(axes, state, _NOW, plane)
                 if arrow is not None and column:
                     _push(axes, plane.axes @ state.contact, arrow, acting=column == 2)
-                axes.set_xlim(low[0], high[0])
-                axes.set_ylim(low[1], high[1])
-                axes.set_aspect("equal", adjustable="box")
-                axes.locator_params(nbins=5)
+                frame_flat(axes, low, high, 5)
                 first = f"{word}\n" * (view is views[0])
                 axes.set_title(f"{first}t = {max(time, 0.0):.2f} s", fontsize=8)
             axes_row[0].set_ylabel(f"{plot_label(view.name)}\n{plane.up}  [m]")
         for axes in panels[-1]:
             axes.set_xlabel(f"{plane.right}  [m]")
-        # The lowest panels say what the eye looks along.
+        # The lowest panels name the viewing direction.
         panels[-1][1].set_xlabel(f"{plane.right}  [m]\nseen along {depth_of(plane)}")
         shared_legend(body, _handles(rows[0][0], views[0]), "lower")
     return figure
@@ -119,22 +124,20 @@ def _skeleton(view: RunView, tick: int) -> Skeleton:
 
 
 def _window(low: Vector, high: Vector, view: RunView, plane: Plane) -> tuple[Vector, Vector]:
-    """Corners of what is shown: all sticks, and the surface where it is seen from its edge."""
+    """Return the corners of a panel, which shows all sticks, and the surface where it is seen from its edge."""
     if view.surface is not None:
         touched = plane.axes @ view.surface
         n = plane.axes @ np.array(view.contact.normal)
-        # The surface's own place along its normal only: it has no end across.
+        # Only the place of the surface along its normal counts, because it has no end across.
         edge = touched - 0.05 * float((high - low).max()) * n
         for axis in range(2):
             if abs(n[axis]) > 0.5:
                 low[axis], high[axis] = min(low[axis], edge[axis]), max(high[axis], edge[axis])
-    longest = float((high - low).max()) or 1.0
-    middle, half = (low + high) / 2, np.maximum(high - low, 0.5 * longest) / 2 + 0.06 * longest
-    return middle - half, middle + half
+    return padded(low, high)
 
 
 def _surface(axes: Any, view: RunView, plane: Plane, low: Vector, high: Vector) -> None:
-    """The surface from its edge, hatched behind it."""
+    """Draw the surface as seen from its edge, hatched behind it."""
     if view.surface is None:
         return
     n = plane.axes @ np.array(view.contact.normal)
@@ -143,15 +146,15 @@ def _surface(axes: Any, view: RunView, plane: Plane, low: Vector, high: Vector) 
     n = n / np.linalg.norm(n)
     size = 2 * float((high - low).max())
     point, along = plane.axes @ view.surface, size * np.array([-n[1], n[0]])
-    # From where the panel's middle is nearest.
+    # The strip begins next to the middle of the panel.
     point = point + along * float(along @ ((low + high) / 2 - point)) / size**2
     corners = np.array([point + along, point - along, point - along - size * n, point + along - size * n])
-    axes.fill(*corners.T, facecolor="white", edgecolor=GRAY, hatch="/////", linewidth=0, zorder=0.5)
+    axes.fill(*corners.T, facecolor="white", edgecolor=GRAY, hatch=HATCH, linewidth=0, zorder=0.5)
     axes.plot(*corners[:2].T, color=INK, linewidth=1.0, zorder=1)
 
 
 def _arrow(view: RunView, state: Skeleton, plane: Plane, reach: float) -> Vector | None:
-    """The push from tail to tip in the picture; ``None`` where there is none."""
+    """Return the push from tail to tip in the figure; ``None`` without a push."""
     largest = view.force[int(np.argmax(np.linalg.norm(view.force, axis=1)))]
     size = float(np.linalg.norm(largest))
     if not view.pushed or size == 0:
@@ -160,26 +163,13 @@ def _arrow(view: RunView, state: Skeleton, plane: Plane, reach: float) -> Vector
 
 
 def _push(axes: Any, contact: Vector, arrow: Vector, *, acting: bool) -> None:
-    look = {"arrowstyle": "-|>", "color": VERMILLION, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 3}
-    look |= {} if acting else {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}
-    axes.annotate("", tuple(contact), tuple(contact - arrow), arrowprops=look, zorder=7)
+    look = {"linewidth": 1.8} if acting else {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}
+    draw_arrow(axes, contact - arrow, contact, 7, color=VERMILLION, shrinkB=3, **look)
 
 
 def _handles(state: Skeleton, view: RunView) -> list[Any]:
-    def mark(label: str, marker: str, **look: Any) -> Line2D:
-        return Line2D([], [], linestyle="", marker=marker, color=BLUE, label=label, **look)
-
-    handles: list[Any] = [
-        Line2D([], [], label="now", **_NOW),
-        Line2D([], [], label="start", **_START),
-        mark("base", "P", markersize=7),
-        mark("contact point", "o", markersize=5.5),
-    ]
-    if len(state.feet):
-        handles.append(mark("foot that stays", "^", markersize=6, markerfacecolor="white"))
+    handles = robot_handles(state, {"now": _NOW, "start": _START}, BLUE)
     if view.surface is not None:
-        handles.append(Patch(facecolor=PALE, edgecolor=GRAY, hatch="/////", linewidth=0, label="surface"))
-    else:
-        handles.append(mark("push (dashed: to come)", r"$\rightarrow$", markersize=11))
-        handles[-1].set_color(VERMILLION)
-    return handles
+        return [*handles, Patch(facecolor=PALE, edgecolor=GRAY, hatch=HATCH, linewidth=0, label="surface")]
+    arrow: dict[str, Any] = {"linestyle": "", "marker": r"$\rightarrow$", "markersize": 11, "color": VERMILLION}
+    return [*handles, Line2D([], [], label="push (dashed: to come)", **arrow)]

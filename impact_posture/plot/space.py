@@ -1,4 +1,4 @@
-"""Axes in space: equal scales, and ticks and names that do not stand on each other."""
+"""3-D axes with equal scales, and with ticks and names that do not overlap."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import text_width
 
 _TICKS = 6.5
-# Of an axis' length, at its ends: two axes meet there.
+# Part of an axis without ticks at each end, where two axes meet.
 _CORNER = 0.07
 
 
 class Space(Axes3D):  # type: ignore[misc]
-    """3-D axes that the layout leaves room for, names of the axes included."""
+    """3-D axes whose names the layout leaves room for."""
 
     def get_tightbbox(self, renderer: Any = None, **more: Any) -> Any:
-        """All that is drawn; matplotlib leaves the names out for the layout, and others end upon them."""
+        """Return the box of all that is drawn, with the names, which matplotlib leaves out for the layout."""
         return super().get_tightbbox(renderer, **(more | {"for_layout_only": False}))
 
 
@@ -34,14 +34,14 @@ def frame_space(axes: Any, low: Vector, high: Vector, unit: str, bins: int, *, a
         axis = getattr(axes, f"{name}axis")
         share = float(size[k] / size.max())
         longest = _set_ticks(axis, low[k], high[k], round(bins * share), room=np.inf if name == "z" else 95 * share)
-        # Matplotlib puts numbers 8 and names 21 off their axis, centered there: points in a cube, less in a flat box.
+        # Matplotlib centers numbers 8 and names 21 points off their axis in a cube, and nearer in a flat box.
         scale = max(float(np.delete(size, k).mean() / size.max()), 0.25)
         axes.tick_params(axis=name, pad=(8 if name == "z" else 6) / scale - 8, labelsize=_TICKS)
         getattr(axes, f"set_{name}label")(f"{name}  [{unit}]", labelpad=(longest / 2 + 4) / scale - 13, fontsize=7.0)
 
 
 def _set_ticks(axis: Any, low: float, high: float, bins: int, room: float) -> float:
-    """Few ticks, none at the ends, whose numbers fit a length in points; return the longest number's."""
+    """Set few ticks whose numbers fit ``room`` (points), none at the ends; return the width of the longest number."""
     air = _CORNER * (high - low)
     for count in range(max(bins, 3), 0, -1):
         ticks = np.asarray(MaxNLocator(count, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))

@@ -1,4 +1,4 @@
-"""How every picture looks: one color-blind-safe palette that also works in gray, sizes that print, and saving."""
+"""Style of all figures: a color-blind-safe palette that works in gray, print sizes, header, legend, saving."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ VERMILLION, BLUE, GREEN, SKY, PURPLE, ORANGE = "#D55E00", "#0072B2", "#009E73", 
 INK, GRAY, PALE = "#000000", "#6b6b6b", "#d9d9d9"
 
 # Before and after differ by line and hatch as well, so that a gray print tells them apart.
-# The dashes lie on top: where both coincide, the solid line shows in their gaps.
+# The dashes lie on top, so that the solid line shows in their gaps where both coincide.
 BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (4, 2)), "linewidth": 1.4, "zorder": 3.5}
 AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.6, "zorder": 3.0}
-# The same without supports: thinner, in other dashes.
+# Lines of the robot without supports are thinner and have other dashes.
 FREE_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (1, 1.6)), "linewidth": 1.0, "zorder": 2.8}
 FREE_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": (0, (6, 1.6, 1, 1.6)), "linewidth": 0.9, "zorder": 2.6}
 # Arrows of the worst normals of a cone.
@@ -39,7 +39,7 @@ BEFORE_BAR: dict[str, Any] = {"facecolor": "#fbe3d3", "edgecolor": VERMILLION, "
 AFTER_BAR: dict[str, Any] = {"facecolor": BLUE, "edgecolor": BLUE, "linewidth": 0.6}
 
 FORMATS = ("png", "svg", "pdf")
-# Of a PDF alone, a figure takes as long as of the PNG of three.
+# A PDF takes as long as three PNG files.
 DEFAULT_FORMATS = ("png",)
 # Width of a two-column page, inches.
 WIDTH = 7.2
@@ -70,39 +70,44 @@ _RC: dict[str, Any] = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw and save with our settings, whatever the user's matplotlibrc says; theirs are put back afterwards."""
+    """Draw and save with these settings, and restore the settings of the user afterwards."""
     with matplotlib.rc_context(), warnings.catch_warnings():
-        # A letter that the font lacks is drawn as a box.
+        # Matplotlib draws a box for a letter that the font lacks.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_RC)
         yield
 
 
-def framed(title: str, lines: Sequence[str], height: float, notes: Sequence[str] = ()) -> tuple[Figure, Any]:
-    """Make a figure with the header above and ``notes`` below; return it and the part to draw in.
+@contextmanager
+def framed(
+    title: str, lines: Sequence[str], height: float, notes: Sequence[str] = ()
+) -> Iterator[tuple[Figure, Any]]:
+    """Yield a figure with the header above and ``notes`` below, and the part to draw in; apply :func:`style`.
 
     Args:
         title: First line.
-        lines: Small print below it, broken between its facts where it is too long.
+        lines: Small print below the title, broken between its facts where a line is too long.
         height: Height of the part to draw in, inches.
-        notes: Sentences below the picture.
+        notes: Sentences of the paragraph below.
     """
     title = printable(title, longest=_LONGEST_TITLE)
     small = [part for line in lines for part in wrap(printable(line), SEPARATOR)]
-    below = [part for line in notes for part in wrap(line, " ")]
+    below = wrap(" ".join(notes), " ")
     head, foot = 0.26 + _LINE * len(small), 0.06 + _LINE * len(below)
-    figure = Figure(figsize=(WIDTH, head + height + foot), layout="constrained")
-    parts: Any = figure.subfigures(3, 1, height_ratios=[head, height, foot])
-    top, body, bottom = parts
-    top.text(0.012, 1 - 0.06 / head, title, fontsize=10, fontweight="bold", va="top", parse_math=False)
-    top.text(0.012, 1 - 0.26 / head, "\n".join(small), fontsize=_SMALL, va="top", linespacing=1.4, parse_math=False)
-    bottom.text(0.012, 1, "\n".join(below), fontsize=_SMALL, va="top", linespacing=1.4, color="#333333")
-    return figure, body
+    with style():
+        figure = Figure(figsize=(WIDTH, head + height + foot), layout="constrained")
+        parts: Any = figure.subfigures(3, 1, height_ratios=[head, height, foot])
+        top, body, bottom = parts
+        look = {"fontsize": _SMALL, "va": "top", "linespacing": 1.4}
+        top.text(0.012, 1 - 0.06 / head, title, fontsize=10, fontweight="bold", va="top", parse_math=False)
+        top.text(0.012, 1 - 0.26 / head, "\n".join(small), parse_math=False, **look)
+        bottom.text(0.012, 1, "\n".join(below), color="#333333", **look)
+        yield figure, body
 
 
 def wrap(line: str, separator: str) -> list[str]:
-    """Break a line of small print at separators so that it fits the page, by the font's own widths."""
+    """Break a line of small print at separators so that it fits the page, by the widths of the font."""
     parts, room = [""], 72 * WIDTH * 0.975
     for piece in line.split(separator):
         longer = f"{parts[-1]}{separator}{piece}" if parts[-1] else piece
@@ -114,13 +119,13 @@ def wrap(line: str, separator: str) -> list[str]:
 
 
 def text_width(text: str, size: float) -> float:
-    """Width of a text, points."""
+    """Return the width of a text, points."""
     font = FontProperties(family="DejaVu Sans", size=size)
     return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0])
 
 
 def shared_legend(body: Any, handles: Sequence[Any], place: str, **look: Any) -> None:
-    """Put the one legend of a figure above (``upper``) or below (``lower``) its panels, as wide as the page."""
+    """Put the legend of a figure above (``upper``) or below (``lower``) its panels, as wide as the page."""
     size, handle, gap, room = float(_RC["legend.fontsize"]), 2.2, 1.4, 72 * WIDTH * 0.96
     widths = [text_width(str(h.get_label()).replace("$", ""), size) + size * (handle + 0.8 + gap) for h in handles]
 
@@ -130,14 +135,14 @@ def shared_legend(body: Any, handles: Sequence[Any], place: str, **look: Any) ->
         return sum(max(widths[k : k + rows]) for k in range(0, len(widths), rows))
 
     columns = next((n for n in range(len(handles), 1, -1) if width(n) <= room), 1)
-    # As few rows as that takes, and those alike.
+    # Rows of equal length, as few as possible.
     columns = -(-len(handles) // -(-len(handles) // columns))
     look = {"ncols": columns, "handlelength": handle, "columnspacing": gap} | look
     body.legend(handles=list(handles), loc=f"outside {place} center", **look)
 
 
 def lay_out(figure: Figure) -> None:
-    """Give everything its place and keep it: every format then shows the same picture, in half the time."""
+    """Lay out a figure once, so that every format shows the same figure in half the time."""
     # Panels with equal axes change their size in the first round and are placed in the others.
     engine: Any = figure.get_layout_engine()
     if engine is None:
@@ -145,21 +150,20 @@ def lay_out(figure: Figure) -> None:
     for _ in range(3):
         engine.execute(figure)
     figure.set_layout_engine("none")
-    figure.draw_without_rendering()
-    place_labels(figure)
-    # The layout's solver differs in the last digits from run to run; the files must not.
+    # Rounded, because the solver of the layout differs in the last digits from run to run.
     for part in figure.subfigs:
         box = part.bbox_relative
         box.p0, box.p1 = np.round(box.p0, 6), np.round(box.p1, 6)
     for axes in figure.axes:
         axes.set_position(np.round(axes.get_position(original=True).bounds, 6))
+    place_labels(figure)
 
 
 def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
     """Return the formats in order, once each.
 
     Raises:
-        InputError: A format that pictures are not written in.
+        InputError: An unknown format.
     """
     wanted = tuple(dict.fromkeys(f.lower().lstrip(".") for f in formats))
     for one in wanted:
@@ -169,7 +173,9 @@ def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
 
 
 def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write ``figure`` as ``out_dir/name.<format>`` for each format, each file whole or not at all; return the paths.
+    """Write ``figure`` as ``out_dir/name.<format>`` for each format, each file completely or not at all.
+
+    Return the paths.
 
     Raises:
         InputError: An unknown format.
@@ -181,7 +187,7 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
         lay_out(figure)
     for extension in wanted:
         path = Path(out_dir) / f"{name}.{extension}"
-        # No date: the same result gives the same file.
+        # Without a date, so that the same result gives the same file.
         metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(extension, {})
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""What the pictures are drawn from: a contact, two postures, an approach, and the way from one to the other."""
+"""Data of the figures of a result: an impact, two postures, an approach, the path and the trade-off between them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -18,18 +18,20 @@ from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
 from impact_posture.impact.scalars import objective_value
+from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.impact.worst_case import SingleImpact
 from impact_posture.robot.robot import Robot
 
 Vector = NDArray[np.float64]
 
-# Between the facts of a header line.
+# Separator of the facts in a header line.
 SEPARATOR = "  ·  "
+_UNITS = {"H": "‖Δν‖²/(N·s)²", "G": "1/kg", "V": "‖Δν‖²/(m/s)²", "S": "‖Δν‖²/(m/s)²", "E": "kg"}
 
 
 @dataclass(frozen=True, eq=False)
 class PathData:
-    """The impact quantities along a path of postures, one entry for each.
+    """Impact quantities along a path of postures.
 
     Attributes:
         s: Path length in the tangent norm, ``∫‖dν‖`` (rad mixed with m), increasing, shape (k,).
@@ -52,17 +54,17 @@ class PathData:
 
 @dataclass(frozen=True, eq=False)
 class TradeOffData:
-    """The best posture within each distance from the initial one, one entry for each, the initial one first.
+    """Best posture within each distance from the initial posture, which comes first.
 
     Attributes:
         within: The bounds on the distance (rad mixed with m), increasing, shape (k,).
-        distance: How far each posture is, at most ``within``, shape (k,).
-        objective: Its objective, shape (k,).
+        distance: Distance of each posture, at most ``within``, shape (k,).
+        objective: Objective of each posture, shape (k,).
         H: ``nᵀΛ_c n``, shape (k,).
         G: ``1/m_eff`` along the normal, 1/kg, shape (k,).
         V: ``H/G²``, shape (k,).
         S: The sticking counterpart of V, shape (k,); NaN where it does not exist.
-        certified: Whether its certificate holds, shape (k,).
+        certified: Whether the certificate of each posture holds, shape (k,).
         knee: Index of the knee, if there is one.
     """
 
@@ -84,7 +86,7 @@ class TradeOffData:
 
 @dataclass(frozen=True, eq=False)
 class ResultView:
-    """Everything that a picture needs to know of one result.
+    """Data that the figures of a result need.
 
     Attributes:
         robot: The robot.
@@ -95,7 +97,7 @@ class ResultView:
         restitution: Coefficient of restitution e, in [0, 1].
         path: Quantities along the null-space path between them, if known.
         tradeoff: The trade-off of objective against distance, if it was computed.
-        title: First line of every picture; robot and contact frame if empty.
+        title: First line of every figure; robot and contact frame if empty.
     """
 
     robot: Robot
@@ -110,39 +112,26 @@ class ResultView:
 
     @cached_property
     def before(self) -> ImpactQuantities:
-        """The quantities at ``q_initial``."""
+        """Quantities at ``q_initial``."""
         return self.objective.oracle.quantities(self.q_initial)
 
     @cached_property
     def after(self) -> ImpactQuantities:
-        """The quantities at ``q_optimal``."""
+        """Quantities at ``q_optimal``."""
         return self.objective.oracle.quantities(self.q_optimal)
 
     @cached_property
-    def free_before(self) -> ImpactQuantities | None:
-        """The quantities at ``q_initial`` without the supports; ``None`` where there are none."""
-        return self._free(self.q_initial)
+    def free(self) -> tuple[ImpactQuantities, ...]:
+        """Quantities before and after without the supports; empty for a robot that has no supports."""
+        if not self.objective.supports:
+            return ()
+        oracle = ImpactOracle(replace(self.objective.case, supports=()))
+        return oracle.quantities(self.q_initial), oracle.quantities(self.q_optimal)
 
     @cached_property
-    def free_after(self) -> ImpactQuantities | None:
-        """The quantities at ``q_optimal`` without the supports; ``None`` where there are none."""
-        return self._free(self.q_optimal)
-
-    def _free(self, q: Vector) -> ImpactQuantities | None:
-        objective = self.objective
-        if not objective.supports:
-            return None
-        return ImpactOracle(replace(objective.case, supports=())).quantities(q)
-
-    @cached_property
-    def worst_before(self) -> WorstNormal | None:
-        """The worst normal of the cone at ``q_initial``, world; ``None`` without a cone or where there is none."""
-        return self._worst(self.q_initial)
-
-    @cached_property
-    def worst_after(self) -> WorstNormal | None:
-        """The worst normal of the cone at ``q_optimal``, world; ``None`` without a cone or where there is none."""
-        return self._worst(self.q_optimal)
+    def worst(self) -> tuple[WorstNormal | None, WorstNormal | None]:
+        """World worst normals of the cone before and after; ``None`` without a cone or where none exists."""
+        return self._worst(self.q_initial), self._worst(self.q_optimal)
 
     def _worst(self, q: Vector) -> WorstNormal | None:
         cone = self.objective.normal_cone
@@ -155,11 +144,11 @@ class ResultView:
 
     @cached_property
     def contact_point(self) -> PointOnLink:
-        """The contact point on its link."""
+        """Contact point on its link."""
         return point_on(self.robot, self.objective.contact.frame, self.objective.contact.offset)
 
     def jacobian(self, q: Vector) -> Vector:
-        """``J(q)``, shape (3, nv): world velocity of the contact point, supports left out."""
+        """Return ``J(q)``, shape (3, nv), of the world velocity of the contact point without supports."""
         return np.array(self.objective.oracle.numeric.at(q).jacobian(self.contact_point)[:3])
 
 
@@ -173,33 +162,13 @@ def sample_path(
     model = objective.robot.model
     steps = [float(np.linalg.norm(pin.difference(model, q, p))) for q, p in pairwise(configurations)]
     found = [objective.oracle.quantities(q) for q in configurations]
-    return PathData(
-        s=np.concatenate([[0.0], np.cumsum(steps)]),
-        H=np.array([f.H for f in found]),
-        G=np.array([f.G for f in found]),
-        V=np.array([f.V for f in found]),
-        S=np.array([np.nan if f.S is None else f.S for f in found]),
-        start=start,
-        optimum=optimum,
-    )
-
-
-def velocity_units(robot: Robot) -> tuple[str, ...]:
-    """``m/s`` or ``rad/s`` for each of the nv velocity entries."""
-    units = []
-    for index in range(1, robot.model.njoints):
-        joint = robot.model.joints[index]
-        data = joint.createData()
-        own = pin.Model()
-        own.addJoint(0, joint, pin.SE3.Identity(), "joint")
-        joint.calc(data, pin.neutral(own))
-        motion = np.asarray(data.S).reshape(6, -1)
-        units += ["rad/s" if turns else "m/s" for turns in (np.abs(motion[3:]).max(axis=0) > 1e-12)]
-    return tuple(units)
+    # A missing S becomes NaN.
+    curves = {name: np.array([getattr(f, name) for f in found], dtype=float) for name in "HGVS"}
+    return PathData(np.concatenate([[0.0], np.cumsum(steps)]), **curves, start=start, optimum=optimum)
 
 
 def jump_unit(view: ResultView) -> str:
-    """Unit of ``‖Δν‖_W`` in the view's metric."""
+    """Return the unit of ``‖Δν‖_W`` in the metric of the view."""
     metric = view.objective.metric
     if metric.kind == "kinetic":
         return "√J"
@@ -209,26 +178,26 @@ def jump_unit(view: ResultView) -> str:
 
 
 def objective_unit(view: ResultView) -> str:
-    """Unit of the objective's values."""
+    """Return the unit of the objective."""
     jump = jump_unit(view)
     square = "J" if jump == "√J" else f"{jump}²"
     return {"impulse": square, "energy": "kg"}.get(view.objective.kind, f"{square}/(m/s)²")
 
 
 def mixed_unit(robot: Robot) -> str:
-    """Unit of the Euclidean ``‖ν‖``: both units where it mixes them."""
-    kinds = [u for u in ("m/s", "rad/s") if u in velocity_units(robot)]
+    """Return the unit of the Euclidean ``‖ν‖``, which is both units where it mixes them."""
+    kinds = [u for u in ("m/s", "rad/s") if u in tangent_units(robot)]
     return kinds[0] if len(kinds) == 1 else f"({', '.join(kinds)})"
 
 
 def contact_letters(view: ResultView) -> list[str]:
-    """What tells the contacts of a picture apart: nothing where there is one, else a letter each."""
+    """Return a letter for each contact of a figure; an empty text for a single contact."""
     count = len(view.objective.contacts)
     return [f" {letter}" for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[:count]] if count > 1 else [""]
 
 
 def header_lines(view: ResultView) -> tuple[str, list[str]]:
-    """Title, and the small lines below it: what was computed, for which robot, and all five quantities.
+    """Return the title and the small lines below it: robot, contact, settings and all five quantities.
 
     H never stands alone: G, V, S and E stand beside it.
     """
@@ -254,23 +223,16 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
         facts.insert(0, f"drawn and in numbers: the model as it stands; objective the worst of {count}")
     feet = [s.frame for s in view.objective.supports]
     facts.append(f"contact-consistent, on {', '.join(feet)}" if feet else "no supports")
-    quantities: list[tuple[str, str, Callable[[ImpactQuantities], float | None]]] = [
-        ("H", "‖Δν‖²/(N·s)²", lambda f: f.H),
-        ("G", "1/kg", lambda f: f.G),
-        ("V", "‖Δν‖²/(m/s)²", lambda f: f.V),
-        ("S", "‖Δν‖²/(m/s)²", lambda f: f.S),
-        ("E", "kg", lambda f: f.E),
-    ]
-    numbers = [
-        f"{name} {number(get(view.before))} → {number(get(view.after))}"
-        + (f" {unit}" if (get(view.before), get(view.after)) != (None, None) else "")
-        for name, unit, get in quantities
-    ]
+    numbers = []
+    for name, unit in _UNITS.items():
+        first, second = getattr(view.before, name), getattr(view.after, name)
+        shown = f" {unit}" if (first, second) != (None, None) else ""
+        numbers.append(f"{name} {number(first)} → {number(second)}{shown}")
     return title, [SEPARATOR.join(facts), SEPARATOR.join(numbers)]
 
 
 def _worst_values(view: ResultView) -> str:
-    """The objective before and after, where it is none of the five quantities but the worst of several impacts."""
+    """Return the objective before and after, where it is the worst of several impacts."""
     if isinstance(view.objective.worst_case, SingleImpact):
         return ""
     found = [objective_value(view.objective, q) for q in (view.q_initial, view.q_optimal)]
@@ -278,7 +240,7 @@ def _worst_values(view: ResultView) -> str:
 
 
 def number(value: float | None) -> str:
-    """Three digits with a true minus sign; ``undefined`` for ``None``."""
+    """Format a number with three digits and a true minus sign; ``undefined`` for ``None``."""
     if value is None or np.isnan(value):
         return "undefined"
     if np.isinf(value):
@@ -294,7 +256,7 @@ def _sourced(view: ResultView) -> bool:
 
 
 def _short(source: str) -> str:
-    """A source without its explanation in parentheses, and a path without its folders."""
+    """Return a source without its explanation in parentheses, and a path without its folders."""
     return source.split(" (")[0].rsplit("/", 1)[-1]
 
 

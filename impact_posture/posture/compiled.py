@@ -7,7 +7,6 @@ compiles once.
 
 from __future__ import annotations
 
-import hashlib
 import platform
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,10 +14,9 @@ from typing import Any, Literal, NamedTuple
 import casadi as ca
 
 from impact_posture.errors import CompilerError, OutputError
-from impact_posture.libraries import building, cache_folder, cache_path, is_cached
+from impact_posture.libraries import building, cache_folder, cache_path, is_cached, source_key
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.toolchain import find_compiler, run_compiler, run_compilers
-from impact_posture.version import __version__
+from impact_posture.toolchain import find_compiler, no_compiler, run_compiler, run_compilers
 
 CompileMode = Literal["auto", "always", "never"]
 
@@ -56,7 +54,7 @@ def compiled_solver(
         interpreted = ca.nlpsol("posture", "ipopt", symbols, options)
         compiler = find_compiler()
         if mode == "always" and compiler is None:
-            raise CompilerError("no C compiler found", where="compile", hint="install gcc or clang, or set CC")
+            raise no_compiler("compile")
         if mode == "never" or compiler is None or (mode == "auto" and not _pays(interpreted, starts)):
             return BuiltSolver(interpreted, False)
         _compile(interpreted, compiler, f"{_key(problem)}.so")
@@ -91,8 +89,6 @@ def _pays(solver: ca.Function, starts: int) -> bool:
 def _key(problem: PostureProblem) -> str:
     """Hash of everything that shapes the functions; targets, limits and the leading normal are parameters."""
     content = [
-        __version__,
-        own_source("dynamics", "impact", "posture"),
         ca.CasadiMeta.version(),
         f"{platform.system()} {platform.machine()}",
         problem.robot.model_sha256,
@@ -101,17 +97,7 @@ def _key(problem: PostureProblem) -> str:
         problem.objective.structure,
         *[f"{c.structure}:{problem.carried(i)}" for i, c in enumerate(problem.constraints)],
     ]
-    return hashlib.sha256("\n".join(content).encode()).hexdigest()[:32]
-
-
-def own_source(*packages: str) -> str:
-    """Hash of the code that writes the expressions: a changed formula never meets an old library."""
-    root = Path(__file__).parents[1]
-    digest = hashlib.sha256()
-    for folder in packages:
-        for path in sorted((root / folder).glob("*.py")):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+    return source_key(content, "dynamics", "impact", "posture")
 
 
 def _compile(solver: ca.Function, compiler: list[str], name: str) -> None:

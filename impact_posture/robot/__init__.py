@@ -1,1 +1,1 @@
-"""What a robot is: its model, named postures, limits, armature and actuation."""
+"""Robot descriptions: model, named postures, limits, armature and actuation."""

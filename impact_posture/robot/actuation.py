@@ -1,9 +1,9 @@
-"""What a robot's rotors and motors can do: allocation, hover, and lateral force.
+"""Actuation by rotors and motors: allocation, hover, and lateral force.
 
-Notation is that of the whole package: ``ν = [base linear, base angular, joint rates]`` with the base twist in
-the base frame.  The equation of motion of an aerial robot with arm is ``M(q) ν̇ + h(q, ν) = G u`` with
-``u = [rotor thrusts (N), joint torques (N·m)]``.  Generalized forces are dual to ``ν``, hence ``G`` is
-constant: its rotor columns are wrenches on the base, in the base frame at its origin.
+The velocity is ``ν = [base linear, base angular, joint rates]`` with the base twist in the base frame.  The equation
+of motion of an aerial robot with an arm is ``M(q) ν̇ + h(q, ν) = G u`` with ``u = [rotor thrusts (N), joint torques
+(N·m)]``.  Generalized forces are dual to ``ν``, hence ``G`` is constant.  Its rotor columns are wrenches on the base,
+in the base frame at its origin.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.errors import FrameNotFound, PostureError, SpecError
+from impact_posture.robot.model_joints import is_free_flyer, joint_range
 from impact_posture.robot.spec import PropulsionSpec
 
 Array = NDArray[np.float64]
@@ -25,7 +26,7 @@ _RESIDUAL = 1e-6
 
 @dataclass(frozen=True)
 class Allocation:
-    """How rotor thrusts make a wrench on the base."""
+    """Map from rotor thrusts to the wrench on the base."""
 
     matrix: Array
     """6 × n: base wrench ``[force (N); moment (N·m)]`` per unit thrust (N), base frame, base origin."""
@@ -52,7 +53,7 @@ class Hover:
     residual: float
     """Largest base force or moment (N, N·m) that the rotors leave unbalanced."""
     violations: tuple[str, ...]
-    """What stands against hovering here, in words; empty if nothing does."""
+    """Reasons in words why the robot cannot hover here; empty if it can."""
 
     @property
     def feasible(self) -> bool:
@@ -62,31 +63,25 @@ class Hover:
 
 @dataclass(frozen=True)
 class LateralForce:
-    """Largest net horizontal force without tilting or turning, each way, N; NaN where the robot cannot hover.
+    """Largest net horizontal force without tilt or rotation in each direction, N; NaN if the robot cannot hover.
 
-    The force acts through the center of mass of the robot with its arm held still.  Forward and left are the
-    base's x and y axes made horizontal.
+    The force acts through the center of mass of the robot, whose arm does not move.  Forward and left are the x and y
+    axes of the base, projected on the horizontal plane.
     """
 
     forward: float
     backward: float
     left: float
     right: float
-    mass: float
 
     @property
     def least(self) -> float:
-        """The smallest of the four, N."""
+        """Smallest of the four forces, N."""
         return float(np.min([self.forward, self.backward, self.left, self.right]))
-
-    @property
-    def least_acceleration(self) -> float:
-        """The smallest of the four per mass, m/s²."""
-        return self.least / self.mass
 
 
 def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
-    """Return the smallest and the largest thrust of a rotor, N: ``c_f ω²`` at the speed limits."""
+    """Return the smallest and the largest thrust of a rotor, ``c_f ω²`` at the speed limits, N."""
     if propulsion.speed_min >= propulsion.speed_max:
         raise SpecError(
             f"speed_min {propulsion.speed_min:g} is not below speed_max {propulsion.speed_max:g}",
@@ -100,11 +95,12 @@ def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
 def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
     """Map rotor thrusts (N) to the base wrench ``[force; moment]``, in the base frame at its origin.
 
-    A rotor at ``p`` with unit thrust direction ``d``, spin ``s`` and drag ratio ``κ`` contributes per unit
-    thrust ``[d; p × d - s κ d]``, first in the propulsion frame, then carried to the base (root joint) frame:
-    6 × n_rotors.  The model must be free-flying, with the propulsion frame on its base body.
+    A rotor at ``p`` with unit thrust direction ``d``, spin ``s`` and drag ratio ``κ`` makes the wrench
+    ``[d; p × d - s κ d]`` per unit thrust in the propulsion frame.  It is transformed to the base (root joint) frame,
+    which gives a matrix of 6 × n_rotors.  The model must be free-flying, with the propulsion frame on its base body.
     """
-    _require_free_flyer(model)
+    if not is_free_flyer(model):
+        raise SpecError("rotors on a robot that cannot fly", where="propulsion", hint='set root = "free-flyer"')
     if not model.existFrame(propulsion.frame):
         raise FrameNotFound(propulsion.frame, (f.name for f in model.frames), where="propulsion.frame")
     frame = model.frames[model.getFrameId(propulsion.frame)]
@@ -144,10 +140,10 @@ def allocation(model: pin.Model, propulsion: PropulsionSpec) -> Allocation:
 def actuation_matrix(model: pin.Model, propulsion: PropulsionSpec | None = None) -> Array:
     """Return the constant ``G`` of ``M ν̇ + h = G u``, ``u = [thrusts (N); joint torques (N·m)]``.
 
-    It is nv × (n_rotors + n_joints), joints in the order of ``ν``.  Without ``propulsion`` the base of a
-    free-flying robot is not actuated; a fixed-base robot has ``G = I``.
+    The shape is nv × (n_rotors + n_joints), with joints in the order of ``ν``.  Without ``propulsion``, the base of a
+    free-flying robot is not actuated.  A fixed-base robot has ``G = I``.
     """
-    base = 6 if _is_free_flyer(model) else 0
+    base = 6 if is_free_flyer(model) else 0
     rotors = np.zeros((base, 0)) if propulsion is None else allocation_matrix(model, propulsion)
     joints = model.nv - base
     matrix = np.zeros((model.nv, rotors.shape[1] + joints))
@@ -157,11 +153,11 @@ def actuation_matrix(model: pin.Model, propulsion: PropulsionSpec | None = None)
 
 
 def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
-    """Find the thrusts and torques that hold posture ``q`` at rest: ``h(q, 0) = G u``.
+    """Return the thrusts and torques that hold posture ``q`` at rest: ``h(q, 0) = G u``.
 
-    The rows of the base fix the thrusts: six independent rotors uniquely; of more rotors, those farthest
-    from their limits; where the rotors cannot make the wrench, the nearest one within the limits.  The other
-    rows are the torques, compared with the model's effort limits.
+    The rows of the base determine the thrusts.  For six independent rotors, they are unique.  For more rotors, they
+    are the thrusts farthest from their limits.  If the rotors cannot make the wrench, they are the nearest within the
+    limits.  The other rows are the torques, which are compared with the effort limits of the model.
     """
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)
@@ -174,13 +170,14 @@ def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
     width = high - low
     thrust_margin = float(np.min(np.minimum(thrusts - low, high - thrusts)) / width)
     used = np.divide(np.abs(torques), limits, out=np.full(torques.shape, np.inf), where=limits > 0)
+    joints = [model.names[i] for i in joint_range(model) for _ in range(model.nvs[i])]
     violations = []
     if residual > _RESIDUAL:
         violations.append(f"the rotors leave {residual:.3g} (N or N·m) of the weight unbalanced")
     for rotor, thrust in zip(propulsion.rotors, thrusts, strict=True):
         if not low - 1e-9 * width <= thrust <= high + 1e-9 * width:
             violations.append(f"{rotor.name} would need {thrust:.3g} N, outside [{low:.3g}, {high:.3g}]")
-    for name, torque, share in zip(_velocity_names(model)[6:], torques, used, strict=True):
+    for name, torque, share in zip(joints, torques, used, strict=True):
         if share > 1.0:
             violations.append(f"{name} would need {torque:.3g} N·m, above its limit")
     return Hover(
@@ -195,16 +192,13 @@ def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
 
 
 def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> LateralForce:
-    """Find the largest net horizontal force that keeps attitude and height, in each of four directions.
+    """Return the largest net horizontal force that keeps attitude and height, in each of four directions.
 
-    A linear program for each: maximize ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0``, subject
-    to ``A f = h_b + M_b e a`` (six rows: the weight is carried, nothing else moves and nothing turns), to the
-    thrust limits and to ``|h_j + M_j e a| <= τ_max`` for the joints that hold the arm still; ``e`` moves the
-    whole robot one way.  Give a level base for the force at zero tilt.
+    A linear program per direction maximizes ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0``.  Its
+    constraints are ``A f = h_b + M_b e a`` (six rows, which carry the weight and permit no rotation), the thrust
+    limits, and ``|h_j + M_j e a| <= τ_max`` for the joints, which do not move; ``e`` moves the whole robot in the
+    direction.  The force is that at zero tilt if the base is level.
     """
-    # Here, not above: the online controllers want G alone, and SciPy's optimizers take long to load.
-    from scipy.optimize import linprog
-
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)
     q = _configuration(model, q)
@@ -225,41 +219,47 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
         count = matrix.shape[1]
         held = np.isfinite(limits)
         zeros = np.zeros((int(held.sum()), count))
-        result = linprog(
-            np.r_[np.zeros(count), -1.0],
-            A_eq=np.column_stack([matrix, -push[:6]]),
-            b_eq=load[:6],
-            A_ub=np.block([[zeros, push[6:][held, None]], [zeros, -push[6:][held, None]]]),
-            b_ub=np.r_[(limits - load[6:])[held], (limits + load[6:])[held]],
-            bounds=[(low, high)] * count + [(0.0, None)],
-            method="highs",
+        found = _maximize_last(
+            np.column_stack([matrix, -push[:6]]),
+            load[:6],
+            np.block([[zeros, push[6:][held, None]], [zeros, -push[6:][held, None]]]),
+            np.r_[(limits - load[6:])[held], (limits + load[6:])[held]],
+            [(low, high)] * count + [(0.0, None)],
         )
-        return mass * float(result.x[-1]) if result.status == 0 else float("nan")
+        return float("nan") if found is None else mass * float(found[-1])
 
-    return LateralForce(largest(forward), largest(-forward), largest(left), largest(-left), mass)
+    return LateralForce(largest(forward), largest(-forward), largest(left), largest(-left))
 
 
 def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
-    """Thrusts with ``A f = w``, as far from their limits as can be; if there are none, the nearest within."""
-    from scipy.optimize import linprog, lsq_linear
+    """Return the thrusts with ``A f = w`` farthest from their limits; without any, the nearest within the limits."""
+    from scipy.optimize import lsq_linear
 
     count = matrix.shape[1]
     if count == 6 and np.linalg.matrix_rank(matrix) == 6:
         return np.asarray(np.linalg.solve(matrix, wrench))
-    # Variables f and s: low + s (high - low) <= f <= high - s (high - low), s as large as possible.
+    # Variables f and s: low + s (high - low) <= f <= high - s (high - low) with the largest s.
     width = np.full((count, 1), high - low)
-    result = linprog(
-        np.r_[np.zeros(count), -1.0],
-        A_eq=np.column_stack([matrix, np.zeros(6)]),
-        b_eq=wrench,
-        A_ub=np.block([[-np.eye(count), width], [np.eye(count), width]]),
-        b_ub=np.r_[np.full(count, -low), np.full(count, high)],
-        bounds=[(None, None)] * (count + 1),
-        method="highs",
+    found = _maximize_last(
+        np.column_stack([matrix, np.zeros(6)]),
+        wrench,
+        np.block([[-np.eye(count), width], [np.eye(count), width]]),
+        np.r_[np.full(count, -low), np.full(count, high)],
+        [(None, None)] * (count + 1),
     )
-    if result.status == 0:
-        return np.asarray(result.x[:-1])
-    return np.asarray(lsq_linear(matrix, wrench, bounds=(low, high)).x)
+    return np.asarray(lsq_linear(matrix, wrench, bounds=(low, high)).x) if found is None else found[:-1]
+
+
+def _maximize_last(
+    A: Array, b: Array, A_upper: Array, b_upper: Array, bounds: list[tuple[float | None, float | None]]
+) -> Array | None:
+    """Return the ``x`` with the largest last entry subject to ``A x = b``, ``A_upper x ≤ b_upper`` and the bounds."""
+    # Imported here, because SciPy takes long to import and online controllers only need G.
+    from scipy.optimize import linprog
+
+    cost = np.r_[np.zeros(A.shape[1] - 1), -1.0]
+    result = linprog(cost, A_ub=A_upper, b_ub=b_upper, A_eq=A, b_eq=b, bounds=bounds, method="highs")
+    return np.asarray(result.x) if result.status == 0 else None
 
 
 def _configuration(model: pin.Model, q: ArrayLike) -> Array:
@@ -269,18 +269,3 @@ def _configuration(model: pin.Model, q: ArrayLike) -> Array:
     if not np.all(np.isfinite(values)):
         raise PostureError("a value is not finite", where="posture", hint="correct it")
     return values
-
-
-def _is_free_flyer(model: pin.Model) -> bool:
-    return bool(model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer")
-
-
-def _require_free_flyer(model: pin.Model) -> None:
-    if not _is_free_flyer(model):
-        raise SpecError("rotors on a robot that cannot fly", where="propulsion", hint='set root = "free-flyer"')
-
-
-def _velocity_names(model: pin.Model) -> list[str]:
-    """Joint name of each entry of ν."""
-    # Joint 0 is the universe, which has no entry.
-    return [model.names[i] for i in range(1, model.njoints) for _ in range(model.joints[i].nv)]

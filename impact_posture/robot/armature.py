@@ -1,4 +1,4 @@
-"""Armature: where it comes from, and a word when there is none."""
+"""Armature of a model: its sources, and a warning if there is none."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.errors import InputError, SpecError
+from impact_posture.robot.model_joints import is_free_flyer, joint_index, joint_range, v_slice
 from impact_posture.robot.spec import RobotSpec
-from impact_posture.robot.urdf import joint_index
 from impact_posture.tables import read_toml
-
-Vector = NDArray[np.float64]
 
 ArmatureOption = Mapping[str, float] | str | None
 
@@ -22,38 +20,52 @@ ArmatureOption = Mapping[str, float] | str | None
 def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: ArmatureOption, name: str) -> str:
     """Set ``model.armature``, kg·m² (kg for prismatic joints).
 
-    First of: the option, robot.toml, rotor data of the SRDF, zero.
+    The values come from the option, else from robot.toml, else from rotor data of the SRDF, else they are zero.
 
     Returns:
-        Where the values came from, in words.
+        Source of the values in words.
 
     Raises:
-        InputError: A joint that does not exist, a value below zero, or an unreadable file.
+        InputError: A joint does not exist, a value is below zero, or a file cannot be read.
     """
     if option == "none":
         model.armature = np.zeros(model.nv)
         return "none (given)"
     armature, source = np.array(model.armature, dtype=float), "none"
     if spec.armature.default is not None or spec.armature.joints:
-        armature = _armature_vector(model, spec.armature.default or 0.0, spec.armature.joints, name)
+        armature[:] = spec.armature.default or 0.0
+        _set_joints(model, armature, spec.armature.joints, f"{name} [armature]")
         source = f"robot.toml ({spec.armature.source})" if spec.armature.source else "robot.toml"
     elif srdf is not None and "rotor_params" in srdf.read_text(encoding="utf-8", errors="replace"):
         pin.loadRotorParameters(model, str(srdf), False)
         armature = np.array(model.armature, dtype=float)
-        armature[: _base_width(model)] = 0.0
         source = "rotor data in the SRDF"
     if isinstance(option, str):
-        armature = _armature_vector(model, 0.0, _armature_file(Path(option)), option)
+        armature[:] = 0.0
+        _set_joints(model, armature, _armature_file(Path(option)), f"{option} [armature]")
         source = option
     elif option:
-        for joint, value in option.items():
-            if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"armature {joint}={value:g}", where="armature", hint="give a number ≥ 0")
-            index = joint_index(model, joint, "armature")
-            armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]] = value
+        _set_joints(model, armature, option, "armature", InputError)
         source = f"given values over {source}"
+    if is_free_flyer(model):
+        armature[:6] = 0.0
     model.armature = armature
     return source
+
+
+def armature_warning(model: pin.Model, source: str, held: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return a warning about joints without armature, or nothing; joints that are held by default do not count."""
+    armature = np.asarray(model.armature)
+    counted = {i: str(model.names[i]) for i in joint_range(model) if model.names[i] not in held}
+    bare = [name for i, name in counted.items() if not (armature[v_slice(model, i)] > 0).any()]
+    if not bare:
+        return ()
+    listed = ", ".join(bare[:3]) + (f" and {len(bare) - 3} more" if len(bare) > 3 else "")
+    which = "" if len(bare) == len(counted) else f" at {listed}"
+    return (
+        f"armature is zero{which} ({source}). Geared motors usually have some, and H scales like 1/armature² "
+        "where it dominates; give `armature` or robot.toml [armature]",
+    )
 
 
 def _armature_file(path: Path) -> dict[str, float]:
@@ -66,39 +78,15 @@ def _armature_file(path: Path) -> dict[str, float]:
         raise SpecError("holds no table joint = value", where=str(path), hint="write: joint_name = 0.01") from None
 
 
-def _armature_vector(model: pin.Model, default: float, joints: Mapping[str, float], where: str) -> Vector:
-    armature = np.full(model.nv, default)
-    armature[: _base_width(model)] = 0.0
-    for joint, value in joints.items():
-        index = joint_index(model, joint, f"{where} [armature]")
+def _set_joints(
+    model: pin.Model,
+    armature: NDArray[np.float64],
+    values: Mapping[str, float],
+    where: str,
+    error: type[InputError] = SpecError,
+) -> None:
+    for joint, value in values.items():
+        index = joint_index(model, joint, where)
         if not (np.isfinite(value) and value >= 0):
-            raise SpecError(f"armature of '{joint}' is {value:g}", where=where, hint="give a number ≥ 0")
-        armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]] = value
-    return armature
-
-
-def _base_width(model: pin.Model) -> int:
-    return 6 if model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer" else 0
-
-
-def armature_warning(model: pin.Model, source: str, held: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return one line where joints have no armature, else nothing; joints that are held by default do not count."""
-    first = 2 if _base_width(model) else 1
-    armature = np.asarray(model.armature)
-    joints = [str(model.names[i]) for i in range(first, model.njoints)]
-    bare = [
-        name
-        for i, name in enumerate(joints, first)
-        if name not in held and not (armature[model.idx_vs[i] : model.idx_vs[i] + model.nvs[i]] > 0).any()
-    ]
-    if not bare:
-        return ()
-    which = "" if len(bare) == len([j for j in joints if j not in held]) else f" at {_listed(bare)}"
-    return (
-        f"armature is zero{which} ({source}): geared motors usually have some, and H scales like 1/armature² "
-        "where it dominates; give `armature` or robot.toml [armature]",
-    )
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+            raise error(f"armature of '{joint}' is {value:g}", where=where, hint="give a number ≥ 0")
+        armature[v_slice(model, index)] = value

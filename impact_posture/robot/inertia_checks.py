@@ -1,4 +1,4 @@
-"""Masses and inertias that no rigid body can have, and mass matrices that cannot be inverted."""
+"""Checks for masses and inertias that no rigid body has, and for singular mass matrices."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.errors import InertiaError
+from impact_posture.robot.model_joints import v_slice
 
-# Below _TINY a mass (kg) or a moment (kg m²) counts as zero; a relative fault below the slack is rounding.
+# A mass (kg) or a moment (kg m²) below _TINY counts as zero.  A relative fault below the slack counts as rounding.
 _TINY = 1e-10
 _TRIANGLE_SLACK = 1e-3
-# Least eigenvalue over the largest of a mass matrix with unit diagonal; known robots stay above 1e-3.
+# Ratio of extreme eigenvalues below which a mass matrix with unit diagonal is singular; known robots exceed 1e-3.
 _SINGULAR = 1e-12
 
 
 def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool) -> tuple[str, ...]:
-    """Refuse links that no rigid body can be; returns warnings.
+    """Refuse links that no rigid body can be; return warnings.
 
-    A fault too small to matter in the body that the link is lumped into is a warning, and so is any with ``accept``.
+    A fault is a warning if it is too small to matter in the body that contains the link, or with ``accept``.
 
     Raises:
-        InertiaError: A negative mass, a mass without extent that has moments, or moments that break the triangle
-            inequality.
+        InertiaError: A mass is negative, a link without mass has moments, or moments break the triangle inequality.
     """
     where, warnings = str(path), []
     for link in root.iter("link"):
@@ -37,13 +37,13 @@ def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool)
         frame = model.getFrameId(name, pin.FrameType.BODY)
         joint = model.frames[frame].parentJoint if frame < model.nframes else 0
         if joint == 0:
-            continue  # welded to the world: it never moves
+            continue  # The link is welded to the world.
         size, words = fault
         body = float(np.linalg.eigvalsh(model.inertias[joint].inertia)[-1])
         if size <= _TRIANGLE_SLACK * body:
             warnings.append(f"{words}; too small to matter in the body it belongs to")
         elif accept:
-            warnings.append(f"{words}; accepted as robot.toml asks")
+            warnings.append(f"{words}; accepted by robot.toml")
         else:
             raise InertiaError(
                 words, where=where, hint="correct its <inertial>, or set accept_inertias = true in robot.toml [model]"
@@ -56,8 +56,7 @@ def massless_joints(model: pin.Model) -> tuple[str, ...]:
     moved = np.array([max(i.mass, float(np.abs(i.inertia).max())) for i in model.inertias])
     found: list[str] = []
     for joint in range(model.njoints - 1, 0, -1):
-        first = model.idx_vs[joint]
-        armature = np.asarray(model.armature)[first : first + model.nvs[joint]]
+        armature = np.asarray(model.armature)[v_slice(model, joint)]
         if moved[joint] <= _TINY and not (armature > 0).all():
             found.insert(0, str(model.names[joint]))
         moved[model.parents[joint]] += moved[joint]
@@ -65,10 +64,10 @@ def massless_joints(model: pin.Model) -> tuple[str, ...]:
 
 
 def check_moved_mass(model: pin.Model, where: str) -> None:
-    """Refuse joints that move nothing: the mass matrix would be singular.
+    """Refuse joints that move no mass, because the mass matrix would be singular.
 
     Raises:
-        InertiaError: Naming all of them.
+        InertiaError: Joints move no mass; the message names all of them.
     """
     found = massless_joints(model)
     if found:
@@ -85,19 +84,20 @@ def check_moved_mass(model: pin.Model, where: str) -> None:
 def check_mass_matrix(
     model: pin.Model, q: NDArray[np.float64], tangent_names: Sequence[str], where: str, posture: str
 ) -> None:
-    """Refuse a singular mass matrix: a massless floating base, a point mass that turns, two joints about one axis.
+    """Refuse a singular mass matrix.
 
-    ``M`` is scaled to a unit diagonal first, so that kilograms and kg m² compare.
+    Causes are a massless floating base, a point mass that turns, or two joints about one axis.  ``M`` is first scaled
+    to a unit diagonal, so that kilograms and kg m² compare.
 
     Args:
         model: The model, armature included.
         q: Configuration, shape (nq,).
-        tangent_names: A name for each of the nv directions.
-        where: The model's source.
+        tangent_names: Names of the nv directions.
+        where: Source of the model.
         posture: Name of ``q``.
 
     Raises:
-        InertiaError: Naming the directions that move without moving anything.
+        InertiaError: The matrix is singular; the message names the directions that move no inertia.
     """
     upper = np.triu(pin.crba(model, model.createData(), q))
     M = upper + np.triu(upper, 1).T
@@ -108,7 +108,7 @@ def check_mass_matrix(
         values, vectors = np.linalg.eigh(M * np.outer(scale, scale))
         if values[0] >= _SINGULAR * values[-1]:
             return
-        # Back in rad and m (per s), the way that the robot moves freely.
+        # The free motion in rad and m (per s).
         motion = np.abs(scale * vectors[:, 0])
         free = motion >= 0.1 * motion.max()
     named = [name for name, moves in zip(tangent_names, free, strict=True) if moves]
@@ -121,7 +121,7 @@ def check_mass_matrix(
 
 
 def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:
-    """Return how far, in kg m², a link's inertia is from a possible one, and the fault in words."""
+    """Return the distance of a link's inertia from a possible one, kg m², and the fault in words."""
     inertial, name = link.find("inertial"), link.get("name", "?")
     if inertial is None:
         return None

@@ -1,9 +1,9 @@
-"""The same robot under other assumptions: more or less armature, a payload."""
+"""Variants of a robot under other assumptions: more or less armature, a payload."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +12,7 @@ from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 
 AS_MODELED = "as modeled"
-# Each variant is a model of its own in the program.
+# Largest number of variants, because each is a separate model in the optimization.
 MOST_VARIANTS = 12
 
 
@@ -31,13 +31,13 @@ class Payload:
 
 @dataclass(frozen=True, eq=False)
 class ModelVariant:
-    """One of the models that the robot may turn out to be.
+    """A possible model of the robot.
 
     Attributes:
-        name: What it is called in outputs.
-        robot: The robot under its assumptions.
-        armature_factor: What the stated armature is multiplied by.
-        payload: What it carries besides, or ``None``.
+        name: Name in outputs.
+        robot: The robot under these assumptions.
+        armature_factor: Factor on the stated armature.
+        payload: Payload that the robot carries, or ``None``.
     """
 
     name: str
@@ -46,12 +46,11 @@ class ModelVariant:
     payload: Payload | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        payload = self.payload
+        """Return the content for JSON."""
         return {
             "name": self.name,
             "armature_factor": self.armature_factor,
-            "payload": None if payload is None else {"frame": payload.frame, "mass": payload.mass},
+            "payload": None if self.payload is None else asdict(self.payload),
             "model_sha256": self.robot.model_sha256,
         }
 
@@ -59,19 +58,19 @@ class ModelVariant:
 def build_model_variants(
     robot: Robot, armature_range: tuple[float, float] | None, payloads: Sequence[Payload]
 ) -> tuple[ModelVariant, ...]:
-    """All pairs of an armature (as stated, lowest, highest) with a payload (none, or one of those given).
+    """Return all pairs of an armature (as stated, lowest, highest) and a payload (none, or one of those given).
 
     Args:
-        robot: As modeled; the first variant.
+        robot: The robot as modeled, which is the first variant.
         armature_range: Factors on the stated armature, lowest and highest.
-        payloads: Each is there or not, one at a time.
+        payloads: Payloads; each variant has at most one of them.
 
     Returns:
-        Empty where nothing is uncertain.
+        The variants; empty if nothing is uncertain.
 
     Raises:
-        InputError: A range or a mass that makes no sense, a factor on an armature of zero, or too many variants.
-        FrameNotFound: Of a payload.
+        InputError: A range or mass is invalid, the armature is zero, or there are too many variants.
+        FrameNotFound: The robot lacks the frame of a payload.
     """
     factors = _factors(robot, armature_range)
     for payload in payloads:
@@ -82,20 +81,17 @@ def build_model_variants(
             )
         if robot.model.frames[robot.frame_id(payload.frame)].parentJoint == 0:
             raise InputError(
-                f"frame '{payload.frame}' is welded to the world: a mass there changes nothing",
+                f"frame '{payload.frame}' is welded to the world, where a mass changes nothing",
                 where="payload",
                 hint="choose a frame on a moving link",
             )
         if payloads.count(payload) > 1:
-            raise InputError(f"{payload.mass:g} kg at '{payload.frame}' is given twice", where="payload",
-                             hint="remove one")  # fmt: skip
+            what = f"{payload.mass:g} kg at '{payload.frame}' is given twice"
+            raise InputError(what, where="payload", hint="remove one of them")
     found = [_variant(robot, factor, payload) for payload in (None, *payloads) for factor in factors]
     if len(found) > MOST_VARIANTS:
-        raise InputError(
-            f"{len(found)} model variants, each a model of its own",
-            where="payload",
-            hint=f"have at most {MOST_VARIANTS}",
-        )
+        hint = f"give at most {MOST_VARIANTS} combinations"
+        raise InputError(f"{len(found)} model variants, each a separate model", where="payload", hint=hint)
     return tuple(found) if len(found) > 1 else ()
 
 
@@ -105,13 +101,13 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
     low, high = armature_range
     if not (np.isfinite([low, high]).all() and 0 < low <= high):
         raise InputError(
-            f"the armature's range is {low:g} to {high:g}",
+            f"the armature range is {low:g} to {high:g}",
             where="armature_range",
-            hint="give two factors above zero on the stated armature, the lower first, such as 0.5 2",
+            hint="give two factors above zero, the lower first, such as 0.5 2",
         )
     if not robot.armature.any():
         raise InputError(
-            f"{robot.name} has no armature: a factor on zero changes nothing",
+            f"{robot.name} has no armature, so a factor changes nothing",
             where="armature_range",
             hint="state one with `armature` or in robot.toml",
         )
@@ -119,10 +115,9 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
 
 
 def _variant(robot: Robot, factor: float, payload: Payload | None) -> ModelVariant:
-    words = []
-    model = robot.model
-    if factor != 1 or payload is not None:
-        model = pin.Model(robot.model)
+    if factor == 1 and payload is None:
+        return ModelVariant(AS_MODELED, robot)
+    words, model = [], pin.Model(robot.model)
     if factor != 1:
         words.append(f"armature × {factor:g}")
         model.armature = factor * robot.armature
@@ -131,28 +126,27 @@ def _variant(robot: Robot, factor: float, payload: Payload | None) -> ModelVaria
         frame = model.frames[robot.frame_id(payload.frame)]
         mass = pin.Inertia(payload.mass, np.array(frame.placement.translation), np.zeros((3, 3)))
         model.inertias[frame.parentJoint] = model.inertias[frame.parentJoint] + mass
-    same = robot if model is robot.model else replace(robot, model=model)
-    return ModelVariant(", ".join(words) or AS_MODELED, same, factor, payload)
+    return ModelVariant(", ".join(words), replace(robot, model=model), factor, payload)
 
 
-def between(model_variants: Sequence[ModelVariant], count: int, seed: int) -> list[Robot]:
-    """Draw robots between model variants, with any factor on the armature and any share of one of the payloads.
+def between(variants: Sequence[ModelVariant], count: int, seed: int) -> list[Robot]:
+    """Return random robots between variants: any factor on the armature, any share of one of the payloads.
 
     Args:
-        model_variants: As :func:`build_model_variants` gives them, the robot as modeled first.
-        count: How many.
-        seed: Of the draw.
+        variants: Variants of :func:`build_model_variants`, the robot as modeled first.
+        count: Number of robots.
+        seed: Seed of the draw.
     """
     generator = np.random.default_rng(seed)
-    factors = [variant.armature_factor for variant in model_variants]
-    payloads = [variant.payload for variant in model_variants if variant.payload is not None]
+    factors = [variant.armature_factor for variant in variants]
+    payloads = [variant.payload for variant in variants if variant.payload is not None]
     found = []
     for _ in range(count):
-        # Evenly in the logarithm: half and twice are equally far from what is stated.
+        # Uniform in the logarithm, because half and twice are equally far from the stated value.
         factor = float(np.exp(generator.uniform(np.log(min(factors)), np.log(max(factors)))))
         payload = None
         if payloads:
             whole = payloads[generator.integers(len(payloads))]
             payload = replace(whole, mass=float(generator.uniform(0, whole.mass)))
-        found.append(_variant(model_variants[0].robot, factor, payload).robot)
+        found.append(_variant(variants[0].robot, factor, payload).robot)
     return found

@@ -1,4 +1,4 @@
-"""Postures as people give them: a name, ``posture.json``, joints by name, or a ``sensor_msgs/JointState`` as YAML."""
+"""Postures as users write them: a name, ``posture.json``, joints by name, or a ``sensor_msgs/JointState`` in YAML."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from impact_posture.errors import JointNotFound, PostureError, PostureNotFound, nearest
+from impact_posture.robot.model_joints import q_slice, scalar_entries
 from impact_posture.robot.robot import Robot, Vector
 
 SCHEMA = "impact-posture/posture/1"
@@ -19,25 +20,25 @@ _OUR_KEYS = ("schema", "robot", "convention", "joint_names", "q")
 _BY_NAME_KEYS = ("schema", "robot", "base", "joints")
 _SHAPES = "q with joint_names, joints by name, or a JointState's name and position"
 
-_FIXED = ", but the root is fixed: the root link sits at the world's origin along its axes"
-_NO_BASE = "remove the base and give `normal` as it is seen from there, or `root='free-flyer'`"
+_FIXED = ", but the root is fixed, with the root link at the world's origin along its axes"
+_NO_BASE = "remove the base and give `normal` in those axes, or use `root='free-flyer'`"
 
 
 def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Vector:
-    """Return the configuration that ``text`` names, shape (nq,), checked against length, quaternion and limits.
+    """Return the configuration that ``text`` names, shape (nq,), with its length, quaternion and limits checked.
 
     Args:
         robot: The robot.
         text: Name of one of its postures, or a file: ``posture.json`` (``q`` in the order of ``joint_names``),
             ``{"base": [x, y, z, qx, qy, qz, qw], "joints": {name: value}}``, or a ``sensor_msgs/JointState`` in YAML
-            (``name: [...]``, ``position: [...]``).  By name, a continuous joint is one angle in rad, and what is not
-            named stays as in the default posture.  ``None``: the default posture.
-        where: The option or file to name in errors.
+            (``name: [...]``, ``position: [...]``).  By name, a continuous joint is one angle in rad, and joints
+            that are not named stay as in the default posture.  ``None`` means the default posture.
+        where: Option or file to name in errors.
 
     Raises:
-        PostureNotFound: Neither a posture nor a file, with the nearest names.
-        JointNotFound: A file names a joint that the robot lacks, with the nearest names.
-        PostureError: The file cannot be read, or its numbers make no posture of this robot.
+        PostureNotFound: ``text`` is neither a posture nor a file; carries the nearest names.
+        JointNotFound: A file names a joint that the robot lacks; carries the nearest names.
+        PostureError: The file cannot be read, or its numbers are no posture of this robot.
     """
     if text is None or text in robot.postures:
         return robot.check_posture(robot.posture(text), where=f"{where} {text or robot.default_posture}")
@@ -49,7 +50,7 @@ def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Vect
 
 
 def write_posture(robot: Robot, q: Vector) -> dict[str, object]:
-    """Return ``posture.json``'s content for ``q``, shape (nq,); :func:`read_posture` reads it back.
+    """Return the content of ``posture.json`` for ``q``, shape (nq,); :func:`read_posture` reads it back.
 
     Raises:
         PostureError: ``q`` is no posture of this robot.
@@ -65,7 +66,7 @@ def write_posture(robot: Robot, q: Vector) -> dict[str, object]:
 
 
 def posture_path(text: str) -> Path | None:
-    """Tell a posture file from a posture name."""
+    """Return the path if ``text`` names a posture file, else ``None``."""
     path = Path(text).expanduser()
     return path if path.suffix in (".json", ".yaml", ".yml") or path.is_file() else None
 
@@ -74,7 +75,7 @@ def _load(path: Path) -> Mapping[str, object]:
     kind = "JSON" if path.suffix == ".json" else "YAML"
     try:
         text = path.read_text(encoding="utf-8")
-        # `ros2 topic echo` ends every message with `---`: the first document counts.
+        # `ros2 topic echo` ends every message with `---`, hence the first document is read.
         data = json.loads(text) if kind == "JSON" else next(iter(yaml.safe_load_all(text)), None)
     except FileNotFoundError:
         raise PostureError("no such file", where=str(path), hint="check the path") from None
@@ -88,7 +89,7 @@ def _load(path: Path) -> Mapping[str, object]:
 
 
 def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Vector:
-    """Tell the three shapes apart by their keys."""
+    """Read one of the three shapes, which differ in their keys."""
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
         raise PostureError(f"schema '{schema}' is no posture", where=where, hint=f'give a file of "{SCHEMA}"')
@@ -144,39 +145,39 @@ def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: st
 
 
 def set_joints(robot: Robot, q: Vector, joints: Mapping[str, object], where: str) -> Vector:
-    """A configuration with some joints at other values; unchecked otherwise.
+    """Return a configuration with the given joints at other values, otherwise unchecked.
 
     Args:
         robot: The robot.
-        q: The configuration, shape (nq,); not changed.
+        q: Configuration, shape (nq,); not changed.
         joints: Values by name: one number for a joint of one degree of freedom, its entries of q for others.
-        where: What to name in errors.
+        where: Option or file to name in errors.
 
     Raises:
-        JointNotFound: With the nearest names.
-        PostureError: A value that is none.
+        JointNotFound: The robot lacks a joint; carries the nearest names.
+        PostureError: A value is invalid.
     """
     q = q.copy()
     for name, value in joints.items():
         if name in robot.locked:
-            continue  # a robot's own message names all its joints; a rigid one has no value to set
+            continue  # Messages of a robot name all its joints, and a rigid one has no entry in q.
         if name not in robot.joint_names:
             raise JointNotFound(name, robot.joint_names, where=where)
         index = robot.joint_id(name)
-        first, nq, nv = (int(v[index]) for v in (robot.model.idx_qs, robot.model.nqs, robot.model.nvs))
-        if nv == 1:
+        entries = q_slice(robot.model, index)
+        if robot.model.nvs[index] == 1:
             angle = _number(value, f"joint '{name}'", where)
-            # nq = 2: a continuous joint is kept as cosine and sine, which hide what is not finite.
+            # Cosine and sine of a continuous joint would hide a value that is not finite.
             if not math.isfinite(angle):
                 raise PostureError(f"joint '{name}' is not finite", where=where, hint="correct it")
-            q[first : first + nq] = (angle,) if nq == 1 else (math.cos(angle), math.sin(angle))
+            q[entries] = scalar_entries(robot.model, index, angle)
         else:
-            numbers = _numbers(value, f"joint '{name}'", where)
+            numbers, nq = _numbers(value, f"joint '{name}'", where), int(robot.model.nqs[index])
             if len(numbers) != nq:
                 raise PostureError(
                     f"joint '{name}' takes {nq} numbers, not {len(numbers)}", where=where, hint="correct it"
                 )
-            q[first : first + nq] = numbers
+            q[entries] = numbers
     return q
 
 
@@ -184,7 +185,7 @@ def _joint_state(name: object, position: object, where: str) -> dict[str, object
     names, positions = _names(name, "name", where), _numbers(position, "position", where)
     if len(names) != len(positions):
         raise PostureError(
-            f"{len(names)} names but {len(positions)} positions", where=where, hint="give one position a name"
+            f"{len(names)} names but {len(positions)} positions", where=where, hint="give one position per name"
         )
     return dict(zip(names, positions, strict=True))
 
@@ -194,7 +195,7 @@ def _names(value: object, key: str, where: str) -> list[str]:
         raise PostureError(f"'{key}' is no list of names", where=where, hint="correct it")
     for name in value:
         if value.count(name) > 1:
-            raise PostureError(f"'{key}' names '{name}' twice", where=where, hint="remove one")
+            raise PostureError(f"'{key}' names '{name}' twice", where=where, hint="remove one of them")
     return value
 
 
@@ -205,7 +206,7 @@ def _numbers(value: object, key: str, where: str) -> list[float]:
 
 
 def _number(value: object, key: str, where: str) -> float:
-    # PyYAML reads 1e-3 as text: YAML 1.1 wants a point in it.
+    # PyYAML reads 1e-3 as text, because YAML 1.1 demands a point in it.
     if isinstance(value, (int, float, str)) and not isinstance(value, bool):
         try:
             return float(value)

@@ -1,4 +1,4 @@
-"""The robot as the rest of the package sees it: a ``pin.Model`` with names, postures and what URDF cannot say."""
+"""The robot: a ``pin.Model`` with names, postures, and the data of ``robot.toml``."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.errors import FrameNotFound, JointNotFound, NotWithinLimits, PostureError, PostureNotFound
+from impact_posture.robot.model_joints import joint_range, q_slice
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.settings import ContactPose, RobotSettings, Root
 
@@ -24,8 +25,8 @@ CONVENTION = (
 )
 FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
 
-# What rounding leaves of a zero in a rotation matrix or an inertia (SI units).
-_DUST = 1e-14
+# Rounding error of a zero in a rotation matrix or an inertia (SI units).
+_ROUNDING = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,17 +34,17 @@ class Robot:
     """A loaded robot.
 
     Attributes:
-        name: What it is called in outputs.
-        source: Path or ``example-robot-data:`` URI of its URDF.
-        model: Pinocchio's model with armature, limits and locked joints as used.  Treat as read-only.
+        name: Name in outputs.
+        source: Path or ``example-robot-data:`` URI of the URDF.
+        model: Model with armature, limits and locked joints as used; treat it as read-only.
         root: ``free-flyer`` or ``fixed``.
         postures: Named configurations, shape (nq,).
-        default_posture: Name of the one to start from.
+        default_posture: Name of the posture to start from.
         spec: The resolved ``robot.toml``.
         locked: Joints made rigid.
-        armature_source: Where the armature came from, in words.
-        warnings: What a user should know about this model, one line each.
-        settings: What it was loaded by; ``None`` for a robot that was built otherwise.
+        armature_source: Source of the armature in words.
+        warnings: Warnings about this model, one line each.
+        settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` for any other origin.
     """
 
     name: str
@@ -75,18 +76,17 @@ class Robot:
 
     @property
     def convention(self) -> str:
-        """The order and meaning of ``q`` and ``v`` in one line."""
+        """Order and meaning of ``q`` and ``v`` in one line."""
         return CONVENTION if self.floating else FIXED_CONVENTION
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints in the model's order, the free-flyer left out."""
-        first = 2 if self.floating else 1
-        return tuple(self.model.names[i] for i in range(first, self.model.njoints))
+        """Names of the joints in the order of the model, without the free-flyer."""
+        return tuple(self.model.names[i] for i in joint_range(self.model))
 
     @cached_property
     def tangent_names(self) -> tuple[str, ...]:
-        """A name for each of the nv velocity entries: ``base vx`` … ``base wz``, then joints."""
+        """Names of the nv velocity entries: ``base vx`` … ``base wz``, then joints."""
         names = [f"base {s}" for s in ("vx", "vy", "vz", "wx", "wy", "wz")] if self.floating else []
         for joint in self.joint_names:
             width = self.model.nvs[self.model.getJointId(joint)]
@@ -105,12 +105,12 @@ class Robot:
 
     @cached_property
     def frame_names(self) -> tuple[str, ...]:
-        """Names of all frames that a contact can be given at."""
+        """Names of all frames at which a contact can be."""
         return tuple(f.name for f in self.model.frames if f.name != "universe")
 
     @cached_property
     def model_sha256(self) -> str:
-        """Hash of what the dynamics depends on: joints, placements, inertias and armature as used."""
+        """Hash of the quantities that determine the dynamics: joints, placements, inertias and armature as used."""
         model = self.model
         content = [
             [
@@ -129,39 +129,37 @@ class Robot:
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
     def frame_id(self, name: str) -> int:
-        """Index of the frame ``name``: a link's frame where a link and a joint share it.
+        """Return the index of the frame ``name``; if a link and a joint share the name, that of the link.
 
         Raises:
-            FrameNotFound: With the nearest names.
+            FrameNotFound: There is no such frame; carries the nearest names.
         """
-        for index, frame in enumerate(self.model.frames):
-            if frame.name == name and frame.type == pin.FrameType.BODY:
-                return index
-        for index, frame in enumerate(self.model.frames):
-            if frame.name == name and name != "universe":
-                return index
-        raise FrameNotFound(name, self.frame_names, where=self.name)
+        found = [i for i, frame in enumerate(self.model.frames) if frame.name == name]
+        links = [i for i in found if self.model.frames[i].type == pin.FrameType.BODY]
+        if not links and (not found or name == "universe"):
+            raise FrameNotFound(name, self.frame_names, where=self.name)
+        return (links or found)[0]
 
     def joint_id(self, name: str) -> int:
-        """Index of the joint ``name`` in the model.
+        """Return the index of the joint ``name`` in the model.
 
         Raises:
-            JointNotFound: With the nearest names.
+            JointNotFound: There is no such joint; carries the nearest names.
         """
         if name not in self.joint_names:
             raise JointNotFound(name, self.joint_names, where=self.name)
         return int(self.model.getJointId(name))
 
     def contact_pose(self, frame: str) -> ContactPose:
-        """What is held of a contact frame unless the user says otherwise; of a ball of a foot its position."""
+        """Return the default pose mode of a contact frame, which is ``position`` for a point foot."""
         balls = [foot.frame for foot in self.spec.supports if foot.kind == "point"]
         return self.spec.contact.frames.get(frame, "position" if frame in balls else self.spec.contact.pose)
 
     def posture(self, name: str | None = None) -> Vector:
-        """Return a copy of the named posture (the default one without a name), shape (nq,).
+        """Return a copy of the named posture, or of the default one, shape (nq,).
 
         Raises:
-            PostureNotFound: With the nearest names.
+            PostureNotFound: There is no such posture; carries the nearest names.
         """
         name = name or self.default_posture
         if name not in self.postures:
@@ -172,7 +170,8 @@ class Robot:
         """Check length, finiteness, quaternion and limits of ``q``; return it with unit quaternions.
 
         Raises:
-            PostureError: What is wrong and what to do.
+            PostureError: ``q`` has a wrong length, a number that is not finite, or an invalid quaternion.
+            NotWithinLimits: A joint is outside its limits.
         """
         q = np.array(q, dtype=float).reshape(-1)
         if q.size != self.nq:
@@ -194,7 +193,7 @@ class Robot:
         return np.asarray(q)
 
     def _check_norms(self, q: Vector, where: str) -> None:
-        """Refuse quaternions, and cosines with sines of continuous joints, that are not of unit length."""
+        """Refuse quaternions, and cosines and sines of continuous joints, without unit length."""
         for i, part in unit_parts(self.model):
             norm = float(np.linalg.norm(q[part]))
             if abs(norm - 1) > 1e-3:
@@ -205,59 +204,51 @@ class Robot:
                 raise PostureError(f"{whose} has norm {norm:.4g}", where=where, hint=f"give a unit {what}{order}")
 
     def _check_swapped(self, quaternion: Vector, where: str) -> None:
-        """Refuse a base quaternion that is plainly w x y z: read as x y z w it would put the robot on its head."""
+        """Refuse a base quaternion that is plainly in the order w x y z."""
         rotation = pin.Quaternion(*[float(quaternion[k]) for k in (3, 0, 1, 2)]).matrix()
         swapped = pin.Quaternion(*[float(v) for v in quaternion]).matrix()
-        # Upside down as read, upright if the first number were w: nobody stands or hovers on their head.
+        # Upside down as given, but upright if w were first.  These robots do not start upside down.
         if rotation[2, 2] < -0.9 and swapped[2, 2] > 0.9 and self.spec.kind in ("aerial", "quadruped", "humanoid"):
-            raise PostureError(
-                "the base quaternion puts the robot on its head and looks like w x y z",
-                where=where,
-                hint="give it as x y z w (scalar last)",
-            )
-        if abs(quaternion[0]) > 0.999 and abs(quaternion[3]) < 0.04:
-            raise PostureError(
-                "the base quaternion turns the robot by 180° about x and looks like w x y z",
-                where=where,
-                hint="give it as x y z w (scalar last)",
-            )
+            fault = "puts the robot on its head"
+        elif abs(quaternion[0]) > 0.999 and abs(quaternion[3]) < 0.04:
+            fault = "turns the robot by 180° about x"
+        else:
+            return
+        what = f"the base quaternion {fault} and looks like w x y z"
+        raise PostureError(what, where=where, hint="give it as x y z w (scalar last)")
 
     def check_limits(self, q: Vector, *, where: str = "posture", tolerance: float = 1e-6) -> None:
         """Raise :class:`NotWithinLimits` for the first joint of ``q`` outside its position limits."""
         for joint in self.joint_names:
             index = self.model.getJointId(joint)
             if self.model.nqs[index] != self.model.nvs[index]:
-                continue  # continuous joints have no limits
-            for k in range(self.model.idx_qs[index], self.model.idx_qs[index] + self.model.nqs[index]):
+                continue  # Continuous joints have no limits.
+            entries = q_slice(self.model, index)
+            for k in range(entries.start, entries.stop):
                 low, high = float(self.model.lowerPositionLimit[k]), float(self.model.upperPositionLimit[k])
                 if not low - tolerance <= q[k] <= high + tolerance:
                     raise NotWithinLimits(joint, float(q[k]), low, high, where=where)
 
 
 def _axis(joint: pin.JointModel) -> Vector:
-    """The joint's motion subspace at the identity: what distinguishes two unaligned joints."""
-    data = joint.createData()
-    joint.calc(data, pin.neutral(_single(joint)))
+    """Return the motion subspace of a joint at the identity, which distinguishes two unaligned joints."""
+    model, data = pin.Model(), joint.createData()
+    model.addJoint(0, joint, pin.SE3.Identity(), "joint")
+    joint.calc(data, pin.neutral(model))
     return np.asarray(data.S).reshape(-1)
 
 
-def _single(joint: pin.JointModel) -> pin.Model:
-    model = pin.Model()
-    model.addJoint(0, joint, pin.SE3.Identity(), "joint")
-    return model
-
-
 def _rounded(values: object) -> list[str]:
-    # 12 digits, and no dust of sines that should be zero: a model read twice, or on another machine, hashes the same.
-    return [f"{v:.12g}" if abs(v) > _DUST else "0" for v in map(float, np.asarray(values).reshape(-1))]
+    # 12 digits, and zero for the rounding errors of sines, so that a model has the same hash on every machine.
+    return [f"{v:.12g}" if abs(v) > _ROUNDING else "0" for v in map(float, np.asarray(values).reshape(-1))]
 
 
 def unit_parts(model: pin.Model) -> list[tuple[int, slice]]:
-    """Joints whose ``q`` holds a quaternion or a cosine with its sine, and where: last among the joint's numbers."""
+    """Return the joints with a quaternion or a cosine and sine in ``q``, with its entries, the last of the joint."""
     found = []
     for joint in range(1, model.njoints):
-        width, freedom, start = int(model.nqs[joint]), int(model.nvs[joint]), int(model.idx_qs[joint])
-        if width != freedom:
+        freedom, end = int(model.nvs[joint]), q_slice(model, joint).stop
+        if model.nqs[joint] != freedom:
             count = 4 if freedom in (3, 6) and "Planar" not in model.joints[joint].shortname() else 2
-            found.append((joint, slice(start + width - count, start + width)))
+            found.append((joint, slice(end - count, end)))
     return found

@@ -1,4 +1,4 @@
-"""What there is to know about a robot, as plain JSON values: the content of ``robots`` and ``inspect``."""
+"""Summary of a robot in plain JSON values, the content of ``robots`` and ``inspect``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WAYS_TO_NAME = (
 
 
 def catalogue() -> list[dict[str, Any]]:
-    """One entry for each robot known by name: what its ``robot.toml`` says, no URDF read."""
+    """Return an entry for each known robot, from its ``robot.toml`` alone."""
     entries = []
     for name in known_robots():
         spec = read_spec(robots_data() / name / "robot.toml")
@@ -49,7 +49,7 @@ def catalogue() -> list[dict[str, Any]]:
 
 
 def summarize(robot: Robot) -> dict[str, Any]:
-    """Everything that ``inspect`` shows: joints, frames, mass, limits, postures, contact, supports, actuation."""
+    """Return joints, frames, mass, limits, postures, contact, supports and actuation of a robot."""
     spec = robot.spec
     return {
         "name": robot.name,
@@ -114,7 +114,7 @@ def _family(joint: pin.JointModel) -> str:
 
 
 def _frames(robot: Robot) -> list[dict[str, Any]]:
-    """Each name once, as :meth:`Robot.frame_id` finds it: a link's frame where a link and a joint share it."""
+    """Return the frames, each name once, as :meth:`Robot.frame_id` finds it."""
     frames = [robot.model.frames[robot.frame_id(name)] for name in dict.fromkeys(robot.frame_names)]
     return [
         {
@@ -137,9 +137,9 @@ def _posture(robot: Robot, name: str) -> dict[str, Any]:
 
 
 def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
-    """Rotors: rank and condition of the allocation, lateral force and hover at each posture.
+    """Return rank and condition of the allocation, and lateral force and hover at each posture.
 
-    The condition mixes N and N·m; it and the forces are ``None`` where they do not exist.
+    The condition mixes N and N·m.  It and the forces are ``None`` where they do not exist.
     """
     model = robot.model
     found = allocation(model, propulsion)

@@ -1,4 +1,4 @@
-"""``robot.toml``: what URDF and SRDF cannot say about a robot, checked where it is read."""
+"""``robot.toml``: the data of a robot that URDF and SRDF cannot hold, checked as it is read."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Table:
 
 @dataclass(frozen=True)
 class ModelSpec(_Table):
-    """Where the model comes from: a path (relative to robot.toml) or ``example-robot-data:<path>``."""
+    """Files of the model: paths relative to robot.toml, or ``example-robot-data:<path>``."""
 
     urdf: str | None = None
     srdf: str | None = None
@@ -32,13 +32,13 @@ class ModelSpec(_Table):
     package_dirs: tuple[str, ...] = ()
     lock: tuple[str, ...] = ()
     lock_massless: bool = False
-    # Some published URDFs carry links that no rigid body can be; their owner may insist.
+    # A user may accept the impossible inertias of a published URDF.
     accept_inertias: bool = False
 
 
 @dataclass(frozen=True)
 class PostureSpec(_Table):
-    """A named posture: joints by name (missing ones neutral), base pose ``[x, y, z, qx, qy, qz, qw]``."""
+    """A named posture: joints by name (the others are neutral), base pose ``[x, y, z, qx, qy, qz, qw]``."""
 
     base: tuple[float, float, float, float, float, float, float] | None = None
     joints: dict[str, float] = field(default_factory=dict)
@@ -46,7 +46,7 @@ class PostureSpec(_Table):
 
 @dataclass(frozen=True)
 class ContactSpec(_Table):
-    """The frame that touches by default, and what is held of which frame while the posture moves."""
+    """The default contact frame, and the pose mode of contact frames while the posture moves."""
 
     frame: str | None = None
     offset: Vector3 = (0.0, 0.0, 0.0)
@@ -58,9 +58,9 @@ class ContactSpec(_Table):
 class SupportSpec(_Table):
     """A foot that stays on the ground.
 
-    ``point``: the contact point (frame origin plus ``offset``, in the frame) does not move.
-    ``surface``: neither does the frame turn.
-    ``size``: half extents (x, y) of a sole around that point, in the frame, meters; it widens the support polygon.
+    With kind ``point``, the contact point (frame origin plus ``offset``, in the frame) does not move.  With
+    ``surface``, the frame does not turn either.  ``size`` holds the half extents (x, y) of a sole around that point,
+    in the frame, meters, and widens the support polygon.
     """
 
     frame: str
@@ -71,7 +71,7 @@ class SupportSpec(_Table):
 
 @dataclass(frozen=True)
 class ConstraintSpec(_Table):
-    """Constraints that the robot's optimizations carry unless told otherwise."""
+    """Default constraints of optimizations with this robot."""
 
     hold: tuple[str, ...] = ()
     level_base: bool = False
@@ -82,7 +82,7 @@ class ConstraintSpec(_Table):
 
 @dataclass(frozen=True)
 class LimitSpec(_Table):
-    """Limits that replace the URDF's: rad or m, rad/s or m/s, N·m or N."""
+    """Limits that replace those of the URDF: rad or m, rad/s or m/s, N·m or N."""
 
     position: dict[str, tuple[float, float]] = field(default_factory=dict)
     velocity: dict[str, Positive] = field(default_factory=dict)
@@ -91,7 +91,7 @@ class LimitSpec(_Table):
 
 @dataclass(frozen=True)
 class ArmatureSpec(_Table):
-    """Rotor inertia reflected to the joint (gear ratio² × rotor inertia), kg·m² (kg for a prismatic joint)."""
+    """Rotor inertia reflected to the joint (gear ratio² × rotor inertia), kg·m² (kg for prismatic joints)."""
 
     default: NonNegative | None = None
     joints: dict[str, NonNegative] = field(default_factory=dict)
@@ -100,7 +100,7 @@ class ArmatureSpec(_Table):
 
 @dataclass(frozen=True)
 class RotorSpec(_Table):
-    """One propeller: where it sits, which way it pushes, which way it turns (seen against the thrust)."""
+    """A propeller: position, thrust direction, and direction of rotation (seen against the thrust)."""
 
     name: str
     position: Vector3
@@ -144,15 +144,15 @@ class RobotSpec(_Table):
 
 
 def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
-    """Read and check a ``robot.toml``; what it does not say is taken from ``over``, paths relative to either file.
+    """Read and check a ``robot.toml``; ``over`` provides missing values, with paths relative to its own folder.
 
-    A file that names another URDF describes another robot: nothing is taken over then.
+    A file that names another URDF describes another robot and takes nothing from ``over``.
     """
     data = read_toml(path)
     model = data.get("model", {})
     if over is not None and not (isinstance(model, dict) and "urdf" in model):
         data = _overlay(_absolute_paths(read_toml(over), over.parent), data)
-    # Before the keys: those of another schema are not misspelt.
+    # Checked before the keys, because those of another schema are not misspelt.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
         raise SpecError(f"schema '{schema}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
@@ -160,7 +160,7 @@ def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
 
 
 def _overlay(below: dict[str, object], above: dict[str, object]) -> dict[str, object]:
-    """Merge tables; lists, values and the armature as a whole are replaced."""
+    """Merge tables; replace lists, values, and the armature as a whole."""
     merged = dict(below)
     for key, value in above.items():
         old = merged.get(key)

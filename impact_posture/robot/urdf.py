@@ -1,4 +1,4 @@
-"""Read a URDF into a ``pin.Model``, meshes or not, and say plainly what is wrong with one that cannot be."""
+"""Reading of a URDF into a ``pin.Model`` without its meshes, with plain errors."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import IO
 
 import pinocchio as pin
 
-from impact_posture.errors import JointNotFound, PackageNotFound, UrdfError
+from impact_posture.errors import PackageNotFound, UrdfError
 from impact_posture.robot.inertia_checks import check_inertias
 
-# Pinocchio's data hold 6 nv³ numbers, 0.4 GB at 200 degrees of freedom and 48 GB at 1,000, whatever is asked of it.
+# The data of Pinocchio always hold 6 nv³ numbers: 0.4 GB at 200 degrees of freedom and 48 GB at 1,000.
 MOST_DEGREES_OF_FREEDOM = 200
 
 EXAMPLE_PREFIX = "example-robot-data:"
@@ -26,7 +26,7 @@ def example_robot_data() -> Path:
     """Return the ``robots/`` folder of the installed example-robot-data package.
 
     Raises:
-        PackageNotFound: The package is not installed or is laid out otherwise.
+        PackageNotFound: The package is not installed, or its files are elsewhere.
     """
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import files as dist_files
@@ -45,36 +45,36 @@ def example_robot_data() -> Path:
 
 
 def robots_data() -> Path:
-    """Return the folder with this project's own robot descriptions."""
+    """Return the folder of the robot descriptions that ship with this project."""
     return Path(str(files("impact_posture_robots")))
 
 
 def resolve_path(text: str, base: Path) -> Path:
-    """Turn a path of robot.toml into a file.
+    """Return the file of a path in robot.toml.
 
-    It is ``example-robot-data:<below robots/>``, absolute, or relative to ``base``.
+    The path is ``example-robot-data:<below robots/>``, absolute, or relative to ``base``.
 
     Raises:
-        PackageNotFound: With the nearest paths below ``robots/``.
+        PackageNotFound: There is no such file in the package; carries the nearest paths below ``robots/``.
     """
     if not text.startswith(EXAMPLE_PREFIX):
         return (base / Path(text).expanduser()).resolve()
     root = example_robot_data()
     path = root / text.removeprefix(EXAMPLE_PREFIX)
     if not path.is_file():
-        fitting = example_models(path.suffix)
-        raise PackageNotFound(text.removeprefix(EXAMPLE_PREFIX), fitting, where=EXAMPLE_PREFIX.rstrip(":"))
+        known = example_models(path.suffix)
+        raise PackageNotFound(text.removeprefix(EXAMPLE_PREFIX), known, where=EXAMPLE_PREFIX.rstrip(":"))
     return path
 
 
 def example_models(suffix: str = ".urdf") -> list[str]:
-    """Paths below the ``robots/`` folder of example-robot-data, sorted."""
+    """Return the paths of models below the ``robots/`` folder of example-robot-data, sorted."""
     root = example_robot_data()
     return [p.relative_to(root).as_posix() for p in sorted(root.rglob("*.[us]rdf")) if str(p).endswith(suffix)]
 
 
 def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) -> tuple[pin.Model, tuple[str, ...]]:
-    """Parse the URDF at ``path``; no mesh is opened.  Returns the model and warnings about its links.
+    """Parse the URDF at ``path`` without opening meshes; return the model and warnings about its links.
 
     Args:
         path: The URDF.
@@ -82,40 +82,25 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
         accept_inertias: Turn refusals of impossible inertias into warnings.
 
     Raises:
-        UrdfError: Missing file, not XML, not a URDF, a tree that Pinocchio rejects, or too many joints.
-        InertiaError: A mass or inertia that no rigid body has.
+        UrdfError: The file is missing or is no URDF, Pinocchio rejects its tree, or it has too many joints.
+        InertiaError: A link has a mass or inertia that no rigid body has.
     """
     root = _parse(path)
     try:
         with _quiet_stderr() as words:
-            if free_flyer:
-                model = pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
-            else:
-                model = pin.buildModelFromUrdf(str(path))
-    except Exception as error:  # Pinocchio raises ValueError, RuntimeError or IndexError by version and fault.
+            model = pin.buildModelFromUrdf(str(path), *([pin.JointModelFreeFlyer()] if free_flyer else []))
+    except Exception as error:  # Pinocchio raises ValueError, RuntimeError or IndexError, by version and fault.
         said = words[0] or str(error)
         raise UrdfError(f"makes no robot ({said})", where=str(path), hint="correct the URDF") from None
     if model.nv == 0:
         raise UrdfError("has no movable joint", where=str(path), hint="use `root='free-flyer'` or another URDF")
     if model.nv > MOST_DEGREES_OF_FREEDOM:
         raise UrdfError(
-            f"has {model.nv} degrees of freedom, more than the {MOST_DEGREES_OF_FREEDOM} that are computed with",
+            f"has {model.nv} degrees of freedom, more than the supported {MOST_DEGREES_OF_FREEDOM}",
             where=str(path),
-            hint="make joints that hardly matter fixed in the URDF",
+            hint="fix joints in the URDF that hardly matter",
         )
     return model, check_inertias(root, model, path, accept_inertias)
-
-
-def joint_index(model: pin.Model, joint: str, where: str) -> int:
-    """Index of a movable joint by name.
-
-    Raises:
-        JointNotFound: With the nearest names.
-    """
-    known = [n for n in model.names if n not in ("universe", "root_joint")]
-    if joint not in known:
-        raise JointNotFound(joint, known, where=where)
-    return int(model.getJointId(joint))
 
 
 def _parse(path: Path) -> ET.Element:
@@ -141,13 +126,13 @@ def _parse(path: Path) -> ET.Element:
 
 
 def _nameless_file() -> IO[bytes]:
-    """A file in memory where the system has such: to read a robot, no folder need be writable."""
+    """Return a file in memory if the system supports it, because no folder may be writable."""
     return os.fdopen(os.memfd_create("words"), "w+b") if hasattr(os, "memfd_create") else tempfile.TemporaryFile()
 
 
 @contextlib.contextmanager
 def _quiet_stderr() -> Iterator[list[str]]:
-    """Keep the URDF parser's own words off the terminal; hand back the first line of them."""
+    """Keep the output of the URDF parser off the terminal, and yield its first error line in a list."""
     words = [""]
     with _nameless_file() as sink:
         saved = os.dup(2)

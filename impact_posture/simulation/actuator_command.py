@@ -1,4 +1,4 @@
-"""What goes into the world and what comes out of it."""
+"""Input and output of a simulated world: commands, pushes, and the true state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 class Commands(Protocol):
-    """What drives the robot: anything with these two, such as a controller's command."""
+    """Any object with joint torques and rotor speeds, such as the command of a controller."""
 
     @property
     def torque(self) -> Array:
@@ -23,12 +23,12 @@ class Commands(Protocol):
 
     @property
     def rotor_speed(self) -> Array:
-        """In the unit of robot.toml's ``speed_max``, shape (rotors,)."""
+        """Rotor speeds in the unit of ``speed_max`` in robot.toml, shape (rotors,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ActuatorCommand:
-    """Commands as plain numbers; see :class:`Commands`."""
+    """Joint torques and rotor speeds (:class:`Commands`)."""
 
     torque: Array
     rotor_speed: Array
@@ -36,13 +36,13 @@ class ActuatorCommand:
 
 @dataclass(frozen=True)
 class Push:
-    """A force at a point of the robot, constant in the world.
+    """Force at a point of the robot, constant in the world.
 
     Attributes:
         frame: The frame that carries the point.
-        force: World, N.
-        duration: Seconds; rounded to physics steps.
-        offset: The point from the frame's origin, in the frame, meters.
+        force: Force, world, N.
+        duration: Duration, s, rounded to physics steps.
+        offset: The point from the origin of the frame, in the frame, m.
     """
 
     frame: str
@@ -53,16 +53,16 @@ class Push:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The state as it is.
+    """True state of a world.
 
     Attributes:
-        t: Seconds since the reset.
+        t: Time since the reset, s.
         q: Configuration, shape (nq,).
         v: ν, shape (nv,).
-        rotor_speeds: In the unit of ``speed_max``, shape (rotors,).
-        thrusts: N, shape (rotors,).
-        torques: As applied in the last step, within the limits, shape (joints,).
-        shapes: What the surfaces do to each shape, in the scene's order.
+        rotor_speeds: Rotor speeds in the unit of ``speed_max``, shape (rotors,).
+        thrusts: Thrusts, N, shape (rotors,).
+        torques: Joint torques of the last step, within the limits, shape (joints,).
+        shapes: Contact of each shape with the surfaces, in the order of the scene.
         at_stops: Joints at or beyond a position limit.
     """
 

@@ -1,4 +1,4 @@
-"""What the impact-robust term is held against: a stiffer nominal controller, and two published ways."""
+"""Controllers to compare the impact-robust term with: a stiffer nominal controller, and two published methods."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.driver import Driver
+from impact_posture.simulation.driver import Driver, RobustDriver
 from impact_posture.simulation.reference import ReferencePoint
-from impact_posture.simulation.scenario import RepeatedContacts, Setup
+from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient
 from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.controller import Command
@@ -20,21 +20,21 @@ from impact_posture.tsid.state import State
 
 Array = NDArray[np.float64]
 
-# Of the central differences of the gradient, rad.
+# Step of the central differences of the gradient, rad.
 _STEP = 1e-5
 
 
 class StiffPosture(JointPosture):
-    """``ν̇* = K (q_des ⊖ q) − D ν`` with ``K = K_p + K_r ∇²H(q_des)/λ`` and ``D = 2 K^½``: the term's gain.
+    """``ν̇* = K (q_des ⊖ q) − D ν`` with ``K = K_p + K_r ∇²H(q_des)/λ`` and ``D = 2 K^½``.
 
-    An impact-robust term that stays on pulls back like a spring ``K_r ∇²H/λ`` when the robot is pushed away from
-    where it rests.  This nominal controller has that spring from the start, critically damped, and no better posture:
-    what the term gains over it, the posture gains.  ``∇²H`` is symmetrized; the base of a floating robot, which other
-    tasks lead, is left out, and so is negative curvature: there the term is no spring, and ``K`` stays at ``K_p``.
+    An impact-robust term that stays on pulls like a spring ``K_r ∇²H/λ`` when the robot is pushed away from its rest
+    posture.  This nominal controller has that spring from the start, critically damped, but no better posture.  The
+    term gains over it by the posture alone.  ``∇²H`` is symmetrized.  The base of a floating robot is left out,
+    because other tasks control it.  Negative curvature is left out, because the term is no spring there.
 
     Attributes:
-        stiffness: ``K``, 1/s², shape (nv, nv), once reset.
-        damping: ``D``, 1/s, likewise.
+        stiffness: ``K`` after a reset, 1/s², shape (nv, nv).
+        damping: ``D`` after a reset, 1/s, shape (nv, nv).
     """
 
     def __init__(
@@ -46,24 +46,24 @@ class StiffPosture(JointPosture):
         base_weight: float | None,
         weight: ArrayLike = 1.0,
     ) -> None:
-        """Take the gradient whose curvature counts, and the gains.
+        """Set the gradient, whose curvature counts, and the gains.
 
         Args:
             robot: The robot.
             gradient: ``q → (H, ∇H)``.
             K: ``K_r``, 1/s².
             kp: ``K_p``, 1/s².
-            base_weight: Weight of the base's entries in the cost.
-            weight: Of the others.
+            base_weight: Weight of the base entries in the cost.
+            weight: Weight of the other entries.
         """
         super().__init__(robot, kp=kp, weight=weight, base_weight=base_weight)
         self._gradient, self._K = gradient, K
-        # Only for its scale λ: normalized as the term would be.
+        # Only its scale λ is used, which the impact-robust term would have.
         self._like = ImpactRobustPosture(robot, gradient, K=K, kp=kp)
         self.stiffness, self.damping = np.diag(self.kp), np.diag(self.kd)
 
     def stiffen(self, state: State, redundancy: Array) -> None:
-        """Measure the curvature at ``state``, with ``redundancy`` as in :meth:`ImpactRobustPosture.normalize`."""
+        """Measure the curvature at a state (``redundancy`` as in :meth:`ImpactRobustPosture.normalize`)."""
         self._like.normalize(state, redundancy)
         columns = []
         for unit in np.eye(state.nv):
@@ -81,17 +81,17 @@ class StiffPosture(JointPosture):
         self.damping = (vectors * (2 * np.sqrt(np.maximum(values, 0.0)))) @ vectors.T
 
     def desired(self, state: State) -> Array:
-        """``ν̇*``, shape (nv,)."""
+        """Return ``ν̇*``, shape (nv,)."""
         return np.asarray(self.stiffness @ self.error(state) - self.damping @ state.v)
 
 
 class StiffDriver(Driver):
-    """Nominal, with the gains of :class:`StiffPosture`."""
+    """Nominal controller with the gains of :class:`StiffPosture`."""
 
     posture: StiffPosture
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest; measure the curvature there."""
+        """Begin at rest, and measure the curvature there."""
         super().reset(q)
         state = self.controller.state
         self.posture.stiffen(state, self.controller.assembly.redundancy(state))
@@ -99,39 +99,38 @@ class StiffDriver(Driver):
 
 
 class FlowPosture(JointPosture):
-    """Walker's projected gradient at the level of velocities (Walker 1994), made the reference of a posture task.
+    """Projected gradient flow of Walker 1994 as the reference of a posture task.
 
-    ``ν_ref = −α k Z Zᵀ ∇H/λ`` with ``Z`` a basis of what the other tasks leave; ``q_des`` is ``ν_ref`` integrated
-    and ``ν_ref`` the velocity reference.  ``k = K/K_d`` makes the flow as fast as the impact-robust term, with its
-    gain K, would be on its way; bound and fade towards joint limits are that term's.
+    ``ν_ref = −α k Z Zᵀ ∇H/λ``, where the columns of ``Z`` span what the other tasks leave free.  ``q_des`` is the
+    integral of ``ν_ref``, and ``ν_ref`` is the velocity reference.  ``k = K/K_d`` makes the flow as fast as the
+    impact-robust term with the gain K would be.  It has the bound and the fade near joint limits of that term.
 
     Attributes:
-        term: Whose gradient, scale, bound and activation are used; it is no task itself.
+        term: The impact-robust term whose gradient, scale, bound and activation are used.  It is no task itself.
     """
 
     def __init__(
         self, robot: Robot, term: ImpactRobustPosture, base_weight: float | None, weight: ArrayLike = 1.0
     ) -> None:
-        """Take the gains from a term."""
+        """Set the gains of the term."""
         super().__init__(robot, kp=term.kp, kd=term.kd, weight=weight, base_weight=base_weight)
         self.term = term
         self._flow = np.zeros(robot.nv)
         self._basis: Array | None = None
-        self._count = 0
 
     def reset(self, state: State) -> None:
-        """Hold what is there."""
+        """Hold the present posture."""
         super().reset(state)
         self.term.reset(state)
-        self._basis, self._count = None, 0
+        self._basis = None
         self._flow[:] = 0.0
 
     def lead(self, basis: Array) -> None:
-        """Flow within the columns of ``basis`` from now on, shape (nv, r)."""
+        """Flow within the columns of ``basis``, shape (nv, r), from now on."""
         self._basis = basis
 
     def advance(self, state: State, dt: float) -> None:
-        """Move ``q_des`` on."""
+        """Move ``q_des``."""
         super().advance(state, dt)
         self.term.advance(state, dt)
         level = self.term.activation.level
@@ -143,73 +142,66 @@ class FlowPosture(JointPosture):
         self._target[:] = pin.integrate(self._model, self._target, dt * self._flow)
 
     def desired(self, state: State) -> Array:
-        """``ν̇*``, shape (nv,), with the flow as velocity reference."""
+        """Return ``ν̇*``, shape (nv,), with the flow as velocity reference."""
         return super().desired(state) + self.kd * self._flow
 
 
-class WalkerDriver(Driver):
-    """Nominal, with the posture's reference flowing down the gradient."""
+class WalkerDriver(RobustDriver):
+    """Nominal controller whose posture reference flows down the gradient."""
 
     posture: FlowPosture
 
+    @property
+    def term(self) -> ImpactRobustPosture:
+        """The impact-robust term whose activation switches the flow."""
+        return self.posture.term
+
     def reset(self, q: Array) -> Command:
-        """Begin at rest; measure the term's scale there."""
+        """Begin at rest, and measure the scale of the term there."""
         command = super().reset(q)
         state = self.controller.state
         self._free = self.controller.assembly.redundancy(state)
-        self.posture.term.normalize(state, self._free)
+        self.term.normalize(state, self._free)
         self._ticks = 0
         return command
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """The command; what the tasks leave is found anew as often as the gradient."""
+        """Return the command.  The redundancy is computed as often as the gradient."""
         if self.level > 0:
-            if self._ticks % self.posture.term.every == 0:
+            if self._ticks % self.term.every == 0:
                 self._free = self.controller.assembly.redundancy(self.controller.state)
             self._ticks += 1
         self.posture.lead(self._free)
         return super().tick(reading, reference)
 
-    def brace(self) -> None:
-        """Let it flow."""
-        self.posture.term.brace()
-
     def hold(self) -> None:
-        """Stop the flow; hold the reached posture, center of mass and base orientation."""
-        self.posture.term.contact()
-        # The reference has gone ahead wherever other tasks kept the robot back.
-        self.posture.move_to(self.controller.state.q, self.posture.term.activation.ramp)
-        self._freeze()
-
-    @property
-    def level(self) -> float:
-        """Activation of the flow."""
-        return self.posture.term.activation.level
+        """Stop the flow and hold the present posture, center of mass and base orientation."""
+        super().hold()
+        # The reference is ahead of the robot wherever other tasks kept the robot back.
+        self.posture.move_to(self.controller.state.q, self.term.activation.ramp)
 
 
 class InvariantDriver(Driver):
     """Feedback on the impact-invariant subspace around an impact (Yang and Posa 2021).
 
-    No impulse at the contact changes the component of ν in the null space of ``J M⁻¹``.  Around the impact the
-    feedback sees ``ν̂ = ν + α M⁻¹Jᵀ λ*``, with ``λ*`` the impulse that brings the tasks' velocities
-    nearest to what they are asked for: what an impulse may have done is not fought.  The posture task has no say in
-    ``λ*`` beside others: it asks for rest while they move.  ``M⁻¹`` is contact-consistent for a robot that stands.
-    ``α`` is 1 from ``BEFORE`` before the impact, expected or felt, to ``AFTER`` after it, with smooth flanks of
-    ``FLANK`` (s).
+    An impulse at the contact does not change the component of ν in the null space of ``J M⁻¹``.  Around the impact,
+    the feedback gets ``ν̂ = ν + α M⁻¹Jᵀ λ*``.  The impulse ``λ*`` brings the velocities of the tasks nearest to their
+    targets, so the feedback does not fight what an impulse may have done.  The posture task does not count for ``λ*``
+    if there are others, because its target is rest while they move.  For a robot that stands, ``M⁻¹`` is
+    contact-consistent.  ``α`` is 1 from ``BEFORE`` before the expected or felt impact to ``AFTER`` after it, with
+    smooth flanks of ``FLANK`` (s).
     """
 
     BEFORE, AFTER, FLANK = 0.02, 0.05, 0.03
-    # What is felt as an impact, N.
+    # Force that counts as an impact, N.
     FELT = 5.0
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
         """Build the nominal controller."""
         super().__init__(setup, posture)
-        scenario = setup.scenario
-        offset = scenario.shape.offset if isinstance(scenario.task, RepeatedContacts) else (0.0, 0.0, 0.0)
-        self._point = Point(scenario.task.frame, offset)
+        self._point = Point(setup.scenario.task.frame, setup.scenario.offset)
         points = (*self.controller.formulation.points, self._point)
-        self._aside = State(setup.robot, tuple(dict.fromkeys(points)))
+        self._state = State(setup.robot, tuple(dict.fromkeys(points)))
         self._at, self._felt = -np.inf, False
 
     def reset(self, q: Array) -> Command:
@@ -218,13 +210,13 @@ class InvariantDriver(Driver):
         return super().reset(q)
 
     def expect(self, t: float) -> None:
-        """Go around this time, unless the impact is felt."""
+        """Expect an impact at a time, s.  One that is felt earlier or later moves the time."""
         self._at, self._felt = t, False
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """The command for the velocity without what an impulse could have changed."""
+        """Return the command for a velocity without the change that an impulse may have caused."""
         if reference is not None:
-            # What is asked for now is what the error is measured from.
+            # The error is measured from the present targets.
             self._follow(reference)
         if reading.force is not None and not self._felt and reading.t > self._at - 0.2:
             if float(np.linalg.norm(reading.force)) > self.FELT:
@@ -236,13 +228,14 @@ class InvariantDriver(Driver):
         return super().tick(reading, reference)
 
     def share(self, t: float) -> float:
-        """``α`` at a time."""
+        """Return ``α`` at a time, s."""
         since = t - self._at
         left = max(-self.BEFORE - since, since - self.AFTER, 0.0)
         return smooth(1 - left / self.FLANK) if left < self.FLANK else 0.0
 
     def _correction(self, reading: Reading) -> Array:
-        state, formulation = self._aside.update(reading.q, reading.v), self.controller.formulation
+        """Return ``M⁻¹Jᵀ λ*``, shape (nv,)."""
+        state, formulation = self._state.update(reading.q, reading.v), self.controller.formulation
         inverse = np.linalg.inv(state.M)
         if formulation.contacts:
             feet = np.vstack([state.at(c.point).jacobian[: c.size] for c in formulation.contacts])

@@ -1,13 +1,13 @@
-"""The controllers that are compared: one name, one driver."""
+"""The controllers that are compared.  Each name makes one driver."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from impact_posture.errors import ControllerNotFound, InputError
 from impact_posture.impact.objective import ImpactObjective
@@ -27,13 +27,12 @@ from impact_posture.simulation.task_formulations import base_weight, nominal_pos
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 
-Array = NDArray[np.float64]
 ControllerName = Literal[
     "nominal", "robust", "robust-speed", "robust-sticking", "posture", "stiff", "invariant", "walker"
 ]
 Mode = Literal["live", "held"]
 CONTROLLERS: tuple[ControllerName, ...] = get_args(ControllerName)
-# In words, for tables and help.
+# Descriptions for tables and help.
 MEANING: dict[str, str] = {
     "nominal": "TSID with the start posture",
     "robust": "its posture task with -K grad H, the paper's",
@@ -49,12 +48,12 @@ _KINDS: dict[str, ObjectiveKind] = {"robust-speed": "speed", "robust-sticking": 
 
 @dataclass(eq=False)
 class ControllerFactory:
-    """A scenario with what its controllers are made of, each part made when first asked for.
+    """A scenario and the parts of its controllers.  Each part is made at its first use.
 
     Attributes:
         setup: The experiment.
-        free: Gradients and optimum of the robot without its feet.
-        gradient_of: From an objective to its gradient: the C export, or interpreted.
+        free: Whether gradients and the offline optimum ignore the feet.
+        gradient_of: Makes the gradient of an objective, compiled or interpreted.
     """
 
     setup: Setup
@@ -62,58 +61,53 @@ class ControllerFactory:
     gradient_of: Callable[[ImpactObjective], Gradient] = compiled
     _objectives: dict[ObjectiveKind, ImpactObjective] = field(default_factory=dict)
     _gradients: dict[ObjectiveKind, Gradient] = field(default_factory=dict)
-    _offline: OfflinePosture | None = None
 
     def objective(self, kind: ObjectiveKind = "impulse") -> ImpactObjective:
-        """The scenario's impact in one of the metric family."""
+        """Return an objective for the impact of the scenario."""
         if kind not in self._objectives:
             self._objectives[kind] = scenario_objective(self.setup, kind, free=self.free)
         return self._objectives[kind]
 
     def gradient(self, kind: ObjectiveKind = "impulse") -> Gradient:
-        """Its gradient."""
+        """Return the gradient of an objective."""
         if kind not in self._gradients:
             self._gradients[kind] = self.gradient_of(self.objective(kind))
         return self._gradients[kind]
 
-    @property
+    @cached_property
     def offline(self) -> OfflinePosture:
         """The posture of the ``posture`` controller."""
-        if self._offline is None:
-            self._offline = offline_posture(self.setup, self.objective())
-        return self._offline
+        return offline_posture(self.setup, self.objective())
 
     def driver(self, name: str, mode: Mode = "live", gain: float | None = None) -> Driver:
         """Make a controller.
 
         Args:
-            name: Which.
-            mode: Whether the impact-robust term stays on through the impact, or the reached posture is held.
-            gain: K instead of the scenario's, 1/s².
+            name: Name of the controller.
+            mode: ``live`` keeps the impact-robust term on through the impact, ``held`` holds the reached posture.
+            gain: K instead of that of the scenario, 1/s².
 
         Raises:
-            NameNotFound: No such controller.
-            InputError: No such mode; ``held`` for a controller that has nothing to hold.
+            ControllerNotFound: There is no such controller.
+            InputError: There is no such mode, or the controller has no term to hold.
         """
         if name not in CONTROLLERS:
             raise ControllerNotFound(name, CONTROLLERS, hint=f"one of: {', '.join(CONTROLLERS)}")
-        if mode not in get_args(Mode):
-            raise InputError(
-                f"there is no mode '{mode}'", where="--mode", hint=f"one of: {', '.join(get_args(Mode))}"
-            )
+        modes = get_args(Mode)
+        if mode not in modes:
+            raise InputError(f"there is no mode '{mode}'", where="--mode", hint=f"one of: {', '.join(modes)}")
         if mode == "held" and not (name.startswith("robust") or name == "walker"):
             raise InputError(f"'{name}' has no term to hold", where="--mode", hint="only robust… and walker have one")
         setup, robot, gains = self.setup, self.setup.robot, self.setup.scenario.control.posture
-        term = setup.scenario.control.robust
-        K = term.gain if gain is None else gain
         if name == "posture":
             return PostureDriver(setup, nominal_posture(setup), self.offline.q)
         if name == "nominal":
             return Driver(setup, nominal_posture(setup))
         if name == "invariant":
             return InvariantDriver(setup, nominal_posture(setup))
-        gradient = self.gradient(_KINDS.get(name, "impulse"))
-        base = base_weight(setup)
+        term = setup.scenario.control.robust
+        K = term.gain if gain is None else gain
+        gradient, base = self.gradient(_KINDS.get(name, "impulse")), base_weight(setup)
         if name == "stiff":
             return StiffDriver(setup, StiffPosture(robot, gradient, K, gains.kp, base, gains.weight))
         robust = ImpactRobustPosture(
@@ -121,7 +115,7 @@ class ControllerFactory:
             gradient,
             K=K,
             kp=gains.kp,
-            # The same damping as every other controller's.
+            # All controllers have the same damping.
             kd=2 * np.sqrt(gains.kp) if gains.kd is None else gains.kd,
             weight=gains.weight,
             base_weight=base,

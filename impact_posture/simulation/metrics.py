@@ -1,51 +1,46 @@
-"""What a run is measured by: the paper's metrics and those without which they mislead."""
+"""Metrics of a run: those of the paper, and those without which they mislead."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from impact_posture.simulation.recorder import STATUSES
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.scenario import RepeatedContacts, Setup
-from impact_posture.simulation.series import Series, Window
-from impact_posture.tsid.controller import Status
+from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.series import Array, Flags, Series, Window
 
-Flags = NDArray[np.bool_]
-
-# Within how long after the first touch the velocity's jump is looked for, s.
+# Time after the first touch within which the velocity jump is measured, s.
 JUMP = 0.015
-# A command counts as saturated within this share of the range of its limit.
+# Distance from a limit that counts as saturated, as a share of the range.
 _NEAR = 1e-3
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Of one run; sums over its contacts.
+    """Metrics of a run, summed over its contacts.
 
     Attributes:
-        q_total_impact: ``∫‖ν‖dt`` over the impact windows (m and rad mixed, as in the paper).
-        q_total_impact_base: The same of the floating base's six entries.
-        q_total_impact_joints: The same of the joints'.
-        q_total_dwell: The same as the first over the dwell windows; 0 for pushes.
-        q_total_recovery: The same over the recovery windows: a push that is stored and given back is in here.
-        peak_jump: Largest ``‖ν(t) − ν⁻‖`` within 15 ms of the first touch, mean over the contacts that came about (0
-            without any); for pushes the largest ``‖ν‖`` within the window.
-        peak_jump_max: The largest of them.
-        peak_recovery: As ``peak_jump``, but looked for over the whole recovery window.
-        peak_force: Largest normal force within the impact windows, N; for pushes the push.
-        saturation_inside: Seconds within the impact windows with a rotor or a joint at a control limit.
-        saturation_outside: Seconds without.
-        saturation_rotors: Seconds within the impact windows with a rotor at a limit.
-        relaxed_ticks: Ticks in which a level gave way.
-        failed_ticks: Ticks that held the command before.
-        slip: Way that the shape that hits (the fastest foot, for pushes) slid within the impact windows, m.
-        stops: Joints at a position limit within the impact windows that were not there at the start.
-        contacts: How many contacts (or pushes) came about.
-        contacts_asked: How many the scenario asks for.
-        rested: Whether the robot was at rest before it was pushed; true for contacts.
+        q_total_impact: ``∫‖ν‖dt`` over the impact windows (mixes m and rad, as in the paper).
+        q_total_impact_base: The same for the six entries of the floating base.
+        q_total_impact_joints: The same for the joints.
+        q_total_dwell: ``∫‖ν‖dt`` over the dwell windows, 0 for pushes.
+        q_total_recovery: ``∫‖ν‖dt`` over the recovery windows, which includes a motion that only comes later.
+        peak_jump: Largest ``‖ν(t) − ν⁻‖`` within 15 ms of the first touch, mean over the contacts that were made (0
+            without any).  For pushes, the largest ``‖ν‖`` within the window.
+        peak_jump_max: Largest instead of mean over the contacts.
+        peak_recovery: As ``peak_jump``, but over the whole recovery window.
+        peak_force: Largest normal force within the impact windows, N.  For pushes, the push.
+        saturation_inside: Time within the impact windows with a rotor or a joint at a control limit, s.
+        saturation_outside: The same outside the impact windows, s.
+        saturation_rotors: Time within the impact windows with a rotor at a limit, s.
+        relaxed_ticks: Number of ticks in which a level gave way.
+        failed_ticks: Number of ticks that held the last command.
+        slip: Distance that the shape that hits (for pushes, the fastest foot) slid within the impact windows, m.
+        stops: Joints that reached a position limit within the impact windows, and were not there at the start.
+        contacts: Number of contacts (or pushes) that were made.
+        contacts_asked: Number of contacts in the scenario.
+        rested: Whether the robot was at rest before it was pushed.  True for contacts.
     """
 
     q_total_impact: float
@@ -69,58 +64,60 @@ class Metrics:
     rested: bool = True
 
     def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        found = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        """Return the JSON content, with the saturations in a table of their own."""
+        found = asdict(self)
         saturation = {key: found.pop(f"saturation_{key}") for key in ("inside", "outside", "rotors")}
-        found["stops"] = list(self.stops)
         return {**found, "saturation_s": saturation}
 
 
 def measure(setup: Setup, run: Run) -> Metrics:
     """Measure a run."""
-    series, impacts, task = run.series, run.impacts, setup.scenario.task
+    series, impacts, contacts = run.series, run.of("impact"), setup.scenario.contacts
     inside: Flags = np.zeros(series.t.size, dtype=bool)
     for window in impacts:
         inside[series.slice(window.begin, window.end)] = True
     period = setup.scenario.control.period
     base = 6 if setup.robot.floating else 0
-    speed = np.linalg.norm(series.v, axis=1)
     rotors, joints = saturated(setup, series)
-    relaxed = series.status == STATUSES.index(Status.RELAXED)
-    failed = ~relaxed & (series.status != STATUSES.index(Status.SOLVED))
-    dwell, recovery = (
-        sum(float(speed[series.slice(w.begin, w.end)].sum()) * period for w in run.windows if w.kind == kind)
-        for kind in ("dwell", "recovery")
-    )
-    # An impact that never came is no small one.
+
+    def integral(values: Array) -> float:
+        return float(values.sum() * period)
+
+    def way(v: Array) -> float:
+        return integral(np.linalg.norm(v, axis=1))
+
+    def ways(kind: str) -> float:
+        return sum(way(series.v[series.slice(w.begin, w.end)]) for w in run.of(kind))
+
+    # A contact that was never made is no small impact.
     jumps = [jump(setup, series, w) for w in impacts if w.touched] or [0.0]
-    later = [_peak(setup, series, w, w.end) for w in run.windows if w.kind == "recovery" and w.touched] or [0.0]
-    stopped = (series.at_stop[inside] & ~series.at_stop[0]).any(axis=0) if inside.any() else np.zeros(0, bool)
+    later = [_peak(setup, series, w, w.end) for w in run.of("recovery") if w.touched] or [0.0]
+    stopped = (series.at_stop[inside] & ~series.at_stop[0]).any(axis=0)
     return Metrics(
-        q_total_impact=float(speed[inside].sum() * period),
-        q_total_impact_base=float(np.linalg.norm(series.v[inside, :base], axis=1).sum() * period),
-        q_total_impact_joints=float(np.linalg.norm(series.v[inside, base:], axis=1).sum() * period),
-        q_total_dwell=dwell,
-        q_total_recovery=recovery,
+        q_total_impact=way(series.v[inside]),
+        q_total_impact_base=way(series.v[inside, :base]),
+        q_total_impact_joints=way(series.v[inside, base:]),
+        q_total_dwell=ways("dwell"),
+        q_total_recovery=ways("recovery"),
         peak_jump=float(np.mean(jumps)),
         peak_jump_max=float(np.max(jumps)),
         peak_recovery=float(np.mean(later)),
         peak_force=float(series.peak[inside].max(initial=0.0)),
-        saturation_inside=float((rotors | joints)[inside].sum() * period),
-        saturation_outside=float((rotors | joints)[~inside].sum() * period),
-        saturation_rotors=float(rotors[inside].sum() * period),
-        relaxed_ticks=int(relaxed.sum()),
-        failed_ticks=int(failed.sum()),
-        slip=float(series.slip[inside].sum() * period),
+        saturation_inside=integral((rotors | joints)[inside]),
+        saturation_outside=integral((rotors | joints)[~inside]),
+        saturation_rotors=integral(rotors[inside]),
+        relaxed_ticks=int(series.relaxed.sum()),
+        failed_ticks=int(series.held.sum()),
+        slip=integral(series.slip[inside]),
         stops=tuple(setup.robot.tangent_names[k] for k in np.flatnonzero(stopped)),
         contacts=sum(w.touched for w in impacts),
-        contacts_asked=task.count if isinstance(task, RepeatedContacts) else 1,
+        contacts_asked=contacts.count if contacts else 1,
         rested=run.rested,
     )
 
 
 def saturated(setup: Setup, series: Series) -> tuple[Flags, Flags]:
-    """In which ticks a rotor's, and a joint's, command was at its limit; each of shape (n,)."""
+    """Return the ticks in which a rotor command, and a joint command, was at its limit, each of shape (n,)."""
     rotors: Flags = np.zeros(series.t.size, dtype=bool)
     propulsion = setup.robot.spec.propulsion
     if propulsion is not None:
@@ -135,19 +132,18 @@ def saturated(setup: Setup, series: Series) -> tuple[Flags, Flags]:
 
 
 def before(series: Series, window: Window) -> int:
-    """The last tick before a window begins."""
+    """Return the last tick before a window begins."""
     return int(max(series.slice(window.begin, window.end).start - 1, 0))
 
 
 def jump(setup: Setup, series: Series, window: Window) -> float:
-    """Largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP` of a window's begin; for pushes the largest ``‖ν‖`` within it."""
-    hits = isinstance(setup.scenario.task, RepeatedContacts)
-    return _peak(setup, series, window, window.begin + JUMP if hits else window.end)
+    """Return the largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP` of the begin, or for pushes ``‖ν‖`` in the window."""
+    return _peak(setup, series, window, window.begin + JUMP if setup.scenario.contacts else window.end)
 
 
 def _peak(setup: Setup, series: Series, window: Window, end: float) -> float:
-    """Largest ``‖ν(t) − ν⁻‖`` from a window's begin until ``end``; for pushes the largest ``‖ν‖``."""
+    """Return the largest ``‖ν(t) − ν⁻‖`` from the begin of a window until ``end``, or for pushes ``‖ν‖``."""
     after = series.v[series.slice(window.begin, end)]
-    if isinstance(setup.scenario.task, RepeatedContacts):
+    if setup.scenario.contacts:
         after = after - series.v[before(series, window)]
     return float(np.linalg.norm(after, axis=1).max(initial=0.0))

@@ -1,4 +1,4 @@
-"""The offline optimum under a scenario's constraints, as far as the motors can hold it."""
+"""Offline optimum under the constraints of a scenario, as far as the motors can hold it."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from impact_posture.tsid.controller import Status
 
 Array = NDArray[np.float64]
 
-# Distances on the way to the optimum at which postures are tried, farthest first.
+# Number of distances on the way to the optimum at which postures are tried, farthest first.
 _POINTS = 16
-# Rad (m) that stay between the posture and a joint's stops: a posture on a stop braces on it.
+# Distance from the joint stops, rad (m), because a robot on a stop braces on it.
 _MARGIN = 0.1
-# Acceleration (rad/s², m/s²) that the least normal forces of the feet may cause in a robot that is held.
+# Acceleration that the least normal forces of the feet may cause in a robot that is held, rad/s² (m/s²).
 _STILL = 0.5
-# Least distance in m of the center of mass from the edges of the feet's polygon.  The motors alone would hold a robot
+# Least distance of the center of mass from the edges of the support polygon, m.  The motors alone would hold a robot
 # that stands on its heels, but an impact tips it.
 _COM_MARGIN = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class OfflinePosture:
-    """What was found.
+    """The posture that was found.
 
     Attributes:
         q: The posture, shape (nq,).
-        objective: There.
-        initial: The objective at the scenario's start posture, put on the constraints.
-        optimum: The objective at the optimum.
-        distance: From the start posture, rad (m).
-        whole: Distance of the optimum.
-        note: In words, where it is not the optimum.
+        objective: Objective at the posture.
+        initial: Objective at the start posture of the scenario, after it was put on the constraints.
+        optimum: Objective at the optimum.
+        distance: Distance from the start posture, rad (m).
+        whole: Distance of the optimum from the start posture, rad (m).
+        note: Reason if it is not the optimum.
     """
 
     q: Array
@@ -60,28 +60,28 @@ class OfflinePosture:
 def offline_posture(
     setup: Setup, objective: ImpactObjective, *, starts: int = 16, seed: int = 0, share: float = 0.8
 ) -> OfflinePosture:
-    """Optimize the posture for the scenario's impact; stop where the motors can hold it.
+    """Optimize the posture for the impact of a scenario, but only as far as the motors can hold it.
 
-    End effector where it starts, as far as its task holds it; base level (a robot that flies); feet where they are,
-    center of mass above them (one that stands).  Of the trade-off between objective and distance from the start, the
-    farthest posture that a nominal controller holds at rest with at most ``share`` of every torque limit, and of the
-    rotors' range, is taken.
+    The end effector stays where it starts, as far as its task holds it.  The base of a robot that flies stays level.
+    The feet of a robot that stands stay where they are, with the center of mass above them.  The result is on the
+    trade-off between objective and distance from the start.  It is the farthest posture that a nominal controller
+    holds at rest with at most ``share`` of every torque limit and of the range of the rotors.
 
     Args:
         setup: The experiment.
-        objective: The impact.
-        starts: Of the optimizer.
-        seed: Of its random starts.
-        share: Of the limits that holding the posture may take.
+        objective: The objective.
+        starts: Number of starts of the optimizer.
+        seed: Seed of its random starts.
+        share: Share of the limits that holding the posture may take.
 
     Raises:
         Infeasible, SolverFailed: As :func:`impact_posture.posture.solve.solve`.
     """
     tell("looking for the offline posture")
-    solution = _solved(setup, objective, starts, seed)
+    solution = _solve(setup, objective, starts, seed)
     initial = objective.value(solution.initial)
     if holds(setup, solution.q, share):
-        value, far = objective.value(solution.q), _far(setup, solution.q, solution.initial)
+        value, far = objective.value(solution.q), distance(Chart(setup.robot.model), solution.q, solution.initial)
         return OfflinePosture(solution.q, value, initial, value, far, far)
     curve = pareto_front(solution, _POINTS, progress=_tell)
     whole, optimum = curve.points[-1].distance, curve.points[-1].objective
@@ -96,25 +96,26 @@ def offline_posture(
     return OfflinePosture(solution.initial, initial, initial, optimum, 0.0, whole, note)
 
 
-def _solved(setup: Setup, objective: ImpactObjective, starts: int, seed: int) -> PostureSolution:
-    """The optimum as far from stops and from the feet's edges as the start allows."""
+def _solve(setup: Setup, objective: ImpactObjective, starts: int, seed: int) -> PostureSolution:
+    """Return the optimum as far from the stops and from the edges of the feet as the start allows."""
     robot, control = setup.robot, setup.scenario.control
     stands = control.footing is not None
-    asked = Requirements(
+    requirements = Requirements(
         contact_pose="free" if control.end_effector is None else control.end_effector.pose,
         base="level" if control.tilt is not None and robot.floating else "free",
         hold=tuple(j for j in robot.spec.constraints.hold if j not in robot.locked),
         com_over_feet=stands,
         com_asked=False,
     )
-    for stops, edges in ((_MARGIN, _COM_MARGIN), (0.0, _COM_MARGIN), (0.0, _COM_MARGIN / 2)):
+    for stops, edges in ((_MARGIN, _COM_MARGIN), (0.0, _COM_MARGIN), (0.0, _COM_MARGIN / 2), (0.0, 0.0)):
         try:
-            wanted = replace(asked, limit_margin=stops, com_margin=edges if stands else 0.0)
+            wanted = replace(requirements, limit_margin=stops, com_margin=edges if stands else 0.0)
             problem = build_problem(robot, objective, setup.q, wanted)
             return solve(problem, starts=starts, seed=seed, jobs=1, progress=_tell)
         except (Infeasible, SolverFailed):
-            continue
-    return solve(build_problem(robot, objective, setup.q, asked), starts=starts, seed=seed, jobs=1, progress=_tell)
+            if edges == 0.0:
+                raise
+    raise AssertionError("the last attempt returns or raises")
 
 
 def _tell(done: int, total: int) -> None:
@@ -132,7 +133,3 @@ def holds(setup: Setup, q: Array, share: float) -> bool:
     half = np.where(np.isfinite(limits.upper), limits.upper - middle, np.inf)
     still = float(np.abs(command.acceleration).max()) < _STILL
     return bool((np.abs(command.u - middle) <= share * half).all()) and still
-
-
-def _far(setup: Setup, q: Array, start: Array) -> float:
-    return distance(Chart(setup.robot.model), q, start)

@@ -1,37 +1,35 @@
-"""What the rigid model says of each impact of a run, and what came."""
+"""Impacts of a run, as the rigid model predicts them and as they were."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.simulation.metrics import before, jump
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.scenario import RepeatedContacts, Setup
-
-Array = NDArray[np.float64]
+from impact_posture.simulation.scenario import Setup
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Of one impact.
+    """Prediction of one impact.
 
     Attributes:
-        contact: Which, from 0.
-        H: ``nᵀΛ_c n`` just before it, squared jump per squared impulse.
+        contact: Number of the contact, from 0.
+        H: ``nᵀΛ_c n`` just before the impact, squared jump per squared impulse.
         G: 1/kg.
         V: ``H/G²``.
-        S: The same when it sticks; ``None`` where undefined.
-        approach: Speed into the surface just before it, m/s; for pushes the push's impulse, N·s.
-        frictionless: Jump without friction and rebound, ``v √V``; for pushes ``√H`` times the impulse, which a robot
-            that no controller holds would have at the end of the push.
-        sticking: Jump if the contact sticks, ``v √S`` (for the approach along the normal); ``None`` for pushes.
-        measured: As in :class:`~impact_posture.simulation.metrics.Metrics`.
+        S: Squared jump per squared approach speed if the contact sticks, or ``None`` where it is undefined.
+        approach: Speed into the surface just before the impact, m/s.  For pushes, the impulse of the push, N·s.
+        frictionless: Jump without friction and rebound, ``v √V``.  For pushes, ``√H`` times the impulse, which is the
+            velocity at the end of the push of a robot without controller.
+        sticking: Jump if the contact sticks, ``v √S`` (for an approach along the normal), or ``None`` for pushes.
+        measured: Measured jump, as in :class:`~impact_posture.simulation.metrics.Metrics`.
+        ratio: ``measured`` over ``frictionless``, or ``None`` if the latter vanishes.
     """
 
     contact: int
@@ -43,32 +41,30 @@ class Prediction:
     frictionless: float
     sticking: float | None
     measured: float
-
-    def to_dict(self) -> dict[str, object]:
-        """JSON content, with ``ratio``: measured over frictionless."""
-        ratio = self.measured / self.frictionless if self.frictionless > 1e-9 else None
-        return {**asdict(self), "ratio": ratio}
+    ratio: float | None
 
 
 def predict(setup: Setup, objective: ImpactObjective, run: Run) -> tuple[Prediction, ...]:
-    """Hold a run's impacts against the rigid model at the state before each."""
-    task, found = setup.scenario.task, []
+    """Predict the impacts of a run with the rigid model at the state before each."""
+    scenario, found = setup.scenario, []
     numeric = Numeric(setup.robot.model)
     point = point_on(setup.robot, objective.contact.frame, objective.contact.offset)
-    for window in run.impacts:
+    for window in run.of("impact"):
         if not window.touched:
             continue
         k = before(run.series, window)
         q, v = run.series.q[k], run.series.v[k]
         here = objective.oracle.quantities(q)
-        measured = jump(setup, run.series, window)
-        if isinstance(task, RepeatedContacts):
-            speed = float(-setup.scenario.normal @ numeric.at(q).jacobian(point)[:3] @ v)
-            smooth, stick = speed * np.sqrt(here.V), None if here.S is None else speed * float(np.sqrt(here.S))
+        if scenario.push:
+            approach = float(np.linalg.norm(scenario.push.force)) * scenario.push.duration
+            smooth, sticking = approach * float(np.sqrt(here.H)), None
         else:
-            speed = float(np.linalg.norm(task.force)) * task.duration
-            smooth, stick = speed * np.sqrt(here.H), None
+            approach = float(-scenario.normal @ numeric.at(q).jacobian(point)[:3] @ v)
+            smooth = approach * float(np.sqrt(here.V))
+            sticking = None if here.S is None else approach * float(np.sqrt(here.S))
+        measured = jump(setup, run.series, window)
+        ratio = measured / smooth if smooth > 1e-9 else None
         found.append(
-            Prediction(window.contact, here.H, here.G, here.V, here.S, speed, float(smooth), stick, measured)
+            Prediction(window.contact, here.H, here.G, here.V, here.S, approach, smooth, sticking, measured, ratio)
         )
     return tuple(found)

@@ -1,4 +1,4 @@
-"""Takes down what happens in a run."""
+"""Recorder of a run."""
 
 from __future__ import annotations
 
@@ -8,26 +8,25 @@ from numpy.typing import NDArray
 from impact_posture.errors import ImpactPostureError
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.actuator_command import Truth
-from impact_posture.simulation.scenario import RepeatedContacts, Setup
+from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient
-from impact_posture.simulation.series import Series
-from impact_posture.tsid.controller import Command, Status
+from impact_posture.simulation.series import STATUSES, Series
+from impact_posture.tsid.controller import Command
 
 Array = NDArray[np.float64]
 
-STATUSES: tuple[Status, ...] = tuple(Status)
-# The metric is drawn, not controlled with: ticks from one evaluation to the next.
+# Ticks from one evaluation of the metric to the next.  The metric is only drawn.
 _EVERY = 10
 
 
 def feet_of(setup: Setup) -> tuple[str, ...]:
-    """Frames of the shapes on bodies that are to stay on the ground; none where the robot does not stand."""
+    """Return the frames of the shapes on bodies that must stay on the ground, if the robot stands."""
     scenario, robot = setup.scenario, setup.robot
     if scenario.control.footing is None:
         return ()
     held = {_joint(robot, support.frame) for support in robot.spec.supports}
-    led = scenario.task.frame if isinstance(scenario.task, RepeatedContacts) else None
-    return tuple(s.frame for s in scenario.scene.shapes if s.frame != led and _joint(robot, s.frame) in held)
+    hits = None if scenario.contacts is None else scenario.contacts.frame
+    return tuple(s.frame for s in scenario.shapes if s.frame != hits and _joint(robot, s.frame) in held)
 
 
 def _joint(robot: Robot, frame: str) -> int:
@@ -35,21 +34,21 @@ def _joint(robot: Robot, frame: str) -> int:
 
 
 class Recorder:
-    """One row a tick.
+    """Record of a run, one row for each tick.
 
     Args:
         setup: The experiment.
-        metric: ``q → (H, ∇H)``, for the course of H.
+        metric: ``q → (H, ∇H)``, for the time series of H.
     """
 
     def __init__(self, setup: Setup, metric: Gradient) -> None:
         self._setup, self._metric = setup, metric
-        robot, task = setup.robot, setup.scenario.task
-        shapes = [s.frame for s in setup.scenario.scene.shapes]
-        self._shape = shapes.index(task.frame) if isinstance(task, RepeatedContacts) else None
+        robot, contacts = setup.robot, setup.scenario.contacts
+        shapes = [s.frame for s in setup.scenario.shapes]
+        self._shape = None if contacts is None else shapes.index(contacts.frame)
         feet = feet_of(setup)
         self._feet = [k for k, frame in enumerate(shapes) if frame in feet]
-        self._joints = {robot.tangent_names[k]: k for k in range(robot.nv)}
+        self._joints = {name: k for k, name in enumerate(robot.tangent_names)}
         self._rows: list[tuple[object, ...]] = []
         self._touches: list[float] = []
         self._touching = False
@@ -60,43 +59,44 @@ class Recorder:
         """``‖ν‖`` at the last tick."""
 
     def pushed(self, force: Array, begin: float, end: float) -> None:
-        """A push acts from ``begin`` to ``end``."""
+        """Record a push that acts from ``begin`` to ``end``."""
         self._push = (force, begin, end)
 
     @property
     def ticks(self) -> int:
-        """How many were taken down."""
+        """Number of recorded ticks."""
         return len(self._rows)
 
     def take(self, truth: Truth, command: Command, level: float, distance: float) -> None:
-        """Take down a tick."""
+        """Record a tick."""
         self.speed = float(np.linalg.norm(truth.v))
-        hit = None if self._shape is None else truth.shapes[self._shape]
-        if hit is not None:
-            # One that lasts is told of anew at every look.
+        if self._shape is not None:
+            hit = truth.shapes[self._shape]
+            # Every look reports a contact that lasts again.
             if hit.began is not None and not self._touching:
                 self._touches.append(hit.began)
             self._touching = hit.touching
-        force, begin, end = self._push
-        if hit is not None:
             force, peak, slip = hit.force, hit.peak, hit.slip
         else:
+            force, begin, end = self._push
             force = force if begin < truth.t <= end + 1e-9 else np.zeros(3)
             peak = float(np.linalg.norm(force))
             slip = max((s.slip for s in truth.shapes), default=0.0)
+        stopped = np.zeros(self._setup.robot.nv, dtype=bool)
+        stopped[[self._joints[name] for name in truth.at_stops if name in self._joints]] = True
         self._rows.append((
             truth.t, truth.q, truth.v, truth.torques, np.clip(command.rotor_speed, *self._rotors), truth.rotor_speeds,
             force, peak, slip, sum(s.touching for s in truth.shapes),
             [truth.shapes[k].touching for k in self._feet], self._value(truth.q), level,
-            STATUSES.index(command.status), self._stopped(truth), distance,
+            STATUSES.index(command.status), stopped, distance,
         ))  # fmt: skip
 
     def first_touch(self, begin: float, end: float) -> float | None:
-        """When a touch of the shape that hits first began within ``[begin, end)``, s."""
+        """Return when the shape that hits first began to touch within ``[begin, end)``, s."""
         return next((t for t in self._touches if begin <= t < end), None)
 
     def series(self) -> Series:
-        """All of it."""
+        """Return the time series."""
         return Series(*(np.array(column) for column in zip(*self._rows, strict=True)))
 
     def _value(self, q: Array) -> float:
@@ -106,10 +106,3 @@ class Recorder:
             return self._metric(q)[0]
         except ImpactPostureError:
             return float("nan")
-
-    def _stopped(self, truth: Truth) -> Array:
-        stopped = np.zeros(self._setup.robot.nv, dtype=bool)
-        for name in truth.at_stops:
-            if name in self._joints:
-                stopped[self._joints[name]] = True
-        return stopped

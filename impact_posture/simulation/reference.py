@@ -1,4 +1,4 @@
-"""Where the end effector of repeated contacts is asked to be, over time."""
+"""Reference of the end effector for repeated contacts, over time."""
 
 from __future__ import annotations
 
@@ -12,41 +12,38 @@ from impact_posture.simulation.scenario import RepeatedContacts
 
 @dataclass(frozen=True)
 class ReferencePoint:
-    """Along the way in, from where the shape is at the start.
+    """Reference along the way in, from the place of the shape at the start.
 
     Attributes:
         distance: m.
         speed: m/s.
         acceleration: m/s².
-        contact: Which contact it belongs to, from 0; −1 while the robot settles.
     """
 
     distance: float
     speed: float
     acceleration: float
-    contact: int
 
 
 class Reference:
-    """The reference of :class:`RepeatedContacts` along ``−n``.
+    """Reference of :class:`RepeatedContacts` along ``−n``, the way into the surface.
 
-    In: from rest with ``acceleration`` to ``speed``, on at ``speed`` to the surface, and braking evenly to rest
-    ``beyond`` it.  It stays for ``dwell``, comes back from rest to rest with the same acceleration and at most the
-    same speed, and pauses.
+    On the way in, it speeds up from rest with ``acceleration`` to ``speed``, goes to the surface with ``speed``, and
+    brakes evenly to rest ``beyond`` the surface.  It stays for ``dwell``.  It comes back from rest to rest with the
+    same acceleration and at most the same speed, and pauses.
 
     Attributes:
-        task: What happens.
-        inward: Seconds that the way in takes.
-        back: Seconds that the way back takes.
-        cycle: Seconds from one approach to the next.
-        total: Seconds of the whole run.
+        task: The contacts.
+        inward: Time of the way in, s.
+        cycle: Time from one approach to the next, s.
+        total: Time of the whole run, s.
 
     Args:
-        task: What happens.
+        task: The contacts.
         gap: Distance of shape and surface at the start, m.
 
     Raises:
-        InputError: The gap is too short to come up to speed in.
+        InputError: The gap is too short to reach the speed.
     """
 
     def __init__(self, task: RepeatedContacts, gap: float) -> None:
@@ -58,47 +55,35 @@ class Reference:
                 where="contacts",
                 hint="widen the gap, slow down, or accelerate more",
             )
-        self.task, self._gap = task, gap
-        self._depth = gap + task.beyond
-        # Legs of constant acceleration: for how long, which, from what speed.
-        braking = 2 * task.beyond / v
-        self._in = [(v / a, a, 0.0), ((gap - run_up) / v, 0.0, v)]
+        depth, braking = gap + task.beyond, 2 * task.beyond / v
+        top = min(v, float(np.sqrt(a * depth)))
+        # Legs of constant acceleration: duration, acceleration, distance and speed at their begin.
+        inward = [(v / a, a, 0.0, 0.0), ((gap - run_up) / v, 0.0, run_up, v)]
         if braking:
-            self._in.append((braking, -v / braking, v))
-        top = min(v, float(np.sqrt(a * self._depth)))
-        cruise = (self._depth - top**2 / a) / top
-        self._back = [(top / a, -a, 0.0), (cruise, 0.0, -top), (top / a, a, -top)]
-        self.inward = sum(leg[0] for leg in self._in)
-        self.back = sum(leg[0] for leg in self._back)
-        self.cycle = self.inward + task.dwell + self.back + task.pause
+            inward.append((braking, -v / braking, gap, v))
+        rest = [
+            (task.dwell, 0.0, depth, 0.0),
+            (top / a, -a, depth, 0.0),
+            ((depth - top**2 / a) / top, 0.0, depth - top**2 / (2 * a), -top),
+            (top / a, a, top**2 / (2 * a), -top),
+            (task.pause, 0.0, 0.0, 0.0),
+        ]
+        self.task, self._legs = task, (*inward, *rest)
+        self._ends = np.cumsum([leg[0] for leg in self._legs])
+        self.inward, self.cycle = float(self._ends[len(inward) - 1]), float(self._ends[-1])
         self.total = task.settle + task.count * self.cycle
 
     def start(self, contact: int) -> float:
-        """When the approach of a contact begins, s."""
+        """Return when the approach of a contact begins, s."""
         return float(self.task.settle + contact * self.cycle)
 
     def at(self, t: float) -> ReferencePoint:
-        """The reference at a time, s."""
-        contact = int(np.floor((t - self.task.settle) / self.cycle))
-        if contact < 0:
-            return ReferencePoint(0.0, 0.0, 0.0, -1)
-        contact = min(contact, self.task.count - 1)
+        """Return the reference at a time, s."""
+        contact = min(max(int((t - self.task.settle) // self.cycle), 0), self.task.count - 1)
         since = t - self.start(contact)
-        if since < self.inward:
-            return _along(self._in, since, 0.0, contact)
-        since -= self.inward + self.task.dwell
-        if since < 0:
-            return ReferencePoint(self._depth, 0.0, 0.0, contact)
-        if since < self.back:
-            return _along(self._back, since, self._depth, contact)
-        return ReferencePoint(0.0, 0.0, 0.0, contact)
-
-
-def _along(legs: list[tuple[float, float, float]], since: float, distance: float, contact: int) -> ReferencePoint:
-    for duration, acceleration, speed in legs:
-        t = min(since, duration)
-        distance += speed * t + acceleration * t**2 / 2
-        if since < duration:
-            return ReferencePoint(distance, speed + acceleration * t, acceleration, contact)
-        since -= duration
-    return ReferencePoint(distance, 0.0, 0.0, contact)
+        k = int(np.searchsorted(self._ends, since, side="right"))
+        if since < 0 or k == len(self._legs):
+            return ReferencePoint(0.0, 0.0, 0.0)
+        duration, acceleration, distance, speed = self._legs[k]
+        s = float(since - (self._ends[k] - duration))
+        return ReferencePoint(distance + speed * s + acceleration * s**2 / 2, speed + acceleration * s, acceleration)

@@ -1,4 +1,4 @@
-"""Propellers: speeds that follow their commands with a lag, within their limits."""
+"""Propellers: their speeds, thrusts, and the vibration that they cause."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ Array = NDArray[np.float64]
 class Rotors:
     """Speeds ω of the propellers, in the unit of ``speed_max``.
 
-    ``ω̇ = (ω* − ω)/τ`` with the command ω* cut to ``[speed_min, speed_max]`` and τ the time constant up (ω* > ω) or
-    down, integrated exactly over a step.  Thrust is ``c_f ω²`` along each rotor's direction, the drag moment ``κ``
-    times that against its spin.  The propellers' own inertia is not in the model: no gyroscopic moment.
+    A speed follows its command ω*, cut to ``[speed_min, speed_max]``, with ``ω̇ = (ω* − ω)/τ``.  τ is the time
+    constant up (ω* > ω) or down, and a step integrates exactly.  The thrust is ``c_f ω²`` along the direction of the
+    rotor, and the drag moment is ``κ`` times the thrust against its spin.  There is no gyroscopic moment, because the
+    inertia of the propellers is not in the model.
 
     Args:
-        propulsion: Of the robot.
-        timestep: Seconds.
+        propulsion: Data of the rotors.
+        timestep: Time step, s.
 
     Raises:
-        SpecError: Limits that are none.
+        SpecError: The limits are wrong.
     """
 
     def __init__(self, propulsion: PropulsionSpec, timestep: float) -> None:
@@ -37,10 +38,10 @@ class Rotors:
         self.speeds: Array = np.full(len(propulsion.rotors), self._lowest)
 
     def reset(self, speeds: ArrayLike) -> None:
-        """Turn at these speeds, cut to the limits.
+        """Set the speeds, cut to the limits.
 
         Raises:
-            InputError: Not one finite number a rotor.
+            InputError: There is not one finite number for each rotor.
         """
         speeds = np.asarray(speeds, dtype=float)
         if speeds.shape != self.speeds.shape or not np.isfinite(speeds).all():
@@ -48,32 +49,32 @@ class Rotors:
         self.speeds = self.within(speeds)
 
     def within(self, command: Array) -> Array:
-        """A command cut to the limits."""
+        """Return a command cut to the limits."""
         return np.asarray(np.clip(command, self._lowest, self._highest))
 
     def step(self, command: Array) -> Array:
-        """Go on by a time step under a command within the limits; the thrusts (N) at its end, shape (rotors,)."""
+        """Take a time step under a command within the limits.  Return the thrusts at its end, N, shape (rotors,)."""
         away = command - self.speeds
         self.speeds = self.speeds + np.where(away > 0, self._up, self._down) * away
         return self.thrusts
 
     @property
     def thrusts(self) -> Array:
-        """``c_f ω²``, N, shape (rotors,)."""
+        """Thrusts ``c_f ω²``, N, shape (rotors,)."""
         return np.asarray(self._coefficient * self.speeds**2)
 
 
 class Vibration:
-    """The shaking of unbalanced propellers as the base's sensors see it; the body itself is left alone.
+    """Vibration of unbalanced propellers in the measured twist of the base.  The body itself does not vibrate.
 
     Propeller i at ``p_i`` with unbalance U (kg·m) turns with ω_i about ``d_i`` and pulls with ``U(2πω_i)² e_i``.  In
-    its disc ``e_i = cos φ_i x_i + s_i sin φ_i y_i`` turns with its spin ``s_i``, ``φ̇_i = 2πω_i``.  Integrated over
-    time with the joints held, that is the twist ``Σ I⁻¹ [f_i; p_i × f_i]`` with the momentum
-    ``f_i = 2πω_i U (sin φ_i x_i − s_i cos φ_i y_i)`` and the robot's inertia I at the base (6 × 6).
+    its disc, ``e_i = cos φ_i x_i + s_i sin φ_i y_i`` turns with its spin ``s_i`` and ``φ̇_i = 2πω_i``.  The integral
+    over time, with the joints held, is the twist ``Σ I⁻¹ [f_i; p_i × f_i]``.  The momentum is
+    ``f_i = 2πω_i U (sin φ_i x_i − s_i cos φ_i y_i)``, and I (6 × 6) is the inertia of the robot at the base.
 
     Args:
-        model: The robot.
-        propulsion: Its rotors; speeds in Hz.
+        model: The model of the robot.
+        propulsion: Data of the rotors, with speeds in Hz.
         unbalance: U, kg·m.
     """
 
@@ -92,16 +93,16 @@ class Vibration:
         self.phases: Array = np.zeros(len(propulsion.rotors))
 
     def reset(self, q: Array, phases: Array) -> None:
-        """Take the inertia at a configuration, shape (nq,), and the propellers' angles, shape (rotors,), rad."""
+        """Set the inertia of a configuration, shape (nq,), and the angles of the propellers, shape (rotors,), rad."""
         M = np.triu(pin.crba(self._model, self._data, q)[:6, :6])
         self._inverse = np.linalg.inv(M + np.triu(M, 1).T)
         self.phases = np.array(phases)
 
     def step(self, speeds: Array, timestep: float) -> None:
-        """Turn on."""
+        """Turn the propellers for a time step."""
         self.phases = self.phases + 2 * np.pi * timestep * speeds
 
     def twist(self, speeds: Array, phases: Array) -> Array:
-        """What the base's measured twist has too much, base axes, shape (6,)."""
+        """Return the error of the measured base twist, base axes, shape (6,)."""
         rates = 2 * np.pi * speeds
         return np.asarray(self._inverse @ (self._x @ (rates * np.sin(phases)) + self._y @ (rates * np.cos(phases))))

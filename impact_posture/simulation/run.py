@@ -1,4 +1,4 @@
-"""One run: a controller in a scenario, from the start to the end, with a record of all that happened."""
+"""One run of a controller through a scenario, with a record of everything that happened."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.processes import fork_call
 from impact_posture.progress import tell
-from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.recorder import Recorder
@@ -21,28 +19,25 @@ from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush
 from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.simulation.series import RECOVERY, Series, Window
-from impact_posture.tsid.controller import Command
 
-Array = NDArray[np.float64]
-
-# When controllers begin to prepare, s: after the first reaction of sensors and motors.
+# Time when controllers begin to prepare, after the first reaction of sensors and motors, s.
 _BRACE = 0.1
-# Ticks from one word about the progress to the next.
+# Ticks from one message about the progress to the next.
 _TELL = 100
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What came of a run.
+    """Record of a run.
 
     Attributes:
-        series: Tick by tick.
-        windows: What counts as impact, one for each contact or push; then, for contacts, the dwell windows.
-        sign: Of the push; 1 for contacts.
-        waited: Seconds until the robot was pushed; NaN for contacts.
-        rested: Whether it had come to rest by then; one that does not within the scenario's patience is pushed all
-            the same, and what is measured holds its own motion.
-        away: When the state ran away, which ended the run, s.
+        series: Time series.
+        windows: An impact window for each contact or push, then the dwell and recovery windows.
+        sign: Sign of the push, 1 for contacts.
+        waited: Time until the robot was pushed, s, NaN for contacts.
+        rested: Whether the robot had come to rest before the push.  After the patience of the scenario it is pushed
+            anyway, and the metrics contain its own motion.
+        away: Time when the state ran away, which ended the run, s.
     """
 
     series: Series
@@ -52,36 +47,37 @@ class Run:
     rested: bool = True
     away: float | None = None
 
-    @property
-    def impacts(self) -> tuple[Window, ...]:
-        """The windows that count as impact."""
-        return tuple(w for w in self.windows if w.kind == "impact")
+    def of(self, kind: str) -> tuple[Window, ...]:
+        """Return the windows of a kind."""
+        return tuple(window for window in self.windows if window.kind == kind)
 
 
 def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mode = "live", gain: float | None = None,
         only: int | None = None) -> tuple[Run, ...]:  # fmt: skip
-    """Let a controller live through a scenario: one run, or one for each sign of the push.
+    """Run a controller through a scenario: one run, or one for each sign of the push.
 
     Args:
-        factory: The scenario and its parts.
-        controller: Its name.
-        seed: Of the sensors' noise.
-        mode: ``live``: the term stays on; ``held``: the reached posture is held before the first impact.
-        gain: K instead of the scenario's, 1/s².
-        only: That sign of the push alone.
+        factory: The scenario and the parts of its controllers.
+        controller: Name of the controller.
+        seed: Seed of the sensor noise.
+        mode: ``live`` keeps the term on, ``held`` holds the reached posture before the first impact.
+        gain: K instead of that of the scenario, 1/s².
+        only: The only sign of the push to run.
 
     Raises:
-        SimulationDiverged: The robot ran away at once; one that does so later has a run that ends there.
-        ControllerNotFound: No such controller.
-        InputError: Ticks that are no multiple of the physics' steps, or a sign that is none.
+        SimulationDiverged: The state ran away at once.  If it does so later, the run ends there.
+        ControllerNotFound: There is no such controller.
+        InputError: A tick is no multiple of the physics step, or the sign is neither 1 nor -1.
     """
     driver = factory.driver(controller, mode, gain)
-    task = factory.setup.scenario.task
-    if isinstance(task, RepeatedContacts):
-        return (_contacts(factory, driver, task, seed, mode),)
+    scenario = factory.setup.scenario
+    if scenario.contacts:
+        return (_contacts(_Loop(factory, driver, seed), scenario.contacts, mode),)
     if only not in (None, 1, -1):
-        raise InputError(f"{only} is no sign of a push", where=factory.setup.scenario.source, hint="give 1 or -1")
-    return _pushes(factory, driver, task, task.signs if only is None else (only,), seed, mode)
+        raise InputError(f"{only} is no sign of a push", where=scenario.source, hint="give 1 or -1")
+    assert scenario.push is not None  # noqa: S101 (a scenario has contacts or a push)
+    signs = scenario.push.signs if only is None else (only,)
+    return _pushes(_Loop(factory, driver, seed), scenario.push, signs, mode)
 
 
 class _Loop:
@@ -90,7 +86,7 @@ class _Loop:
     def __init__(self, factory: ControllerFactory, driver: Driver, seed: int) -> None:
         setup = factory.setup
         self.setup, self.driver, self.world = setup, driver, setup.world
-        self.period = setup.scenario.control.period
+        self.period, self.ramp = setup.scenario.control.period, setup.scenario.control.robust.ramp
         self.count = round(self.period / self.world.timestep)
         if self.count < 1 or abs(self.count * self.world.timestep - self.period) > 1e-9:
             raise InputError(
@@ -109,13 +105,13 @@ class _Loop:
         return self.world.time
 
     def tick(self, reference: Reference | None = None) -> bool:
-        """Go on by a tick; whether the state is still one."""
+        """Take a tick.  Return whether the state did not run away."""
         point = None if reference is None else reference.at(self.t)
-        command: Command = self.driver.tick(self.world.read(), point)
+        command = self.driver.tick(self.world.read(), point)
         try:
-            self.world.step(ActuatorCommand(command.torque, command.rotor_speed), self.count)
+            self.world.step(command, self.count)
         except SimulationDiverged as error:
-            # A picture needs two ticks.
+            # A figure needs two ticks.
             if self.recorder.ticks < 2:
                 raise
             self.away = error.time
@@ -127,49 +123,42 @@ class _Loop:
         return True
 
 
-def _contacts(factory: ControllerFactory, driver: Driver, task: RepeatedContacts, seed: int, mode: Mode) -> Run:
-    loop = _Loop(factory, driver, seed)
-    reference = Reference(task, factory.setup.gap)
-    # Where the way in crosses the surface: what follows is braking behind it.
+def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
+    driver, reference = loop.driver, Reference(task, loop.setup.gap)
+    # The way in crosses the surface here, and brakes behind it.
     crossing = reference.inward - 2 * task.beyond / task.speed
-    impacts = [reference.start(k) + crossing for k in range(task.count)]
-    ramp = factory.setup.scenario.control.robust.ramp
+    starts = [reference.start(k) for k in range(task.count)]
     events = [(_BRACE, driver.brace)]
     if mode == "held":
-        events.append((max(_BRACE, reference.start(0) - 2 * ramp), driver.hold))
-    expected = list(impacts)
+        events.append((max(_BRACE, starts[0] - 2 * loop.ramp), driver.hold))
+    # From the begin of the way in, the next impact is the expected one.
+    events += [(start, partial(driver.expect, start + crossing)) for start in starts]
+    events.sort(key=lambda event: event[0])
     for _ in range(round(reference.total / loop.period)):
         while events and loop.t >= events[0][0] - 1e-9:
             events.pop(0)[1]()
-        # The way in begins long before: from there on the next impact is the one that is expected.
-        if expected and loop.t >= expected[0] - crossing - 1e-9:
-            driver.expect(expected.pop(0))
         if not loop.tick(reference):
             break
-    series, first = loop.recorder.series(), []
-    for k, impact in enumerate(impacts):
-        begin, end = reference.start(k), reference.start(k) + reference.cycle
-        touch = loop.recorder.first_touch(begin, end)
-        leaves = begin + reference.inward + task.dwell
-        at = impact if touch is None else touch
-        first.append(Window("impact", k, at, at + task.window, touch is not None))
-        first.append(Window("dwell", k, at, max(leaves, at), touch is not None))
-        first.append(Window("recovery", k, at, min(at + RECOVERY, end), touch is not None))
-    return Run(series, tuple(sorted(first, key=lambda w: w.kind != "impact")), away=loop.away)
+    windows = []
+    for k, start in enumerate(starts):
+        end = start + reference.cycle
+        touch = loop.recorder.first_touch(start, end)
+        begin = start + crossing if touch is None else touch
+        leaves = start + reference.inward + task.dwell
+        ends = {"impact": begin + task.window, "dwell": max(leaves, begin), "recovery": min(begin + RECOVERY, end)}
+        windows += [Window(kind, k, begin, until, touch is not None) for kind, until in ends.items()]
+    windows.sort(key=lambda window: window.kind != "impact")
+    return Run(loop.recorder.series(), tuple(windows), away=loop.away)
 
 
-def _pushes(
-    factory: ControllerFactory, driver: Driver, task: SinglePush, signs: Sequence[int], seed: int, mode: Mode
-) -> tuple[Run, ...]:
-    """Settle once, and push each way from there: the other ways in copies of this process."""
-    loop = _Loop(factory, driver, seed)
-    ramp, brace = factory.setup.scenario.control.robust.ramp, [driver.brace]
-    # Whatever the scenario's patience: all controllers begin to prepare before a push.
-    rested = _settle(loop, task, max(task.settle, _BRACE + loop.period), brace)
+def _pushes(loop: _Loop, task: SinglePush, signs: Sequence[int], mode: Mode) -> tuple[Run, ...]:
+    """Settle once and push with each sign from there, the other signs in forked processes."""
+    # All controllers begin to prepare before a push, whatever the patience of the scenario is.
+    rested = _settle(loop, task, max(task.settle, _BRACE + loop.period), [loop.driver.brace])
     if mode == "held":
-        # What was reached is held, and comes to rest once more without the term.
-        driver.hold()
-        rested = _settle(loop, task, loop.t + 2 * ramp, []) and rested
+        # The posture that was reached is held, and comes to rest again without the term.
+        loop.driver.hold()
+        rested = _settle(loop, task, loop.t + 2 * loop.ramp, []) and rested
     if loop.away is not None:
         return tuple(Run(loop.recorder.series(), (), sign, rested=False, away=loop.away) for sign in signs)
     first, *others = (partial(_push, loop, task, sign, rested) for sign in signs)
@@ -193,7 +182,7 @@ def _push(loop: _Loop, task: SinglePush, sign: int, rested: bool) -> Run:
 
 
 def _settle(loop: _Loop, task: SinglePush, least: float, brace: list[Callable[[], None]]) -> bool:
-    """Go on until ``least`` and until the robot has been quiet for long enough; whether it has."""
+    """Go on until ``least`` and until the robot has been quiet for long enough.  Return whether it has."""
     still, end = 0.0, max(least, loop.t) + task.patience
     while loop.t < least - 1e-9 or still < task.still - 1e-9:
         if loop.t > end or loop.away is not None:

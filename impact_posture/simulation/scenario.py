@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from impact_posture.errors import InputError, SpecError
 from impact_posture.progress import tell
@@ -15,224 +16,260 @@ from impact_posture.robot.actuation import allocation
 from impact_posture.robot.postures import read_posture, set_joints
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.settings import LoadOptions, Vector3
+from impact_posture.robot.spec import NonNegative, Positive
+from impact_posture.settings import RobotSettings, Vector3
 from impact_posture.simulation.actuator_command import Push
-from impact_posture.simulation.scene import Scene, Shape, Surface
+from impact_posture.simulation.scene import Finite, FiniteVector, Scene, Shape, Surface
 from impact_posture.simulation.world import World, build_world
+from impact_posture.tables import Checked
 
 Array = NDArray[np.float64]
 EndEffectorPose = Literal["full", "position", "aligned"]
+OneOrEach = Positive | Annotated[tuple[Positive, ...], Field(min_length=1)]
+SCHEMA = "impact-posture/scenario/1"
 
 
 @dataclass(frozen=True)
-class RepeatedContacts:
+class RepeatedContacts(Checked):
     """The end effector flies into a surface and away again, several times.
 
-    A reference starts where the shape is at the start, moves along the surface's normal to ``beyond`` behind the
-    surface, stays there, and comes back (:mod:`impact_posture.simulation.reference`).
+    A reference starts where the shape is at the start.  It moves against the normal of the surface until it is
+    ``beyond`` behind the surface, stays there, and comes back (:mod:`impact_posture.simulation.reference`).
 
     Attributes:
-        frame: Of the shape that touches.
+        frame: Frame of the shape that touches.
         surface: Name of the surface.
-        count: How many contacts.
-        speed: Of the reference at the surface, m/s.
-        acceleration: Of the reference before the surface and on its way back, m/s².
-        settle: Seconds before the first approach.
-        dwell: Seconds that the reference stays behind the surface.
-        beyond: How far behind, m.
-        pause: Seconds between coming back and the next approach.
-        window: Seconds from the first touch that count as the impact, the same for every controller.
+        speed: Speed of the reference at the surface, m/s.
+        acceleration: Acceleration of the reference before the surface and on its way back, m/s².
+        count: Number of contacts.
+        settle: Time before the first approach, s.
+        dwell: Time that the reference stays behind the surface, s.
+        beyond: Distance of the reference behind the surface, m.
+        pause: Time between the way back and the next approach, s.
+        window: Time from the first touch that counts as the impact, s.  It is the same for every controller.
     """
 
     frame: str
     surface: str
-    speed: float
-    acceleration: float = 1.0
-    count: int = 5
-    settle: float = 4.0
-    dwell: float = 0.8
-    beyond: float = 0.03
-    pause: float = 1.0
-    window: float = 0.3
+    speed: Positive
+    acceleration: Positive = 1.0
+    count: Annotated[int, Field(ge=1)] = 5
+    settle: NonNegative = 4.0
+    dwell: Positive = 0.8
+    beyond: NonNegative = 0.03
+    pause: NonNegative = 1.0
+    window: Positive = 0.3
 
 
 @dataclass(frozen=True)
-class SinglePush:
-    """A robot that stands is pushed once it has come to rest.
+class SinglePush(Checked):
+    """A standing robot is pushed after it has come to rest.
 
     Attributes:
-        frame: Where it is pushed.
-        force: World, N, for sign +1.
-        duration: Seconds; also the window that counts as the impact.
-        signs: Which ways: a run for each.
-        settle: Least seconds before the push.
-        quiet: ``‖ν‖`` below which the push may begin (mixes m/s and rad/s, as the paper's metric does).
-        still: Seconds for which it must have been below.
-        patience: Seconds beyond ``settle`` after which a robot that is not quiet is pushed all the same.
-        after: Seconds that the run goes on after the push.
+        frame: Frame that is pushed.
+        force: Force of a push with sign 1, world, N.
+        duration: Duration of the push and of its impact window, s.
+        signs: Signs of the pushes, one run each.
+        settle: Least time before the push, s.
+        quiet: ``‖ν‖`` below which the push may begin (mixes m/s and rad/s, as the metric of the paper does).
+        still: Time for which ``‖ν‖`` must have been below ``quiet``, s.
+        patience: Time beyond ``settle`` after which a robot that still moves is pushed anyway, s.
+        after: Time that the run goes on after the push, s.
     """
 
     frame: str
-    force: Vector3
-    duration: float = 0.4
-    signs: tuple[int, ...] = (1, -1)
-    settle: float = 1.0
-    quiet: float = 0.005
-    still: float = 0.2
-    patience: float = 20.0
-    after: float = 1.0
+    force: FiniteVector
+    duration: Positive = 0.4
+    signs: Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)] = (1, -1)
+    settle: NonNegative = 1.0
+    quiet: Positive = 0.005
+    still: NonNegative = 0.2
+    patience: Positive = 20.0
+    after: NonNegative = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse a push without force."""
+        super().__post_init__()
+        if not any(self.force):
+            raise InputError("key 'push.force': no force", hint="give newtons, not all zero")
 
     def push(self, sign: int) -> Push:
-        """The push of a run."""
+        """Return the push of a run."""
         x, y, z = (sign * value for value in self.force)
         return Push(self.frame, (x, y, z), self.duration)
 
 
 @dataclass(frozen=True)
-class Gains:
-    """Of one task.
+class Gains(Checked):
+    """Gains of one task.
 
     Attributes:
-        kp: Stiffness, 1/s²; one number, or one an entry of the task.
-        kd: Damping, 1/s; ``None``: critical, ``2√kp``.
-        weight: In the cost, where the task has no level of its own.
+        kp: Stiffness, 1/s², one number or one for each row of the task.
+        kd: Damping, 1/s.  ``None`` is critical, ``2√kp``.
+        weight: Weight in the cost, if the task has no level of its own.
     """
 
-    kp: float | tuple[float, ...]
-    kd: float | tuple[float, ...] | None = None
-    weight: float = 1.0
+    kp: OneOrEach
+    kd: OneOrEach | None = None
+    weight: Positive = 1.0
 
 
 @dataclass(frozen=True)
 class EndEffectorGains(Gains):
-    """Of the end effector's task.
+    """Gains of the end effector task.
 
     Attributes:
-        pose: What is led: the frame's pose (``full``), its ``position``, or with ``aligned`` position and the frame's
-            direction that is the surface's normal at the start, spin about it free.
+        pose: What the task controls.  ``full`` is the pose of the frame, ``position`` its position.  ``aligned`` is
+            its position and the direction that is the normal of the surface at the start, with free spin about it.
     """
 
     pose: EndEffectorPose = "full"
 
 
 @dataclass(frozen=True)
-class RobustTerm:
-    """The impact-robust term.
+class RobustTerm(Checked):
+    """The impact-robust term of the posture task.
 
     Attributes:
-        gain: K of the term that is scaled by the objective's curvature, 1/s²: comparable with the posture's ``kp``.
-        ramp: Seconds from off to on.
+        gain: K of the term, scaled by the curvature of the objective, 1/s².  It compares to ``kp`` of the posture.
+        ramp: Time from off to on, s.
         fade: Distances from a position limit between which the term fades out, rad (m).
     """
 
-    gain: float
-    ramp: float = 0.3
-    fade: tuple[float, float] = (0.05, 0.2)
+    gain: Positive
+    ramp: Positive = 0.3
+    fade: tuple[NonNegative, Positive] = (0.05, 0.2)
 
 
 @dataclass(frozen=True)
-class StanceGains:
-    """How a controller treats the contacts of a robot that stands.
+class StanceGains(Checked):
+    """Contact constraints of a controller for a standing robot.
 
     Attributes:
-        friction: Coulomb coefficient that it trusts in.
-        least: Least normal force, N (of a sole: of the whole sole).
-        force_weight: Of contact forces in the cost, 1/N².
+        friction: Coulomb coefficient that the controller assumes.
+        least: Least normal force of a contact (for a sole, of the whole sole), N.
+        force_weight: Weight of contact forces in the cost, 1/N².
     """
 
-    friction: float = 0.5
-    least: float = 1.0
-    force_weight: float = 1e-5
+    friction: Positive = 0.5
+    least: Positive = 1.0
+    force_weight: Positive = 1e-5
 
 
 @dataclass(frozen=True)
-class Control:
-    """What all controllers of an experiment have in common; a task without gains is not there.
+class Control(Checked):
+    """Gains that all controllers of an experiment share.  A task without gains is not there.
 
     Attributes:
-        posture: Of the posture task.
-        robust: Of the impact-robust term.
-        period: Seconds from tick to tick.
-        tilt: Of the level base, first priority.
-        end_effector: Of the end effector, second priority: linear entries first.
-        apparent_mass: M_d of ``F̂/M_d`` in the end effector's law, kg; ``None``: the force is left out.
-        center_of_mass: Of the center of mass.
-        base: Of the base's orientation.
-        footing: Of robots that stand.
+        posture: Gains of the posture task.
+        robust: The impact-robust term.
+        period: Time from tick to tick, s.
+        tilt: Gains of the level base, first priority.
+        end_effector: Gains of the end effector, second priority, linear rows first.
+        apparent_mass: M_d of ``F̂/M_d`` in the law of the end effector, kg.  ``None`` leaves the force out.
+        center_of_mass: Gains of the center of mass.
+        base: Gains of the base orientation.
+        footing: Contact constraints of a standing robot.
     """
 
     posture: Gains
     robust: RobustTerm
-    period: float = 1e-3
+    period: Positive = 1e-3
     tilt: Gains | None = None
     end_effector: EndEffectorGains | None = None
-    apparent_mass: float | None = None
+    apparent_mass: Positive | None = None
     center_of_mass: Gains | None = None
     base: Gains | None = None
     footing: StanceGains | None = None
 
 
 @dataclass(frozen=True)
-class Bounds:
-    """What a run must keep to count (:func:`impact_posture.simulation.outcome.judge`).
+class Bounds(Checked):
+    """Bounds that a run must keep to count (:func:`impact_posture.simulation.outcome.judge`).
 
     The first three are for a floating base.
 
     Attributes:
-        tilt_deg: Largest angle between vertical and the base's axis that was vertical at the start, degrees.
-        clearance: Least height of the base's origin above every surface, m.
-        sink: How far the base may be below its start, or below where a reference leads it, m.
-        lifted: Longest time without contact of a foot that is to stay, s.
+        tilt_deg: Largest angle between vertical and the base axis that was vertical at the start, degrees.
+        clearance: Least height of the base origin above every surface, m.
+        sink: Largest distance of the base below its start, or below where a reference leads it, m.
+        lifted: Longest time that a foot loses its contact, s.
         relaxed: Largest share of relaxed ticks.
-        held: Longest time that a command is held for, s.
+        held: Longest time that a command is held, s.
     """
 
-    tilt_deg: float = 60.0
-    clearance: float = 0.0
-    sink: float = 1.0
-    lifted: float = 0.1
-    relaxed: float = 0.5
-    held: float = 0.05
+    tilt_deg: Positive = 60.0
+    clearance: Finite = 0.0
+    sink: Positive = 1.0
+    lifted: NonNegative = 0.1
+    relaxed: Annotated[float, Field(ge=0, le=1)] = 0.5
+    held: NonNegative = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class Scenario:
-    """An experiment as a file describes it; nothing is loaded yet.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScenarioTable(Scene, RobotSettings):
+    """Content of a ``scenario.toml``.
 
     Attributes:
-        name: What it is called.
-        source: The file.
+        name: Name of the experiment.
         description: One line.
-        robot: Known name, path, or ``example-robot-data:`` URI.
-        load: How it is loaded.
-        posture: Name or file of the start posture; ``None``: the robot's default.
-        joints: Values that replace the start posture's, by joint.
-        scene: The surroundings.
-        task: What happens.
+        posture: Name or file of the start posture.  ``None`` takes the default posture of the robot.
+        joints: Values that replace those of the start posture, by joint, rad or m.
+        contacts: The contacts, or ``None`` if the robot is pushed.
+        push: The push, or ``None`` if the robot makes contacts.
         control: The gains.
-        bounds: What a run must keep to count.
+        bounds: Bounds that a run must keep to count.
     """
 
+    schema: Literal["impact-posture/scenario/1"] = "impact-posture/scenario/1"
     name: str
-    source: str
-    description: str
-    robot: str
-    load: LoadOptions
-    posture: str | None
-    joints: Mapping[str, float]
-    scene: Scene
-    task: RepeatedContacts | SinglePush
+    description: str = ""
+    posture: str | None = None
+    joints: Mapping[str, float] = field(default_factory=dict)
+    contacts: RepeatedContacts | None = None
+    push: SinglePush | None = None
     control: Control
     bounds: Bounds = Bounds()
 
+    def __post_init__(self) -> None:
+        """Refuse no task, two tasks, and contacts of an unknown shape or surface."""
+        super().__post_init__()
+        if (self.contacts is None) == (self.push is None):
+            what = "neither [contacts] nor [push]" if self.push is None else "both [contacts] and [push]"
+            raise InputError(f"has {what}", hint="have one of them")
+        if self.contacts is None:
+            return
+        for key, name, known in (
+            ("surface", self.contacts.surface, [s.name for s in self.surfaces]),
+            ("frame", self.contacts.frame, [s.frame for s in self.shapes]),
+        ):
+            if name not in known:
+                table = "surfaces" if key == "surface" else "shapes"
+                hint = f"one of: {', '.join(known)}" if known else f"add it to [[{table}]]"
+                raise InputError(f"key 'contacts.{key}': there is no '{name}'", hint=hint)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scenario(ScenarioTable):
+    """An experiment before anything is loaded.
+
+    Attributes:
+        source: Path of the file, for errors.
+    """
+
+    source: str = ""
+
+    @property
+    def task(self) -> RepeatedContacts | SinglePush:
+        """The contacts or the push."""
+        task = self.contacts or self.push
+        assert task is not None  # noqa: S101 (__post_init__ has checked it)
+        return task
+
     @property
     def normal(self) -> Array:
-        """Unit normal of the impact, shape (3,): the surface's, or along the push."""
-        task = self.task
-        if isinstance(task, RepeatedContacts):
-            n = np.array(self.surface.normal, dtype=float)
-        else:
-            n = np.array(task.force, dtype=float)
+        """Unit normal of the impact, shape (3,): that of the surface, or the direction of the push."""
+        n = np.array(self.push.force if self.push else self.surface.normal, dtype=float)
         return np.asarray(n / np.linalg.norm(n))
 
     @property
@@ -242,34 +279,39 @@ class Scenario:
         Raises:
             InputError: The robot is pushed instead.
         """
-        if isinstance(self.task, RepeatedContacts):
-            return next(s for s in self.scene.surfaces if s.name == self.task.surface)
-        raise self._without("surface that is hit")
+        name = self._contacts("surface that is hit").surface
+        return next(s for s in self.surfaces if s.name == name)
 
     @property
     def shape(self) -> Shape:
-        """The shape that hits it.
+        """The shape that hits the surface.
 
         Raises:
             InputError: The robot is pushed instead.
         """
-        if isinstance(self.task, RepeatedContacts):
-            return next(s for s in self.scene.shapes if s.frame == self.task.frame)
-        raise self._without("shape that hits")
+        frame = self._contacts("shape that hits").frame
+        return next(s for s in self.shapes if s.frame == frame)
 
-    def _without(self, what: str) -> InputError:
-        return InputError(f"there is no {what}", where=self.source, hint="ask only where there are contacts")
+    @property
+    def offset(self) -> Vector3:
+        """Contact point of the shape that hits, or of the pushed frame, in the frame, m."""
+        return self.shape.offset if self.contacts else (0.0, 0.0, 0.0)
+
+    def _contacts(self, what: str) -> RepeatedContacts:
+        if self.contacts is None:
+            raise InputError(f"there is no {what}", where=self.source, hint="ask only where there are contacts")
+        return self.contacts
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """An experiment ready to run.
+    """An experiment that is ready to run.
 
     Attributes:
-        scenario: What was asked for.
-        robot: Its robot.
+        scenario: The experiment.
+        robot: The loaded robot.
         q: Start posture, shape (nq,).
-        world: Not reset yet.
+        world: The simulated world, before its first reset.
     """
 
     scenario: Scenario
@@ -291,15 +333,15 @@ def set_up(scenario: Scenario) -> Setup:
     """Load the robot, pose it, and build the world around it.
 
     Raises:
-        ImpactPostureError: The first thing that does not fit, in one line.
+        ImpactPostureError: Something does not fit.
     """
     tell(f"loading {scenario.robot}")
-    robot = load_robot(scenario.robot, scenario.load)
+    robot = load_robot(scenario.robot, scenario)
     _check_base(robot, scenario)
     q = set_joints(robot, read_posture(robot, scenario.posture, where="posture"), scenario.joints, scenario.source)
     q = robot.check_posture(q, where=scenario.source)
     robot.frame_id(scenario.task.frame)
-    return Setup(scenario, robot, q, build_world(robot, scenario.scene, q))
+    return Setup(scenario, robot, q, build_world(robot, scenario, q))
 
 
 def _check_base(robot: Robot, scenario: Scenario) -> None:

@@ -1,4 +1,4 @@
-"""From the truth to what a controller is told."""
+"""Readings of imperfect sensors."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What the sensors say.
+    """Measured state.
 
     Attributes:
-        t: Time of reading, s; what is read may be older (``Sensors.delay``).
+        t: Time of the reading, s.  What is measured may be older (``Sensors.delay``).
         q: Configuration, shape (nq,).
         v: ν, shape (nv,).
-        force: Force of the surfaces on the robot at the sensor's frame, world axes, N, shape (3,), low-passed;
-            ``None`` without a sensor.
+        force: Force of the surfaces on the robot at the frame of the sensor, world axes, N, shape (3,), after the
+            low-pass filter.  ``None`` without a force sensor.
     """
 
     t: float
@@ -34,28 +34,27 @@ class Reading:
 
 
 class SensorNoise:
-    """White noise on the tangent space, and the encoders' steps.
+    """White noise in the tangent space, and the steps of the encoders.
 
     Args:
         robot: The robot.
-        sensors: How good its sensors are.
+        sensors: Errors of its sensors.
     """
 
     def __init__(self, robot: Robot, sensors: Sensors) -> None:
         self._model, self._sensors = robot.model, sensors
-        base = 6 if robot.floating else 0
         angles, rates = (np.full(robot.nv, value) for value in (sensors.joint_angle, sensors.joint_rate))
-        if base:
+        if robot.floating:
             angles[:6] = [sensors.base_position] * 3 + [sensors.base_angle] * 3
             rates[:6] = [sensors.base_velocity] * 3 + [sensors.base_rate] * 3
         self._angles = angles if angles.any() else None
         self._rates = rates if rates.any() else None
-        # Encoders count; joints of several numbers have none.
+        # Only joints with one number have an encoder.
         slots = Chart(robot.model).slots
         self._counted = np.array([s.q.start for s in slots if s.kind.family in ("revolute", "prismatic")], dtype=int)
 
     def read(self, t: float, q: Array, v: Array, force: Array | None, generator: np.random.Generator) -> Reading:
-        """Add noise to the truth; the arrays given are not changed."""
+        """Add noise to the true state.  The given arrays are not changed."""
         sensors = self._sensors
         if self._angles is not None:
             q = pin.integrate(self._model, q, self._angles * generator.standard_normal(self._angles.size))

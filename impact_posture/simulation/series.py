@@ -1,4 +1,4 @@
-"""What happened in a run, tick by tick."""
+"""Time series of a run, tick by tick, and the windows that count."""
 
 from __future__ import annotations
 
@@ -12,26 +12,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import SpecError
+from impact_posture.tsid.controller import Status
 
 Array = NDArray[Any]
+Flags = NDArray[np.bool_]
 
-# S within which two times are one: sums of time steps are not exact.
+STATUSES: tuple[Status, ...] = tuple(Status)
+# Times that differ by less are equal, because sums of time steps are not exact, s.
 _SAME = 1e-9
-# S from the begin of an impact in which what was held back may come out again.
+# Time from the begin of an impact in which a motion that was held back may come out again, s.
 RECOVERY = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A time that counts.
+    """A window of time that counts.
 
     Attributes:
-        kind: ``impact``; ``dwell``, from the first touch until the reference leaves; or ``recovery``, from the
-            impact's begin until :data:`RECOVERY` later, at most until the next approach begins or the run ends.
-        contact: Which contact, or push, it belongs to, from 0.
-        begin: s.
-        end: s.
-        touched: Whether the impact came; else the window begins where it was expected.
+        kind: ``impact``, ``dwell`` (from the first touch until the reference leaves), or ``recovery`` (until
+            :data:`RECOVERY` after the begin of the impact, the next approach, or the end of the run).
+        contact: Number of the contact or push, from 0.
+        begin: Begin, s.
+        end: End, s.
+        touched: Whether the impact came.  If not, the window begins where it was expected.
     """
 
     kind: str
@@ -40,32 +43,28 @@ class Window:
     end: float
     touched: bool
 
-    def to_dict(self) -> dict[str, object]:
-        """JSON content."""
-        return {name.name: getattr(self, name.name) for name in fields(self)}
-
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """The truth of a run, n ticks; times and states are those at a tick's end, when its command has been executed.
+    """True states of a run of n ticks, each at the end of a tick, when its command has been executed.
 
     Attributes:
-        t: s, shape (n,).
+        t: Time, s, shape (n,).
         q: Configuration, shape (n, nq).
         v: ν, shape (n, nv).
-        torque: Joint torques as commanded, within the limits, shape (n, joints).
-        rotor_command: Rotor speeds as commanded, within the limits, shape (n, rotors).
-        rotor_speed: As they turn, shape (n, rotors).
-        force: Of the surfaces on the shape that hits, or of the push, world, N, shape (n, 3).
+        torque: Commanded joint torques, within the limits, shape (n, joints).
+        rotor_command: Commanded rotor speeds, within the limits, shape (n, rotors).
+        rotor_speed: True rotor speeds, shape (n, rotors).
+        force: Force on the shape that hits, or of the push, world, N, shape (n, 3).
         peak: Largest normal force on that shape within the tick, N, shape (n,).
-        slip: Tangential speed of the shape, or of the fastest foot, where it touches, m/s, shape (n,).
-        touching: Shapes that touch, shape (n,).
-        feet: Whether each foot that is to stay touches, shape (n, feet).
-        objective: H of the impact, shape (n,); NaN where it was not evaluated.
-        level: Of the preparing term, shape (n,).
+        slip: Tangential speed of that shape, or of the fastest foot, in contact, m/s, shape (n,).
+        touching: Number of shapes in contact, shape (n,).
+        feet: Whether each foot that must stay is in contact, shape (n, feet).
+        objective: H of the impact, shape (n,), NaN in ticks without an evaluation.
+        level: Level of the term that prepares for the impact, shape (n,).
         status: Index into :data:`STATUSES`, shape (n,).
         at_stop: Whether a joint is at a position limit, shape (n, nv).
-        reference: Distance of the reference along its way in, m, shape (n,); zero for pushes.
+        reference: Distance of the reference along its way in, m, shape (n,), zero for pushes.
     """
 
     t: Array
@@ -85,15 +84,24 @@ class Series:
     at_stop: Array
     reference: Array
 
+    @property
+    def relaxed(self) -> Flags:
+        """Ticks in which a level gave way, shape (n,)."""
+        return np.asarray(self.status == STATUSES.index(Status.RELAXED))
+
+    @property
+    def held(self) -> Flags:
+        """Ticks in which no command was found and the last one was held, shape (n,)."""
+        return np.asarray(~self.relaxed & (self.status != STATUSES.index(Status.SOLVED)))
+
     def slice(self, begin: float, end: float) -> slice:
-        """The ticks that lie in ``(begin, end]``, rounding of the times aside."""
+        """Return the ticks in ``(begin, end]``, except for rounding of the times."""
         first, last = np.searchsorted(self.t, [begin + _SAME, end + _SAME], side="right")
         return slice(int(first), int(last))
 
     def save(self, path: Path, **more: Any) -> None:
         """Write as NPZ."""
-        columns: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        np.savez_compressed(path, **columns, **more)
+        np.savez_compressed(path, **vars(self), **more)
 
     @staticmethod
     def load(path: Path) -> Series:

@@ -1,11 +1,13 @@
-"""From a scenario's gains to the program of a controller: the same tasks for all, but for the posture task."""
+"""Tasks of a controller from the gains of a scenario.  All controllers have the same tasks except for the posture."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import SpecError
 from impact_posture.impact.contact import point_on
-from impact_posture.simulation.scenario import Control, RepeatedContacts, Setup
+from impact_posture.simulation.scenario import Setup
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
 from impact_posture.tsid.contacts import SupportContact, support_contacts
 from impact_posture.tsid.frame_tasks import EndEffector, FrameAligned, FramePose, FramePosition, Impedance
@@ -16,76 +18,74 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 
 
 def end_effector_task(setup: Setup) -> EndEffector | None:
-    """The end effector's task, where the scenario has gains for one.
+    """Return the task of the end effector, if the scenario has contacts.
 
     Raises:
-        SpecError: Gains for an end effector where nothing is touched, or none where something is.
+        SpecError: A push has gains for an end effector, or contacts have none.
     """
-    control, task = setup.scenario.control, setup.scenario.task
-    gains = control.end_effector
-    if not isinstance(task, RepeatedContacts):
-        if gains is not None:
-            where = setup.scenario.source
-            raise SpecError(
-                "has [control.end_effector], but a push", where=where, hint="remove [control.end_effector]"
-            )
+    scenario, gains = setup.scenario, setup.scenario.control.end_effector
+    if scenario.push and gains is not None:
+        raise SpecError(
+            "has [control.end_effector], but a push", where=scenario.source, hint="remove [control.end_effector]"
+        )
+    if scenario.push:
         return None
     if gains is None:
         raise SpecError(
             "has contacts, but nothing that leads the frame there",
-            where=setup.scenario.source,
+            where=scenario.source,
             hint="add [control.end_effector]",
         )
-    soften = None if control.apparent_mass is None else Impedance(control.apparent_mass)
-    point = Point(task.frame, setup.scenario.shape.offset)
-    common = {"name": "end effector", "impedance": soften, "kp": gains.kp, "kd": gains.kd, "weight": gains.weight}
+    mass, frame = scenario.control.apparent_mass, scenario.shape.frame
+    impedance = None if mass is None else Impedance(mass)
+    point = Point(frame, scenario.shape.offset)
+    common = {"name": "end effector", "impedance": impedance, "kp": gains.kp, "kd": gains.kd, "weight": gains.weight}
     if gains.pose == "aligned":
-        placed = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, task.frame))
-        return FrameAligned(point, placed.rotation.T @ setup.scenario.normal, **common)  # type: ignore[arg-type]
+        placed = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, frame))
+        return FrameAligned(point, placed.rotation.T @ scenario.normal, **common)  # type: ignore[arg-type]
     kind = FramePose if gains.pose == "full" else FramePosition
     return kind(point, **common)  # type: ignore[arg-type]
 
 
 def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffector | None) -> TaskFormulation:
-    """The program of a scenario with a posture task of its own.
+    """Build the tasks of a scenario around a posture task.
 
-    A robot with ``[control.footing]`` stands: contacts and friction constrain, center of mass, base orientation, end
-    effector and posture weigh.  Any other has strict levels: level base, end effector, posture in the cost.
+    A robot with ``[control.footing]`` stands.  Contacts and friction are constraints, and center of mass, base
+    orientation, end effector and posture are weighted.  Any other robot has strict levels: level base, end effector,
+    and the posture in the cost.
 
     Raises:
-        SpecError: Gains for a task that the robot cannot have.
+        SpecError: There are gains for a task that the robot cannot have.
     """
     control, scenario = setup.scenario.control, setup.scenario
     _check_gains(setup)
-    felt = None if end_effector is None or scenario.scene.sensors.force_frame is None else end_effector.point
-    if control.footing is not None:
-        weighted: list[Task] = [
-            task(kp=gains.kp, kd=gains.kd, weight=gains.weight)
-            for task, gains in ((CenterOfMass, control.center_of_mass), (BaseOrientation, control.base))
-            if gains is not None
-        ]
-        if end_effector is not None:
-            weighted.append(end_effector)
-        contacts, cost = _contacts(setup, control), control.footing.force_weight
-        return TaskFormulation((), tuple(weighted), posture, contacts, force_point=felt, force_weight=cost)
-    tilt = () if control.tilt is None else ((Tilt(kp=control.tilt.kp, kd=control.tilt.kd),),)
-    hand = () if end_effector is None else ((end_effector,),)
-    return TaskFormulation((*tilt, *hand), (), posture, force_point=felt)
+    felt = None if end_effector is None or scenario.sensors.force_frame is None else end_effector.point
+    tasks = () if end_effector is None else (end_effector,)
+    if control.footing is None:
+        tilt = () if control.tilt is None else ((Tilt(kp=control.tilt.kp, kd=control.tilt.kd),),)
+        return TaskFormulation((*tilt, *((task,) for task in tasks)), (), posture, force_point=felt)
+    weighted: list[Task] = [
+        task(kp=gains.kp, kd=gains.kd, weight=gains.weight)
+        for task, gains in ((CenterOfMass, control.center_of_mass), (BaseOrientation, control.base))
+        if gains is not None
+    ]
+    contacts, cost = _contacts(setup, control.footing.friction, control.footing.least), control.footing.force_weight
+    return TaskFormulation((), (*weighted, *tasks), posture, contacts, force_point=felt, force_weight=cost)
 
 
 def base_weight(setup: Setup) -> float | None:
-    """Weight of the base's entries in the posture task: none, where other tasks lead a floating base."""
+    """Return the weight of the base entries in the posture task: 0 for a floating base, which other tasks control."""
     return 0.0 if setup.robot.floating else None
 
 
 def nominal_posture(setup: Setup) -> JointPosture:
-    """The posture task that holds the start posture."""
+    """Return the posture task that holds the start posture."""
     gains = setup.scenario.control.posture
     return JointPosture(setup.robot, kp=gains.kp, kd=gains.kd, weight=gains.weight, base_weight=base_weight(setup))
 
 
 def _check_gains(setup: Setup) -> None:
-    """Refuse gains that no task would take."""
+    """Refuse gains that no task would use."""
     control, source = setup.scenario.control, setup.scenario.source
     stands, flies = control.footing is not None, setup.robot.floating
     for key, given, fits, why in (
@@ -98,17 +98,12 @@ def _check_gains(setup: Setup) -> None:
             raise SpecError(f"has [control.{key}], but {why}", where=source, hint=f"remove [control.{key}]")
 
 
-def _contacts(setup: Setup, control: Control) -> tuple[SupportContact, ...]:
-    footing = control.footing
-    assert footing is not None  # noqa: S101 (narrows a type)
-    contacts = support_contacts(setup.robot, friction=footing.friction)
+def _contacts(setup: Setup, friction: float, least: float) -> tuple[SupportContact, ...]:
+    contacts = support_contacts(setup.robot, friction=friction)
     if not contacts:
         raise SpecError(
             "has [control.footing], but the robot has no supports",
             where=setup.scenario.source,
             hint="name [[supports]] in robot.toml",
         )
-    return tuple(
-        SupportContact(c.point, c.kind, c.half, c.normal, c.friction, footing.least, c.kp, c.kd, c.weight)
-        for c in contacts
-    )
+    return tuple(replace(contact, least=least) for contact in contacts)

@@ -1,14 +1,16 @@
-"""The world: a robot in MuJoCo under rotor and motor commands, what its sensors read, and the truth beside it."""
+"""A robot in MuJoCo under rotor and motor commands, with readings of its sensors and the true state."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.dynamics.mjcf import import_mujoco
+from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.errors import InputError, PostureError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import hover
@@ -22,29 +24,34 @@ from impact_posture.simulation.world_builder import BuiltScene, build_scene
 
 Array = NDArray[np.float64]
 
-_NOTHING = np.zeros(3)
-# No robot is as far or as fast, m, m/s, rad/s; nor are its torques, N·m.
+# No robot is so far away or so fast, m, m/s, rad/s, and no torque so large, N·m.
 _RUNAWAY = 1e6
 
 
-def _silent(message: str) -> None:
-    """Take a warning of MuJoCo's: what it is about shows in the state."""
+def _ignore(message: str) -> None:
+    """Ignore a MuJoCo warning, because the state already shows the problem."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """What the sensors saw at one step."""
+    """What the sensors see after a step."""
 
+    layout: MjcfLayout
     qpos: Array
     qvel: Array
     speeds: Array
     phases: Array
     force: Array
 
+    @cached_property
+    def state(self) -> tuple[Array, Array]:
+        """The Pinocchio ``(q, ν)``, which callers must copy."""
+        return self.layout.state(self.qpos, self.qvel)
+
 
 @dataclass(frozen=True, eq=False)
 class _ActivePush:
-    """A push under way: on which body, where in it, until which step."""
+    """A push on a point of a body until a step."""
 
     body: int
     point: Array
@@ -53,15 +60,15 @@ class _ActivePush:
 
 
 class World:
-    """A robot in its surroundings; made by :func:`build_world`.
+    """A robot in its surroundings, which :func:`build_world` makes.
 
-    Call :meth:`reset` first.  Coordinates are Pinocchio's throughout.
+    Call :meth:`reset` first.  All coordinates are those of Pinocchio.
 
     Attributes:
         robot: The robot.
         scene: Its surroundings.
-        built: The MuJoCo model and where the surfaces are.
-        timestep: Of the physics, s.
+        built: The MuJoCo model, and where the surfaces are.
+        timestep: Time step of the physics, s.
     """
 
     def __init__(self, robot: Robot, scene: Scene, built: BuiltScene) -> None:
@@ -76,47 +83,43 @@ class World:
         self._layout = built.mjcf.layout
         self._model = built.mjcf.compile()
         self._data = self._mujoco.MjData(self._model)
-        self._log = ContactLog(self._model, built.shape_geoms, tuple(s.frame for s in scene.shapes))
-        self._noise = SensorNoise(robot, scene.sensors)
-        propulsion, unbalance = robot.spec.propulsion, scene.sensors.unbalance
+        frames, sensors, propulsion = tuple(s.frame for s in scene.shapes), scene.sensors, robot.spec.propulsion
+        self._log = ContactLog(self._model, built.shape_geoms, frames)
+        self._noise = SensorNoise(robot, sensors)
         self._rotors = None if propulsion is None else Rotors(propulsion, self.timestep)
         self._vibration = None
-        if propulsion is not None and unbalance:
-            self._vibration = Vibration(robot.model, propulsion, unbalance)
+        if propulsion is not None and sensors.unbalance:
+            self._vibration = Vibration(robot.model, propulsion, sensors.unbalance)
         self._count = 0 if propulsion is None else len(propulsion.rotors)
         effort = np.asarray(robot.model.effortLimit, dtype=float)[6 if robot.floating else 0 :]
-        # No effort limit, or zero, is none stated.
+        # An effort limit of zero means that none is stated.
         self._effort = np.where(effort > 0, effort, np.inf)
         self._torques: Array = np.zeros(self._effort.size)
-        frames = [s.frame for s in scene.shapes]
-        self._felt = None if scene.sensors.force_frame is None else frames.index(scene.sensors.force_frame)
-        self._smoothing = -np.expm1(-2 * np.pi * scene.sensors.force_cutoff * self.timestep)
+        self._felt = None if sensors.force_frame is None else frames.index(sensors.force_frame)
+        self._smoothing = -np.expm1(-2 * np.pi * sensors.force_cutoff * self.timestep)
         self._force: Array = np.zeros(3)
-        self._past: deque[_Sample] = deque(maxlen=1 + round(scene.sensors.delay / self.timestep))
+        self._past: deque[_Sample] = deque(maxlen=1 + round(sensors.delay / self.timestep))
         self._pushes: list[_ActivePush] = []
         self._steps = 0
-        self._converted: tuple[_Sample, Array, Array] | None = None
-        self._ready = False
-        limits = np.array(self._model.jnt_range)
         limited = np.array(self._model.jnt_limited, dtype=bool)
         self._limited = np.array(self._model.jnt_qposadr)[limited]
-        self._low, self._high = limits[limited].T
+        self._low, self._high = np.array(self._model.jnt_range)[limited].T
         self._limited_names = [self._model.joint(int(k)).name for k in np.flatnonzero(limited)]
 
     def reset(
         self, q: ArrayLike, v: ArrayLike | None = None, seed: int = 0, *, rotor_speed: ArrayLike | None = None
     ) -> None:
-        """Begin anew.
+        """Begin again.
 
         Args:
             q: Configuration, shape (nq,).
-            v: ν, shape (nv,); at rest by default.
-            seed: Of all noise.
-            rotor_speed: Of the propellers, shape (rotors,); as for hovering at ``q`` by default.
+            v: ν, shape (nv,).  At rest by default.
+            seed: Seed of all noise.
+            rotor_speed: Speeds of the propellers, shape (rotors,).  Those of hovering at ``q`` by default.
 
         Raises:
-            PostureError: No configuration of the robot, or a velocity that is none.
-            InputError: Rotor speeds that are none.
+            PostureError: The configuration or the velocity does not fit the robot.
+            InputError: The rotor speeds do not fit the robot.
         """
         q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False, where="reset")
         v = np.zeros(self.robot.nv) if v is None else np.asarray(v, dtype=float)
@@ -141,19 +144,18 @@ class World:
         self._mujoco.mj_step1(self._model, self._data)
         self._past.clear()
         self._past.append(self._sample())
-        self._ready = True
 
     @property
     def time(self) -> float:
-        """Seconds since the reset."""
+        """Time since the reset, s."""
         return self._steps * self.timestep
 
     def push(self, push: Push) -> None:
-        """Begin to push now; pushes add up.
+        """Begin a push now.  Several pushes add up.
 
         Raises:
-            FrameNotFound: No such frame.
-            InputError: A force or duration that is none.
+            FrameNotFound: There is no such frame.
+            InputError: The force is not finite, or the duration is shorter than a time step.
         """
         point = point_on(self.robot, push.frame, push.offset)
         steps = round(push.duration / self.timestep) if np.isfinite(push.duration) else 0
@@ -165,22 +167,22 @@ class World:
         self._pushes.append(_ActivePush(body, point.position, force, self._steps + steps))
 
     def step(self, command: Commands, count: int = 1) -> None:
-        """Go on by physics steps under one command.
+        """Take physics steps under one command.
 
         Args:
-            command: Rotor speeds and joint torques, cut to their limits.
-            count: How many steps.
+            command: Rotor speeds and joint torques, which are cut to their limits.
+            count: Number of steps.
 
         Raises:
-            InputError: Before the first reset, or a command of other sizes or not finite.
+            InputError: There was no reset, or the command has other sizes or is not finite.
             SimulationDiverged: The state ran away.
         """
         self._check_ready()
         speed, self._torques = self._checked(command)
         self._data.ctrl[self._count :] = self._torques
-        # MuJoCo's own way with a warning is a log file in the working directory.
+        # MuJoCo itself would write a warning to a log file in the working directory.
         before = self._mujoco.get_mju_user_warning()
-        self._mujoco.set_mju_user_warning(_silent)
+        self._mujoco.set_mju_user_warning(_ignore)
         try:
             for _ in range(count):
                 self._advance(speed)
@@ -192,7 +194,7 @@ class World:
             self._past.append(self._sample())
 
     def _advance(self, speed: Array) -> None:
-        """One physics step."""
+        """Take one physics step."""
         mujoco, model, data = self._mujoco, self._model, self._data
         if self._rotors is not None:
             data.ctrl[: self._count] = self._rotors.step(speed)
@@ -204,28 +206,26 @@ class World:
         self._log.step(data)
         if self._felt is not None:
             self._force += self._smoothing * (self._log.forces[self._felt] - self._force)
-        # Positions, contacts and velocities of the new state; forces stay those of the step.
+        # Now positions, contacts and velocities are those of the new state, and forces those of the step.
         mujoco.mj_step1(model, data)
         if self._past.maxlen != 1:
             self._past.append(self._sample())
 
     def read(self) -> Reading:
-        """What the sensors say now; every call draws its own noise."""
+        """Return what the sensors measure now.  Every call draws new noise."""
         self._check_ready()
         sample = self._past[0]
-        q, v = self._state_of(sample)
+        q, v = (part.copy() for part in sample.state)
         if self._vibration is not None:
             v[:6] += self._vibration.twist(sample.speeds, sample.phases)
         force = None if self._felt is None else sample.force
         return self._noise.read(self.time, q, v, force, self._generator)
 
     def truth(self) -> Truth:
-        """The state as it is; each shape's peak force and first touch start anew."""
+        """Return the true state.  The peak force and the first touch of each shape begin again."""
         self._check_ready()
-        data = self._data
-        # The newest sample is the present state: its conversion serves the sensors, too.
-        q, v = self._state_of(self._past[-1])
-        values = data.qpos[self._limited]
+        q, v = (part.copy() for part in self._past[-1].state)
+        values = self._data.qpos[self._limited]
         stopped = np.flatnonzero((values <= self._low) | (values >= self._high))
         rotors = self._rotors
         return Truth(
@@ -235,25 +235,15 @@ class World:
             rotor_speeds=np.zeros(0) if rotors is None else rotors.speeds,
             thrusts=np.zeros(0) if rotors is None else rotors.thrusts,
             torques=self._torques,
-            shapes=self._log.look(data),
+            shapes=self._log.look(self._data),
             at_stops=tuple(self._limited_names[k] for k in stopped),
         )
 
-    def _state_of(self, sample: _Sample) -> tuple[Array, Array]:
-        """Pinocchio's ``(q, ν)`` of a sample, the caller's own arrays."""
-        if self._converted is None or self._converted[0] is not sample:
-            self._converted = (sample, *self._layout.state(sample.qpos, sample.qvel))
-        return self._converted[1].copy(), self._converted[2].copy()
-
     def _sample(self) -> _Sample:
-        nothing = np.zeros(0)
-        return _Sample(
-            self._data.qpos.copy(),
-            self._data.qvel.copy(),
-            nothing if self._rotors is None else self._rotors.speeds,
-            nothing if self._vibration is None else self._vibration.phases,
-            self._force.copy(),
-        )
+        speeds = np.zeros(0) if self._rotors is None else self._rotors.speeds
+        phases = np.zeros(0) if self._vibration is None else self._vibration.phases
+        data = self._data
+        return _Sample(self._layout, data.qpos.copy(), data.qvel.copy(), speeds, phases, self._force.copy())
 
     def _apply_pushes(self) -> None:
         if not self._pushes:
@@ -263,7 +253,7 @@ class World:
         self._pushes = [push for push in self._pushes if push.end > self._steps]
         for push in self._pushes:
             place = data.xpos[push.body] + data.xmat[push.body].reshape(3, 3) @ push.point
-            self._mujoco.mj_applyFT(self._model, data, push.force, _NOTHING, place, push.body, data.qfrc_applied)
+            self._mujoco.mj_applyFT(self._model, data, push.force, np.zeros(3), place, push.body, data.qfrc_applied)
 
     def _checked(self, command: Commands) -> tuple[Array, Array]:
         speed, torque = np.asarray(command.rotor_speed, dtype=float), np.asarray(command.torque, dtype=float)
@@ -277,11 +267,11 @@ class World:
             raise InputError("is not finite", where="command", hint="hold the last one instead")
         torque = np.clip(torque, -self._effort, self._effort)
         if not np.abs(torque).max(initial=0.0) < _RUNAWAY:
-            raise InputError("asks for endless torque", where="command", hint="give the joints effort limits")
+            raise InputError("has an endless torque", where="command", hint="give the joints effort limits")
         return speed if self._rotors is None else self._rotors.within(speed), torque
 
     def _check_ready(self) -> None:
-        if not self._ready:
+        if not self._past:
             raise InputError("has not been reset", where="world", hint="call reset(q) first")
 
 
@@ -291,11 +281,10 @@ def build_world(robot: Robot, scene: Scene, q: ArrayLike | None = None) -> World
     Args:
         robot: The robot.
         scene: Its surroundings.
-        q: Posture at which surfaces with a gap are placed, shape (nq,); the robot's default posture if not given.
+        q: Posture at which surfaces with a gap are placed, shape (nq,).  The default posture of the robot by default.
 
     Raises:
-        InputError: MuJoCo is not installed, or something of the scene does not fit the robot.
+        InputError: MuJoCo is not installed, or the scene does not fit the robot.
     """
     start = robot.posture() if q is None else robot.check_posture(np.asarray(q, dtype=float), where="start posture")
-    import_mujoco()
     return World(robot, scene, build_scene(robot, scene, start))

@@ -1,42 +1,43 @@
-"""A robot and its surroundings as one MuJoCo model."""
+"""One MuJoCo model of a robot and its surroundings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
-from impact_posture.dynamics.mjcf import Mjcf, write_mjcf
-from impact_posture.dynamics.mjcf_scene import Additions
-from impact_posture.dynamics.mjcf_text import numbers
+from impact_posture.dynamics.mjcf import Mjcf, build_mjcf, import_mujoco
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, UnsupportedJoint
 from impact_posture.escape import xml_name
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import actuation_matrix
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.scene import Scene, Shape, Surface
+from impact_posture.simulation.scene import Physics, Scene, Shape, Surface
 
 Array = NDArray[np.float64]
 
-# Families whose velocities are the same numbers, in the same axes, in Pinocchio and MuJoCo.
+# Families with the same velocities, in the same axes, in Pinocchio and MuJoCo.
 _DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")
+# Where in the width of solimp the share d is halfway, and the power of its rise (MuJoCo defaults).
+_SOLIMP_SHAPE = (0.5, 2.0)
 
 
 @dataclass(frozen=True, eq=False)
 class BuiltScene:
-    """A scene's model before MuJoCo has compiled it.
+    """Model of a scene before MuJoCo compiles it.
 
     Attributes:
-        mjcf: The model.  Its actuators: rotors (control: thrust, N), then joints (N·m or N), in the order of ``u``.
+        mjcf: The model.  Its actuators are the rotors (thrust, N), then the joints (N·m or N), in the order of ``u``.
         normals: Unit normal of each surface, by name.
-        points: A point on each surface, world, meters, by name.
+        points: A point on each surface, world, m, by name.
         gaps: Distance of each shape from each surface in the start posture, m, by surface and shape.
-        shape_geoms: Name of each shape's geom, in the scene's order.
+        shape_geoms: Name of the geom of each shape, in the order of the scene.
     """
 
     mjcf: Mjcf
@@ -47,30 +48,23 @@ class BuiltScene:
 
 
 def build_scene(robot: Robot, scene: Scene, q: Array) -> BuiltScene:
-    """Put a robot into its surroundings.
+    """Build the model of a robot in its surroundings.
 
     Args:
         robot: The robot.
         scene: Its surroundings.
-        q: Start posture, shape (nq,): gaps and the shapes' default centers are taken there.
+        q: Start posture, shape (nq,), which defines the gaps and the default centers of the shapes.
 
     Raises:
-        FrameNotFound: Of a shape.
-        ContactError: A shape on a frame that is welded to the world.
-        InputError: A shape without a center where there is no surface, or a surface with a gap to no shape.
-        UnsupportedJoint: A joint that no motor drives.
+        FrameNotFound: The frame of a shape does not exist.
+        ContactError: The frame of a shape is welded to the world.
+        InputError: MuJoCo is not installed, a shape has no center and there is no surface, or a surface has no point
+            and there is no shape.
+        UnsupportedJoint: No motor can drive a joint.
     """
     numeric = Numeric(robot.model).at(q)
-    written = write_mjcf(robot.model, robot.name)
-    added = Additions(written)
-    physics = scene.physics
-    added.option(timestep=repr(float(physics.timestep)), integrator="implicitfast", cone="elliptic")
-    # A diverging simulation must not go on from its start in silence.
-    added.flag(autoreset="disable")
-    if physics.gravity is not None:
-        added.option(gravity=numbers(physics.gravity))
-    added.stops(solreflimit=numbers(physics.stop_solref), solimplimit=numbers(physics.stop_solimp))
-
+    mjcf = build_mjcf(robot.model, robot.name)
+    _set_physics(mjcf.spec, scene.physics)
     normals = {s.name: np.array(s.normal, dtype=float) / np.linalg.norm(s.normal) for s in scene.surfaces}
     first = next(iter(normals.values()), None)
     geoms, placed = [], []
@@ -78,7 +72,7 @@ def build_scene(robot: Robot, scene: Scene, q: Array) -> BuiltScene:
         place = _placement(robot, numeric, shape, first)
         joint = point_on(robot, shape.frame).joint
         geoms.append(xml_name(f"shape {shape.frame}"))
-        added.shape(joint, geoms[-1], shape.kind, shape.size, place)
+        mjcf.add_geom(joint, geoms[-1], shape.kind, shape.size, place)
         placed.append((shape, numeric.data.oMi[joint] * place))
     points = {s.name: _point(s, normals[s.name], placed) for s in scene.surfaces}
     gaps = {
@@ -87,24 +81,38 @@ def build_scene(robot: Robot, scene: Scene, q: Array) -> BuiltScene:
         for shape, place in placed
     }
     for surface in scene.surfaces:
-        name, law = xml_name(f"surface {surface.name}"), surface.law
-        added.plane(name, points[surface.name], normals[surface.name])
+        name = xml_name(f"surface {surface.name}")
+        mjcf.add_plane(name, points[surface.name], normals[surface.name])
         for geom in geoms:
-            added.pair(
-                name,
-                geom,
-                condim="3" if law.friction else "1",
-                friction=numbers((law.friction, law.friction, 0.0, 0.0, 0.0)),
-                solref=numbers(law.solref),
-                solimp=numbers(law.solimp),
+            mjcf.spec.add_pair(
+                geomname1=name,
+                geomname2=geom,
+                condim=3 if surface.friction else 1,
+                friction=(surface.friction, surface.friction, 0.0, 0.0, 0.0),
+                solref=surface.solref,
+                solimp=(*surface.solimp, *_SOLIMP_SHAPE),
             )
-    _add_rotors(added, robot)
-    _add_motors(added, robot, written.joints)
-    return BuiltScene(added.model(), normals, points, gaps, tuple(geoms))
+    _add_rotors(mjcf, robot)
+    _add_motors(mjcf, robot)
+    return BuiltScene(mjcf, normals, points, gaps, tuple(geoms))
+
+
+def _set_physics(spec: Any, physics: Physics) -> None:
+    """Set the time step, the solver, gravity, and how the joint stops push."""
+    mujoco = import_mujoco()
+    spec.option.timestep = physics.timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    # A simulation that diverges must not silently restart.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if physics.gravity is not None:
+        spec.option.gravity = physics.gravity
+    for joint in spec.joints:
+        joint.solref_limit, joint.solimp_limit = physics.stop_solref, (*physics.stop_solimp, *_SOLIMP_SHAPE)
 
 
 def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | None) -> pin.SE3:
-    """A shape's pose in its joint's frame."""
+    """Return the pose of a shape in the frame of its joint."""
     point = point_on(robot, shape.frame)
     frame = pin.SE3(point.rotation, point.position)
     if shape.center is not None:
@@ -122,7 +130,7 @@ def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | Non
 
 
 def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]]) -> Array:
-    """A point on a surface: given, or below the nearest shape."""
+    """Return the given point on a surface, or the one below the nearest shape."""
     if surface.point is not None:
         return np.array(surface.point, dtype=float)
     if not placed:
@@ -133,26 +141,29 @@ def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]])
 
 
 def _lowest(shape: Shape, place: pin.SE3, normal: Array) -> Array:
-    """Below a shape's center, on its lowest plane along a normal."""
+    """Return the point below the center of a shape on its lowest plane along a normal."""
     reach = shape.size[0]
     if shape.kind == "box":
         reach = float(np.abs(place.rotation.T @ normal) @ np.array(shape.size))
     return np.asarray(place.translation - reach * normal)
 
 
-def _add_rotors(added: Additions, robot: Robot) -> None:
-    """One motor a rotor: its control is the thrust, its wrench acts at the base."""
+def _add_rotors(mjcf: Mjcf, robot: Robot) -> None:
+    """Add a motor for each rotor, whose control is the thrust and whose wrench acts on the base."""
     propulsion = robot.spec.propulsion
     if propulsion is None:
         return
     wrenches = actuation_matrix(robot.model, propulsion)[:6, : len(propulsion.rotors)]
-    added.site(1, "base of the rotors", pin.SE3.Identity())
+    site, transmission = "base of the rotors", import_mujoco().mjtTrn.mjTRN_SITE
+    mjcf.body(1).add_site(name=site)
     for rotor, wrench in zip(propulsion.rotors, wrenches.T, strict=True):
-        added.motor(xml_name(f"rotor {rotor.name}"), wrench, site="base of the rotors")
+        name = xml_name(f"rotor {rotor.name}")
+        mjcf.spec.add_actuator(name=name, gear=wrench, target=site, trntype=transmission)
 
 
-def _add_motors(added: Additions, robot: Robot, joints: Mapping[int, tuple[str, ...]]) -> None:
-    """One motor an entry of ν behind the base."""
+def _add_motors(mjcf: Mjcf, robot: Robot) -> None:
+    """Add a motor for each entry of ν behind the base."""
+    transmission = import_mujoco().mjtTrn.mjTRN_JOINT
     for slot in Chart(robot.model).slots[1 if robot.floating else 0 :]:
         if slot.kind.family not in _DRIVEN:
             raise UnsupportedJoint(
@@ -160,9 +171,10 @@ def _add_motors(added: Additions, robot: Robot, joints: Mapping[int, tuple[str, 
                 where="simulation",
                 hint="lock it (--lock), or model it as slides and hinges",
             )
+        targets = mjcf.joints[slot.index]
+        motors = [(f"motor {name}", name, np.eye(3)[0]) for name in targets]
         if slot.kind.family == "spherical":
-            for k, axis in enumerate(np.eye(3)):
-                added.motor(xml_name(f"motor {slot.name}[{k}]"), axis, joint=joints[slot.index][0])
-            continue
-        for name in joints[slot.index]:
-            added.motor(f"motor {name}", (1.0,), joint=name)
+            motors = [(xml_name(f"motor {slot.name}[{k}]"), targets[0], axis) for k, axis in enumerate(np.eye(3))]
+        for name, target, axis in motors:
+            gear = (*axis, 0.0, 0.0, 0.0)
+            mjcf.spec.add_actuator(name=name, gear=gear, target=target, trntype=transmission)

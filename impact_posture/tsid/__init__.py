@@ -1,44 +1,21 @@
-"""Task-space inverse dynamics at 1 kHz with the impact-robust posture task; imports no CasADi.
+"""Task-space inverse dynamics at 1 kHz with the impact-robust posture task; imports no CasADi."""
 
-The names below are imported when they are first used.
-"""
-
-from __future__ import annotations
-
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from impact_posture.tsid.activation import Phase
-    from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
-    from impact_posture.tsid.contacts import SupportContact, support_contacts
-    from impact_posture.tsid.controller import Command, Controller, Report, Status
-    from impact_posture.tsid.frame_tasks import FrameAligned, FramePose, FramePosition, Impedance
-    from impact_posture.tsid.impact_robust import ImpactRobustPosture
-    from impact_posture.tsid.limits import LimitLaw
-    from impact_posture.tsid.points import Point
-    from impact_posture.tsid.posture_tasks import JointPosture
-    from impact_posture.tsid.task import Task
-    from impact_posture.tsid.task_formulation import (
-        TaskFormulation,
-        aerial_formulation,
-        arm_formulation,
-        legged_formulation,
-    )
-
-_HOMES = {
-    "activation": ("Phase",),
-    "body_tasks": ("BaseOrientation", "CenterOfMass", "Tilt"),
-    "contacts": ("SupportContact", "support_contacts"),
-    "controller": ("Command", "Controller", "Report", "Status"),
-    "frame_tasks": ("FrameAligned", "FramePose", "FramePosition", "Impedance"),
-    "impact_robust": ("ImpactRobustPosture",),
-    "limits": ("LimitLaw",),
-    "points": ("Point",),
-    "posture_tasks": ("JointPosture",),
-    "task": ("Task",),
-    "task_formulation": ("TaskFormulation", "aerial_formulation", "arm_formulation", "legged_formulation"),
-}
+from impact_posture.tsid.activation import Phase
+from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
+from impact_posture.tsid.contacts import SupportContact, support_contacts
+from impact_posture.tsid.controller import Command, Controller, Report, Status
+from impact_posture.tsid.frame_tasks import FrameAligned, FramePose, FramePosition, Impedance
+from impact_posture.tsid.impact_robust import ImpactRobustPosture
+from impact_posture.tsid.limits import LimitLaw
+from impact_posture.tsid.points import Point
+from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.task import Task
+from impact_posture.tsid.task_formulation import (
+    TaskFormulation,
+    aerial_formulation,
+    arm_formulation,
+    legged_formulation,
+)
 
 __all__ = [
     "BaseOrientation",
@@ -65,10 +42,3 @@ __all__ = [
     "legged_formulation",
     "support_contacts",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    for module, names in _HOMES.items():
-        if name in names:
-            return getattr(import_module(f"impact_posture.tsid.{module}"), name)
-    raise AttributeError(f"module 'impact_posture.tsid' has no attribute '{name}'")

@@ -1,15 +1,15 @@
-"""When the impact-robust term is on: free, brace, contact, release."""
+"""Phases of an anticipated impact, and the activation of the impact-robust term in them."""
 
 from __future__ import annotations
 
 from enum import Enum
 
 from impact_posture.errors import InputError
-from impact_posture.tsid.posture_tasks import smooth
+from impact_posture.tsid.smooth_step import STEEPEST, smooth
 
 
 class Phase(Enum):
-    """Where in the course of an anticipated impact the controller is."""
+    """Phase of the controller in the course of an anticipated impact."""
 
     FREE = "free"
     BRACE = "brace"
@@ -17,7 +17,7 @@ class Phase(Enum):
     RELEASE = "release"
 
 
-# Which phase may follow which; the end of a release leads back to FREE by itself.
+# Phases that may follow each phase.  The end of a release also leads to FREE, without a call.
 _FOLLOWS = {
     Phase.FREE: (Phase.BRACE,),
     Phase.BRACE: (Phase.CONTACT, Phase.RELEASE),
@@ -27,40 +27,40 @@ _FOLLOWS = {
 
 
 class Activation:
-    """A level between 0 and 1 that moves along ``3x² − 2x³`` towards what the phase asks for.
+    """Level between 0 and 1 that moves along ``3x² − 2x³`` to the goal of the phase.
 
-    FREE: 0.  BRACE: 1.  CONTACT: 1, or 0 if the robot holds the reached posture during the impact.  RELEASE: 0, then
-    FREE.
-
-    Within ``dt`` the level moves by at most ``1.5 dt/ramp`` (:meth:`step_bound`), whatever is asked when.
+    The goal is 0 in FREE, 1 in BRACE and 0 in RELEASE, which ends in FREE.  In CONTACT it is 1 if ``live``, and 0 if
+    the robot holds the reached posture during the impact.  Within ``dt`` the level moves by at most
+    ``1.5 dt/ramp`` (:meth:`step_bound`) in every phase.
 
     Attributes:
-        phase: The present one.
+        phase: The present phase.
         ramp: Seconds from 0 to 1 and back.
         live: Whether the term stays on during the contact.
         level: The present level α.
+        goal: The level to which the phase leads.
     """
 
     def __init__(self, *, ramp: float = 0.3, live: bool = False) -> None:
-        """Start free.
+        """Start in FREE.
 
         Raises:
-            InputError: A ramp that is not positive.
+            InputError: The ramp is not positive.
         """
         if not ramp > 0:
             raise InputError("the ramp is not positive", where="activation", hint="give seconds above zero")
         self.ramp, self.live = ramp, live
-        self.phase, self.level, self._x, self._goal = Phase.FREE, 0.0, 0.0, 0.0
+        self.reset()
 
     def reset(self) -> None:
-        """Free, level zero."""
-        self.phase, self.level, self._x, self._goal = Phase.FREE, 0.0, 0.0, 0.0
+        """Return to FREE with level zero."""
+        self.phase, self.level, self.goal, self._x = Phase.FREE, 0.0, 0.0, 0.0
 
     def enter(self, phase: Phase) -> None:
         """Go to the next phase.
 
         Raises:
-            InputError: It does not follow the present one.
+            InputError: The phase does not follow the present phase.
         """
         if phase not in _FOLLOWS[self.phase]:
             names = " or ".join(p.value for p in _FOLLOWS[self.phase])
@@ -69,24 +69,18 @@ class Activation:
             )
         self.phase = phase
         on = phase is Phase.BRACE or (phase is Phase.CONTACT and self.live)
-        self._goal = 1.0 if on else 0.0
-
-    @property
-    def goal(self) -> float:
-        """The level that the phase asks for."""
-        return self._goal
+        self.goal = 1.0 if on else 0.0
 
     def advance(self, dt: float) -> float:
-        """Let ``dt`` seconds pass; return the level."""
-        goal = self._goal
-        if self._x != goal:
+        """Advance the level by ``dt`` seconds and return it."""
+        if self._x != self.goal:
             step = dt / self.ramp
-            self._x = min(goal, self._x + step) if goal > self._x else max(goal, self._x - step)
+            self._x = min(self.goal, self._x + step) if self.goal > self._x else max(self.goal, self._x - step)
             self.level = smooth(self._x)
         if self.phase is Phase.RELEASE and self._x == 0.0:
             self.phase = Phase.FREE
         return self.level
 
     def step_bound(self, dt: float) -> float:
-        """The most that the level moves within ``dt`` seconds."""
-        return min(1.0, 1.5 * dt / self.ramp)
+        """Return the largest change of the level within ``dt`` seconds."""
+        return min(1.0, STEEPEST * dt / self.ramp)

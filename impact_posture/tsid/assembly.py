@@ -1,8 +1,6 @@
-"""From a program and a state to the QP of one tick."""
+"""Assembly of the QP of a tick from a formulation and a state."""
 
 from __future__ import annotations
-
-from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +9,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.contacts import ContactStack
 from impact_posture.tsid.limits import AccelerationBounds
-from impact_posture.tsid.qp import EQUALITY, QP
+from impact_posture.tsid.qp import EQUALITY, QP, stacked_rows
 from impact_posture.tsid.rank import LevelRank
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import TaskStack
@@ -19,17 +17,20 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 
 Array = NDArray[np.float64]
 
-# Where no task has a say the cost still needs a minimum: weight of an acceleration that nothing weighs.
+# Weight of an acceleration that no task weighs, because the cost always needs a minimum.
 _IDLE = 1e-8
+# Weight of a moment (N·m) relative to that of a force (N).
+_MOMENT = 100.0
 
 
 class Assembly:
-    """The buffers of a program's QP, and how a tick fills them.
+    """Buffers of the QP of a formulation, which each tick fills.
 
-    Variables ``z = [ν̇; w; f]``: accelerations, what spare rotors leave to choose, contact forces in world axes.
-    Controls are no variables: ``u`` follows from ``p = Mν̇ + h − Jᵀf − J_eᵀF̂`` (:class:`Actuators`).  Rows, in order:
+    The variables are ``z = [ν̇; w; f]``: accelerations, the choice of redundant rotors, contact forces in world axes.
+    Controls are no variables, because ``u`` follows from ``p = Mν̇ + h − Jᵀf − J_eᵀF̂`` (:class:`Actuators`).  The
+    rows are, in order:
 
-    - ``blind``: ``blindᵀ p_base = 0``, the part of the dynamics that no rotor or motor acts on;
+    - ``blind``: ``blindᵀ p_base = 0``, the unactuated part of the dynamics;
     - ``contacts``: ``J ν̇ = a`` of the hard contacts;
     - ``levels``: ``J ν̇ = a`` of each strict level;
     - ``controls``: ``u_min ≤ u(z) ≤ u_max``;
@@ -38,13 +39,13 @@ class Assembly:
     Bounds on the variables are the acceleration bounds of the joint limits.
 
     Attributes:
-        formulation: What it is made from.
-        qp: The program of the last :meth:`build_qp`.
-        rank: What of its levels is independent, and the program without the rest.
-        levels: Names and rows of the strict levels in the order in which they give way last to first; hard contacts
-            come first, as ``contacts``.
-        limits: The entries of ``[z; A z]`` that come from joint limits.
-        names: A name for each entry of ``[z; A z]``.
+        formulation: The formulation.
+        qp: The QP of the last :meth:`build_qp`.
+        rank: The independent rows of the levels, and the QP without the others.
+        levels: Names and rows of the strict levels, the most important first; hard contacts come first of all, as
+            ``contacts``.
+        limits: Entries of ``[z; A z]`` that come from joint limits.
+        names: Name of each entry of ``[z; A z]``.
     """
 
     def __init__(self, robot: Robot, formulation: TaskFormulation, actuators: Actuators) -> None:
@@ -52,12 +53,14 @@ class Assembly:
         nv = self._nv = robot.nv
         self.contacts = ContactStack(robot, formulation.contacts)
         strict = [task for level in formulation.levels for task in level]
-        widths = (actuators.blind.shape[1], int(self.contacts.hard.sum()), sum(task.size for task in strict))
-        ends = list(accumulate((*widths, actuators.controls, self.contacts.cone.shape[0])))
-        blind, hard, levels, controls, cones = (slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True))
+        self._hard_rows, self._soft = np.flatnonzero(self.contacts.hard), np.flatnonzero(~self.contacts.hard)
+        widths = (actuators.blind.shape[1], self._hard_rows.size, sum(task.size for task in strict))
+        (blind, hard, levels, controls, cones), m = stacked_rows(
+            (*widths, actuators.controls, self.contacts.cone.shape[0])
+        )
         spare, forces = actuators.spare.shape[1], self.contacts.size
-        self._w, self._f = slice(nv, nv + spare), slice(nv + spare, nv + spare + forces)
-        self.qp = qp = QP.empty(nv + spare + forces, ends[-1])
+        (_, self._w, self._f), n = stacked_rows((nv, spare, forces))
+        self.qp = qp = QP.empty(n, m)
         self.strict = TaskStack(strict, nv, qp.A[levels, :nv])
         self.weighted = TaskStack(formulation.weighted, nv)
         self.bounds = (
@@ -69,7 +72,7 @@ class Assembly:
         self._place_cost(robot)
         self.levels = self._name_levels(hard, levels)
         self.limits = np.arange(nv)
-        # What a force of one newton accelerates: else the cheapest way to move would be to lift the robot's weight.
+        # Forces count by the acceleration of the robot's mass, or lifting its weight would be the cheapest motion.
         units = np.ones(qp.n)
         units[self._f] = robot.mass
         self.rank = LevelRank(qp, blind.stop, [rows for _, rows in self.levels], nv, units)
@@ -81,13 +84,16 @@ class Assembly:
             *(f"contact motion {k}" for k in range(hard.stop - hard.start)),
             *(f"{t.name}[{k}]" for t in strict for k in range(t.size)),
             *actuators.names,
-            *(f"cone of {c.point.frame}[{k}]" for c in formulation.contacts for k in range(5 if c.size == 3 else 17)),
+            *(
+                f"cone of {c.point.frame}[{k}]"
+                for c, rows in zip(self.contacts.contacts, self.contacts.cone_rows, strict=True)
+                for k in range(rows.stop - rows.start)
+            ),
         )
-        self._force = np.zeros(nv)
         self._free = np.zeros(nv)
 
     def reset(self, state: State) -> None:
-        """Take gains, weights and the places of the contacts anew."""
+        """Read gains and weights again, and hold the contacts where they are."""
         self.strict.refresh(state)
         self.weighted.refresh(state)
         self.contacts.reset(state)
@@ -97,7 +103,7 @@ class Assembly:
         self.rank.reset()
 
     def build_qp(self, state: State) -> QP:
-        """Fill the buffers for the tasks, contacts and limits at ``state``; the same object every time."""
+        """Fill the buffers for the tasks, contacts and limits at ``state``, and return the same QP every time."""
         self.strict.update(state)
         self.weighted.update(state)
         self.contacts.update(state)
@@ -108,18 +114,18 @@ class Assembly:
         self.rank.update()
         return self.qp
 
-    # ---- what a solution means ----------------------------------------------------------------------------------
+    # ---- reading a solution --------------------------------------------------------------------------------------
 
     def acceleration(self, z: Array) -> Array:
-        """``ν̇``, shape (nv,)."""
+        """Return ``ν̇``, shape (nv,)."""
         return z[: self._nv]
 
     def forces(self, z: Array) -> Array:
-        """Contact forces in world axes, one contact after the other."""
+        """Return the contact forces in world axes, one contact after the other."""
         return z[self._f]
 
     def generalized_force(self, state: State, z: Array) -> Array:
-        """``p = Mν̇ + h − Jᵀf − J_eᵀF̂``, what the actuators are to make, shape (nv,)."""
+        """Return ``p = Mν̇ + h − Jᵀf − J_eᵀF̂``, the force that the actuators must make, shape (nv,)."""
         force = state.M @ z[: self._nv]
         force += self._free
         if self.contacts.size:
@@ -127,28 +133,34 @@ class Assembly:
         return np.asarray(force)
 
     def controls(self, state: State, z: Array) -> Array:
-        """``u``: rotor thrusts (N), then joint torques (N·m); a fresh array.
+        """Return ``u``: rotor thrusts (N), then joint torques (N·m); a fresh array.
 
-        It is ``actuators.solve(generalized_force(state, z), w)``; the rows that limit it hold it already.
+        It is ``actuators.solve(generalized_force(state, z), w)``, computed by the rows that limit it.
         """
         u = self._A_controls @ z
         u += self._known
         return np.asarray(u)
 
     def redundancy(self, state: State) -> Array:
-        """Orthonormal basis of the accelerations that no task but the posture determines, shape (nv, r).
+        """Return an orthonormal basis of the accelerations that only the posture task determines, shape (nv, r).
 
-        Where tasks by weight determine all, those that only contacts and strict levels leave.
+        If weighted tasks determine all of them, return the accelerations that contacts and strict levels leave.
         """
         rows = [self.contacts.J, self.strict.J, self.weighted.J]
         Z = _null_space(np.vstack(rows))
         return Z if Z.shape[1] else _null_space(np.vstack(rows[:2]))
 
-    # ---- parts ----------------------------------------------------------------------------------------------------
+    # ---- filling the QP -------------------------------------------------------------------------------------------
 
     def _at(self, rows: slice) -> slice:
-        """Where rows of A stand among the bounds."""
+        """Return the places of rows of ``A`` among the bounds."""
         return slice(self.qp.n + rows.start, self.qp.n + rows.stop)
+
+    def _equate(self, rows: slice, value: Array) -> None:
+        """Set both bounds of equations."""
+        at = self._at(rows)
+        self.qp.lower[at] = value
+        self.qp.upper[at] = value
 
     def _place_rows(self, blind: slice, hard: slice, levels: slice, controls: slice, cones: slice) -> None:
         qp, nv, actuators = self.qp, self._nv, self.actuators
@@ -158,7 +170,7 @@ class Assembly:
         for rows in (blind, hard, levels):
             qp.sense[self._at(rows)] = EQUALITY
         qp.A[thrusts, self._w] = actuators.spare
-        self._controls, self._thrusts, self._torques = controls, thrusts, torques
+        self._controls = controls
         self._A_blind, self._A_blind_f = qp.A[blind, :nv], qp.A[blind, self._f]
         self._A_thrust, self._A_thrust_f = qp.A[thrusts, :nv], qp.A[thrusts, self._f]
         self._A_torque, self._A_torque_f = qp.A[torques, :nv], qp.A[torques, self._f]
@@ -168,20 +180,17 @@ class Assembly:
 
     def _place_cost(self, robot: Robot) -> None:
         nv, contacts = self._nv, self.contacts
-        self._soft = np.flatnonzero(~contacts.hard)
-        self._hard_rows = np.flatnonzero(contacts.hard)
         rows = self.weighted.size + self._soft.size
         self._C, self._Cw = np.zeros((rows, nv)), np.zeros((rows, nv))
         self._root, self._wanted = np.zeros((rows, 1)), np.zeros(rows)
         diagonal = self.qp.H.reshape(-1)[:: self.qp.n + 1]
         self._diagonal = diagonal[:nv]
         diagonal[self._w] = self.formulation.spare_weight
-        moments = [6 * [1.0] if c.size == 6 else 3 * [1.0] for c in self.formulation.contacts]
-        for scale in moments:
-            scale[3:] = [100.0] * (len(scale) - 3)
-        diagonal[self._f] = self.formulation.force_weight * np.array([x for scale in moments for x in scale])
-        self._H = self.qp.H[:nv, :nv]
-        self._g = self.qp.g[:nv]
+        units = [1.0] * 3 + [_MOMENT] * 3
+        diagonal[self._f] = self.formulation.force_weight * np.array(
+            [x for c in contacts.contacts for x in units[: c.size]]
+        )
+        self._H, self._g = self.qp.H[:nv, :nv], self.qp.g[:nv]
         self._posture_weight = np.zeros(nv)
 
     def _set_weights(self) -> None:
@@ -195,13 +204,12 @@ class Assembly:
         self._diagonal[:] = self._added
 
     def _name_levels(self, hard: slice, levels: slice) -> tuple[tuple[str, slice], ...]:
-        found = [("contacts", hard)] if hard.stop > hard.start else []
-        start = levels.start
-        for tasks in self.formulation.levels:
-            stop = start + sum(task.size for task in tasks)
-            found.append((", ".join(task.name for task in tasks), slice(start, stop)))
-            start = stop
-        return tuple(found)
+        (_, *rows), _ = stacked_rows(
+            (levels.start, *(sum(t.size for t in tasks) for tasks in self.formulation.levels))
+        )
+        named = (", ".join(task.name for task in tasks) for tasks in self.formulation.levels)
+        contacts = [("contacts", hard)] if hard.stop > hard.start else []
+        return (*contacts, *zip(named, rows, strict=True))
 
     def _fill_dynamics(self, state: State) -> None:
         qp, actuators, base, J = self.qp, self.actuators, self.actuators.base, self.contacts.J
@@ -214,8 +222,7 @@ class Assembly:
             plain = not actuators.rotors
             self._A_blind[:] = M_base if plain else self._blind_transposed @ M_base
             rhs = free[:base] if plain else self._blind_transposed @ free[:base]
-            np.negative(rhs, out=qp.lower[self._at(self._blind)])
-            np.negative(rhs, out=qp.upper[self._at(self._blind)])
+            self._equate(self._blind, -rhs)
             if J.size:
                 turned = J[:, :base].T if plain else self._blind_transposed @ J[:, :base].T
                 np.negative(turned, out=self._A_blind_f)
@@ -233,13 +240,10 @@ class Assembly:
         np.subtract(actuators.lower, known, out=qp.lower[at])
         np.subtract(actuators.upper, known, out=qp.upper[at])
         if self._hard_rows.size:
-            whole = self._hard_rows.size == self.contacts.size
-            self._A_hard[:] = J if whole else J[self._hard_rows]
-            qp.lower[self._at(self._hard)] = self.contacts.a[self._hard_rows]
-            qp.upper[self._at(self._hard)] = self.contacts.a[self._hard_rows]
+            self._A_hard[:] = J[self._hard_rows]
+            self._equate(self._hard, self.contacts.a[self._hard_rows])
         if self.strict.size:
-            qp.lower[self._at(self._levels)] = self.strict.a
-            qp.upper[self._at(self._levels)] = self.strict.a
+            self._equate(self._levels, self.strict.a)
 
     def _fill_cost(self, state: State) -> None:
         g, count, posture = self._g, self.weighted.size, self.formulation.posture
@@ -247,9 +251,7 @@ class Assembly:
             C, wanted = self._C, self._wanted
             C[:count], wanted[:count] = self.weighted.J, self.weighted.a
             if self._soft.size:
-                whole = self._soft.size == self.contacts.size
-                C[count:] = self.contacts.J if whole else self.contacts.J[self._soft]
-                wanted[count:] = self.contacts.a if whole else self.contacts.a[self._soft]
+                C[count:], wanted[count:] = self.contacts.J[self._soft], self.contacts.a[self._soft]
             np.multiply(C, self._root, out=self._Cw)
             wanted *= self._root[:, 0]
             np.matmul(self._Cw.T, self._Cw, out=self._H)
@@ -263,6 +265,7 @@ class Assembly:
 
 
 def _null_space(J: Array) -> Array:
+    """Return an orthonormal basis of the null space of ``J``, shape (nv, r)."""
     if not J.shape[0]:
         return np.eye(J.shape[1])
     _, values, right = np.linalg.svd(J)

@@ -1,10 +1,9 @@
-"""Contacts that stay: what they ask of the accelerations, and the cones that their forces stay in."""
+"""Contacts that stay: the accelerations that they demand, and the friction cones of their forces."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -15,6 +14,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.settings import SupportKind
 from impact_posture.tsid.friction import point_cone, surface_cone, to_world
 from impact_posture.tsid.points import Point
+from impact_posture.tsid.qp import stacked_rows
 from impact_posture.tsid.state import State
 
 Array = NDArray[np.float64]
@@ -25,17 +25,17 @@ class SupportContact:
     """A foot (or hand) on the ground.
 
     Attributes:
-        point: Where it touches.
+        point: Contact point.
         kind: ``point`` (3 forces) or ``surface`` (force and moment).
         half: Half extents (x, y) of a surface around the point, in the frame, meters.
-        normal: Unit, out of the ground, world.
+        normal: Unit normal out of the ground, world.
         friction: Coulomb coefficient.
         least: Least normal force, N.
-        kp: Stiffness of the pull back to where the contact was at ``reset``, 1/s².
-        kd: Its damping, 1/s.
-        weight: Of the contact's acceleration in the cost; ``None``: a hard constraint.  Several points on one body
-            can have dependent rows, whose rank changes with posture (the four feet of solo8 have rank 9 to 11 of 12);
-            as constraints they would then ask for unbounded accelerations.
+        kp: Stiffness that pulls the contact back to its place at ``reset``, 1/s².
+        kd: Damping of the contact, 1/s.
+        weight: Weight of the contact's acceleration in the cost; ``None`` makes it a hard constraint.  Points on one
+            body can have dependent rows, whose rank changes with posture (the four feet of solo8 have rank 9 to 11
+            of 12).  As constraints, they would then demand unbounded accelerations.
     """
 
     point: Point
@@ -49,7 +49,7 @@ class SupportContact:
     weight: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what makes no contact."""
+        """Refuse values that make no contact."""
         where = f"contact at {self.point.frame}"
         if not self.friction > 0:
             raise ContactError("friction is not positive", where=where, hint="give a coefficient above zero")
@@ -62,12 +62,26 @@ class SupportContact:
 
     @property
     def size(self) -> int:
-        """Numbers in its force: 3, or 6 with the moment."""
+        """Number of force components: 3, or 6 with the moment."""
         return 3 if self.kind == "point" else 6
+
+    def cone(self, rotation: Array) -> Array:
+        """Return the rows ``C f ≥ 0`` of the friction cone in world axes, shape (rows, size); normal force first.
+
+        Args:
+            rotation: World from frame, shape (3, 3); the x axis of the frame is the x axis of a sole.
+
+        Raises:
+            ContactError: The sole stands on its edge.
+        """
+        normal = np.array(self.normal)
+        if self.kind == "point":
+            return to_world(point_cone(self.friction), normal, np.eye(3)[0])
+        return to_world(surface_cone(self.friction, *self.half), normal, rotation[:, 0])
 
 
 def support_contacts(robot: Robot, *, friction: float = 0.7) -> tuple[SupportContact, ...]:
-    """The supports of ``robot.toml`` as contacts on level ground: soles as hard constraints, points with a weight.
+    """Return the supports of ``robot.toml`` on level ground: soles are hard constraints, points have a weight.
 
     Args:
         robot: The robot.
@@ -87,53 +101,48 @@ def support_contacts(robot: Robot, *, friction: float = 0.7) -> tuple[SupportCon
 
 @dataclass
 class _ContactAnchor:
-    """Where a contact was at reset."""
+    """Place of a contact at reset."""
 
     position: Array = field(default_factory=lambda: np.zeros(3))
     rotation: Array = field(default_factory=lambda: np.eye(3))
 
 
 class ContactStack:
-    """Contacts one below the other: ``J ν̇ = a`` and ``lower ≤ cone · f``, with forces ``f`` in world axes.
+    """Stack contacts to ``J ν̇ = a`` and ``lower ≤ cone · f``, with forces ``f`` in world axes.
 
     Attributes:
-        contacts: From the top.
-        rows: Where each stands, in ``J`` and in ``f``.
-        size: Rows altogether.
+        contacts: Contacts from top to bottom.
+        rows: Rows of each contact in ``J`` and in ``f``.
+        size: Number of all rows.
         J: Shape (size, nv).
-        a: What the contact's acceleration less drift is to be, shape (size,): ``−K_d Jν + K_p e − J̇ν``.
+        a: Desired acceleration of the contacts minus drift, shape (size,): ``−K_d Jν + K_p e − J̇ν``.
         cone: Shape (cone rows, size), constant after ``reset``.
+        cone_rows: Rows of each contact in ``cone``.
         least: Lower bounds of the cone's rows.
         weight: Shape (size,), zero for hard rows.
+        hard: Whether a row is a hard constraint, shape (size,).
     """
 
     def __init__(self, robot: Robot, contacts: Sequence[SupportContact]) -> None:
-        ends = np.cumsum([0, *(c.size for c in contacts)])
         self.contacts = tuple(contacts)
-        self.rows = tuple(slice(int(b), int(e)) for b, e in pairwise(ends))
-        self.size = int(ends[-1])
-        self.J, self.a = np.zeros((self.size, robot.nv)), np.zeros(self.size)
-        self._drift, self._e, self._v = np.zeros(self.size), np.zeros(self.size), np.zeros(self.size)
+        sizes = np.array([c.size for c in contacts], dtype=int)
+        self.rows, self.size = stacked_rows(sizes.tolist())
+        self.J = np.zeros((self.size, robot.nv))
+        self.a, self._drift, self._e, self._v = np.zeros((4, self.size))
         self._home = [_ContactAnchor() for _ in contacts]
-        self._kp = np.concatenate([np.zeros(0), *(np.full(c.size, c.kp) for c in contacts)])
-        self._kd = np.concatenate([np.zeros(0), *(np.full(c.size, c.kd) for c in contacts)])
-        self.weight = np.concatenate([np.zeros(0), *(np.full(c.size, c.weight or 0.0) for c in contacts)])
-        self.hard = np.concatenate([np.zeros(0, bool), *(np.full(c.size, c.weight is None) for c in contacts)])
-        blocks = [self._cone(k) for k in range(len(contacts))]
-        self.cone = np.zeros((sum(block.shape[0] for block in blocks), self.size))
-        self.least = np.zeros(self.cone.shape[0])
+        self._kp, self._kd = (np.repeat([getattr(c, key) for c in contacts], sizes) for key in ("kp", "kd"))
+        self.weight = np.repeat([c.weight or 0.0 for c in contacts], sizes)
+        self.hard = np.repeat(np.array([c.weight is None for c in contacts], dtype=bool), sizes)
+        self.cone_rows, count = stacked_rows(c.cone(np.eye(3)).shape[0] for c in contacts)
+        self.cone, self.least = np.zeros((count, self.size)), np.zeros(count)
 
     def reset(self, state: State) -> None:
-        """Take the present places as those that are held."""
-        row = 0
-        for k, (contact, rows) in enumerate(zip(self.contacts, self.rows, strict=True)):
+        """Hold the present places from now on."""
+        for k, (contact, rows, cone_rows) in enumerate(zip(self.contacts, self.rows, self.cone_rows, strict=True)):
             here = state.at(contact.point)
             self._home[k] = _ContactAnchor(here.position.copy(), here.rotation.copy())
-            block = self._cone(k)
-            self.cone[row : row + block.shape[0], rows] = block
-            # The first row of a cone is the normal force.
-            self.least[row] = contact.least
-            row += block.shape[0]
+            self.cone[cone_rows, rows] = contact.cone(here.rotation)
+            self.least[cone_rows.start] = contact.least
 
     def update(self, state: State) -> None:
         """Move to the present state."""
@@ -152,10 +161,3 @@ class ContactStack:
         self._v *= self._kd
         self.a -= self._v
         self.a -= self._drift
-
-    def _cone(self, k: int) -> Array:
-        contact, rotation = self.contacts[k], self._home[k].rotation
-        if contact.kind == "point":
-            return to_world(point_cone(contact.friction), np.array(contact.normal), np.eye(3)[0])
-        cone = surface_cone(contact.friction, *contact.half)
-        return to_world(cone, np.array(contact.normal), rotation[:, 0])

@@ -1,4 +1,4 @@
-"""The controller: one tick, one command."""
+"""The controller, which turns each measured state into a command."""
 
 from __future__ import annotations
 
@@ -23,44 +23,44 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 
 Array = NDArray[np.float64]
 
-# A longer pause between ticks (in periods) lets ramps move no further than this.
+# Longest time step of ramps, in periods.  Longer pauses between ticks count as this.
 _LONGEST = 10
-# Entries of ν from which a dense cost is whitened by LAPACK: measured, a quadruped's is not worth it.
+# Least nv for which LAPACK whitens a dense cost; by measurement, a quadruped gains nothing.
 _LARGE = 20
-# A measurement beyond this (squares of all numbers summed: 1e8 m, rad/s or N) is as good as none.
+# Largest sum of squares of a measurement (1e8 m, rad/s or N); a larger one is refused.
 _ABSURD = 1e16
-# Of the largest control limit.
+# Largest violation of a control limit, relative to the largest limit.
 _EXCESS = 1e-6
-# Damping of a held command, 1/s, times each joint's inertia.
+# Damping of a held command, 1/s, times the inertia of each joint.
 _HOLD = 10.0
 
 
 class Status(Enum):
-    """How a tick ended."""
+    """Result of a tick."""
 
     SOLVED = "solved"
-    """Everything holds that has to; strict levels as far as their rank goes (``Report.deficient``)."""
+    """All constraints hold, and strict levels hold as far as their rank permits (``Report.deficient``)."""
     RELAXED = "relaxed"
-    """Limits took from a strict level what it could have had beside those above it (``Report.relaxed``)."""
+    """A strict level gave way to limits (``Report.relaxed``)."""
     INFEASIBLE = "infeasible"
-    """No acceleration satisfies what must hold: the previous command is held."""
+    """No acceleration satisfies the hard constraints, and the previous command is held."""
     UNSOLVED = "unsolved"
-    """The QP solver gave up, or its answer breaks a control limit: the previous command is held."""
+    """The QP solver gave up, or its answer violates a control limit, and the previous command is held."""
     NON_FINITE = "non-finite"
-    """A measurement is not finite, beyond 1e8, or no rotation: the previous command is held."""
+    """A measurement is not finite, exceeds 1e8, or is no rotation, and the previous command is held."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Command:
-    """What to send to the motors; nothing else writes into these arrays later.
+    """Command for the motors, in arrays that the controller does not write again.
 
     Attributes:
         u: Rotor thrusts (N), then joint torques (N·m), shape (controls,).
         torque: Joint torques, N·m (N for prismatic joints), shape (joints,).
-        rotor_speed: In the unit of robot.toml's ``speed_max``, shape (rotors,).
-        status: How the tick ended.
-        acceleration: ``ν̇`` as planned, shape (nv,); zero in a held command.
-        forces: Contact forces as planned, world axes, one contact after the other, N and N·m.
+        rotor_speed: Rotor speeds in the unit of ``speed_max`` in robot.toml, shape (rotors,).
+        status: Result of the tick.
+        acceleration: Planned ``ν̇``, shape (nv,); zero in a held command.
+        forces: Planned contact forces, world axes, one contact after the other, N and N·m.
     """
 
     u: Array
@@ -73,19 +73,19 @@ class Command:
 
 @dataclass(frozen=True)
 class Report:
-    """What a tick did, for people and tests.
+    """Diagnosis of a tick.
 
     Attributes:
-        status: How it ended.
-        relaxed: What gave way to limits, the most important first.
-        deficient: What levels miss for want of rank, not because of limits: they ask for a motion that the levels
-            above them determine, contradict themselves, or are damped near a singularity (:class:`LevelRank`).
-        residuals: ``ÿ − ÿ*`` of each task, by name; of ``contacts`` likewise.
-        active: Names of the bounds that hold, with ``lower`` or ``upper``.
+        status: Result of the tick.
+        relaxed: Levels and limits that gave way, the most important first.
+        deficient: Levels that miss because of their rank and not because of limits.  The levels above determine their
+            motion, they contradict themselves, or they are damped near a singularity (:class:`LevelRank`).
+        residuals: ``ÿ − ÿ*`` of each task by name, and of ``contacts``.
+        active: Names of the active bounds, with ``lower`` or ``upper``.
         dynamics: ``‖Mν̇ + h − Gu − Jᵀf − J_eᵀF̂‖_∞``.
         level: Activation of the impact-robust term.
-        objective: Its ``H`` (or objective); NaN without one.
-        iterations: Of the QP solver.
+        objective: ``H`` (or the objective) of that term; NaN without one.
+        iterations: Iterations of the QP solver.
     """
 
     status: Status
@@ -100,13 +100,15 @@ class Report:
 
 
 class Controller:
-    """Task-space inverse dynamics: each tick one QP.
+    """Task-space inverse dynamics by one QP per tick.
 
     Attributes:
         robot: The robot.
-        formulation: What it does.
-        state: The robot's dynamics at the last tick.
-        assembly: The QP's buffers.
+        formulation: Tasks, contacts and limits.
+        period: Expected time between ticks, s.
+        state: Dynamics of the robot at the last tick.
+        actuators: Rotors and motors.
+        assembly: Buffers of the QP.
     """
 
     def __init__(self, robot: Robot, formulation: TaskFormulation, *, period: float = 1e-3) -> None:
@@ -114,12 +116,12 @@ class Controller:
 
         Args:
             robot: The robot.
-            formulation: What to do.
-            period: Expected time between ticks, s: of the first tick, and of what counts as a long pause.
+            formulation: Tasks, contacts and limits.
+            period: Expected time between ticks, s, which defines the first time step and the longest one.
 
         Raises:
-            FrameNotFound: A task's frame does not exist.
-            InputError: A period that is not positive.
+            FrameNotFound: The frame of a task does not exist.
+            InputError: The period is not positive.
         """
         if not period > 0:
             raise InputError("the period is not positive", where="controller", hint="give seconds above zero")
@@ -132,21 +134,21 @@ class Controller:
         self._solver = _solver(n, m, dense)
         self._aside = DaqpSolver(n, m)
         self._tasks = formulation.tasks
-        # Most tasks remember nothing.
+        # Most tasks have no memory to advance.
         self._advancing = [task for task in self._tasks if type(task).advance is not Task.advance]
         self._ready = False
-        # How far controls may pass their limits: more than a solver's tolerance is no solution.
+        # Square of the largest violation of a control limit.  More than the tolerance of a solver is no solution.
         limits = np.abs([self.actuators.lower, self.actuators.upper])
         self._excess = (_EXCESS * max(1.0, float(np.max(limits, where=np.isfinite(limits), initial=0.0)))) ** 2
 
     def reset(self, q: ArrayLike, v: ArrayLike) -> Command:
-        """Begin anew at ``(q, ν)``: tasks without a target take the present as theirs, ramps and warm starts go.
+        """Start again at ``(q, ν)``: set the targets that tasks lack, and clear ramps and warm starts.
 
         Returns:
-            The first command, also the one that is held if the first tick fails.
+            The first command, which is also held if the first tick fails.
 
         Raises:
-            PostureError: No configuration of the robot, or a velocity that is none.
+            PostureError: ``q`` is no configuration of the robot, or ``v`` is no velocity.
         """
         q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False)
         v = np.asarray(v, dtype=float)
@@ -165,7 +167,7 @@ class Controller:
         if isinstance(posture, ImpactRobustPosture):
             posture.normalize(state, assembly.redundancy(state))
         self._damping = _HOLD * np.diag(state.M)[self.actuators.base :].copy()
-        # Until something better is known: hold against gravity.
+        # The initial command holds the robot against gravity.
         held = self.actuators.solve(state.h, np.zeros(self.actuators.spare.shape[1]))
         self._u = np.clip(held, self.actuators.lower, self.actuators.upper)
         self._solver.reset()
@@ -176,17 +178,17 @@ class Controller:
         return first
 
     def tick(self, t: float, q: ArrayLike, v: ArrayLike, force: ArrayLike | None = None) -> Command:
-        """The command at ``(q, ν)``.
+        """Return the command at ``(q, ν)``.
 
         Args:
             t: Time, s.
             q: Configuration, shape (nq,).
             v: ν, shape (nv,).
-            force: Measured contact force (3) or wrench (6) on the robot at the program's ``force_point``, world axes.
+            force: Measured contact force (3) or wrench (6) on the robot at ``force_point``, world axes.
 
         Raises:
-            InputError: Before the first ``reset``.
-            ValueError: Arrays of another shape.
+            InputError: ``reset`` has not been called.
+            ValueError: An array has another shape.
         """
         if not self._ready:
             raise InputError("has not been reset", where="controller", hint="call reset(q, v) first")
@@ -194,7 +196,7 @@ class Controller:
         q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
         if q.shape != state.q.shape or v.shape != state.v.shape:
             raise ValueError(f"q and v have shapes {q.shape} and {v.shape}, not {state.q.shape} and {state.v.shape}")
-        # A sum of squares is finite, and below a bound, only if every number is.
+        # A sum of squares is finite and below a bound only if all numbers are.
         total = q.dot(q) + v.dot(v)
         if force is not None:
             force = np.asarray(force, dtype=float)
@@ -211,7 +213,7 @@ class Controller:
         return self._finish(solve(self.assembly, self._solver, self._aside))
 
     def report(self) -> Report:
-        """What the last tick did; computed when asked."""
+        """Return the diagnosis of the last tick, computed by this call."""
         assembly, state, posture = self.assembly, self.state, self.formulation.posture
         residuals, active, dynamics = {}, [], float("nan")
         deficient: tuple[Relaxed, ...] = ()
@@ -244,7 +246,7 @@ class Controller:
         )
 
     def _finish(self, outcome: Outcome) -> Command:
-        """Decode a solution, or hold."""
+        """Return the command of a solution, or hold the previous command."""
         state, assembly, solved = self.state, self.assembly, outcome.solved
         self._outcome = outcome
         if solved is None:
@@ -255,7 +257,7 @@ class Controller:
         over = np.minimum(u, self.actuators.upper)
         np.maximum(over, self.actuators.lower, out=over)
         over -= u
-        # Not ">": that is false for a NaN.
+        # Not ">", which is false for a NaN.
         if not over.dot(over) <= self._excess:
             return self._held(Status.UNSOLVED, state.v)
         self._status = Status.RELAXED if outcome.relaxed else Status.SOLVED
@@ -271,7 +273,7 @@ class Controller:
         return False
 
     def _held(self, status: Status, v: Array) -> Command:
-        """The previous command, joints damped where their rates are known."""
+        """Return the previous command, with damping of the joints whose rates are finite."""
         rotors, actuators = self.actuators.rotors, self.actuators
         self._status, self._outcome = status, Outcome(None)
         u = self._u.copy()
@@ -287,9 +289,10 @@ class Controller:
 
 
 def _solver(n: int, m: int, dense: int) -> Solver:
+    """Return DAQP, or DAQP on whitened QPs if the first ``dense`` variables have a dense cost."""
     if not dense:
         return DaqpSolver(n, m)
-    # Only humanoids' programs are worth the time that importing SciPy takes.
+    # Imported here, because SciPy takes long to import and only humanoids need it.
     from impact_posture.tsid.whitened import WhitenedSolver
 
     return WhitenedSolver(n, m, dense)

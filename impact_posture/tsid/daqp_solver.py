@@ -1,4 +1,4 @@
-"""DAQP held as one model across ticks."""
+"""DAQP in one model that is kept across ticks."""
 
 from __future__ import annotations
 
@@ -7,45 +7,45 @@ import numpy as np
 
 from impact_posture.tsid.qp import QP, Solved
 
-# Exit flags of DAQP: 1 and 2 are solutions (2: soft constraints are active); -1 says that there is none.  So would -6
-# (equations depend on others), were it not also about bounds that were active before.
+# Exit flag of DAQP for a program without a solution; 1 and 2 (soft constraints are active) are solutions.  -6
+# (dependent equations) does not count, because DAQP also returns it for bounds that were active before.
 _NONE = -1
 
 
 class DaqpSolver:
     """DAQP (Arnström, Bemporad, Axehill 2022) in one workspace; each solution starts from the last active set.
 
-    Two solvers that were reset and given the same programs give the same answers to the bit.
+    After a reset, equal programs give bitwise equal answers.
     """
 
     def __init__(self, n: int, m: int, *, tolerance: float = 1e-9, iterations: int = 1000) -> None:
         """Allocate a workspace for ``n`` variables and ``m`` rows.
 
         Args:
-            n: Variables.
-            m: Rows.
-            tolerance: Of a bound's violation.
-            iterations: At most, for one program.
+            n: Number of variables.
+            m: Number of rows.
+            tolerance: Largest violation of a bound.
+            iterations: Largest number of iterations for one program.
         """
         self._flag = 1
         self._model = daqp.Model()
         self._model.settings = {"primal_tol": tolerance, "iter_limit": iterations}
-        # Dimensions only: this first program has no bound that could bind.
+        # The first program only sets the dimensions.  None of its bounds can be active.
         blank, upper = QP.empty(n, m), np.full(n + m, 1e30)
         self._model.setup(blank.H, blank.g, blank.A, upper, -upper, blank.sense)
         self._cold = True
 
     def reset(self) -> None:
-        """Begin the next program with no active set, and take its types of bounds anew."""
+        """Start the next program without an active set, and read its types of bounds again."""
         self._cold = True
 
     def solve(self, qp: QP) -> Solved | None:
-        """Solve; ``None`` without a solution."""
+        """Return the solution, or ``None`` if there is none."""
         sense = qp.sense if self._cold else None
         self._flag = self._model.update(qp.H, qp.g, qp.A, qp.upper, qp.lower, sense)
         if self._flag >= 0:
             z, _, self._flag, info = self._model.solve()
-        # A failed attempt leaves no active set worth having.
+        # The active set of a failed attempt is useless.
         self._cold = self._flag <= 0
         if self._flag <= 0:
             return None

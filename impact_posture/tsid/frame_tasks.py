@@ -1,8 +1,9 @@
-"""Tasks of a frame: its pose on SE(3), its position, its position with the direction of an axis."""
+"""Tasks of a frame: its position, its pose on SE(3), or its position with the direction of an axis."""
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,21 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 from impact_posture.errors import InputError
 from impact_posture.tsid.points import Point, PointState
 from impact_posture.tsid.state import State
-from impact_posture.tsid.task import Task
+from impact_posture.tsid.task import Target, TargetTask
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Impedance:
-    """How a measured force enters a frame's acceleration: ``M_d⁻¹ F̂``.
+    """Apparent inertia by which a measured force accelerates a frame: ``M_d⁻¹ F̂``.
 
-    A force that stands in the dynamics but not here is compensated by the controller, which then pushes against the
-    wall ever harder.
+    If a force enters the dynamics but not this law, the controller compensates it and pushes against the wall with a
+    growing force.
 
     Attributes:
         mass: Apparent mass, kg.
-        inertia: Apparent rotational inertia, kg·m²; ``None``: measured moments do not turn the frame.
+        inertia: Apparent rotational inertia, kg·m²; with ``None``, measured moments do not turn the frame.
     """
 
     mass: float
@@ -40,16 +41,17 @@ class Impedance:
             )
 
     def inverse(self) -> Array:
-        """``M_d⁻¹`` of force and moment, shape (6,)."""
+        """Return the diagonal of ``M_d⁻¹`` for force and moment, shape (6,)."""
         turn = 0.0 if self.inertia is None else 1.0 / self.inertia
         return np.array([1.0 / self.mass] * 3 + [turn] * 3)
 
 
-class FramePosition(Task):
-    """World position of a point: ``e = p_des − p``, ``J`` its linear Jacobian (3 × nv).
+class FrameTask(TargetTask[Target]):
+    """Base of the tasks of a point that moves with a frame.
 
     Attributes:
-        target: ``p_des``, world, meters, shape (3,); where the point is at ``reset`` unless set.
+        target: Target of the point, world; by default, its place at ``reset``.
+        point: The point.
     """
 
     def __init__(
@@ -62,98 +64,111 @@ class FramePosition(Task):
         weight: ArrayLike = 1.0,
         impedance: Impedance | None = None,
     ) -> None:
-        super().__init__(name or f"{point.frame} position", 3, kp=kp, kd=kd, weight=weight)
+        """Set the point and the gains; see :class:`~impact_posture.tsid.task.Task`.
+
+        Args:
+            point: The point.
+            name: Name in reports.
+            kp: Stiffness, 1/s².
+            kd: Damping, 1/s; critical by default.
+            weight: Weight in the cost of a weighted formulation.
+            impedance: Law by which a measured force accelerates the frame; ``None`` ignores the force.
+
+        Raises:
+            InputError: A gain or weight is negative, is not finite, or has another shape.
+        """
+        super().__init__(name=name or f"{point.frame} {self.title}", kp=kp, kd=kd, weight=weight)
         self.point, self.points = point, (point,)
-        self.target: Array | None = None
-        self._soften = None if impedance is None else impedance.inverse()[:3]
+        self._soften = None if impedance is None else impedance.inverse()
 
-    def reset(self, state: State) -> None:
-        """Take the present position as target unless one is set."""
-        if self.target is None:
-            self.target = state.at(self.point).position.copy()
-
-    def error(self, state: State) -> Array:
-        """``p_des − p``."""
-        if self.target is None:
-            raise without_target(self.name)
-        return np.asarray(self.target - state.at(self.point).position)
+    @abstractmethod
+    def select(self, here: PointState, six: Array) -> Array:
+        """Select the task's rows of a linear and an angular part in world axes, shape (6,) or (6, nv)."""
 
     def jacobian(self, state: State) -> Array:
-        """Linear rows, world-aligned."""
-        return state.at(self.point).jacobian[:3]
+        """Return the task's rows of the point's Jacobian."""
+        here = state.at(self.point)
+        return self.select(here, here.jacobian)
 
     def drift(self, state: State) -> Array:
-        """Acceleration of the point at ``ν̇ = 0``."""
-        return state.at(self.point).drift[:3]
+        """Return the task's rows of the point's acceleration at ``ν̇ = 0``."""
+        here = state.at(self.point)
+        return self.select(here, here.drift)
 
     def feedforward(self, state: State) -> Array | None:
-        """``F̂/M_d`` where an impedance is set."""
-        return None if self._soften is None or not state.pushed else self._soften * state.force[:3]
+        """Return ``M_d⁻¹ F̂`` if there are an impedance and a measured force."""
+        if self._soften is None or not state.pushed:
+            return None
+        return self.select(state.at(self.point), self._soften * state.force)
 
 
-class FramePose(Task):
-    """Pose of a frame at a point of it: ``e = log₆(T⁻¹ T_des)``, turned into world axes (6 × nv).
-
-    The twist is that of the frame at the point, in world-aligned axes, and ``ẏ`` its body twist turned likewise; with
-    an impedance the law is ``M_d(ÿ − ÿ_des) + … = F̂``.
+class FramePosition(FrameTask[Array]):
+    """Regulate the world position of a point: ``e = p_des − p``, ``J`` is its linear Jacobian (3 × nv).
 
     Attributes:
-        target: ``T_des``, world from frame, origin at the point; where it is at ``reset`` unless set.
+        target: ``p_des``, world, meters, shape (3,); by default, the position at ``reset``.
     """
 
-    def __init__(
-        self,
-        point: Point,
-        *,
-        name: str | None = None,
-        kp: ArrayLike = 100.0,
-        kd: ArrayLike | None = None,
-        weight: ArrayLike = 1.0,
-        impedance: Impedance | None = None,
-    ) -> None:
-        super().__init__(name or f"{point.frame} pose", 6, kp=kp, kd=kd, weight=weight)
-        self.point, self.points = point, (point,)
-        self.target: pin.SE3 | None = None
-        self._soften = None if impedance is None else impedance.inverse()
-        self._e = np.zeros(6)
+    title, rows = "position", 3
 
-    def reset(self, state: State) -> None:
-        """Take the present pose as target unless one is set."""
-        if self.target is None:
-            self.target = placement(state.at(self.point))
+    def present(self, state: State) -> Array:
+        """Return the present position, shape (3,)."""
+        return state.at(self.point).position.copy()
 
     def error(self, state: State) -> Array:
-        """``log₆`` of the way to the target, linear part first, world axes."""
-        here = state.at(self.point)
-        if self.target is None:
-            raise without_target(self.name)
-        way = pin.log6(placement(here).actInv(self.target))
-        # Row vectors: linear and angular part, turned together.
-        np.matmul(way.vector.reshape(2, 3), here.rotation.T, out=self._e.reshape(2, 3))
-        return self._e
+        """Return ``p_des − p``."""
+        return np.asarray(self.required_target() - state.at(self.point).position)
 
-    def jacobian(self, state: State) -> Array:
-        """The point's Jacobian, world-aligned."""
-        return state.at(self.point).jacobian
+    def select(self, here: PointState, six: Array) -> Array:
+        """Select the linear rows."""
+        return six[:3]
+
+
+class FramePose(FrameTask[pin.SE3]):
+    """Regulate the pose of a frame at one of its points: ``e = log₆(T⁻¹ T_des)`` in world axes (6 × nv).
+
+    The twist is the twist of the frame at the point in world axes.  ``ẏ`` is the frame's body twist, also turned
+    into world axes.  With an impedance, the law is ``M_d(ÿ − ÿ_des) + … = F̂``.
+
+    Attributes:
+        target: ``T_des``, world from frame, with its origin at the point; by default, the pose at ``reset``.
+    """
+
+    title, rows = "pose", 6
+
+    def present(self, state: State) -> pin.SE3:
+        """Return the present pose."""
+        return placement(state.at(self.point))
+
+    def error(self, state: State) -> Array:
+        """Return ``log₆`` of the way to the target, linear part first, in world axes; a fresh array."""
+        here, error = state.at(self.point), np.empty(6)
+        way = pin.log6(placement(here).actInv(self.required_target()))
+        # One product turns the linear and the angular part, which are the rows of a matrix.
+        np.matmul(way.vector.reshape(2, 3), here.rotation.T, out=error.reshape(2, 3))
+        return error
 
     def drift(self, state: State) -> Array:
-        """Spatial acceleration of the body at the point at ``ν̇ = 0``: the classical one less ``ω × v``."""
+        """Return the spatial acceleration at the point at ``ν̇ = 0``: the classical acceleration minus ``ω × v``."""
         return state.at(self.point).spatial_drift
 
-    def feedforward(self, state: State) -> Array | None:
-        """``M_d⁻¹ F̂`` where an impedance is set."""
-        return None if self._soften is None or not state.pushed else self._soften * state.force
+    def select(self, here: PointState, six: Array) -> Array:
+        """Select all rows."""
+        return six
 
 
-class FrameAligned(Task):
-    """World position of a point, and where an axis of its frame points; spin about the axis is free (5 × nv).
+class FrameAligned(FrameTask[pin.SE3]):
+    """Regulate the world position of a point and the direction of an axis; spin about the axis is free (5 × nv).
 
-    Position as in :class:`FramePosition`.  Then the shortest rotation that takes the axis to where the target has it,
-    in the two directions of the frame across the axis; ``J`` picks those of the frame's angular velocity.
+    The first three rows are those of :class:`FramePosition`.  The other two are the shortest rotation that takes the
+    axis to its target direction, along two directions of the frame that are orthogonal to the axis.  ``J`` selects
+    the same two components of the frame's angular velocity.
 
     Attributes:
-        target: ``T_des``, world from frame, origin at the point; where it is at ``reset`` unless set.
+        target: ``T_des``, world from frame, with its origin at the point; by default, the pose at ``reset``.
     """
+
+    title, rows = "axis", 5
 
     def __init__(
         self,
@@ -166,60 +181,39 @@ class FrameAligned(Task):
         weight: ArrayLike = 1.0,
         impedance: Impedance | None = None,
     ) -> None:
-        """Set gains and the axis, in the frame; its length does not matter.
+        """Set gains and the axis, in the frame and of any length; see :class:`FrameTask`.
 
         Raises:
-            InputError: The axis has no direction, or gains that are none.
+            InputError: The axis has no direction, or a gain is invalid.
         """
-        super().__init__(name or f"{point.frame} axis", 5, kp=kp, kd=kd, weight=weight)
-        self.point, self.points = point, (point,)
-        self.target: pin.SE3 | None = None
+        super().__init__(point, name=name, kp=kp, kd=kd, weight=weight, impedance=impedance)
         self._axis = np.array(axis, dtype=float)
         length = float(np.linalg.norm(self._axis))
         if not (length > 0 and math.isfinite(length)):
             raise InputError("the axis has no direction", where=self.name, hint="give a vector that is not zero")
         self._axis /= length
-        # Across the axis: the other right singular vectors of a row.
+        # The last two right singular vectors of a row vector are orthogonal to it.
         self._across = np.linalg.svd(self._axis[None])[2][1:]
-        self._soften = None if impedance is None else impedance.inverse()
 
-    def reset(self, state: State) -> None:
-        """Take the present pose as target unless one is set."""
-        if self.target is None:
-            self.target = placement(state.at(self.point))
+    def present(self, state: State) -> pin.SE3:
+        """Return the present pose."""
+        return placement(state.at(self.point))
 
     def error(self, state: State) -> Array:
-        """``p_des − p``, then angle (rad) times axis of the shortest rotation."""
-        here = state.at(self.point)
-        if self.target is None:
-            raise without_target(self.name)
-        wanted = here.rotation.T @ (self.target.rotation @ self._axis)
+        """Return ``p_des − p``, then angle (rad) times axis of the shortest rotation."""
+        here, target = state.at(self.point), self.required_target()
+        wanted = here.rotation.T @ (target.rotation @ self._axis)
         turn = self._across @ np.cross(self._axis, wanted)
         sine, cosine = math.hypot(*turn), float(self._axis @ wanted)
         if sine >= 1e-12:
             turn *= math.atan2(sine, cosine) / sine
         elif cosine < 0:
-            # The other way round: there every axis is as short as any other.
+            # The axis points the opposite way, and rotations about all orthogonal axes are equally short.
             turn[0] = math.pi
-        return np.concatenate([self.target.translation - here.position, turn])
+        return np.concatenate([target.translation - here.position, turn])
 
-    def jacobian(self, state: State) -> Array:
-        """Linear rows, world-aligned, then angular velocity across the axis."""
-        here = state.at(self.point)
-        return self._picked(here, here.jacobian)
-
-    def drift(self, state: State) -> Array:
-        """Acceleration at ``ν̇ = 0``; ``d(Rᵀω)/dt = Rᵀω̇``."""
-        here = state.at(self.point)
-        return self._picked(here, here.drift)
-
-    def feedforward(self, state: State) -> Array | None:
-        """``M_d⁻¹ F̂`` where an impedance is set."""
-        if self._soften is None or not state.pushed:
-            return None
-        return self._picked(state.at(self.point), self._soften * state.force)
-
-    def _picked(self, here: PointState, six: Array) -> Array:
+    def select(self, here: PointState, six: Array) -> Array:
+        """Select the linear rows and the angular part across the axis; ``d(Rᵀω)/dt = Rᵀω̇``."""
         return np.concatenate([six[:3], self._across @ (here.rotation.T @ six[3:])])
 
 
@@ -227,10 +221,5 @@ EndEffector = FramePose | FramePosition | FrameAligned
 
 
 def placement(point: PointState) -> pin.SE3:
-    """World placement of a point with its frame's rotation."""
+    """Return the world placement of a point with the rotation of its frame."""
     return pin.SE3(point.rotation, point.position)
-
-
-def without_target(name: str) -> InputError:
-    """What is wrong with a task that was asked for its error too early."""
-    return InputError("has no target", where=name, hint="set `target`, or reset the controller first")

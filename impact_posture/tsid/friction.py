@@ -1,4 +1,4 @@
-"""Friction pyramids of points and of flat soles, as rows ``C f ≥ 0``; the first row is the normal force itself."""
+"""Friction pyramids of points and of flat soles as rows ``C f ≥ 0``; the first row is the normal force."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ Array = NDArray[np.float64]
 
 
 def point_cone(friction: float) -> Array:
-    """``f_z ≥ 0`` and ``|f_x|, |f_y| ≤ μ' f_z``, shape (5, 3), z along the normal.
+    """Return ``f_z ≥ 0`` and ``|f_x|, |f_y| ≤ μ' f_z``, shape (5, 3), z along the normal.
 
-    ``μ' = μ/√2``: the pyramid lies inside Coulomb's cone.
+    With ``μ' = μ/√2``, the pyramid lies inside the Coulomb cone.
     """
     mu = friction / np.sqrt(2)
     return np.array([[0, 0, 1], [-1, 0, mu], [1, 0, mu], [0, -1, mu], [0, 1, mu]], dtype=float)
 
 
 def surface_cone(friction: float, half_x: float, half_y: float) -> Array:
-    """The wrenches at a sole's center that forces at its four corners can make, each in its pyramid: shape (17, 6).
+    """Return the cone of wrenches that forces in the pyramids at the four corners make at a sole's center, (17, 6).
 
-    ``f_z ≥ 0``; four rows of friction; four that keep the center of pressure on the sole; eight that bound the yaw
-    moment (Caron, Pham, Nakamura 2015, "Stability of surface contacts for humanoid robots", eq. 16 to 20):
+    The rows are ``f_z ≥ 0``, four rows of friction, four rows that keep the center of pressure on the sole, and
+    eight rows that bound the yaw moment (Caron, Pham, Nakamura 2015, "Stability of surface contacts for humanoid
+    robots", eq. 16 to 20):
     ``−μ(X+Y)f_z + |Y f_x − μ τ_x| + |X f_y − μ τ_y| ≤ τ_z ≤ μ(X+Y)f_z − |Y f_x + μ τ_x| − |X f_y + μ τ_y|``.
     """
     mu, x, y = friction / np.sqrt(2), half_x, half_y
@@ -41,16 +42,16 @@ def surface_cone(friction: float, half_x: float, half_y: float) -> Array:
 
 
 def to_world(cone: Array, normal: Array, heading: Array) -> Array:
-    """A cone for forces (and moments) in world axes: its z is ``normal``, its x the heading made tangential.
+    """Return a cone in world axes, for forces (and moments): z is ``normal``, x the tangential part of ``heading``.
 
     Raises:
-        ContactError: The heading points along the normal.
+        ContactError: The heading of a sole points along the normal.
     """
     x = heading - normal * (normal @ heading)
     if np.linalg.norm(x) < 1e-6:
-        other = np.eye(3)[int(np.argmin(np.abs(normal)))]
         if cone.shape[1] == 6:
             raise ContactError("the sole stands on its edge", where="contact", hint="put the sole on the ground")
+        other = np.eye(3)[int(np.argmin(np.abs(normal)))]
         x = other - normal * (normal @ other)
     x /= np.linalg.norm(x)
     R = np.column_stack([x, np.cross(normal, x), normal])

@@ -1,4 +1,4 @@
-"""Rows in strict order of importance, each level as near to its bounds as those above it let it come."""
+"""Lexicographic least squares: each level comes as near to its bounds as the levels above permit."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from impact_posture.tsid.qp import EQUALITY, INEQUALITY
 
 Array = NDArray[np.float64]
 
-# Bounds are brought below this before they are handed over: DAQP's tolerances are absolute.
+# Bounds are scaled below this, because the tolerances of DAQP are absolute.
 _LARGEST = 1e4
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """``lower ≤ A z ≤ upper``; equal bounds make equations.
+    """Rows ``lower ≤ A z ≤ upper`` of one level; equal bounds make equations.
 
     Attributes:
         A: Shape (k, n).
@@ -33,11 +33,11 @@ class Level:
 
 
 def lexicographic(levels: Sequence[Level]) -> Array | None:
-    """A ``z`` that passes the bounds of the first level least, then of the second, and so on (least squares).
+    """Return the ``z`` that violates the first level least, then the second, and so on (least squares).
 
-    By DAQP's hierarchical programs, which have a solution whatever the bounds are.  It measures how far a row is off
-    in units of the row's length; equations are therefore turned among themselves (:func:`balanced`) until all rows
-    of a level are of one length, which changes nothing in the sum of squares.
+    The hierarchical programs of DAQP have a solution for all bounds.  DAQP measures a violation in units of the row's
+    length.  The equations of a level are therefore rotated among themselves (:func:`balanced`) until all its rows
+    have the same length, which does not change the sum of squares.
 
     Returns:
         Shape (n,), to about six digits; ``None`` if the solver gave up.
@@ -72,10 +72,10 @@ def lexicographic(levels: Sequence[Level]) -> Array | None:
 
 
 def balanced(A: Array, b: Array) -> tuple[Array, Array]:
-    """``QA`` and ``Qb`` with an orthogonal ``Q`` that makes all rows of ``QA`` equally long.
+    """Return ``QA`` and ``Qb`` with an orthogonal ``Q`` that makes all rows of ``QA`` equally long.
 
-    One rotation after the other, each of a row that is too short and one that is too long, in which the short one
-    gets the mean length (Bendel and Mickey 1978, "Population correlation matrices for sampling experiments").
+    Each rotation combines the shortest and the longest row and gives the shortest row the mean length
+    (Bendel and Mickey 1978, "Population correlation matrices for sampling experiments").
 
     Args:
         A: Shape (k, n).

@@ -1,4 +1,4 @@
-"""The impact-robust posture task: the posture task with ``−K ∇H(q)`` in it."""
+"""The impact-robust posture task, which adds ``−K ∇H(q)`` to the posture task."""
 
 from __future__ import annotations
 
@@ -14,25 +14,29 @@ from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.activation import Activation, Phase
-from impact_posture.tsid.posture_tasks import JointPosture, smooth
+from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.ranges import JointRanges
+from impact_posture.tsid.smooth_step import smooth
 from impact_posture.tsid.state import State
 
 Array = NDArray[np.float64]
 Gradient = Callable[[Array], tuple[float, Array]]
 Spring = Literal["keep", "release", "follow"]
 
-# Curvature is measured by central differences of the gradient (rad); less than this share of H per rad² is none.
-_STEP, _FLAT = 1e-5, 1e-3
+# Step of the central differences of the gradient that measure curvature, rad.
+_STEP = 1e-5
+# Least curvature that counts, per rad² and as a share of H.
+_FLAT = 1e-3
 
 
 def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Gradient:
-    """The gradient that the term follows, out of a compiled export.
+    """Return the gradient of a compiled export for the impact-robust term.
 
     Args:
-        export: Of the robot in hand; load it with ``free=True`` for the robot without its supports.
-        normal: ``H`` at this normal (the export's ``_eval``); without one the exported problem's own objective at its
-            own normal (``_objective``): ``impulse``, ``speed``, ``sticking``, ``energy``, a cone, ….
+        export: Export for the robot in hand.  Load it with ``free=True`` for the robot without its supports.
+        normal: Normal at which ``H`` is evaluated (the export's ``_eval``).  With ``None``, the objective of the
+            exported problem at its own normal (``_objective``): ``impulse``, ``speed``, ``sticking``, ``energy``, a
+            cone, ….
 
     Raises:
         InputError: The normal is no unit vector.
@@ -48,29 +52,30 @@ def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Grad
 class ImpactRobustPosture(JointPosture):
     """``ν̇* = K_p (q_des ⊖ q) − K_d ν − α K s(q) ∇H(q)/λ`` (Afifi et al. 2026, impact-robust posture).
 
-    - ``λ`` is ``H``'s largest curvature along the redundancy at ``reset`` (:meth:`normalize`), so that ``K`` is a
-      stiffness like ``K_p``, in 1/s², on every robot: near an optimum the term is a spring of at most ``K`` towards
-      it.  ``H`` itself scales like 1/armature².
-    - ``K_d = 2√(K_p + K)`` by default: critical for the stiffer of the two springs together.
-    - The term is at most ``K·reach`` long: as a spring ``K`` stretched by ``reach``.  A bound below
+    - ``λ`` is the largest curvature of ``H`` along the redundancy at ``reset`` (:meth:`normalize`).  ``K`` is then a
+      stiffness like ``K_p``, in 1/s², on every robot: near an optimum the term is a spring of at most ``K``.  ``H``
+      itself scales like 1/armature².
+    - ``K_d = 2√(K_p + K)`` by default, critical for both springs together.
+    - The length of the term is at most ``K·reach``, like a spring ``K`` stretched by ``reach``.  A bound below
       ``K_p|q_des ⊖ q|`` would stall the flow on its way.
-    - ``s(q)`` fades each joint's part out where it pushes into a position limit, from ``fade[1]`` rad before it to
-      ``fade[0]`` (at most a quarter and a sixteenth of the joint's range): else the robot braces on its stops.
-    - ``α`` is :class:`Activation`'s level.
+    - ``s(q)`` fades out the part of each joint that pushes into a position limit, from ``fade[1]`` rad before the
+      limit to ``fade[0]`` (at most a quarter and a sixteenth of the joint's range).  Without it, the robot would
+      brace on its stops.
+    - ``α`` is the level of :class:`~impact_posture.tsid.activation.Activation`.
 
-    ``spring``: what becomes of ``K_p`` while the term is on.  ``keep``: the flow rests where
-    ``K∇H/λ = K_p(q_des ⊖ q)``, short of the optimum.  ``release``: ``K_p`` is scaled by ``1 − α``; the flow goes all
-    the way.  ``follow``: ``q_des`` follows ``q`` with the time constant ``follow`` (s), so that the spring still
-    resists what is fast.
+    ``spring`` tells what becomes of ``K_p`` while the term is on.  ``keep``: the flow rests where
+    ``K∇H/λ = K_p(q_des ⊖ q)``, short of the optimum.  ``release``: ``K_p`` is scaled by ``1 − α``, and the flow
+    reaches the optimum.  ``follow``: ``q_des`` follows ``q`` with the time constant ``follow`` (s), hence the spring
+    still resists fast motion.
 
-    With :meth:`contact` (unless the activation is ``live``) and :meth:`release` the posture that was reached becomes
-    ``q_des``, faded in as the term fades out.
+    With :meth:`contact` (unless the activation is ``live``) and :meth:`release`, the reached posture becomes
+    ``q_des``.  It is faded in while the term fades out.
 
     Attributes:
         activation: The state machine.
         value: ``H`` (or the objective) at the last evaluation.
         term: ``−K s(q) ∇H/λ`` there, bounded, at full level, shape (nv,).
-        failed: Whether the last evaluation failed (it raised, or was not finite) and the term before it was kept.
+        failed: Whether the last evaluation raised or was not finite, so that the term before it was kept.
     """
 
     def __init__(
@@ -93,28 +98,28 @@ class ImpactRobustPosture(JointPosture):
         scale: float | None = None,
         activation: Activation | None = None,
     ) -> None:
-        """Set gains; see the class.
+        """Set gains; see the class, and :class:`~impact_posture.tsid.posture_tasks.JointPosture` for the others.
 
         Args:
             robot: The robot.
-            gradient: ``q → (H, ∇H)``, or a compiled export, whose own objective is then followed.
+            gradient: ``q → (H, ∇H)``, or a compiled export, whose own objective is then used.
             target: ``q_des``, shape (nq,); the posture at ``reset`` by default.
             K: Gain, 1/s².
-            name: What it is called in reports.
+            name: Name in reports.
             kp: Stiffness, 1/s².
             kd: Damping, 1/s.
-            weight: In the cost, one number or (nv,).
-            base_weight: Of the six base entries instead.
+            weight: Weight in the cost, one number or (nv,).
+            base_weight: Weight of the six base entries, if it differs.
             spring: What becomes of ``K_p`` while the term is on.
             follow: Time constant of ``spring = "follow"``, s.
-            reach: Bound of the term over ``K``, rad.
+            reach: Bound of the term divided by ``K``, rad.
             fade: Distances from a position limit between which the term fades out, rad (m).
-            every: Ticks from one evaluation of the gradient to the next.
-            scale: ``λ``, instead of measuring it at ``reset``.
-            activation: The state machine; one of its own by default.
+            every: Ticks between evaluations of the gradient.
+            scale: ``λ``, if it is not to be measured at ``reset``.
+            activation: The state machine; a new one by default.
 
         Raises:
-            InputError: A number out of its range.
+            InputError: A number is out of range.
         """
         super().__init__(robot, target, name=name, kp=kp, kd=kd, weight=weight, base_weight=base_weight)
         if not (K >= 0 and reach > 0 and follow > 0 and 0 <= fade[0] < fade[1] and every >= 1 and (scale or 1) > 0):
@@ -125,12 +130,12 @@ class ImpactRobustPosture(JointPosture):
         self.spring, self.reach, self.every = spring, float(reach), int(every)
         if kd is None:
             self.kd = 2.0 * np.sqrt(self.kp + self.K)
-        function = gradient if callable(gradient) else gradient_of(gradient)
-        self._function, self._measure, self._follow = function, scale is None, float(follow)
+        self._function = gradient if callable(gradient) else gradient_of(gradient)
+        self._measure, self._follow = scale is None, float(follow)
         ranges = JointRanges(robot)
         width = ranges.upper - ranges.lower
         near, self._farthest = np.minimum(fade[0], width / 16), fade[1]
-        # Plain numbers: few joints are near a limit at a time, and one number is cheaper than an array.
+        # Lists, because few joints are near a limit at a time, and a list gives a number faster than an array.
         self._near, self._band = near.tolist(), (np.minimum(fade[1], width / 4) - near).tolist()
         self._count, self._hold = 0, False
         self.value, self.term, self.failed = 0.0, np.zeros(robot.nv), False
@@ -156,19 +161,19 @@ class ImpactRobustPosture(JointPosture):
         self._scale = float(value)
         self._set_factor()
 
-    # ---- the course of an impact --------------------------------------------------------------------------------
+    # ---- phases of an impact ------------------------------------------------------------------------------------
 
     def brace(self) -> None:
-        """An impact is coming: switch the term on."""
+        """Switch the term on, because an impact is coming."""
         self.activation.enter(Phase.BRACE)
 
     def contact(self) -> None:
-        """The impact is here: hold the reached posture (or, with a live activation, go on)."""
+        """Hold the reached posture during the impact, or keep the term on if the activation is live."""
         self.activation.enter(Phase.CONTACT)
         self._hold = not self.activation.live
 
     def release(self) -> None:
-        """It is over: switch the term off, hold the reached posture."""
+        """Switch the term off after the impact and hold the reached posture."""
         was_on = self.activation.goal > 0
         self.activation.enter(Phase.RELEASE)
         self._hold = self._hold or was_on
@@ -176,7 +181,7 @@ class ImpactRobustPosture(JointPosture):
     # ---- the task -------------------------------------------------------------------------------------------------
 
     def reset(self, state: State) -> None:
-        """Free, with the posture of the constructor; evaluate the gradient."""
+        """Return to FREE with the posture of the constructor, and evaluate the gradient."""
         super().reset(state)
         self.activation.reset()
         self._count, self._hold, self.failed = 0, False, False
@@ -185,8 +190,8 @@ class ImpactRobustPosture(JointPosture):
     def normalize(self, state: State, redundancy: Array) -> None:
         """Measure ``λ`` at ``state``: the spectral norm of ``Zᵀ∇²H Z`` with ``Z`` = ``redundancy``, shape (nv, r).
 
-        Not below a thousandth of ``H`` per rad²: where ``H`` is flat there is nothing to gain.  Nothing happens where
-        ``scale`` was given.
+        ``λ`` is at least a thousandth of ``H`` per rad², because a flat ``H`` leaves nothing to gain.  A ``scale``
+        given to the constructor is kept.
 
         Raises:
             MetricError: The gradient does not exist there, or ``H`` and its curvature vanish.
@@ -196,8 +201,9 @@ class ImpactRobustPosture(JointPosture):
         Z = redundancy if redundancy.shape[1] else np.eye(state.nv)
         columns = []
         for z in Z.T:
-            ahead = np.array(self._function(pin.integrate(self._model, state.q, _STEP * z))[1])
-            behind = np.array(self._function(pin.integrate(self._model, state.q, -_STEP * z))[1])
+            ahead, behind = (
+                np.array(self._function(pin.integrate(self._model, state.q, step * z))[1]) for step in (_STEP, -_STEP)
+            )
             columns.append(Z.T @ (ahead - behind) / (2 * _STEP))
         curvature = float(np.linalg.norm(np.column_stack(columns), 2))
         scale = max(curvature, _FLAT * abs(self._function(state.q)[0]))
@@ -208,14 +214,12 @@ class ImpactRobustPosture(JointPosture):
         self.scale = scale
 
     def advance(self, state: State, dt: float) -> None:
-        """Go on with ramps, fades and the following of ``q_des``; evaluate the gradient when it is due."""
+        """Advance ramps, fades and a following ``q_des``; evaluate the gradient when it is due."""
         if self._hold:
             self._hold = False
-            # Where the spring was let go, it takes hold again at the very posture; where it pulled, it is let go as
-            # slowly as the term is.
+            # A released spring takes hold again at the reached posture.  A kept one lets go as slowly as the term.
             self._fade_to(state.q, self.activation.ramp)
-        if self._blend < 1:
-            super().advance(state, dt)
+        super().advance(state, dt)
         level = self.activation.advance(dt)
         if level <= 0:
             return
@@ -228,40 +232,37 @@ class ImpactRobustPosture(JointPosture):
             self._count = self.every
             self._evaluate(state)
 
-    def desired(self, state: State) -> Array:
-        """``ν̇*``, shape (nv,)."""
-        level = self.activation.level
-        wanted = self.kp * self.error(state)
-        if level > 0 and self.spring == "release":
-            wanted *= 1.0 - level
-        wanted += self._acceleration
-        wanted += self.kd * (self._velocity - state.v)
-        if level == 1:
-            wanted += self.term
-        elif level > 0:
-            wanted += level * self.term
-        return wanted
+    def pull(self, state: State) -> Array:
+        """Return ``K_p (q_des ⊖ q)``, scaled by ``1 − α`` if the spring is released."""
+        pull = super().pull(state)
+        if self.spring == "release" and self.activation.level > 0:
+            pull *= 1.0 - self.activation.level
+        return pull
 
     def feedforward(self, state: State) -> Array | None:
-        """Nothing: :meth:`desired` holds the term."""
-        return None
+        """Return the term at the present level."""
+        level = self.activation.level
+        if level <= 0:
+            return None
+        return self.term if level == 1 else level * self.term
 
     def step_bound(self, state: State, dt: float) -> float:
-        """How far ``ν̇*`` can move within ``dt`` because of ramps and fades alone (``q``, ν, ∇H held), largest entry.
+        """Return the largest change of an entry of ``ν̇*`` within ``dt`` by ramps and fades alone (``q``, ν, ∇H held).
 
-        ``1.5 dt/ramp·(K·reach + K_p|q_des ⊖ q|)`` for the level, plus the posture's own fade.
+        It is ``1.5 dt/ramp·(K·reach + K_p|q_des ⊖ q|)`` for the level, plus the posture's own fade.
         """
-        pull = float(np.max(np.abs(self.kp * self.error(state)))) if self.spring == "release" else 0.0
+        released = self.spring == "release"
+        pull = float(np.max(np.abs(self.kp * self.error(state)))) if released else 0.0
         return self.activation.step_bound(dt) * (self.K * self.reach + pull) + super().step_bound(state, dt)
 
     def _evaluate(self, state: State) -> None:
-        """The term at ``state``; the one before where the gradient does not exist."""
+        """Evaluate the term at ``state``; keep the previous one where the gradient does not exist."""
         term, bound = self._spare, self._K * self.reach
         try:
             value, gradient = self._function(state.q)
             np.multiply(gradient, self._factor, out=term)
         except Exception:
-            # Whatever a user's function raises: a tick must go on, and `failed` tells.
+            # A user's function may raise anything, but the tick must go on.  `failed` reports it.
             self.failed = True
             return
         square = term.dot(term)
@@ -276,10 +277,10 @@ class ImpactRobustPosture(JointPosture):
         self.term, self._spare = term, self.term
 
     def _fade(self, term: Array, rooms: Array) -> None:
-        """Take away, near a position limit, what pushes into it."""
+        """Fade out the entries that push into a position limit nearby."""
         size = term.size
         for at in (rooms < self._farthest).nonzero()[0].tolist():
-            # First come the rooms up to the upper limits.
+            # The distances to the upper limits come first.
             below, k = divmod(at, size)
             push = term.item(k)
             if (push < 0) if below else (push > 0):
@@ -288,5 +289,5 @@ class ImpactRobustPosture(JointPosture):
                     term[k] = push * smooth(distance / band) if distance > 0 else 0.0
 
     def _set_factor(self) -> None:
-        # An array without dimensions: NumPy multiplies by it faster than by a number.
+        # An array without dimensions, because NumPy multiplies by it faster than by a float.
         self._factor[...] = -self._K / self._scale

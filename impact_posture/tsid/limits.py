@@ -17,18 +17,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LimitLaw:
-    """How joints are stopped at their limits.
+    """Law that stops joints at their limits.
 
     A joint at distance ``x`` from a limit may move towards it with at most ``φ(x) = min(approach·x,
-    √(2·deceleration·x), velocity limit)``; beyond the limit it must come back with ``φ``.  The acceleration may bring
-    it to that speed at ``rate``: ``rate·(−φ(q − q_min) − q̇) ≤ q̈ ≤ rate·(φ(q_max − q) − q̇)``.  ``φ`` is odd and
-    grows, hence the lower bound never passes the upper one, inside the limits or outside.
+    √(2·deceleration·x), velocity limit)``.  Beyond the limit it must come back with ``φ``.  The acceleration brings
+    the joint to that speed at ``rate``: ``rate·(−φ(q − q_min) − q̇) ≤ q̈ ≤ rate·(φ(q_max − q) − q̇)``.  ``φ`` is odd
+    and increasing, hence the lower bound never exceeds the upper one, inside the limits or outside.
 
     Attributes:
-        approach: 1/s.
-        rate: 1/s; at least ``4·approach``, or a joint could swing through its limit.
-        deceleration: rad/s² (m/s²) that braking may count on.
-        acceleration: Largest acceleration of any joint either way, rad/s² (m/s²); infinite: none.
+        approach: Speed towards a limit per distance, 1/s.
+        rate: Gain of the speed error, 1/s; below ``4·approach`` a joint could swing through its limit.
+        deceleration: Deceleration available for braking, rad/s² (m/s²).
+        acceleration: Largest acceleration of a joint, rad/s² (m/s²); infinite means no bound.
         margin: Distance kept from the position limits, rad (m); at most a quarter of the joint's range.
     """
 
@@ -39,7 +39,7 @@ class LimitLaw:
     margin: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a law that does not stop."""
+        """Refuse a law that does not stop the joints."""
         if not (self.approach > 0 and self.deceleration > 0 and self.acceleration > 0 and self.margin >= 0):
             raise InputError("a number is not positive", where="limit law", hint="give positive numbers")
         if not self.rate >= 4 * self.approach:
@@ -51,7 +51,7 @@ class LimitLaw:
 
 
 class AccelerationBounds:
-    """The bounds of a :class:`LimitLaw` at one state after the other.
+    """Bounds that a :class:`LimitLaw` sets at each state.
 
     Attributes:
         lower: rad/s² (m/s²), shape (nv,); minus infinity where nothing is limited.
@@ -65,11 +65,11 @@ class AccelerationBounds:
         self.lower = np.full(nv, -np.inf) if lower is None else lower
         self.upper = np.full(nv, np.inf) if upper is None else upper
         self._fastest = ranges.velocity
-        self._size, self._speed, self._signed = np.zeros((2, nv)), np.zeros((2, nv)), np.zeros((2, nv))
+        self._size, self._speed, self._signed = np.zeros((3, 2, nv))
         self._braking, self._margin = np.zeros(nv), np.minimum(law.margin, (ranges.upper - ranges.lower) / 4)
         self._to_upper, self._to_lower = self._speed
         self._twice = np.sqrt(2 * law.deceleration)
-        # The base has no limits, and none are made for it.
+        # The base has no limits.
         self._largest = np.full(nv, law.acceleration)
         self._largest[: 6 if robot.floating else 0] = np.inf
 

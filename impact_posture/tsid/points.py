@@ -1,4 +1,4 @@
-"""Kinematics of a few points of the robot, all at once, from Pinocchio's joint Jacobians."""
+"""Kinematics of a few points of the robot, all at once, from the joint Jacobians of Pinocchio."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impact_posture.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
-# p @ _SHIFT, shape (6, 6), holds -[p]x upper right: what takes a body's velocity at the origin to the one at p.
+# p @ _SHIFT, shape (6, 6), holds -[p]x upper right, which shifts a body's velocity from the origin to p.
 _SHIFT = np.zeros((3, 6, 6))
 _SHIFT[[2, 0, 1], [0, 1, 2], [4, 5, 3]] = 1.0
 _SHIFT[[1, 2, 0], [0, 1, 2], [5, 3, 4]] = -1.0
@@ -25,8 +25,8 @@ class Point:
     """A point that moves with a frame of the robot.
 
     Attributes:
-        frame: The frame's name.
-        offset: The point from the frame's origin, in the frame, meters.
+        frame: Name of the frame.
+        offset: Point from the origin of the frame, in the frame, meters.
     """
 
     frame: str
@@ -35,15 +35,15 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class PointState:
-    """A point at the present state: views on the state's buffers, overwritten by its next update.
+    """Kinematics of a point in views on the buffers of the state, which its next update overwrites.
 
     Attributes:
         position: World, meters, shape (3,).
-        rotation: Of the point's frame, world from frame, shape (3, 3).
-        jacobian: World-aligned linear and angular velocity of the point per ν, shape (6, nv).
+        rotation: Rotation of the frame, world from frame, shape (3, 3).
+        jacobian: Jacobian of the linear and angular velocity of the point, world axes, shape (6, nv).
         velocity: ``Jν``, shape (6,).
-        drift: ``J̇ν``, shape (6,): classical acceleration of the point at ``ν̇ = 0``, and angular acceleration.
-        spatial_drift: The same as a spatial acceleration, ``v̇ − ω × v``: the rate of the body twist, in world axes.
+        drift: ``J̇ν``, shape (6,), the classical and the angular acceleration at ``ν̇ = 0``.
+        spatial_drift: Spatial acceleration ``v̇ − ω × v``, which is the rate of the body twist in world axes.
     """
 
     position: Array
@@ -55,18 +55,18 @@ class PointState:
 
 
 class PointKinematics:
-    """Position, rotation, Jacobian, velocity and drift of points, in buffers that were allocated once."""
+    """Position, rotation, Jacobian, velocity and drift of points, in buffers that are allocated once."""
 
     def __init__(self, robot: Robot, data: pin.Data, points: Sequence[Point]) -> None:
         """Size the buffers.
 
         Args:
             robot: The robot.
-            data: Pinocchio's, on which ``computeJointJacobiansTimeVariation`` is called before each update.
+            data: Data on which the caller runs ``pin.computeJointJacobiansTimeVariation`` before each update.
             points: The points.
 
         Raises:
-            FrameNotFound: With the nearest names.
+            FrameNotFound: The robot has no such frame; carries the nearest names.
         """
         model, nv, count = robot.model, robot.nv, len(points)
         frames = [model.frames[robot.frame_id(point.frame)] for point in points]
@@ -76,7 +76,7 @@ class PointKinematics:
             mask[k, _support(model, frame.parentJoint)] = 1.0
         self._mask, self._rows_mask = mask, np.repeat(mask, 6, axis=0)
         self._position, rotation = np.zeros((count, 3)), np.zeros((count, 3, 3))
-        # The same memory in the shapes that the products want.
+        # Views on the same memory in the shapes of the products.
         self._shift, self._turn = np.zeros((count, 36)), np.zeros((count, 36))
         self._shift_rows = self._shift.reshape(6 * count, 6)
         self._shifts, self._turns = self._shift.reshape(count, 6, 6), self._turn.reshape(count, 6, 6)
@@ -104,7 +104,7 @@ class PointKinematics:
         }
 
     def update(self, v: Array) -> None:
-        """Move to Pinocchio's present configuration and ν, shape (nv,)."""
+        """Move to the configuration of the data and to ν, shape (nv,)."""
         if not self._moving:
             return
         for R, t, offset, turn, position, rotation in self._moving:
@@ -117,7 +117,7 @@ class PointKinematics:
                 rotation[:] = R
             else:
                 np.dot(R, turn, out=rotation)
-        # Pinocchio's J is of the body's point at the world's origin: v_p = v + ω × p.
+        # Pinocchio gives J for the body's point at the world origin: v_p = v + ω × p.
         np.matmul(self._position, _FLAT, out=self._shift)
         self._shift += _EYE
         np.matmul(self._shift_rows, self._J, out=self._jacobian)
@@ -126,14 +126,14 @@ class PointKinematics:
         np.multiply(self._mask, v, out=self._masked)
         np.matmul(self._masked, self._dJ_transposed, out=self._world)
         np.matmul(self._shifts, self._worlds, out=self._spatials)
-        # ω × v_p, by the same operator on v_p.
+        # ω × v_p by the same operator, applied to v_p.
         np.matmul(self._linear, _FLAT, out=self._turn)
         np.matmul(self._turns, self._twists, out=self._drifts)
         self._drift += self._spatial
 
 
 def _fixed(frame: pin.Frame, point: Point) -> tuple[Array | None, Array | None]:
-    """Where point and frame sit on their joint's body; ``None`` for zero and for the identity."""
+    """Return offset and rotation on the joint's body; ``None`` for zero and for the identity."""
     placement = frame.placement
     offset = placement.act(np.array(point.offset, dtype=float))
     turn = np.array(placement.rotation)
@@ -141,7 +141,7 @@ def _fixed(frame: pin.Frame, point: Point) -> tuple[Array | None, Array | None]:
 
 
 def _support(model: pin.Model, joint: int) -> list[int]:
-    """The entries of ν that move a joint's body."""
+    """Return the entries of ν that move the body of a joint."""
     columns: list[int] = []
     while joint > 0:
         columns += range(model.idx_vs[joint], model.idx_vs[joint] + model.nvs[joint])

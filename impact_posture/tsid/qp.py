@@ -1,8 +1,10 @@
-"""A quadratic program in buffers that were sized once, and what solves it."""
+"""A quadratic program in buffers that are sized once, and the protocol of its solvers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from itertools import accumulate, pairwise
 from typing import Protocol
 
 import numpy as np
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# DAQP's constraint types, which we keep as our own.
+# Codes of DAQP for the types of constraints.
 INEQUALITY, EQUALITY = 0, 5
 
 
@@ -36,7 +38,7 @@ class QP:
 
     @classmethod
     def empty(cls, n: int, m: int) -> QP:
-        """A program without cost or bounds."""
+        """Return a program without cost or bounds."""
         return cls(
             np.eye(n),
             np.zeros(n),
@@ -63,33 +65,27 @@ class QP:
         return bool(np.isfinite(sums) and not np.isnan(self.lower).any() and not np.isnan(self.upper).any())
 
     def copy(self) -> QP:
-        """A deep copy."""
-        H, g, A = self.H.copy(), self.g.copy(), self.A.copy()
-        return QP(H, g, A, self.lower.copy(), self.upper.copy(), self.sense.copy())
+        """Return a deep copy."""
+        return QP(*(getattr(self, field.name).copy() for field in fields(self)))
 
     def values(self, z: Array) -> Array:
-        """``[z; A z]``, shape (n + m,)."""
+        """Return ``[z; A z]``, shape (n + m,)."""
         return np.concatenate([z, self.A @ z])
 
     def violation(self, z: Array) -> float:
-        """Largest violation of a bound at ``z``."""
+        """Return the largest violation of a bound at ``z``."""
         values = self.values(z)
         return float(max(np.max(self.lower - values), np.max(values - self.upper), 0.0))
-
-    def stationarity(self, z: Array, multipliers: Array) -> float:
-        """``‖Hz + g + [I; A]ᵀλ‖_∞``."""
-        n = self.n
-        return float(np.max(np.abs(self.H @ z + self.g + multipliers[:n] + self.A.T @ multipliers[n:])))
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """A solver's answer.
+    """Answer of a solver.
 
     Attributes:
         z: Shape (n,).
-        multipliers: Of the variables' bounds, then of the rows: positive at the upper bound, shape (n + m,).
-        iterations: As the solver counts them.
+        multipliers: Multipliers of the variables' bounds, then of the rows; positive at upper bounds, shape (n + m,).
+        iterations: Number of iterations, as the solver counts them.
     """
 
     z: Array
@@ -98,14 +94,20 @@ class Solved:
 
 
 class Solver(Protocol):
-    """What solves one QP after the other, all of one size."""
+    """Solver of a sequence of QPs, all of the same size."""
 
     def reset(self) -> None:
-        """Forget what earlier solutions left for a warm start."""
+        """Discard what earlier solutions left for a warm start."""
 
     def solve(self, qp: QP) -> Solved | None:
-        """The solution, or ``None`` where there is none or none was found (:attr:`infeasible` says which)."""
+        """Return the solution, or ``None`` if there is none or none was found (see :attr:`infeasible`)."""
 
     @property
     def infeasible(self) -> bool:
-        """Whether the last program had no solution, as opposed to: none was found."""
+        """Whether the last program had no solution, in contrast to a solver that found none."""
+
+
+def stacked_rows(sizes: Iterable[int]) -> tuple[tuple[slice, ...], int]:
+    """Return the rows of blocks that stand one below the other, and the number of all rows."""
+    ends = list(accumulate(sizes, initial=0))
+    return tuple(slice(start, stop) for start, stop in pairwise(ends)), ends[-1]

@@ -8,13 +8,13 @@ from impact_posture.robot.robot import Robot
 
 
 class JointRanges:
-    """Position and velocity limits along the entries of ν: infinite for the base and for continuous joints.
+    """Position and velocity limits along the entries of ν, infinite for the base and for continuous joints.
 
     Attributes:
         lower: Position, rad or m, shape (nv,).
         upper: As ``lower``.
         velocity: rad/s or m/s, shape (nv,); infinite where the model states none (or zero).
-        index: Which entry of ``q`` belongs to an entry of ν that has position limits (else any), shape (nv,).
+        index: Entry of ``q`` for each entry of ν with position limits (any entry for the others), shape (nv,).
     """
 
     def __init__(self, robot: Robot) -> None:

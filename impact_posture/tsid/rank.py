@@ -1,4 +1,4 @@
-"""Strict levels of any rank: dependent rows leave a tick's formulation, nearly dependent ones are damped."""
+"""Strict levels of any rank: dependent rows leave the QP of a tick, nearly dependent rows are damped."""
 
 from __future__ import annotations
 
@@ -8,52 +8,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.tsid.qp import EQUALITY, INEQUALITY, QP
+from impact_posture.tsid.smooth_step import smooth
 
 Array = NDArray[np.float64]
 
-# Singular values of a level's rows, over the length of its longest row, below which a direction is damped.  In their
-# postures the shipped robots stay above 0.03.
+# Singular value of a level's rows, over the length of its longest row, below which a direction is damped.  The
+# shipped robots stay above 0.03 in their postures.
 SINGULAR = 2e-2
-# Share of that below which a direction is dropped: far above rounding, far below what could be seen.
+# Share of SINGULAR below which a direction is dropped: far above rounding, far below a visible effect.
 _NOTHING = 1e-9
-# Least 1 − α: a damped row's weight stays within the solver's digits.
+# Least 1 − α, which keeps the weight of a damped row within the digits of the solver.
 _LEAST = 1e-8
 
 
 class LevelRank:
-    """Keeps the strict levels of a program independent of each other and of the dynamics.
+    """Keep the strict levels of a QP independent of each other and of the dynamics.
 
-    A level with rows ``J`` acts in what the levels above leave, with the basis ``Z``: ``J Z = U S Vᵀ``.  Its rows are
-    turned by ``Uᵀ``, which changes no sum of squares; each then belongs to one singular value ``s``.  With
-    ``x = s/s₀``, where ``s₀`` is :data:`SINGULAR` times the length of the level's longest row:
+    A level with rows ``J`` acts in the space that the levels above leave, with the basis ``Z``: ``J Z = U S Vᵀ``.
+    ``Uᵀ`` rotates its rows, which does not change the sum of squares.  Each row then belongs to one singular value
+    ``s``.  With ``x = s/s₀``, where ``s₀`` is :data:`SINGULAR` times the length of the level's longest row:
 
-    - ``x ≥ 1``: the row is an equation, as asked for;
-    - ``x = 0``: the levels above determine the row already, or it contradicts its own level.  It leaves the program.
-      With the others held that is the level's least-squares answer, which is exact where the rows agree;
-    - between: the row is damped.  It moves into the cost as ``α/(1 − α) (q·ν̇ − c/s)²`` with ``α = x²(3 − 2x)`` and
-      the direction ``q`` that it asks to move in, beside ``x (q·ν̇)²``; both have the mean weight of the cost.  This
+    - ``x ≥ 1``: the row is an equation.
+    - ``x = 0``: the levels above determine the row, or it contradicts its own level.  It leaves the QP.  The others
+      then give the least-squares answer of the level, which is exact where the rows agree.
+    - Otherwise, the row is damped.  It moves into the cost as ``α/(1 − α) (q·ν̇ − c/s)²`` with ``α = x²(3 − 2x)`` and
+      its direction of motion ``q``, together with ``x (q·ν̇)²``.  Both have the mean weight of the cost.  The row
       fades from an equation to nothing, so that accelerations are continuous through a singular posture.  They are at
-      most ``3/s₀`` times what the row asks for.  The levels below have ``√(1 − α)`` of the direction.
+      most ``3/s₀`` times the row's demand ``c``.  The levels below have ``√(1 − α)`` of the direction.
 
-    All of this is a function of the present rows; only their lengths are those at reset.  There is no hysteresis.
-    While all rows are independent, the program is the given one.  That is known without a decomposition a tick,
-    because no singular value moves further than the matrix does (Weyl 1912).
+    The result is a function of the present rows and of their lengths at reset, without hysteresis.  While all rows
+    are independent, the QP is the given one.  This needs no decomposition per tick, because no singular value moves
+    further than the matrix does (Weyl 1912).
 
     Attributes:
-        qp: The program to solve.
-        wanted: Right-hand sides of the first rows of ``qp.A``, also of those that are no equations.
-        changed: Whether other rows are equations than at the last :meth:`update`.
+        qp: The QP to solve.
+        wanted: Right-hand sides of the first rows of ``qp.A``, also of rows that are no equations.
+        changed: Whether the set of equations differs from that before the last :meth:`update`.
     """
 
     def __init__(self, qp: QP, always: int, levels: Sequence[slice], accelerations: int, units: Array) -> None:
         """Size the buffers.
 
         Args:
-            qp: The formulation, in its buffers.
-            always: How many rows always hold; they are the first.
-            levels: Rows of each level, next to each other behind those.
-            accelerations: How many variables the levels are about; they are the first.
-            units: What compares with an acceleration of one, for each variable, shape (n,).
+            qp: The given QP in its buffers.
+            always: Number of rows that always hold; they come first.
+            levels: Rows of each level; they follow in order.
+            accelerations: Number of variables in the levels; they come first.
+            units: Value of each variable that compares with an acceleration of 1, shape (n,).
         """
         self._given, self._always, self._levels = qp, always, tuple(levels)
         self._accelerations, self._units = accelerations, units
@@ -66,11 +67,11 @@ class LevelRank:
         self.reset()
 
     def reset(self) -> None:
-        """Take the lengths of the rows anew at the next :meth:`update`."""
+        """Measure the lengths of the rows again at the next :meth:`update`."""
         self._begun = False
 
     def update(self) -> None:
-        """Look at the rows that are in the program now."""
+        """Determine the QP for the present rows."""
         if not self._count:
             return
         if not self._begun:
@@ -78,7 +79,7 @@ class LevelRank:
         way = self._way
         np.subtract(self._rows, self._reference, out=way)
         way *= self._scale
-        # Not ">=": that is false for a NaN.
+        # Not ">=", which is false for a NaN.
         if not self._flat.dot(self._flat) < self._room:
             self._measure()
         before = self.qp
@@ -89,7 +90,7 @@ class LevelRank:
         self.changed = self.qp is not before and not np.array_equal(self.qp.sense, before.sense)
 
     def rows(self, rows: slice, equations: bool) -> NDArray[np.intp]:
-        """Those rows of a level that are equations, or those that are not."""
+        """Return the rows of a level that are equations, or those that are not."""
         n = self._given.n
         held = self.qp.sense[n + rows.start : n + rows.stop] == EQUALITY
         return np.asarray(np.arange(rows.start, rows.stop)[held == equations])
@@ -103,7 +104,7 @@ class LevelRank:
         self._measure()
 
     def _measure(self) -> None:
-        """The least singular value of all rows together: no level has a smaller one in what those above leave."""
+        """Measure the least singular value of all rows, which bounds those of each level from below."""
         self._reference[:] = self._rows
         self._independent, self._room = True, 0.0
         if np.isfinite(self._rows).all():
@@ -114,7 +115,7 @@ class LevelRank:
     def _reduced(self) -> QP:
         given, lengths = self._given, self._lengths
         n = given.n
-        qp = QP(given.H, given.g, given.A.copy(), given.lower.copy(), given.upper.copy(), given.sense.copy())
+        qp = given.copy()
         self.wanted = self._asked.copy()
         Z = np.diag(self._units)
         if self._always:
@@ -129,7 +130,7 @@ class LevelRank:
             qp.sense[at] = np.where(held, EQUALITY, INEQUALITY)
             qp.lower[at] = np.where(held, self.wanted[rows], -np.inf)
             qp.upper[at] = np.where(held, self.wanted[rows], np.inf)
-            alpha = x * x * (3.0 - 2.0 * x)
+            alpha = smooth(x)
             directions = Z @ Vt.T
             damped = np.flatnonzero((x > _NOTHING) & (x < 1.0))
             if damped.size:
@@ -145,6 +146,6 @@ class LevelRank:
 
 
 def _mean_weight(H: Array, Z: Array, count: int) -> float:
-    """Of the cost, over the directions ``Z`` that are left."""
+    """Return the mean weight of the cost over the directions ``Z``."""
     Z = Z[:count]
     return float(np.sum(Z * (H[:count, :count] @ Z)) / np.sum(Z * Z))

@@ -1,4 +1,4 @@
-"""Solving a tick's QP so that it never fails: strict levels give way, the least important first."""
+"""Solution of the QP of a tick that never fails, because strict levels give way, the least important first."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from impact_posture.tsid.qp import EQUALITY, INEQUALITY, QP, Solved, Solver
 
 Array = NDArray[np.float64]
 
-# What counts as not reached, relative to the numbers that a row adds up: the hierarchy is solved to about six digits.
+# Miss that counts, relative to the terms of a row, because the hierarchy is solved to about six digits.
 _OFF = 1e-6
-# Tried one after the other, both likewise: what misses by more than the first may stray from what was reached by the
-# second.  Held to the last digit it would leave no room to satisfy to the last digit what always holds.
+# Pairs that are tried in order, relative to the terms of a row: a level that misses by more than the first number may
+# stray by the second from the point it reached.  Without this room, the hard rows could not hold to the last digit.
 _STRAY = ((_OFF, 1e-6), (0.0, 1e-6), (0.0, 1e-4), (0.0, 1e-2))
-# Proximal weights that are tried one after the other, relative to the largest in the cost: the first that makes the
-# program well enough conditioned for the solver changes its solution the least.  Steps with each bring it back.
+# Proximal weights that are tried in order, relative to the largest weight of the cost, with the number of steps each.
+# The first weight that conditions the QP well enough changes its solution least.  The steps undo the change.
 _PROXIMAL, _STEPS = (0.0, 1e-6, 1e-3, 1e3), 3
-# By how much a bound may be passed in the end, times how far numbers were scaled down.
+# Largest violation of a bound in the end, times the scale of the numbers.
 _EXACT = 1e-9
-# Numbers are brought below this: the solver's tolerances are absolute.
+# Numbers are scaled below this, because the tolerances of the solver are absolute.
 _LARGEST = 1e3
 
 
 @dataclass(frozen=True)
 class Relaxed:
-    """What gave way in a tick.
+    """Level or limit that gave way in a tick.
 
     Attributes:
         level: Name of the level, or ``joint limits``.
-        amount: ``‖Jν̇ − a‖`` of the level; for joint limits the largest passing of an acceleration bound.
+        amount: ``‖Jν̇ − a‖`` of the level, or the largest violation of an acceleration bound.
     """
 
     level: str
@@ -42,11 +42,11 @@ class Relaxed:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The answer to a tick's QP.
+    """Answer to the QP of a tick.
 
     Attributes:
-        solved: ``None`` where even the relaxed programs have none.
-        relaxed: What gave way, the most important first; empty if nothing did.
+        solved: Solution; ``None`` if the relaxed QPs have none either.
+        relaxed: Levels and limits that gave way, the most important first.
     """
 
     solved: Solved | None
@@ -54,25 +54,25 @@ class Outcome:
 
 
 def solve(assembly: Assembly, solver: Solver, aside: Solver) -> Outcome:
-    """Solve the assembly's QP; where that fails, lexicographically relaxed.
+    """Solve the QP of the assembly; if that fails, relax it lexicographically.
 
-    Dynamics, control limits and friction always hold: in every state some acceleration satisfies them.  The
-    acceleration bounds of joint limits are opened only where they cannot hold beside those, and as little as that
-    takes.  Then, from the most important level down: a level that can hold beside those above it holds; one that
-    cannot is brought as close as it comes, in the least-squares sense, and stays there for those below.  Last, the
-    cost is minimized with all of that held.
+    Dynamics, control limits and friction always hold, because every state has an acceleration that satisfies them.
+    The acceleration bounds of joint limits are opened only as far as these rows demand.  Then each level, from the
+    most important down, holds if it can hold together with the levels above it.  Otherwise it comes as close as
+    possible in the least-squares sense and stays there for the levels below.  Last, the cost is minimized with all
+    of them held.
 
     Args:
         assembly: With :attr:`Assembly.qp` built.
-        solver: The tick's own; keeps its active set.
-        aside: For the relaxed programs, of the same size.
+        solver: Solver of the ticks, which keeps its active set.
+        aside: Solver of the relaxed QPs, of the same size.
     """
     qp = assembly.rank.qp
     if assembly.rank.changed:
         solver.reset()
     solved = solver.solve(qp)
     if solved is None and not solver.infeasible:
-        # Gave up from its warm start: once more without.
+        # The solver gave up from its warm start.  Try once without.
         solver.reset()
         solved = solver.solve(qp)
     if solved is not None or not qp.finite:
@@ -89,13 +89,13 @@ def _relax(assembly: Assembly, solver: Solver) -> Outcome:
         if solved is not None:
             break
     else:
-        # What leads nowhere is the cost: without it there is an answer.
+        # Only the cost has no minimum that the solver finds.  Without it there is an answer.
         solved = Solved(nearest, np.zeros(assembly.qp.n + assembly.qp.m), 0)
     return Outcome(solved, _gave_way(assembly, solved.z))
 
 
 def _opened(assembly: Assembly, nearest: Array, least: float, stray: float) -> QP:
-    """The tick's program with what ``nearest`` misses by more than ``least`` held where it is, to ``stray``."""
+    """Return the QP in which rows that ``nearest`` misses by more than ``least`` stay there, up to ``stray``."""
     asked, limits = assembly.rank.qp, assembly.limits
     qp, values = asked.copy(), nearest[limits]
     room = np.where(_passed(asked, nearest, limits) > 0, stray * (1.0 + np.abs(values)), 0.0)
@@ -113,7 +113,7 @@ def _opened(assembly: Assembly, nearest: Array, least: float, stray: float) -> Q
 
 
 def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, ...]:
-    """By how much the levels miss, in those rows that are equations or in those that lack rank."""
+    """Return the levels that miss, in their rows that are equations or in those that lack rank."""
     found = []
     for name, level in assembly.levels:
         off, size = _missed(assembly, z, assembly.rank.rows(level, equations))
@@ -130,13 +130,13 @@ def _gave_way(assembly: Assembly, z: Array) -> tuple[Relaxed, ...]:
 
 
 def _missed(assembly: Assembly, z: Array, rows: NDArray[np.intp]) -> tuple[Array, float]:
-    """``Jν̇ − a`` of some rows, and how large the numbers are that it is the difference of."""
+    """Return ``Jν̇ − a`` of the given rows, and the size of its terms."""
     A = assembly.rank.qp.A[rows]
     return A @ z - assembly.rank.wanted[rows], 1.0 + float(np.max(np.abs(A) @ np.abs(z), initial=0.0))
 
 
 def _hierarchy(assembly: Assembly) -> list[Level]:
-    """What always holds; the acceleration bounds; the strict levels."""
+    """Return the rows that always hold, the acceleration bounds, and the strict levels."""
     qp, limits, rank = assembly.rank.qp, assembly.limits, assembly.rank
     n = qp.n
     always = np.ones(qp.m, dtype=bool)
@@ -152,12 +152,12 @@ def _hierarchy(assembly: Assembly) -> list[Level]:
 
 
 def _passed(qp: QP, z: Array, limits: NDArray[np.intp]) -> Array:
-    """By how much ``z`` passes the bounds of joint limits; negative where it keeps them."""
+    """Return the violation of the bounds of joint limits by ``z``; negative where they hold."""
     return np.asarray(np.maximum(qp.lower[limits] - z[limits], z[limits] - qp.upper[limits]))
 
 
 def _minimize(qp: QP, start: Array, solver: Solver) -> Solved | None:
-    """The cost's minimum near ``start``, which satisfies all bounds to about six digits."""
+    """Return the minimum of the cost near ``start``, which satisfies all bounds to about six digits."""
     values = np.abs(np.concatenate([start, qp.A @ start]))
     scale = max(1.0, float(values.max()) / _LARGEST)
     lower, upper, start = qp.lower / scale, qp.upper / scale, start / scale
@@ -165,7 +165,7 @@ def _minimize(qp: QP, start: Array, solver: Solver) -> Solved | None:
     for share in _PROXIMAL:
         answer, center = None, start
         for _ in range(_STEPS if share else 1):
-            # Neighbors here differ in what is bound at all: what the one before left helps nothing.
+            # These QPs differ in their constraints, hence a warm start does not help.
             solver.reset()
             H, g = qp.H + share * weight * np.eye(qp.n), qp.g / scale - share * weight * center
             found = solver.solve(replace(qp, H=H, g=g, lower=lower, upper=upper))
@@ -180,7 +180,7 @@ def _minimize(qp: QP, start: Array, solver: Solver) -> Solved | None:
 
 
 def _polished(qp: QP, z: Array, multipliers: Array) -> Array:
-    """``z`` moved, by as little as it takes, to where equations and active bounds hold to the last digit."""
+    """Return the point nearest to ``z`` at which equations and active bounds hold to the last digit."""
     above, below = (multipliers > 0) & (qp.sense != EQUALITY), (multipliers < 0) & (qp.sense != EQUALITY)
     held = above | below | (qp.sense == EQUALITY)
     off = np.where(below, qp.lower, qp.upper)[held] - qp.values(z)[held]

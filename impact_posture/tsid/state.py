@@ -1,4 +1,4 @@
-"""Everything a tick needs of the robot's dynamics, computed once a tick into buffers that were allocated once."""
+"""Dynamics of the robot for one tick, in buffers that are allocated once."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ Array = NDArray[np.float64]
 
 
 class State:
-    """``M``, ``h``, point Jacobians, drifts and center of mass at one ``(q, ν)`` at a time.
+    """``M``, ``h``, point Jacobians, drifts and center of mass at ``(q, ν)``.
 
     Attributes:
         robot: The robot.
-        points: The points whose kinematics it follows.
+        points: Points whose kinematics the state holds.
         q: Configuration, shape (nq,), a copy with unit quaternions and cosine-sine pairs.
         v: ν, shape (nv,), a copy.
-        M: Mass matrix with armature, shape (nv, nv); a view on Pinocchio's data, like the next one.
+        M: Mass matrix with armature, shape (nv, nv); a view on the data of Pinocchio, like ``h``.
         h: Coriolis, centrifugal and gravity terms, shape (nv,).
-        room: Distance of every joint to its upper, then to its lower limit, negative beyond, shape (2, nv); infinite
-            where there is none.
-        rooms: The same, flat, shape (2 nv,).
-        least_room: The smallest of them.
+        room: Distance of each joint to its upper, then to its lower limit, shape (2, nv); negative beyond a limit,
+            infinite without one.
+        rooms: Flat view on ``room``, shape (2 nv,).
+        least_room: Smallest entry of ``room``.
         force: Measured contact wrench on the robot ``[force (N); moment (N·m)]``, world axes, shape (6,).
-        pushed: Whether there is such a wrench.
+        pushed: Whether a wrench is measured.
         mass: Total mass, kg.
-        unit_parts: Where quaternions and cosine-sine pairs stand in ``q``.
+        unit_parts: Places of quaternions and cosine-sine pairs in ``q``.
     """
 
     def __init__(self, robot: Robot, points: Iterable[Point] = ()) -> None:
@@ -41,10 +41,10 @@ class State:
 
         Args:
             robot: The robot.
-            points: The points whose kinematics are wanted; look them up with :meth:`at`.
+            points: Points whose kinematics :meth:`at` returns.
 
         Raises:
-            FrameNotFound: With the nearest names.
+            FrameNotFound: The robot has no such frame; carries the nearest names.
         """
         self.robot, self.points = robot, tuple(points)
         self._model = robot.model
@@ -57,7 +57,7 @@ class State:
         self.room, self._joints, self.least_room = np.zeros((2, robot.nv)), np.zeros(robot.nv), np.inf
         self._above, self._below, self.rooms = self.room[0], self.room[1], self.room.reshape(-1)
         self.force, self.pushed, self.mass = np.zeros(6), False, robot.mass
-        # Pinocchio writes into the same memory on every call: views on it stay valid.
+        # Pinocchio writes into the same memory on every call, hence views on it stay valid.
         self.M, self.h = data.M, data.nle
         self._gravity = np.array(robot.model.gravity.linear)
         base = data.oMi[1]
@@ -74,7 +74,7 @@ class State:
         return self.v.size
 
     def update(self, q: ArrayLike, v: ArrayLike) -> State:
-        """Move to ``(q, ν)``; shapes (nq,) and (nv,), finite, quaternions near unit norm (see ``Controller``)."""
+        """Move to ``(q, ν)`` of shapes (nq,) and (nv,), which are finite and have quaternions near unit norm."""
         model, data = self._model, self._data
         self.q[:] = q
         self.v[:] = v
@@ -83,7 +83,7 @@ class State:
             square = float(unit.dot(unit))
             if abs(square - 1.0) > 1e-12:
                 unit /= square**0.5
-        # Indices are right by construction: no need for the slower mode that checks them.
+        # Indices are valid by construction, and the mode that checks them is slower.
         self.q.take(self._index, out=self._joints, mode="clip")
         np.subtract(self._upper, self._joints, out=self._above)
         np.subtract(self._joints, self._lower, out=self._below)
@@ -95,7 +95,7 @@ class State:
         return self
 
     def push(self, force: Array | None) -> None:
-        """Set the measured force (3) or wrench (6) on the robot, world axes; ``None``: there is none."""
+        """Set the measured force (3) or wrench (6) on the robot, world axes; ``None`` removes it."""
         if force is None and not self.pushed:
             return
         self.force[:] = 0.0
@@ -106,10 +106,10 @@ class State:
             self.force[: force.size] = force
 
     def at(self, point: Point) -> PointState:
-        """Kinematics of one of the points given to the constructor.
+        """Return the kinematics of a point given to the constructor.
 
         Raises:
-            InputError: The point is none of them.
+            InputError: The point was not given.
         """
         try:
             return self._views[point]
@@ -123,7 +123,7 @@ class State:
 
     @property
     def base_rotation(self) -> Array:
-        """World from base, shape (3, 3); a view.
+        """Rotation of the base, world from base, shape (3, 3); a view.
 
         Raises:
             InputError: The base is fixed.
@@ -131,10 +131,10 @@ class State:
         return self._floating_base()[0]
 
     def center_of_mass(self) -> tuple[Array, Array, Array]:
-        """World position, shape (3,), Jacobian, shape (3, nv), and drift ``J̇ν``, shape (3,), of the center of mass.
+        """Return position (3,), Jacobian (3, nv) and drift ``J̇ν`` (3,) of the center of mass in the world.
 
-        For a floating base they stand in ``M`` and ``h``: the base's linear rows are the linear momentum in base
-        axes, ``m J_com = R M[:3]``, and ``m J̇_com ν = R h[:3] + m g``.
+        For a floating base, ``M`` and ``h`` hold them, because the base's linear rows are the linear momentum in base
+        axes: ``m J_com = R M[:3]`` and ``m J̇_com ν = R h[:3] + m g``.
 
         Raises:
             InputError: The base is fixed.
@@ -147,12 +147,12 @@ class State:
         return self._com
 
     def displaced(self, step: float) -> State:
-        """Another state at ``(q ⊕ step·ν, ν)``, for finite differences along the motion."""
+        """Return another state at ``(q ⊕ step·ν, ν)``, for finite differences along the motion."""
         if self._aside is None:
             self._aside = State(self.robot, self.points)
         return self._aside.update(pin.integrate(self._model, self.q, step * self.v), self.v)
 
     def _floating_base(self) -> tuple[Array, Array]:
         if self._base is None:
-            raise InputError("the base is fixed", where=self.robot.name, hint="use this on a floating base only")
+            raise InputError("the base is fixed", where=self.robot.name, hint="use a robot with a floating base")
         return self._base

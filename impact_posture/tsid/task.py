@@ -1,58 +1,60 @@
-"""What a task is: an error and a Jacobian; everything else is derived once, here."""
+"""Base classes of tasks: a task defines an error and a Jacobian, and everything else is derived here."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from itertools import pairwise
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.errors import InputError
 from impact_posture.tsid.points import Point
+from impact_posture.tsid.qp import stacked_rows
 from impact_posture.tsid.state import State
 
 Array = NDArray[np.float64]
+Target = TypeVar("Target")
 
-# Central differences along the motion, seconds: truncation and rounding are both far below a tick's tolerance.
+# Time step of central differences along the motion, s.  Truncation and rounding stay far below a tick's tolerance.
 _STEP = 1e-4
 
 
 class Task(ABC):
-    """An output ``y(q)`` that is to accelerate with ``ÿ* = ÿ_des + K_p e + K_d (ẏ_des − Jν)``.
+    """Accelerate an output ``y(q)`` with ``ÿ* = ÿ_des + K_p e + K_d (ẏ_des − Jν)``.
 
-    Define a task by two methods, :meth:`error` and :meth:`jacobian`.  :meth:`drift` (``J̇ν``) is then computed by
-    central differences of the Jacobian along the motion, at the price of two more evaluations of the kinematics;
-    override it to save them.  A controller takes gains and weights over at ``reset``; targets at every tick.
+    A task defines two methods, :meth:`error` and :meth:`jacobian`.  By default, :meth:`drift` computes ``J̇ν`` by
+    central differences of the Jacobian along the motion, which costs two more evaluations of the kinematics.
+    Override it to save them.  A controller reads gains and weights at ``reset``, and targets at every tick.
 
     Attributes:
-        name: What it is called in reports.
-        size: Rows k.
-        points: The points of the robot that it looks at; the state follows them.
+        name: Name in reports.
+        size: Number of rows k.
+        points: Points of the robot whose kinematics the task reads from the state.
         kp: Stiffness, 1/s², shape (k,).
         kd: Damping, 1/s, shape (k,).
-        weight: In a weighted cost, shape (k,).
+        weight: Weight in the cost of a weighted formulation, shape (k,).
     """
 
     points: Sequence[Point] = ()
     constant = False
-    """Whether ``J`` never changes and ``J̇ν`` is zero: a stack then asks for them once."""
+    """Whether ``J`` never changes and ``J̇ν`` is zero.  A stack then evaluates them only once."""
 
     def __init__(
         self, name: str, size: int, *, kp: ArrayLike = 0.0, kd: ArrayLike | None = None, weight: ArrayLike = 1.0
     ) -> None:
-        """Set gains and weight; each is one number or one a row.
+        """Set gains and weight; each is one number, or one number per row.
 
         Args:
-            name: What it is called in reports.
-            size: Rows k.
+            name: Name in reports.
+            size: Number of rows k.
             kp: Stiffness, 1/s².
-            kd: Damping, 1/s; critical, ``2√kp``, by default.
-            weight: In a weighted cost.
+            kd: Damping, 1/s; critical damping ``2√kp`` by default.
+            weight: Weight in the cost of a weighted formulation.
 
         Raises:
-            InputError: A gain or weight that is negative, not finite or of another shape.
+            InputError: A gain or weight is negative, is not finite, or has another shape.
         """
         self.name, self.size = name, size
         self.kp = gain(kp, size, f"{name}: kp")
@@ -62,20 +64,20 @@ class Task(ABC):
 
     @abstractmethod
     def error(self, state: State) -> Array:
-        """``e``, shape (k,): where ``y`` should go from here, so that ``ė = ẏ_des − Jν`` to first order."""
+        """Return ``e``, shape (k,): the way from ``y`` to its target, so that ``ė = ẏ_des − Jν`` to first order."""
 
     @abstractmethod
     def jacobian(self, state: State) -> Array:
-        """``J`` with ``ẏ = Jν``, shape (k, nv)."""
+        """Return ``J`` with ``ẏ = Jν``, shape (k, nv)."""
 
     def drift(self, state: State) -> Array:
-        """``J̇ν``, shape (k,)."""
+        """Return ``J̇ν``, shape (k,)."""
         ahead = np.array(self.jacobian(state.displaced(_STEP)))
         behind = np.array(self.jacobian(state.displaced(-_STEP)))
         return np.asarray((ahead - behind) @ state.v / (2 * _STEP))
 
     def feedforward(self, state: State) -> Array | None:
-        """What is added to ``ÿ*`` beside target and feedback, shape (k,); nothing by default."""
+        """Return a term that is added to ``ÿ*``, shape (k,); ``None`` by default."""
         return None
 
     @property
@@ -97,48 +99,95 @@ class Task(ABC):
         self._acceleration[:] = value
 
     def desired(self, state: State) -> Array:
-        """``ÿ*``, shape (k,)."""
+        """Return ``ÿ*``, shape (k,)."""
         wanted = self._acceleration + self.kp * self.error(state)
         wanted += self.kd * (self._velocity - self.jacobian(state) @ state.v)
         more = self.feedforward(state)
         return wanted if more is None else wanted + more
 
-    def reset(self, state: State) -> None:  # noqa: B027 - a task may have nothing to begin
-        """Begin anew at ``state``: a task without a target takes the present as its own."""
+    def reset(self, state: State) -> None:  # noqa: B027 - many tasks have nothing to reset
+        """Start again at ``state``.  A task without a target takes the present output as its target."""
 
-    def advance(self, state: State, dt: float) -> None:  # noqa: B027 - nor to go on with
-        """Let ``dt`` seconds pass in what the task remembers; nothing by default."""
+    def advance(self, state: State, dt: float) -> None:  # noqa: B027 - many tasks keep no memory
+        """Advance internal memory, such as ramps, by ``dt`` seconds; does nothing by default."""
 
     def bind(self, velocity: Array, acceleration: Array) -> None:
-        """Keep the targets in a stack's buffers from now on, so that a tick copies nothing."""
+        """Move the targets into the buffers of a stack, so that a tick copies nothing."""
         velocity[:], acceleration[:] = self._velocity, self._acceleration
         self._velocity, self._acceleration = velocity, acceleration
 
 
-class TaskStack:
-    """Tasks one below the other: ``J ν̇ = a`` with ``a = ÿ* − J̇ν``, updated once a tick.
+class TargetTask(Task, Generic[Target]):
+    """Base of the tasks that lead an output to a target, by default to the output at ``reset``.
+
+    A subclass defines ``title`` and ``rows``, its default name and its size.
 
     Attributes:
-        tasks: From the top.
-        rows: Where each task stands.
-        size: Rows altogether.
-        J: Shape (size, nv); may be part of a larger matrix.
+        target: Target of the output.
+    """
+
+    title: str
+    rows: int
+
+    def __init__(
+        self,
+        *,
+        name: str | None = None,
+        kp: ArrayLike = 100.0,
+        kd: ArrayLike | None = None,
+        weight: ArrayLike = 1.0,
+    ) -> None:
+        super().__init__(name or self.title, self.rows, kp=kp, kd=kd, weight=weight)
+        self.target: Target | None = self.default_target()
+
+    def default_target(self) -> Target | None:
+        """Return the target before any ``reset``; ``None`` by default."""
+        return None
+
+    @abstractmethod
+    def present(self, state: State) -> Target:
+        """Return the output at ``state`` as a target that does not change with the state."""
+
+    def reset(self, state: State) -> None:
+        """Take the present output as target, unless a target is set.
+
+        Raises:
+            InputError: The task needs a floating base, and the base is fixed.
+        """
+        if self.target is None:
+            self.target = self.present(state)
+
+    def required_target(self) -> Target:
+        """Return the target.
+
+        Raises:
+            InputError: There is none yet.
+        """
+        if self.target is None:
+            raise InputError("has no target", where=self.name, hint="set `target`, or reset the controller first")
+        return self.target
+
+
+class TaskStack:
+    """Stack tasks to ``J ν̇ = a`` with ``a = ÿ* − J̇ν``, updated once a tick.
+
+    Attributes:
+        tasks: Tasks from top to bottom.
+        rows: Rows of each task.
+        size: Number of all rows.
+        J: Shape (size, nv); may be a view on a larger matrix.
         a: Shape (size,).
         weight: Shape (size,).
     """
 
     def __init__(self, tasks: Sequence[Task], nv: int, J: Array | None = None) -> None:
-        ends = np.cumsum([0, *(task.size for task in tasks)])
         self.tasks = tuple(tasks)
-        self.rows = tuple(slice(int(b), int(e)) for b, e in pairwise(ends))
-        self.size = int(ends[-1])
+        self.rows, self.size = stacked_rows(task.size for task in tasks)
         self.J = np.zeros((self.size, nv)) if J is None else J
-        self.a, self._e = np.zeros(self.size), np.zeros(self.size)
-        self._drift, self._work = np.zeros(self.size), np.zeros(self.size)
-        self._yd, self._ydd = np.zeros(self.size), np.zeros(self.size)
+        self.a, self._e, self._drift, self._work, self._yd, self._ydd = np.zeros((6, self.size))
         for task, rows in zip(self.tasks, self.rows, strict=True):
             task.bind(self._yd[rows], self._ydd[rows])
-        # What the loop over the tasks writes into, sliced once.
+        # Views that the loop over the tasks writes into, sliced only once.
         self._parts = [
             (task, self.J[rows], self._e[rows], self._drift[rows], self.a[rows])
             for task, rows in zip(self.tasks, self.rows, strict=True)
@@ -146,7 +195,7 @@ class TaskStack:
         self.refresh()
 
     def refresh(self, state: State | None = None) -> None:
-        """Take gains and weights from the tasks; Jacobians that never change at ``state``."""
+        """Read gains and weights of the tasks, and evaluate the Jacobians at ``state`` if it is given."""
         if state is not None:
             for task, J, *_ in self._parts:
                 J[:] = task.jacobian(state)
@@ -178,16 +227,16 @@ class TaskStack:
                 part += more
 
     def residuals(self, acceleration: Array) -> dict[str, Array]:
-        """``ÿ − ÿ*`` of each task at ``ν̇``, by name."""
+        """Return ``ÿ − ÿ*`` of each task at ``ν̇``, by task name."""
         left = self.J @ acceleration - self.a
         return {task.name: left[rows] for task, rows in zip(self.tasks, self.rows, strict=True)}
 
 
 def gain(value: ArrayLike, size: int, where: str) -> Array:
-    """One number or one a row, as an array of ``size``; finite and not negative.
+    """Return one number, or one number per row, as an array of ``size`` finite and non-negative numbers.
 
     Raises:
-        InputError: Otherwise.
+        InputError: The value has another shape, is negative, or is not finite.
     """
     given = np.asarray(value, dtype=float)
     if given.shape not in ((), (size,)):

@@ -1,4 +1,4 @@
-"""What a controller is asked to do: tasks in strict levels, tasks by weight, a posture, contacts and limits."""
+"""Formulation of a controller: tasks in strict levels, tasks by weight, a posture, contacts and limits."""
 
 from __future__ import annotations
 
@@ -15,20 +15,22 @@ from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.task import Task
 
+Order = Literal["strict", "weighted"]
+
 
 @dataclass(frozen=True, eq=False)
 class TaskFormulation:
-    """One kind of TSID.
+    """Tasks, contacts and limits that a controller solves for at each tick.
 
     Attributes:
         levels: Tasks that hold as equalities, the most important level first (Afifi et al. 2026, Problems 2 and 3).
         weighted: Tasks in the cost, ``Σ wᵢ‖ÿᵢ − ÿᵢ*‖²`` (Problem 1).
-        posture: The posture task, in the cost: ``‖ν̇ − ν̇*‖²_W``.
-        contacts: What stands on the ground.
-        force_point: Where a measured contact force acts; ``None``: it is left out of the dynamics.
-        law: How joints are stopped at their limits; ``None``: nothing limits the accelerations.
-        force_weight: Of contact forces in the cost, 1/N² (a hundred times that for moments, 1/(N·m)²).
-        spare_weight: Of what more rotors than needed leave to choose, 1/N².
+        posture: Posture task, in the cost: ``‖ν̇ − ν̇*‖²_W``.
+        contacts: Contacts with the ground.
+        force_point: Point where a measured contact force acts; ``None`` leaves the force out of the dynamics.
+        law: Law that stops joints at their limits; ``None`` leaves the accelerations unlimited.
+        force_weight: Weight of contact forces in the cost, 1/N² (a hundred times that for moments, 1/(N·m)²).
+        spare_weight: Weight of the choice that redundant rotors leave, 1/N².
     """
 
     levels: tuple[tuple[Task, ...], ...] = ()
@@ -41,13 +43,13 @@ class TaskFormulation:
     spare_weight: float = 1e-3
 
     def __post_init__(self) -> None:
-        """Refuse a program without anything to do, and names that stand for two tasks."""
+        """Refuse a formulation without tasks, two tasks of the same name, and weights that are not positive."""
         names = [task.name for task in self.tasks]
         if not names:
             raise InputError("has no task", where="program", hint="give tasks or a posture")
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise InputError(f"two tasks are called '{twice[0]}'", where="program", hint="name them apart")
+            raise InputError(f"two tasks are called '{twice[0]}'", where="program", hint="rename one of them")
         if not (self.force_weight > 0 and self.spare_weight > 0):
             raise InputError("a weight is not positive", where="program", hint="give positive weights")
 
@@ -59,7 +61,7 @@ class TaskFormulation:
 
     @property
     def points(self) -> tuple[Point, ...]:
-        """All points that the state must follow, contacts first."""
+        """All points whose kinematics the state must hold, contacts first."""
         found = [c.point for c in self.contacts] + [p for task in self.tasks for p in task.points]
         if self.force_point is not None:
             found.append(self.force_point)
@@ -72,19 +74,20 @@ def aerial_formulation(
     *,
     end_effector: EndEffector | None = None,
     tilt: Tilt | None = None,
-    order: Literal["strict", "weighted"] = "strict",
+    order: Order = "strict",
     law: LimitLaw | None = LimitLaw(),
 ) -> TaskFormulation:
-    """The paper's stack for an aerial manipulator: tilt, then end effector, then posture.
+    """Return the paper's stack for an aerial manipulator: tilt, then end effector, then posture.
 
     Args:
         robot: The robot; the end effector is its default contact frame.
         posture: Nominal (:class:`JointPosture`), or impact-robust.
-        end_effector: Instead of a pose with ``kp = 60``; the measured force acts at its point.
-        tilt: Instead of one with ``kp = 100``.
-        order: ``strict``: tilt and end effector as equalities (Problems 2 and 3).  ``weighted``: all in the cost,
-            with the tasks' own weights (Problem 1).
-        law: Of the joint limits.
+        end_effector: Task of the end effector, by default a pose with ``kp = 60``; the measured force acts at its
+            point.
+        tilt: Task of the tilt, by default with ``kp = 100``.
+        order: ``strict`` makes tilt and end effector equalities (Problems 2 and 3).  ``weighted`` puts all tasks into
+            the cost, with their own weights (Problem 1).
+        law: Law of the joint limits.
 
     Raises:
         InputError: The robot does not fly, or has no default contact frame.
@@ -93,12 +96,7 @@ def aerial_formulation(
         raise InputError("the base is fixed", where=robot.name, hint="use arm_formulation")
     if robot.spec.propulsion is None:
         raise InputError("has no propellers", where=robot.name, hint="name [propulsion] in robot.toml")
-    end_effector = end_effector or _end_effector(robot)
-    tilt = tilt or Tilt()
-    point = end_effector.point
-    if order == "strict":
-        return TaskFormulation(((tilt,), (end_effector,)), (), posture, force_point=point, law=law)
-    return TaskFormulation((), (tilt, end_effector), posture, force_point=point, law=law)
+    return _manipulator(robot, (tilt or Tilt(),), end_effector, posture, order, law)
 
 
 def arm_formulation(
@@ -106,26 +104,25 @@ def arm_formulation(
     posture: JointPosture,
     *,
     end_effector: EndEffector | None = None,
-    order: Literal["strict", "weighted"] = "strict",
+    order: Order = "strict",
     law: LimitLaw | None = LimitLaw(),
 ) -> TaskFormulation:
-    """The same stack for an arm on a fixed base, which has no tilt: end effector, then posture.
+    """Return the stack of :func:`aerial_formulation` without the tilt, for an arm on a fixed base.
 
     Args:
         robot: The robot; the end effector is its default contact frame.
         posture: Nominal or impact-robust.
-        end_effector: Instead of a pose with ``kp = 60``; the measured force acts at its point.
-        order: ``strict``: the end effector as an equality.  ``weighted``: in the cost, with its own weight.
-        law: Of the joint limits.
+        end_effector: Task of the end effector, by default a pose with ``kp = 60``; the measured force acts at its
+            point.
+        order: ``strict`` makes the end effector an equality; ``weighted`` puts it into the cost, with its own weight.
+        law: Law of the joint limits.
 
     Raises:
         InputError: The base floats, or the robot has no default contact frame.
     """
     if robot.floating:
         raise InputError("the base floats", where=robot.name, hint="use aerial_formulation or legged_formulation")
-    task = end_effector or _end_effector(robot)
-    levels, weighted = (((task,),), ()) if order == "strict" else ((), (task,))
-    return TaskFormulation(levels, weighted, posture, force_point=task.point, law=law)
+    return _manipulator(robot, (), end_effector, posture, order, law)
 
 
 def legged_formulation(
@@ -140,18 +137,18 @@ def legged_formulation(
     force_point: Point | None = None,
     law: LimitLaw | None = LimitLaw(),
 ) -> TaskFormulation:
-    """The paper's stack for a standing robot: contacts and friction, center of mass, base orientation, posture.
+    """Return the paper's stack for a standing robot: contacts, center of mass, base orientation, posture.
 
     Args:
         robot: The robot; it stands on the supports of its ``robot.toml``.
-        posture: Nominal or impact-robust; its weight says how it compares with the others (10 and 1).
+        posture: Nominal or impact-robust; its weight compares with those of center of mass and base (10 and 1).
         kp: Stiffness of center of mass and base orientation, 1/s².
         friction: Coulomb coefficient of the ground.
-        center_of_mass: Instead of one with weight 10.
-        base: Instead of one with weight 1.
-        contacts: Instead of the robot's supports.
-        force_point: Where a measured contact force acts that is none of the feet's; ``None``: it is left out.
-        law: Of the joint limits.
+        center_of_mass: Task of the center of mass, by default with weight 10.
+        base: Task of the base orientation, by default with weight 1.
+        contacts: Contacts, by default the robot's supports.
+        force_point: Point where a measured contact force acts, apart from the feet; ``None`` leaves the force out.
+        law: Law of the joint limits.
 
     Raises:
         InputError: The robot has no supports.
@@ -168,8 +165,20 @@ def legged_formulation(
     return TaskFormulation((), weighted, posture, contacts, force_point, law)
 
 
-def _end_effector(robot: Robot) -> FramePose:
+def _manipulator(
+    robot: Robot,
+    above: tuple[Task, ...],
+    end_effector: EndEffector | None,
+    posture: JointPosture,
+    order: Order,
+    law: LimitLaw | None,
+) -> TaskFormulation:
+    """Return the stack of the tasks ``above``, the end effector and the posture, one task per strict level."""
     frame = robot.spec.contact.frame
-    if frame is None:
-        raise InputError("has no default contact frame", where=robot.name, hint="give the end effector's task")
-    return FramePose(Point(frame), kp=60.0)
+    if end_effector is None:
+        if frame is None:
+            raise InputError("has no default contact frame", where=robot.name, hint="give the end effector's task")
+        end_effector = FramePose(Point(frame), kp=60.0)
+    tasks = (*above, end_effector)
+    levels, weighted = (tuple((task,) for task in tasks), ()) if order == "strict" else ((), tasks)
+    return TaskFormulation(levels, weighted, posture, force_point=end_effector.point, law=law)

@@ -1,4 +1,4 @@
-"""A QP with a large dense cost in the coordinates in which its Hessian is the identity."""
+"""Solver of QPs with a large dense cost, in coordinates that make the Hessian the identity."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from impact_posture.tsid.qp import QP, Solved
 class WhitenedSolver:
     """DAQP behind a change of variables ``y = Rz``, ``H = RᵀR``, made by LAPACK.
 
-    DAQP brings every program to that form itself, in plain loops, which is most of its time on a humanoid's; the same
-    by LAPACK and one matrix product takes half as long.  Bounds on the dense variables become rows.  The rest of
-    ``H`` must be diagonal.
+    DAQP brings every program to this form by plain loops, which take most of its time for a humanoid.  LAPACK and one
+    matrix product take half as long.  Bounds on the dense variables become rows.  The rest of ``H`` must be diagonal.
     """
 
     def __init__(self, n: int, m: int, dense: int) -> None:
@@ -22,17 +21,17 @@ class WhitenedSolver:
         self._n, self._dense = n, dense
         self._inner = DaqpSolver(n, dense + m)
         self._qp = QP.empty(n, dense + m)
-        # R⁻¹ over A R⁻¹, and where they stand in the whitened rows.
+        # Places of R⁻¹ and, below it, of A R⁻¹ in the whitened rows.
         self._bounds, self._rows = self._qp.A[:dense, :dense], self._qp.A[dense:, :dense]
         self._others = self._qp.A[dense:, dense:]
         self._failed = False
 
     def reset(self) -> None:
-        """Forget what earlier solutions left for a warm start."""
+        """Discard what earlier solutions left for a warm start."""
         self._inner.reset()
 
     def solve(self, qp: QP) -> Solved | None:
-        """The solution, or ``None``."""
+        """Return the solution, or ``None``."""
         n, d, white = self._n, self._dense, self._qp
         R, failed = dpotrf(qp.H[:d, :d])
         self._failed = failed != 0

@@ -15,14 +15,14 @@ _LEVELS = 7
 
 
 def difference_gradient(value: Callable[[Vector], float], model: pin.Model, q: Vector) -> Vector:
-    """``d/dε value(q ⊕ ε e_i)``, shape (nv,), by Ridders' extrapolation of central differences.
+    """Return ``d/dε value(q ⊕ ε e_i)``, shape (nv,), by Ridders' extrapolation of central differences.
 
-    Each entry is the one of its tableau that differs least from its neighbors, so that steps need no tuning: neither
+    Each entry is the one of its tableau that differs least from its neighbors.  So the steps need no tuning, neither
     to stiff supports nor to a flat direction (Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)").
 
     Args:
         value: The function.
-        model: What ``⊕`` means.
+        model: The model that defines ``⊕``.
         q: Configuration, shape (nq,).
     """
     directions = np.eye(model.nv)

@@ -1,4 +1,4 @@
-"""Random postures and normals to compare at."""
+"""Random postures and normals for comparisons."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One place to compare at.
+    """A configuration and a normal.
 
     Attributes:
         q: Configuration, shape (nq,).
@@ -27,12 +27,12 @@ class Sample:
 
 
 def random_samples(robot: Robot, count: int, seed: int, normal: Vector | None = None) -> tuple[Sample, ...]:
-    """Random postures, each with a random normal; the same for the same seed.
+    """Return random postures, each with a random normal; one seed gives one result.
 
-    The first has ``normal``, shape (3,), where one is given.
+    The first sample has ``normal``, shape (3,), if it is given.
 
-    Joints are uniform within their limits.  Where there is none: angles within ±π, lengths within 1 m of the default
-    posture, orientations uniform.  A limit that is missing on one side lies as far from the default posture.
+    Joints are uniform within their limits.  Without limits, angles are within ±π and lengths within 1 m of the
+    default posture, and orientations are uniform.  A limit missing on one side lies as far from the default posture.
     """
     generator, chart = np.random.default_rng(seed), Chart(robot.model)
     start = chart.to_x(robot.posture())
@@ -56,6 +56,6 @@ def random_samples(robot: Robot, count: int, seed: int, normal: Vector | None = 
 
 
 def _direction(generator: np.random.Generator, size: int) -> Vector:
-    """A unit vector, uniform on the sphere."""
+    """Return a unit vector, uniform on the sphere."""
     vector = generator.normal(size=size)
     return np.asarray(vector / np.linalg.norm(vector))

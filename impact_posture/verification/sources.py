@@ -1,4 +1,4 @@
-"""The ways of computing an impact: each gives the same numbers at a sample by other means."""
+"""Sources that compute the same quantities of an impact by different means."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.codegen.build_check import compiled
 from impact_posture.codegen.export import export
+from impact_posture.codegen.functions import casadi_reference, oracle_along
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.dynamics.mjcf_numeric import MujocoNumeric
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.libraries import build_library, load_library
 from impact_posture.output_folder import scratch_folder
 from impact_posture.verification.differences import difference_gradient
 from impact_posture.verification.samples import Sample
@@ -24,11 +24,11 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """What one way computes at one sample, by quantity: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M``, ``J``.
+    """Quantities of one source at one sample: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M``, ``J``.
 
     Attributes:
-        values: Arrays by quantity; a way need not have all.
-        scales: By quantity, what an error is relative to if that is more than the quantity's largest entry.
+        values: Array of each quantity; a source need not have all.
+        scales: Least scale of the relative error of each quantity; its largest entry replaces a smaller scale.
     """
 
     values: dict[str, Vector]
@@ -37,14 +37,14 @@ class Numbers:
 
 Source = Callable[[Sample], Numbers]
 
-# Where n lies across the ways the contact can move, H, G and ∇H vanish: they count relative to this part of their
-# largest value over all normals.
+# H, G and ∇H vanish where the contact cannot move along n.  Their errors are relative to this share of their largest
+# value over all normals.
 _FLOOR = 1e-3
 
 
 def pinocchio_numbers(objective: ImpactObjective, sample: Sample) -> Numbers:
-    """The reference: Pinocchio's ``M``, ``J`` and derivatives, dense linear algebra."""
-    oracle = _oracle(objective, sample)
+    """Return the reference, from ``M``, ``J`` and derivatives of Pinocchio by dense linear algebra."""
+    oracle = oracle_along(objective, sample.normal)
     found = oracle.quantities(sample.q)
     values = {
         "H": np.array([found.H]),
@@ -59,8 +59,8 @@ def pinocchio_numbers(objective: ImpactObjective, sample: Sample) -> Numbers:
 
 
 def pinocchio_differences(objective: ImpactObjective, sample: Sample) -> Numbers:
-    """``∇H`` from Pinocchio's values of ``H`` alone."""
-    oracle = _oracle(objective, sample)
+    """Return ``∇H`` as finite differences of ``H`` from Pinocchio."""
+    oracle = oracle_along(objective, sample.normal)
 
     def value(q: Vector) -> float:
         oracle.at(q)
@@ -70,71 +70,59 @@ def pinocchio_differences(objective: ImpactObjective, sample: Sample) -> Numbers
     return Numbers({"∇H": difference_gradient(value, objective.robot.model, sample.q)})
 
 
-def _oracle(objective: ImpactObjective, sample: Sample) -> ImpactOracle:
-    x, y, z = (float(v) for v in sample.normal)
-    contact = replace(objective.contact, normal=(x, y, z))
-    return ImpactOracle(replace(objective.case, contact=contact))
-
-
 def casadi_source(objective: ImpactObjective) -> Source:
-    """CasADi's interpreter of the symbolic kernel."""
-    k = objective.kernel
-    outputs = {"H": k.H, "G": k.G, "Λ_c": k.ellipsoid, "∇H": k.grad_H}
-    fun = ca.Function("all", [k.q, k.n], list(outputs.values()), {"cse": True})
-
-    def numbers(sample: Sample) -> Numbers:
-        found = fun(sample.q, sample.normal)
-        shapes = {"Λ_c": (3, 3)}
-        return Numbers({
-            name: np.array(value, dtype=float).reshape(shapes.get(name, (-1,)))
-            for name, value in zip(outputs, found, strict=True)
-        })  # fmt: skip
-
-    return numbers
+    """Return the source of the symbolic kernel, interpreted by CasADi."""
+    reference = casadi_reference(_impulse(objective))
+    return lambda sample: _named(reference(sample.q, sample.normal))
 
 
 @contextmanager
 def compiled_source(objective: ImpactObjective) -> Iterator[Source]:
-    """The C export, built by the user's compiler in a temporary folder.
+    """Yield the source of the C export, built by the user's compiler in a temporary folder.
 
     Raises:
-        CompilerError: No compiler, or it failed.
+        CompilerError: There is no compiler, or it failed.
     """
-    # The export's H and ∇H are the same whatever the objective; this one exists everywhere.
-    objective, robot, prefix = replace(objective, kind="impulse"), objective.robot, "verified"
     with scratch_folder() as folder:
-        export(objective, folder, prefix=prefix, check=False)
-        with compiled(folder, prefix, robot.nq, robot.nv) as library:
+        made = export(_impulse(objective), folder, prefix="verified", check=False)
+        compiled = ImpactGradient(load_library(build_library(folder, made.prefix)), made.manifest)
 
-            def numbers(sample: Sample) -> Numbers:
-                code, H, gradient = library.eval(sample.q, sample.normal)
-                jump_code, _, G, _ = library.jump(sample.q, sample.normal)
-                ellipsoid_code, ellipsoid = library.ellipsoid(sample.q)
-                return Numbers({
-                    "H": _accepted(code, np.array([H])),
-                    # Code 3: V does not exist where G is zero; G does, and the comparison refuses what is not finite.
-                    "G": _accepted(0 if jump_code == 3 else jump_code, np.array([G])),
-                    "Λ_c": _accepted(ellipsoid_code, ellipsoid),
-                    "∇H": _accepted(code, gradient),
-                })  # fmt: skip
+        def numbers(sample: Sample) -> Numbers:
+            values: dict[str, Vector] = {}
+            for function, names in _RESULTS.items():
+                code, results = compiled.call(function, sample.q, sample.normal)
+                # Code 3 of jump says that V does not exist, because G is zero.  G does exist.
+                good = code == 0 or (function, code) == ("jump", 3)
+                for name, result in zip(names, results, strict=True):
+                    values[name] = result.copy() if good else np.full(result.shape, np.nan)
+            return _named(values)
 
-            yield numbers
+        yield numbers
 
 
-def _accepted(code: int, values: Vector) -> Vector:
-    """The values of a call that returned 0; no numbers where the code refused its input."""
-    return values if code == 0 else np.full(values.shape, np.nan)
+_RESULTS = {"eval": ("H", "grad"), "jump": ("jump", "G", "V"), "ellipsoid": ("ellipsoid",)}
+
+
+def _impulse(objective: ImpactObjective) -> ImpactObjective:
+    """Return the objective that exists everywhere; it has the same ``H`` and ``∇H``."""
+    return replace(objective, kind="impulse")
+
+
+def _named(values: dict[str, Vector]) -> Numbers:
+    return Numbers(
+        {"H": values["H"], "G": values["G"], "Λ_c": values["ellipsoid"].reshape(3, 3), "∇H": values["grad"]}
+    )
 
 
 class MujocoSource:
-    """MuJoCo's ``M`` and ``J``, and what follows from them by one dense solve."""
+    """``M`` and ``J`` from MuJoCo, and what follows from them by one dense solve."""
 
     def __init__(self, objective: ImpactObjective) -> None:
         self._objective = objective
         self._numeric = MujocoNumeric(objective.robot.model)
 
     def __call__(self, sample: Sample) -> Numbers:
-        """Numbers at one sample; ``∇H`` by differences of MuJoCo's own ``H``."""
+        """Return the numbers at one sample; ``∇H`` by finite differences of this ``H``."""
 
         def value(q: Vector) -> float:
             return float(self._values(q, sample.normal)["H"][0])

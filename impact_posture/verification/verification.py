@@ -1,18 +1,20 @@
-"""Compare every way of computing an impact with Pinocchio's numbers."""
+"""Compare every source of the quantities of an impact with the numbers of Pinocchio."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
+from impact_posture.codegen.build_check import Deviation, deviation
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
-from impact_posture.toolchain import find_compiler
+from impact_posture.toolchain import GET_ONE, find_compiler
 from impact_posture.verification.samples import random_samples
 from impact_posture.verification.sources import (
     MujocoSource,
@@ -23,10 +25,10 @@ from impact_posture.verification.sources import (
     pinocchio_differences,
     pinocchio_numbers,
 )
-from impact_posture.verification.verification_report import Deviation, Row, VerificationReport, deviation
+from impact_posture.verification.verification_report import Row, VerificationReport
 
 CASADI, COMPILED, DIFFERENCES, MUJOCO = "CasADi", "compiled C", "finite differences", "MuJoCo"
-NO_COMPILER = "no C compiler: install gcc or clang, or set CC"
+NO_COMPILER = f"no C compiler: {GET_ONE}"
 
 
 @dataclass(frozen=True)
@@ -34,9 +36,9 @@ class Tolerances:
     """Largest relative errors that pass.
 
     Attributes:
-        model: Of MuJoCo's ``M`` and ``J``: the same rigid bodies, no system solved.
-        values: Of ``H``, ``G``, ``Λ_c``, and of gradients by adjoints.
-        differences: Of gradients by finite differences.
+        model: For ``M`` and ``J`` from MuJoCo, which has the same rigid bodies and solves no system.
+        values: For ``H``, ``G``, ``Λ_c``, and gradients by adjoints.
+        differences: For gradients by finite differences.
     """
 
     model: float = 1e-9
@@ -45,7 +47,7 @@ class Tolerances:
 
     @staticmethod
     def of(objective: ImpactObjective) -> Tolerances:
-        """The tolerances in force: heavy feet at compliance ε make a system of condition 1/ε, which costs digits."""
+        """Return the tolerances.  Feet at compliance ε make a system of condition 1/ε, which costs digits."""
         return Tolerances(values=1e-7, differences=1e-6) if objective.supports else Tolerances()
 
 
@@ -55,27 +57,28 @@ def verify(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> VerificationReport:
-    """Compare ``H``, ``G``, ``Λ_c`` and ``∇H`` from every way there is with Pinocchio's numbers.
+    """Compare ``H``, ``G``, ``Λ_c`` and ``∇H`` from every source with the numbers of Pinocchio.
 
-    The ways: CasADi's interpreter; the compiled C export, where a compiler is there; ``∇H`` by finite differences of
-    Pinocchio's ``H``; MuJoCo's ``M`` and ``J`` of a model written out of the same ``pin.Model``, where it is
-    installed, and ``∇H`` by finite differences of the ``H`` that follows from them.
+    The sources are the interpreter of CasADi, the compiled C export if a compiler is there, ``∇H`` by finite
+    differences of ``H`` from Pinocchio, and MuJoCo if it is installed.  MuJoCo gives ``M`` and ``J`` of a model from
+    the same ``pin.Model``, and ``∇H`` is by finite differences of the ``H`` that follows.
 
-    A quantity's error is relative to its largest entry; ``H``, ``G`` and ``∇H``, which vanish where the contact
-    cannot move along the normal, at least to a thousandth of the largest entry of ``Λ_c`` (``G``: of ``JM⁻¹Jᵀ``).
+    The error of a quantity is relative to its largest entry.  ``H``, ``G`` and ``∇H`` vanish where the contact cannot
+    move along the normal.  So their scale is at least a thousandth of the largest entry of ``Λ_c`` (for ``G`` of
+    ``JM⁻¹Jᵀ``).
 
     Args:
         objective: Robot, contact, metric and supports.
-        samples: How many random postures and normals; the first normal is the contact's.
-        seed: Of the samples.
-        progress: Called with comparisons done and comparisons in all.
+        samples: Number of random postures and normals; the first normal is that of the contact.
+        seed: Seed of the samples.
+        progress: Receives the number of comparisons done and in all.
 
     Raises:
-        InputError: No sample, or a negative seed.
-        CompilerError: There is a compiler and it failed: its words and the command.
+        InputError: There is no sample, or the seed is negative.
+        CompilerError: The compiler failed; with its words and the command.
     """
     if samples < 1:
-        raise InputError(f"asked for {samples}", where="--samples", hint="give one or more")
+        raise InputError(f"the number of samples is {samples}", where="--samples", hint="give one or more")
     if seed < 0:
         raise InputError(f"the seed is {seed}", where="--seed", hint="give zero or more")
     drawn = random_samples(objective.robot, samples, seed, np.array(objective.contact.normal))
@@ -84,37 +87,36 @@ def verify(
     values = dict.fromkeys(("H", "G", "Λ_c", "∇H"), allowed.values)
     of_mujoco = {"M": allowed.model, "J": allowed.model} | values | {"∇H": allowed.differences}
     with ExitStack() as stack:
-        ways: list[_Way] = [_Way(CASADI, values, casadi_source(objective))]
+        candidates: list[_Candidate] = [_Candidate(CASADI, values, casadi_source(objective))]
         if find_compiler() is None:
-            ways.append(_Way(COMPILED, values, note=NO_COMPILER))
+            candidates.append(_Candidate(COMPILED, values, note=NO_COMPILER))
         else:
-            ways.append(_Way(COMPILED, values, stack.enter_context(compiled_source(objective))))
-        ways.append(
-            _Way(DIFFERENCES, {"∇H": allowed.differences}, lambda sample: pinocchio_differences(objective, sample))
-        )
-        ways.append(_mujoco(objective, of_mujoco))
-        compared, total = 0, sum(way.source is not None for way in ways) * len(drawn)
+            candidates.append(_Candidate(COMPILED, values, stack.enter_context(compiled_source(objective))))
+        differences = partial(pinocchio_differences, objective)
+        candidates.append(_Candidate(DIFFERENCES, {"∇H": allowed.differences}, differences))
+        candidates.append(_mujoco(objective, of_mujoco))
+        compared, total = 0, sum(own.source is not None for own in candidates) * len(drawn)
         rows: list[Row] = []
-        for way in ways:
-            if way.source is None:
-                rows.append(Row(way.name, "", "fail" if way.failed else "skipped", note=way.note))
+        for own in candidates:
+            if own.source is None:
+                rows.append(Row(own.name, "", "fail" if own.failed else "skipped", note=own.note))
                 continue
             found: list[Numbers] = []
             for sample in drawn:
-                found.append(way.source(sample))
+                found.append(own.source(sample))
                 compared += 1
                 if progress is not None:
                     progress(compared, total)
             rows += [
-                _row(objective.robot, way.name, quantity, tolerance, found, expected)
-                for quantity, tolerance in way.tolerances.items()
+                _row(objective.robot, own.name, quantity, tolerance, found, expected)
+                for quantity, tolerance in own.tolerances.items()
             ]
     return VerificationReport(tuple(rows), drawn, seed)
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
-    """A source with its tolerances by quantity; without a source, why there is none."""
+class _Candidate:
+    """A source to compare, with the tolerance of each quantity; without a source, the reason."""
 
     name: str
     tolerances: Mapping[str, float]
@@ -123,22 +125,22 @@ class _Way:
     failed: bool = False
 
 
-def _mujoco(objective: ImpactObjective, tolerances: Mapping[str, float]) -> _Way:
+def _mujoco(objective: ImpactObjective, tolerances: Mapping[str, float]) -> _Candidate:
     try:
         import_mujoco()
     except InputError as error:
-        return _Way(MUJOCO, tolerances, note=f"not installed: {error.hint}")
+        return _Candidate(MUJOCO, tolerances, note=f"not installed: {error.hint}")
     try:
-        return _Way(MUJOCO, tolerances, MujocoSource(objective))
+        return _Candidate(MUJOCO, tolerances, MujocoSource(objective))
     except InputError as error:
-        # The other ways stand all the same.
-        return _Way(MUJOCO, tolerances, note=error.line, failed=True)
+        # The other sources remain.
+        return _Candidate(MUJOCO, tolerances, note=error.line, failed=True)
 
 
 def _row(
     robot: Robot, name: str, quantity: str, tolerance: float, found: Sequence[Numbers], expected: Sequence[Numbers]
 ) -> Row:
-    """The worst sample of one quantity."""
+    """Return the row of the worst sample of one quantity."""
     deviations = [
         deviation(mine.values[quantity], reference.values[quantity], reference.scales.get(quantity, 0.0))
         for mine, reference in zip(found, expected, strict=True)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.codegen.build_check import compiled
 from impact_posture.codegen.export import export
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.objective import ImpactObjective
@@ -17,6 +16,7 @@ from tests.benchmarks.cases import CASES, Case
 from tests.benchmarks.core import Request, table
 from tests.exact import Exact, ExactImpact, digits, distance
 from tests.exact_bounds import Bounded
+from tests.exported import built
 from tests.helpers import random_configurations
 
 _CASES = ("solo8, four feet", "solo8, aside", "solo12", "bolt", "talos, two feet")
@@ -49,7 +49,7 @@ def _row(case: Case, share: float, postures: int) -> list[str]:
     moved, bound, ranks = 0.0, 0.0, set()
     with tempfile.TemporaryDirectory() as folder:
         export(objective, Path(folder), prefix="feet", check=False)
-        with compiled(Path(folder), "feet", robot.nq, robot.nv) as library:
+        with built(Path(folder), "feet") as library:
             for q in [
                 robot.posture(),
                 *random_configurations(robot.model, postures, robot.name, "digits", spread=0.5),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.library import library_path
+from impact_posture.libraries import library_path
 from tests.benchmarks.build import Built
 from tests.benchmarks.cases import CASES
 from tests.benchmarks.core import Request, machine, median_time, one_core, table

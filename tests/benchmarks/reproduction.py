@@ -29,14 +29,14 @@ def lines(request: Request) -> Iterator[str]:
     scenarios, store = tuple(s for s in PAPER if request.only in s), Store(ROOT / "build" / "reproduction")
     shared = {"processes": request.jobs, "store": store, "progress": lambda a, b: say(f"\r{a} of {b} runs", end="")}
     began = time.perf_counter()
-    found = reproduce(scenarios, seeds=request.count, **shared)
+    plan = {s: controllers_of(s, False) for s in scenarios}
+    found = reproduce(plan, seeds=request.count, **shared)
     say(f"\nthe first part took {time.perf_counter() - began:.0f} s, less what was kept")
-    every = reproduce(scenarios, seeds=OTHERS, everything=True, **shared)
+    every = reproduce({s: controllers_of(s, True) for s in scenarios}, seeds=OTHERS, **shared)
     yield "\n\n".join(_parts(found, every))
     if request.write:
-        first = [job for s in scenarios for job in jobs_of(s, controllers_of(s, False), 1)]
         with tempfile.TemporaryDirectory() as folder:
-            draw_reproduction(found, first, store, Path(folder), ["png"])
+            draw_reproduction(found, jobs_of(plan, 1), store, Path(folder), ["png"])
             _take_shown(Path(folder))
 
 

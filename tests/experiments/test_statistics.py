@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from impact_posture.errors import InputError
-from impact_posture.experiment.jobs import Job, finite, parse_controller, together
+from impact_posture.experiment.jobs import Job, jsonable, parse_controller, together
 from impact_posture.experiment.paper import PAPER, RECOMMENDED
 from impact_posture.experiment.reproduction import (
     Reproduction,
@@ -76,7 +76,7 @@ def test_runs_that_failed_are_told_and_left_out() -> None:
     assert row.reduction is None and row.recovery is None and not row.change and targets_of(row) is None
     against = row_of("aerial-vertical", "robust", [document("robust", 0, 1.0)], [failed("nominal", 0, "fell")])
     assert against.status == "completed" and against.reduction is None
-    assert row.to_dict()["reduction"] is None and row.to_dict()["completed"] == 1
+    assert jsonable(row)["reduction"] is None and jsonable(row)["completed"] == 1
     nothing = row_of("aerial-vertical", "robust", own[1:], NOMINAL)
     assert nothing.reduction is None and targets_of(nothing) is None and not nothing.metrics
     assert "| robust | fell, 0 of 1 completed |" in scenario_table([nothing])
@@ -159,7 +159,7 @@ def test_the_summary_of_one_seed_has_no_intervals() -> None:
 
 
 def test_a_held_posture_tells_stiffness_from_posture() -> None:
-    for held, word in ((1.9, "stiffness"), (0.6, "most of it is posture")):
+    for held, word in ((1.9, "stiffness"), (0.6, "Most of it is posture")):
         parts = [
             *NOMINAL,
             *[document("robust", k, 0.5) for k in range(4)],
@@ -174,7 +174,7 @@ def test_names_of_controllers() -> None:
     assert parse_controller(" robust:held:free ") == ("robust", "held", True)
     with pytest.raises(InputError, match="no variant 'hold'"):
         parse_controller("robust:hold")
-    assert [job.label for job in jobs_of("solo8-push", ["nominal", "robust:held"], 2)] == [
+    assert [job.label for job in jobs_of({"solo8-push": ["nominal", "robust:held"]}, 2)] == [
         "nominal", "nominal", "robust:held", "robust:held"
     ]  # fmt: skip
     assert Job("a/b.toml", "robust", 3, "held").name == "a_b.toml-robust-held-3"
@@ -201,7 +201,7 @@ def test_metrics_of_both_signs() -> None:
 
 
 def test_documents_have_no_infinities() -> None:
-    assert finite({"a": [1.0, float("inf")], "b": (float("nan"), "x", None, 3)}) == {
+    assert jsonable({"a": [1.0, float("inf")], "b": (float("nan"), "x", None, 3)}) == {
         "a": [1.0, None],
         "b": [None, "x", None, 3],
     }

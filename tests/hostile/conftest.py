@@ -12,11 +12,11 @@ from tests.hostile.arena import SMALL, strike
 @pytest.fixture(scope="session")
 def loaded() -> None:
     """Everything imported once: each attack then is a fork."""
-    import impact_posture.codegen.export_folder
+    import impact_posture.codegen.export
     import impact_posture.experiment.folders
     import impact_posture.impact.evaluation
-    import impact_posture.job
     import impact_posture.posture.robustness
+    import impact_posture.result_folder
     import impact_posture.robot.robot_summary
     import impact_posture.verification.verification  # noqa: F401
 

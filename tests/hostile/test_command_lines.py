@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
-from impact_posture_cli.app import app
+from impact_posture_cli.app import build
 from tests.hostile.arena import attack
 from tests.hostile.values import value
 
@@ -34,7 +33,7 @@ COUNT = 8
 
 
 def parameters(command: str) -> list[Any]:
-    return list(typer.main.get_command(app).commands[command].params)  # type: ignore[attr-defined]
+    return list(build(command).params)
 
 
 def spoil(command: str, rng: random.Random) -> tuple[str, ...]:

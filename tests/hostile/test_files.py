@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture import job, plot
+from impact_posture import plot, result_folder
 from impact_posture.posture.problem_settings import make_settings, prepare
 from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
@@ -148,7 +148,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     solution = solve(prepared.problem, starts=1, compile="never")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plot, "draw_all", lambda *_: [])
-        job.write_result(
+        result_folder.write_result(
             prepared, solution, result_document(prepared, solution), place / "out", codegen=False, jobs=1
         )
     return place / "out"

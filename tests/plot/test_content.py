@@ -10,11 +10,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from impact_posture.errors import InputError
+from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.plot import FIGURES, PathData, ResultView, postures_figure
 from impact_posture.plot.classical_figure import classical_figure, kinds_of
 from impact_posture.plot.ellipsoid_figure import ellipsoid_figure
 from impact_posture.plot.jump_figure import groups_of, jump_figure
-from impact_posture.plot.path_figure import normalized, path_figure
+from impact_posture.plot.path_figures import normalized, path_figure, tradeoff_figure
 from impact_posture.plot.robot_drawing import Surface, side_plane, surfaces_of
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
@@ -23,8 +24,7 @@ from impact_posture.plot.shapes import (
 )
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.style import WIDTH, style, wrap
-from impact_posture.plot.tradeoff_figure import tradeoff_figure
-from impact_posture.plot.view import SEPARATOR, contact_letters, header_lines, number, velocity_units
+from impact_posture.plot.view import SEPARATOR, contact_letters, header_lines, number
 from tests.plot.views import PENDULUM, make_view, text_of
 
 
@@ -109,17 +109,17 @@ def panels_of(figure: Figure) -> list[object]:
 
 
 def test_free_ellipsoid_stands_beside_the_consistent_one(solo8: ResultView, tilthex: ResultView) -> None:
-    assert tilthex.free_before is None and "free" not in text_of(ellipsoid_figure(tilthex))
-    assert solo8.free_before is not None and solo8.free_after is not None
+    assert tilthex.free == () and "free" not in text_of(ellipsoid_figure(tilthex))
+    assert len(solo8.free) == 2
     # The oracle's numbers without feet: M alone.
     J, M = solo8.jacobian(solo8.q_optimal), solo8.objective.oracle.at(solo8.q_optimal).M
     expected = np.linalg.solve(M, J.T).T @ np.linalg.solve(M, J.T)
-    np.testing.assert_allclose(solo8.free_after.ellipsoid, expected, rtol=1e-9, atol=1e-12 * expected.max())
+    np.testing.assert_allclose(solo8.free[1].ellipsoid, expected, rtol=1e-9, atol=1e-12 * expected.max())
     figure = ellipsoid_figure(solo8)
     text = text_of(figure)
-    for word, found in (("before", solo8.free_before), ("after", solo8.free_after)):
+    for word, found in (("before", solo8.free[0]), ("after", solo8.free[1])):
         assert f"{word}, free: √H = {number(np.sqrt(found.H))}" in text
-    matrices = [f.ellipsoid for f in (solo8.before, solo8.after, solo8.free_before, solo8.free_after)]
+    matrices = [f.ellipsoid for f in (solo8.before, solo8.after, solo8.free[0], solo8.free[1])]
     for axes, plane in zip(panels_of(figure), COORDINATE_PLANES, strict=True):
         reach = [line.get_xdata().max() for line in axes.lines if len(line.get_xdata()) == 181]  # type: ignore[attr-defined]
         widths = [half_width(matrix, plane.axes[0]) for matrix in matrices]
@@ -127,7 +127,7 @@ def test_free_ellipsoid_stands_beside_the_consistent_one(solo8: ResultView, tilt
 
 
 def test_cone_and_all_tied_worst_normals_are_drawn(solo8_cone: ResultView, solo8: ResultView) -> None:
-    worst = solo8_cone.worst_after
+    worst = solo8_cone.worst[1]
     assert worst is not None and len(worst.normals) == 2
     figure = ellipsoid_figure(solo8_cone)
     assert "cone of 20° about n" in text_of(figure) and "20° off, 2 tied" in text_of(figure)
@@ -151,7 +151,7 @@ def test_cone_whose_worst_normal_does_not_exist_is_drawn_without() -> None:
     view = make_view(PENDULUM, (0, 1, 0), q0=np.array([0.4, 0.9]), path=False)
     objective = dataclasses.replace(view.objective, kind="sticking", normal_cone_deg=10.0)
     view = dataclasses.replace(view, objective=objective)
-    assert view.worst_before is None
+    assert view.worst[0] is None
     text = text_of(ellipsoid_figure(view))
     assert "cone of 10° about n" in text and "worst before" not in text
     assert "objective sticking undefined → undefined" in text
@@ -321,7 +321,7 @@ def test_jump_bars_carry_the_jump(tilthex: ResultView, panda: ResultView) -> Non
         for state, values, gain in zip((tilthex.before, tilthex.after), drawn, factor, strict=True):
             np.testing.assert_allclose(values, gain * state.jump, rtol=1e-12)
     assert [axes.get_xlabel() for axes in panels[:, 1]] == ["Δν  [m/s]", "Δν  [rad/s]", "Δν  [rad/s]"]
-    units = velocity_units(panda.robot)
+    units = tangent_units(panda.robot)
     assert [n for n, u in zip(panda.robot.tangent_names, units, strict=True) if u == "m/s"] == [
         "panda_finger_joint1",
         "panda_finger_joint2",

@@ -15,9 +15,8 @@ from impact_posture.plot import FIGURES, FORMATS, FigureNotFound, ResultView, dr
 from impact_posture.plot.classical_figure import classical_figure
 from impact_posture.plot.ellipsoid_figure import ellipsoid_figure
 from impact_posture.plot.jump_figure import jump_figure
-from impact_posture.plot.path_figure import path_figure
+from impact_posture.plot.path_figures import path_figure, tradeoff_figure
 from impact_posture.plot.style import WIDTH
-from impact_posture.plot.tradeoff_figure import tradeoff_figure
 from tests.plot.page import defects
 from tests.plot.views import PENDULUM, make_view, text_of
 
@@ -155,7 +154,7 @@ def test_bad_input(pendulum: ResultView, panda: ResultView, tmp_path: Path) -> N
         draw_all(pendulum, tmp_path, ("gif",))
     with pytest.raises(InputError, match="no path to draw"):
         draw_all(panda, tmp_path, only=["nullspace"])
-    with pytest.raises(InputError, match=r"no trade-off to draw.*--tradeoff"):
+    with pytest.raises(InputError, match=r"no trade-off to draw.*`tradeoff`"):
         draw_all(panda, tmp_path, only=["tradeoff"])
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="cannot be written"):

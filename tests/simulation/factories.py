@@ -14,7 +14,7 @@ from impact_posture.simulation.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.offline import offline_posture
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run, run
-from impact_posture.simulation.scenario import RepeatedContacts, Setup, set_up
+from impact_posture.simulation.scenario import Setup, set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.simulation.series import Series
@@ -31,12 +31,12 @@ def needs_mujoco() -> None:
 def shortened(source: str | Path, **changes: Any) -> Setup:
     """A scenario with one contact or a short wait, and whatever else is to change in its task."""
     scenario = read_scenario(source)
-    if isinstance(scenario.task, RepeatedContacts):
+    if scenario.contacts:
         short: dict[str, Any] = {"count": 1, "settle": 0.3, "dwell": 0.2, "pause": 0.05}
     else:
         short = {"settle": 0.1, "patience": 0.3, "duration": 0.2, "after": 0.05}
-    task: Any = replace(scenario.task, **{**short, **changes})
-    return set_up(replace(scenario, task=task))
+    key = "contacts" if scenario.contacts else "push"
+    return set_up(replace(scenario, **{key: replace(scenario.task, **{**short, **changes})}))
 
 
 def controller_factory(setup: Setup, free: bool = False) -> ControllerFactory:
@@ -52,9 +52,9 @@ def factory(name: str, settle: float | None = None) -> ControllerFactory:
 
 def driven(made: ControllerFactory, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
     """A run with the push forward alone."""
-    if controller == "posture" and made._offline is None:
+    if controller == "posture" and "offline" not in vars(made):
         # Few starts: what is tested is the driver.
-        made._offline = offline_posture(made.setup, made.objective(), starts=1)
+        made.offline = offline_posture(made.setup, made.objective(), starts=1)
     return run(made, controller, mode=mode, seed=seed, only=1)[0]
 
 

@@ -201,7 +201,7 @@ def test_what_an_impulse_does_is_invisible_and_nothing_else(name: str) -> None:
         # What the feedback sees is rest.
         np.testing.assert_allclose(impact + correction, 0, atol=1e-6 * np.abs(impact).max())
     # A motion that no impulse makes better: the tasks' errors stand square on what an impulse can do to them.
-    state = driver._aside.update(quiet.q, quiet.v)
+    state = driver._state.update(quiet.q, quiet.v)
     J = np.vstack([task.jacobian(state) for task in leading(driver)])
     v = generator.normal(size=quiet.v.size)
     error = J @ v

@@ -15,7 +15,7 @@ from impact_posture.simulation.controller_factory import CONTROLLERS, Controller
 from impact_posture.simulation.driver import MOVE, Driver, PostureDriver
 from impact_posture.simulation.offline import OfflinePosture
 from impact_posture.simulation.reference import ReferencePoint
-from impact_posture.simulation.scenario import Gains
+from impact_posture.simulation.scenario import EndEffectorGains, Gains
 from impact_posture.simulation.task_formulations import nominal_posture
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.frame_tasks import FramePose
@@ -105,7 +105,7 @@ def test_the_other_gradients_lower_their_own_metric(controller: str) -> None:
 def test_all_controllers_share_gains_tasks_and_weights() -> None:
     for name in ("aerial-lateral", "talos-push"):
         made = factory(name)
-        made._offline = made._offline or OfflinePosture(made.setup.q, 1.0, 1.0, 1.0, 0.0, 0.0)
+        made.offline = vars(made).get("offline") or OfflinePosture(made.setup.q, 1.0, 1.0, 1.0, 0.0, 0.0)
         nominal = made.driver("nominal").controller.formulation
         for controller in CONTROLLERS:
             formulation = made.driver(controller).controller.formulation
@@ -179,7 +179,7 @@ def test_a_reference_of_the_hand_does_not_survive_a_reset() -> None:
     driver = made.driver("nominal")
     fresh = driver.reset(made.setup.q)
     made.setup.world.reset(made.setup.q)
-    driver.tick(made.setup.world.read(), ReferencePoint(0.05, 0.5, 1.0, 0))
+    driver.tick(made.setup.world.read(), ReferencePoint(0.05, 0.5, 1.0))
     again = driver.reset(made.setup.q)
     np.testing.assert_array_equal(fresh.u, again.u)
 
@@ -192,7 +192,7 @@ def test_the_hand_follows_its_reference_into_the_surface() -> None:
     (hand,) = [t for t in driver.controller.formulation.tasks if isinstance(t, FramePose)]
     assert hand.target is not None
     home = hand.target.translation.copy()
-    driver.tick(made.setup.world.read(), ReferencePoint(0.1, 0.3, 0.8, 0))
+    driver.tick(made.setup.world.read(), ReferencePoint(0.1, 0.3, 0.8))
     # Against the wall's normal, which is −x.
     np.testing.assert_allclose(hand.target.translation - home, [0.1, 0, 0], atol=1e-15)
     np.testing.assert_allclose(hand.target_velocity, [0.3, 0, 0, 0, 0, 0])
@@ -244,7 +244,7 @@ def test_the_posture_driver_reaches_its_goal(name: str) -> None:
         ("aerial-vertical", {"center_of_mass": Gains(10)}, r"has \[control.center_of_mass\], but no"),
         ("aerial-vertical", {"base": Gains(10)}, r"has \[control.base\], but no \[control.footing\]"),
         ("solo8-push", {"tilt": Gains(10)}, r"has \[control.tilt\], but feet"),
-        ("solo8-push", {"end_effector": Gains(10)}, r"has \[control.end_effector\], but a push"),
+        ("solo8-push", {"end_effector": EndEffectorGains(10)}, r"has \[control.end_effector\], but a push"),
         ("solo8-push", {"footing": None}, r"but no \[control.footing\]"),
     ],
 )

@@ -60,7 +60,7 @@ def test_tilt_is_measured_from_the_start_and_yaw_is_none(name: str) -> None:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_below_the_surface_and_far_below_the_start(name: str) -> None:
     setup = factory(name).setup
-    surface = setup.scenario.scene.surfaces[0].name
+    surface = setup.scenario.surfaces[0].name
     n, point = setup.world.built.normals[surface], setup.world.built.points[surface]
     q = np.tile(setup.q, (1000, 1))
     q[600:, :3] -= ((setup.q[:3] - point) @ n + 1e-3) * n

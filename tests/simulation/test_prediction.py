@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -19,7 +18,7 @@ from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import interpreted, scenario_objective
-from impact_posture.simulation.scene import ContactLaw, Physics, Scene
+from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors
 from impact_posture.simulation.series import Window
 from impact_posture.simulation.world import build_world
 from impact_posture.tsid.controller import Command, Status
@@ -40,9 +39,9 @@ def adrift(law: ContactLaw, timestep: float) -> Setup:
     """The vertical scenario's robot without rotors and weight, its tip 2 mm above the floor."""
     scenario, found = read_scenario("aerial-vertical"), factory("aerial-vertical").setup
     body = replace(found.robot, spec=replace(found.robot.spec, propulsion=None))
-    floor = replace(scenario.scene.surfaces[0], gap=0.002, law=law)
-    scene = Scene((floor,), scenario.scene.shapes, replace(WEIGHTLESS, timestep=timestep))
-    return Setup(replace(scenario, scene=scene), body, found.q, build_world(body, scene, found.q))
+    floor = replace(scenario.surfaces[0], gap=0.002, **vars(law))
+    scenario = replace(scenario, surfaces=(floor,), physics=replace(WEIGHTLESS, timestep=timestep), sensors=Sensors())
+    return Setup(scenario, body, found.q, build_world(body, scenario, found.q))
 
 
 def drop(law: ContactLaw, q: Vector, speed: float = 0.5, timestep: float = 2.5e-4) -> tuple[Prediction, Run, Setup]:
@@ -113,7 +112,7 @@ def test_a_drop_without_friction_jumps_as_predicted(k: int) -> None:
 
 
 def test_a_drop_that_sticks_jumps_as_predicted() -> None:
-    law = ContactLaw((2e-4, 1.0), (0.9999, 0.9999, 0.001), friction=10.0)
+    law = ContactLaw(solref=(2e-4, 1.0), solimp=(0.9999, 0.9999, 0.001), friction=10.0)
     found, run, setup = drop(law, factory("aerial-vertical").setup.q, timestep=2.5e-5)
     e = restitution(setup, run, 0.5)
     assert found.S is not None and found.sticking == pytest.approx(0.5 * np.sqrt(found.S))
@@ -140,8 +139,7 @@ def test_a_pushs_prediction_is_the_impulses() -> None:
     assert found.approach == pytest.approx(6.5 * 0.2) and found.sticking is None
     assert found.frictionless == pytest.approx(6.5 * 0.2 * np.sqrt(found.H))
     assert found.H == pytest.approx(made.objective().value(made.setup.q), rel=0.02)
-    content: dict[str, Any] = found.to_dict()
-    assert content["ratio"] == pytest.approx(found.measured / found.frictionless)
+    assert found.ratio == pytest.approx(found.measured / found.frictionless)
 
 
 # ---- flight -------------------------------------------------------------------------------------------------------
@@ -149,7 +147,7 @@ def test_a_pushs_prediction_is_the_impulses() -> None:
 
 def free_body(name: str) -> Robot:
     found = robot(name)
-    return replace(found, spec=replace(found.spec, propulsion=None))
+    return replace(found, spec=found.spec.model_copy(update={"propulsion": None}))
 
 
 @pytest.mark.parametrize("name", ["solo8", "go2", "talos"])

@@ -97,7 +97,7 @@ def test_a_push_acts_from_its_begin_to_its_end() -> None:
     ticks = [0.299, 0.3, 0.301, 0.302, 0.303, 0.304]
     for t in ticks:
         shapes = tuple(ShapeTruth(s.frame, True, NOTHING, NOTHING, 0.0, None, 0.01 * k) for k, s in
-                       enumerate(setup.scenario.scene.shapes))  # fmt: skip
+                       enumerate(setup.scenario.shapes))  # fmt: skip
         recorder.take(Truth(t, setup.q, np.zeros(14), np.zeros(0), np.zeros(0), np.zeros(8), shapes, ()),
                       Command(np.zeros(8), np.zeros(8), np.zeros(0), Status.SOLVED, np.zeros(14), np.zeros(0)),
                       0.0, 0.0)  # fmt: skip

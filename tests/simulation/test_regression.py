@@ -46,7 +46,7 @@ def test_robust_against_nominal(
         before.append(predict(made.setup, made.objective(), found)[0].H)
         assert found.rested and metrics[-1].failed_ticks == 0 and metrics[-1].stops == ()
         # H as recorded on the way is H before the impact, but for what happens within ten ticks.
-        (window,) = found.impacts
+        (window,) = found.of("impact")
         course = found.series.objective[: found.series.slice(window.begin, window.end).start]
         assert course[np.isfinite(course)][-1] == pytest.approx(before[-1], rel=0.05)
     q, robust = (m.q_total_impact for m in metrics)

@@ -84,7 +84,7 @@ def test_both_signs_are_run_and_mirror_each_other_roughly() -> None:
     ]
     assert moved[0] > 0.002 and moved[1] < -0.002
     for found, sign in ((forward, 1), (backward, -1)):
-        (window,) = found.impacts
+        (window,) = found.of("impact")
         part = found.series.slice(window.begin, window.end)
         np.testing.assert_array_equal(found.series.force[part], np.tile([sign * 6.5, 0, 0], (200, 1)))
         assert not found.series.force[: part.start].any() and not found.series.force[part.stop :].any()
@@ -108,7 +108,7 @@ def test_a_seed_is_a_run_and_another_seed_another(name: str, controller: str) ->
     # A world, a robot and gradients of its own.
     again = driven(controller_factory(shortened(name)), controller, seed=3)
     other = driven(factory(name), controller, seed=4)
-    assert [w.to_dict() for w in first.windows] == [w.to_dict() for w in again.windows]
+    assert list(map(vars, first.windows)) == list(map(vars, again.windows))
     for key, column in fields_of(first.series).items():
         np.testing.assert_array_equal(column, getattr(again.series, key), err_msg=key)
     size = min(first.series.t.size, other.series.t.size)
@@ -201,7 +201,7 @@ def test_limits_that_the_tasks_break_relax_them(name: str, controller: str) -> N
     weak[6:] /= 3
     setup.robot.model.effortLimit = weak
     # A world for the robot as it has become.
-    made = controller_factory(replace(setup, world=build_world(setup.robot, setup.scenario.scene, setup.q)))
+    made = controller_factory(replace(setup, world=build_world(setup.robot, setup.scenario, setup.q)))
     found = driven(made, controller)
     metrics = measure(made.setup, found)
     assert metrics.relaxed_ticks > 20 and metrics.failed_ticks == 0

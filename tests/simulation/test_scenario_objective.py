@@ -78,7 +78,7 @@ def test_the_value_is_the_papers_formula() -> None:
     assert interpreted(objective)(q)[0] == pytest.approx(a @ a, rel=1e-9)
 
 
-def test_the_buffers_live_as_long_as_the_call() -> None:
+def test_a_gradient_outlives_its_objective() -> None:
     objective = objective_of("panda", "panda_hand_tcp", "impulse", False)
     calls = [interpreted(objective) for _ in range(8)]
     points = [near(objective, "kept", k) for k in range(8)]
@@ -93,7 +93,7 @@ def test_the_buffers_live_as_long_as_the_call() -> None:
         del rubbish
 
 
-def test_two_gradients_of_one_objective_do_not_share_results() -> None:
+def test_results_are_not_shared() -> None:
     objective = objective_of("ur5", "tool0", "impulse", False)
     first, second = interpreted(objective), interpreted(objective)
     a, b = near(objective, "a"), near(objective, "b")
@@ -101,9 +101,8 @@ def test_two_gradients_of_one_objective_do_not_share_results() -> None:
     copy = np.array(kept)
     second(b)
     np.testing.assert_array_equal(kept, copy)
-    # Its own next call overwrites it, as the docstring says.
     first(b)
-    assert not np.array_equal(kept, copy)
+    np.testing.assert_array_equal(kept, copy)
 
 
 def test_where_the_objective_does_not_exist_it_says_so() -> None:
@@ -141,9 +140,9 @@ def test_the_shapes_offset_is_the_contacts() -> None:
     needs_mujoco()
     setup = factory("aerial-vertical").setup
     scenario = setup.scenario
-    moved = replace(scenario.scene.shapes[0], offset=(0.0, 0.01, 0.02))
-    scene = replace(scenario.scene, shapes=(moved, *scenario.scene.shapes[1:]))
-    found = scenario_objective(replace(setup, scenario=replace(scenario, scene=scene)))
+    moved = replace(scenario.shapes[0], offset=(0.0, 0.01, 0.02))
+    moved_scenario = replace(scenario, shapes=(moved, *scenario.shapes[1:]))
+    found = scenario_objective(replace(setup, scenario=moved_scenario))
     assert found.contact.offset == (0.0, 0.01, 0.02)
     assert found.value(setup.q) != pytest.approx(scenario_objective(setup).value(setup.q), rel=1e-3)
 
@@ -184,7 +183,7 @@ def test_compiled_equals_interpreted_and_is_built_once(which: Any, builds: list[
 def test_a_changed_robot_normal_or_objective_is_built_anew(builds: list[Path]) -> None:
     needs_mujoco()
     scenario = read_scenario("aerial-vertical")
-    heavier = replace(scenario, load=replace(scenario.load, armature={"elbow_pitch": 0.05}))
+    heavier = replace(scenario, armature={"elbow_pitch": 0.05})
     first, other = scenario_objective(factory("aerial-vertical").setup), scenario_objective(set_up(heavier))
     turned = replace(first, contact=ImpactContact("ee", (0.0, 0.1, 1.0)))
     q = first.robot.posture()

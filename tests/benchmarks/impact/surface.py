@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.dynamics.mjcf import Mjcf, import_mujoco, write_mjcf
-from impact_posture.dynamics.mjcf_scene import WORLD, Additions
+from impact_posture.dynamics.mjcf import Mjcf, build_mjcf, import_mujoco, pose
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
@@ -27,11 +26,7 @@ _QUIET = 5
 # plane (all postures meet it in the same part of a step); meters.
 _BALL, _GAP = 0.01, 1e-6
 # The stiffest constraint that MuJoCo takes, at any depth.
-_SOLIMP = "0.9999 0.9999 0.001"
-_OPTION = {
-    "gravity": "0 0 0", "integrator": "Euler", "cone": "elliptic", "solver": "Newton",
-    "tolerance": "0", "iterations": "200", "ls_iterations": "100", "ls_tolerance": "1e-6",
-}  # fmt: skip
+_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
 
 @dataclass(frozen=True)
@@ -90,7 +85,7 @@ class Scene:
         self._M, self._J, self._Js, self._n = (np.array(x) for x in (oracle.M, oracle.J, oracle.Js, oracle.n))
         self._mobility = self._J @ oracle.solve(self._J.T)
         self._point, self._feet = oracle.point, oracle.feet
-        written = write_mjcf(self._robot.model)
+        written = build_mjcf(self._robot.model)
         self._layout = written.layout
         self._model = _with_surface(written, objective, q).compile()
         self._ball_body = int(self._model.geom("ball").bodyid[0])
@@ -180,7 +175,7 @@ class Scene:
         model.pair_friction[:, :2] = min(surface.friction, _STICKY)
 
     def _measure(self, data: Any, speed: float, before: Vector, impulse: float, duration: float) -> Measured:
-        after = self._layout.v(data.qpos, data.qvel)
+        after = self._layout.state(data.qpos, data.qvel)[1]
         numeric = Numeric(self._robot.model).at(self._layout.q(data.qpos))
         moved = numeric.jacobian(self._point)[:3] @ after
         normal = float(self._n @ moved)
@@ -200,22 +195,28 @@ def _with_surface(written: Mjcf, objective: ImpactObjective, q: Vector) -> Mjcf:
     """Add a ball at the contact point, the plane below it, and a tie to the world for each support, at ``q``."""
     robot, oracle = objective.robot, objective.oracle.at(q)
     numeric, n = Numeric(robot.model).at(q), oracle.n.copy()
-    added = Additions(written)
-    added.option(**_OPTION)
-    added.flag(limit="disable")
+    mujoco, spec = import_mujoco(), written.spec
+    option = spec.option
+    option.gravity, option.integrator = np.zeros(3), mujoco.mjtIntegrator.mjINT_EULER
+    option.cone, option.solver = mujoco.mjtCone.mjCONE_ELLIPTIC, mujoco.mjtSolver.mjSOL_NEWTON
+    option.tolerance, option.iterations = 0.0, 200
+    option.ls_tolerance, option.ls_iterations = 1e-6, 100
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
 
     contact = point_on(robot, objective.contact.frame, objective.contact.offset)
     position = numeric.placement(contact).translation
     # The ball's lowest point is the contact point.
     center = numeric.data.oMi[contact.joint].actInv(position + _BALL * n)
-    added.shape(contact.joint, "ball", "sphere", (_BALL,), pin.SE3(np.eye(3), center))
-    added.plane("surface", position - _GAP * n, n)
-    added.pair("surface", "ball", solimp=_SOLIMP, condim="1")
+    written.add_geom(contact.joint, "ball", "sphere", (_BALL,), pin.SE3(np.eye(3), center))
+    written.add_plane("surface", position - _GAP * n, n)
+    spec.add_pair(geomname1="surface", geomname2="ball", solimp=_SOLIMP, condim=1)
 
     for k, support in enumerate(objective.supports):
         foot = point_on(robot, support.frame, support.offset)
-        added.site(foot.joint, f"tie_{k}", pin.SE3(foot.rotation, foot.position))
-        added.site(WORLD, f"ground_{k}", numeric.placement(foot))
-        kind = "connect" if support.kind == "point" else "weld"
-        added.tie(kind, f"tie_{k}", f"ground_{k}", solimp=_SOLIMP)
-    return added.model()
+        written.body(foot.joint).add_site(name=f"tie_{k}", **pose(pin.SE3(foot.rotation, foot.position)))
+        spec.worldbody.add_site(name=f"ground_{k}", **pose(numeric.placement(foot)))
+        kind = mujoco.mjtEq.mjEQ_CONNECT if support.kind == "point" else mujoco.mjtEq.mjEQ_WELD
+        spec.add_equality(
+            type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, name1=f"tie_{k}", name2=f"ground_{k}", solimp=_SOLIMP
+        )
+    return written

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 
 import casadi as ca
 
-from impact_posture.codegen.functions import library
-from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph, graph_of
-from impact_posture.codegen.simd_lanes import packed
+from impact_posture.codegen.functions import NamedObjective, library
+from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph
 from impact_posture.impact.objective import ImpactObjective
 
 # How often: "add" (and subtract), "mul", "div", "trig" (sines and cosines), "neg" (sign changes).
@@ -18,7 +17,7 @@ _INSTRUCTIONS = {
     ca.OP_ADD: "add", ca.OP_SUB: "add", ca.OP_MUL: "mul", ca.OP_SQ: "mul", ca.OP_TWICE: "mul", ca.OP_DIV: "div",
     ca.OP_INV: "div", ca.OP_SIN: "trig", ca.OP_COS: "trig", ca.OP_NEG: "neg",
 }  # fmt: skip
-_NODES = {"+": "add", "-": "add", "*": "mul", "/": "div", "inv": "div", "neg": "neg", SINE: "trig", COSINE: "trig"}
+_NODES = {"+": "add", "-": "add", "*": "mul", "inv": "div", "neg": "neg", SINE: "trig", COSINE: "trig"}
 
 
 def total(operations: Operations) -> int:
@@ -36,19 +35,18 @@ def of_export(objective: ImpactObjective) -> tuple[Operations, int | None]:
     """What one call of ``eval`` of the export does, on single numbers; and how many operations vectors make of it.
 
     A call runs the blocks that its outputs need and no others, so the reach of the graph is the count.  The second
-    number counts operations as the C has them, where those on the numbers of twin branches are one; its sines and
-    cosines are still one each; ``None``: no twins.  The order in which the C adds up sums is not looked at: it moves
-    the count by a hundredth at most.
+    number counts operations as the C has them, where those on the numbers of repeated limbs are one; its sines and
+    cosines are still one each; ``None``: no repeated limbs.  The order in which the C adds up sums is not looked at:
+    it moves the count by a hundredth at most.
     """
-    found = library([objective], ["kernel"])
+    found = library([NamedObjective(objective, "kernel")])
     outputs = next(f.outputs for f in found.functions if f.name == "eval")
-    constants = {"constants": list(found.constants)}
-    graph = graph_of(found.function, constants)
+    graph = found.graph()
     kinds = (_NODES.get(graph.nodes[k].op) for k in _reached(graph, outputs))
     single = Counter(kind for kind in kinds if kind)
     if not found.seeds:
         return single, None
-    graph = packed(graph_of(found.function), found.seeds, constants)
+    graph = found.vector_graph()
     done = sum(graph.nodes[k].op in ARITHMETIC - {"neg"} for k in _reached(graph, outputs))
     return single, done + single["trig"]
 

@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.codegen.export import export
-from impact_posture.codegen.functions import library
-from impact_posture.dynamics.chart import Chart, integrate
+from impact_posture.codegen.functions import NamedObjective, library
+from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.contact import point_on
@@ -25,6 +25,7 @@ from tests.benchmarks.build import CONTRACT, Built, build, flag_sets
 from tests.benchmarks.core import say
 from tests.benchmarks.kernel.counts import of_export, of_function
 from tests.benchmarks.kernel.harness import Absent, Kernel, Samples, c_compiler
+from tests.tangent import tangent_map
 
 _WRAPPER = """
 int kernel_eval(const double *q, const double *n, double *H, double *grad)
@@ -74,7 +75,7 @@ def ours(samples: Samples) -> list[Kernel]:
 
 def same_graph(samples: Samples) -> list[Kernel]:
     """The expressions that our export is written from, printed by CasADi, compiled as ours."""
-    found = library([samples.objective], ["kernel"])
+    found = library([NamedObjective(samples.objective, "kernel")])
     q, n, _ = found.function.sx_in()
     values = found.function.call([q, n, ca.DM(found.constants)])
     outputs = next(f.outputs for f in found.functions if f.name == "eval")
@@ -88,7 +89,8 @@ def dense(samples: Samples) -> list[Kernel]:
     """The textbook way within CasADi: composite rigid bodies, LDLᵀ, reverse mode."""
     robot = samples.robot
     q, n, step = ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3), ca.SX.sym("step", robot.nv)
-    at, direction = integrate(Chart(robot.model), q, step), n
+    # To first order in the step this is q ⊕ step.
+    at, direction = q + tangent_map(Chart(robot.model), q) @ step, n
     if robot.floating:
         # M does not depend on the base's pose: leave it at rest and give the normal in the base's axes.
         at = ca.vertcat(ca.DM([0, 0, 0, 0, 0, 0, 1]), at[7:])

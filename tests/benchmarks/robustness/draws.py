@@ -143,18 +143,18 @@ def prepare(chosen: Draw) -> Setup:
         ImpactPostureError: A start that is none: outside the limits, or not on the feet.
     """
     scenario = read_scenario(chosen.scenario)
-    scenario = replace(scenario, load=replace(scenario.load, armature=_armature(scenario, chosen.values["armature"])))
+    scenario = replace(scenario, armature=_armature(scenario, chosen.values["armature"]))
     if isinstance(scenario.task, RepeatedContacts):
         return set_up(_contacts(scenario, scenario.task, chosen.values))
     pushed = _push(scenario, scenario.task, chosen.values)
     shipped = set_up(pushed)
     q = _start(shipped, chosen)
-    return Setup(pushed, shipped.robot, q, build_world(shipped.robot, pushed.scene, q))
+    return Setup(pushed, shipped.robot, q, build_world(shipped.robot, pushed, q))
 
 
 def _armature(scenario: Scenario, factor: float) -> dict[str, float]:
     """By joint; those that have none stay without."""
-    model = load_robot(scenario.robot, scenario.load).model
+    model = load_robot(scenario.robot, scenario).model
     own = {str(name): float(model.armature[k]) for name, k in zip(model.names, model.idx_vs, strict=True) if k >= 0}
     return {name: factor * value for name, value in own.items() if value > 0}
 
@@ -170,8 +170,8 @@ def _contacts(scenario: Scenario, task: RepeatedContacts, v: Mapping[str, float]
     return replace(
         scenario,
         joints={"shoulder_roll": roll, "shoulder_pitch": shoulder, "elbow_pitch": elbow},
-        load=replace(scenario.load, mounting={"shoulder_roll": (v["x"] - _URDF_X, 0.0, v["z"] - _URDF_Z)}),
-        task=replace(task, speed=v["speed"], count=COUNT, dwell=DWELL, pause=PAUSE),
+        mounting={"shoulder_roll": (v["x"] - _URDF_X, 0.0, v["z"] - _URDF_Z)},
+        contacts=replace(task, speed=v["speed"], count=COUNT, dwell=DWELL, pause=PAUSE),
         control=_robust(scenario.control, v["gain"]),
     )
 
@@ -179,12 +179,12 @@ def _contacts(scenario: Scenario, task: RepeatedContacts, v: Mapping[str, float]
 def _push(scenario: Scenario, task: SinglePush, v: Mapping[str, float]) -> Scenario:
     control, (x, y, z), stiffer = scenario.control, task.force, v["stiffness"]
     footing = replace(control.footing or StanceGains(), friction=_TRUST * v["friction"])
-    surfaces = tuple(replace(s, law=replace(s.law, friction=v["friction"])) for s in scenario.scene.surfaces)
+    surfaces = tuple(replace(s, friction=v["friction"]) for s in scenario.surfaces)
     force = (v["force"] * x, v["force"] * y, v["force"] * z)
     return replace(
         scenario,
-        scene=replace(scenario.scene, surfaces=surfaces),
-        task=replace(task, force=force, signs=(int(v["sign"]),), patience=PATIENCE),
+        surfaces=surfaces,
+        push=replace(task, force=force, signs=(int(v["sign"]),), patience=PATIENCE),
         control=replace(
             _robust(control, v["gain"]),
             footing=footing,

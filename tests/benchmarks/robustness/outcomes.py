@@ -170,7 +170,7 @@ def _failure(setup: Setup, found: Run, metrics: Metrics) -> str:
 def _offset(factory: ControllerFactory, found: Run) -> float | None:
     """Distance of the center of mass from the line along which the first impact acts."""
     robot, contact = factory.setup.robot, factory.objective().contact
-    q = found.series.q[before(found.series, found.impacts[0])]
+    q = found.series.q[before(found.series, found.of("impact")[0])]
     place = Numeric(robot.model).at(q).placement(point_on(robot, contact.frame, contact.offset)).translation
     arm = np.array(pin.centerOfMass(robot.model, robot.model.createData(), q)) - place
     n = factory.setup.scenario.normal

@@ -1,4 +1,4 @@
-"""The main job from end to end: settings in, result folder out; and a result folder read back."""
+"""Result folder: write the solution of a posture problem, and read it back."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from impact_posture.codegen.export import Export, export
-from impact_posture.codegen.library import products
+from impact_posture.codegen.naming import products
 from impact_posture.errors import CompilerError, SpecError
 from impact_posture.escape import file_name
 from impact_posture.output_folder import whole_folder, write_record
@@ -25,23 +25,23 @@ from impact_posture.posture.tradeoff import TradeOff
 from impact_posture.processes import fork_map
 from impact_posture.robot.postures import write_posture
 
-# Matplotlib is imported where something is drawn: it takes longer than a small robot's answer.
+# Matplotlib is imported where something is drawn, because the import takes longer than a small problem.
 if TYPE_CHECKING:
     from impact_posture.plot import ResultView, TradeOffData
 
 FORMATS = ("png",)
-# What reading a result raises that somebody has changed, or that was not copied whole.
+# Exceptions from reading a changed or incomplete result.
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, EOFError, BadZipFile, RecursionError)
 
 
 @dataclass(frozen=True)
 class Written:
-    """What :func:`write_result` left behind.
+    """Result folder that :func:`write_result` wrote.
 
     Attributes:
         out: The folder.
         export: The C export, or ``None``.
-        compiler_error: Why the C code could not be built and compared; empty if it was, or no compiler is there.
+        compiler_error: Why the C code could not be built; empty if it was built, or if there is no compiler.
     """
 
     out: Path
@@ -50,7 +50,7 @@ class Written:
 
 
 def default_out(prepared: Prepared) -> Path:
-    """``./<robot>-<frame>``."""
+    """Return the default folder ``./<robot>-<frame>``."""
     return Path(file_name(f"{prepared.impact.robot.name}-{prepared.impact.contact.frame}"))
 
 
@@ -77,12 +77,12 @@ def write_result(
         tradeoff: The trade-off, if it was computed.
         force: Replace an earlier result.
         codegen: Export, build and check the C code, too.
-        formats: Of the pictures.
+        formats: Formats of the figures.
         jobs: Processes that draw and compile side by side.
-        progress: Told of each figure and of the C code: done, all.
+        progress: Called with ``(done, all)`` after each figure and after the C code.
 
     Raises:
-        OutputError: It exists without ``force``, or cannot be written.
+        OutputError: The folder exists without ``force``, or cannot be written.
     """
     path = null_space_path(solution.problem, solution.initial, solution.q)
     made: Export | None = None
@@ -92,7 +92,7 @@ def write_result(
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff))  # type: ignore[arg-type]
         _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
         (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
-        # The C code first: it takes longest.
+        # The C code comes first, because it takes longest.
         tasks: list[Callable[[], Any]] = [partial(_export, prepared, solution, folder / "c")] if codegen else []
         tasks += _drawings(_view(prepared, solution.initial, solution.q, path, document), folder, formats)
         with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
@@ -105,29 +105,29 @@ def write_result(
 
 
 def _export(prepared: Prepared, solution: PostureSolution, folder: Path) -> tuple[Export, str]:
-    """The C export, and why it could not be built."""
+    """Write the C export; return it and the reason if it could not be built."""
     folder.mkdir()
     failure = ""
     try:
         made = export(prepared.impact.objective, folder, posture=solution.q)
     except CompilerError as error:
-        # The posture is worth keeping whatever the compiler says; the user hears of it.
+        # The posture is kept although the compiler failed. The command line reports the error.
         failure = error.line
         made = export(prepared.impact.objective, folder, posture=solution.q, force=True, check=False)
-    # The export may be replaced alone, and what its Makefile makes counts as ours.
+    # A record of its own lets the export be replaced alone, with the products of its Makefile.
     write_record(folder, "export", products(made.prefix))
     return made, failure
 
 
 def _drawings(view: ResultView, folder: Path, formats: Sequence[str]) -> list[Callable[[], Any]]:
-    """What draws each figure."""
+    """Return a function for each figure that draws it."""
     from impact_posture.plot import draw_all, drawable
 
     return [partial(draw_all, view, folder, formats, [name]) for name in drawable(view)]
 
 
 def result_view(prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> ResultView:
-    """What the pictures of a result are drawn from."""
+    """Return the view of a solution, from which its figures are drawn."""
     path = null_space_path(solution.problem, solution.initial, solution.q)
     return _view(prepared, solution.initial, solution.q, path, document)
 
@@ -155,7 +155,7 @@ def _view(
 
 
 def _tradeoff_data(points: Sequence[dict[str, Any]]) -> TradeOffData | None:
-    """``tradeoff`` of a ``result.json`` as it is drawn; ``None`` where there is nothing to trade."""
+    """Return the ``tradeoff`` of a ``result.json`` as arrays; ``None`` for fewer than two points."""
     from impact_posture.plot import TradeOffData
 
     if len(points) < 2:
@@ -167,15 +167,15 @@ def _tradeoff_data(points: Sequence[dict[str, Any]]) -> TradeOffData | None:
 
 
 def _write_json(path: Path, document: dict[str, object]) -> None:
-    # allow_nan=False: a result with NaN in it must fail here and not at its reader.
+    # allow_nan=False: a result with NaN must fail here and not in the program that reads it.
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def load_view(folder: Path) -> ResultView:
-    """Read a result folder back as what its pictures are drawn from.
+    """Read the view of a result folder, from which its figures are drawn.
 
     Raises:
-        SpecError: It is no result folder, or the robot is not the one it was made with.
+        SpecError: The folder is no result folder, or was made with another robot model.
     """
     if not (folder / "result.json").is_file():
         raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
@@ -191,7 +191,7 @@ def load_view(folder: Path) -> ResultView:
             raise SpecError(
                 f"was made with another model of {robot.name} (sha256 {recorded[:12]}…)",
                 where=str(folder),
-                hint="run optimize again, or use the URDF and armature of then",
+                hint="run optimize again, or use the URDF and armature of that result",
             )
         initial, optimal = (
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")

@@ -1,0 +1,227 @@
+"""Figures ``nullspace`` and ``tradeoff``: H, G, V and S along a path, and the objective over the distance moved.
+
+The trade-off is computed by :mod:`impact_posture.posture.pareto`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, NullFormatter
+
+from impact_posture.errors import InputError
+from impact_posture.plot.shapes import Vector
+from impact_posture.plot.style import BLUE, GRAY, GREEN, INK, PURPLE, VERMILLION, framed
+from impact_posture.plot.view import PathData, ResultView, TradeOffData, header_lines, number, objective_unit
+
+NOTES = (
+    "Each point is the best posture found that moves at most so far from the initial one (joint angles, sliding "
+    "joints and base taken together); lines between points only join them. Hollow: not certified as an optimum.",
+)
+_KNEE = (
+    "The knee is the point whose share of the gain exceeds its share of the distance most, marked only if that is by "
+    "1/3 or more (a parabola reaches 1/4)."
+)
+
+
+# Ratio of the largest to the smallest value above which the axis is logarithmic.
+_SPREAD = 30.0
+# Upright line at a posture.
+_MARK: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": ":", "zorder": 1}
+QUANTITIES: dict[str, dict[str, Any]] = {
+    "H": {"color": BLUE, "linestyle": "-", "linewidth": 1.9, "marker": "o"},
+    "G": {"color": GREEN, "linestyle": (0, (1, 1)), "linewidth": 1.5, "marker": "^"},
+    "V": {"color": VERMILLION, "linestyle": (0, (5, 2)), "linewidth": 1.5, "marker": "s"},
+    "S": {"color": PURPLE, "linestyle": (0, (5, 1.5, 1, 1.5)), "linewidth": 1.5, "marker": "D"},
+}
+
+
+def path_figure(view: ResultView) -> Figure:
+    """Draw H, G, V and S along ``view.path``, each divided by its value at the start; log axis if they spread widely.
+
+    Raises:
+        InputError: The view has no path, or its arrays do not fit together.
+    """
+    path = _checked(view.path)
+    with framed(*header_lines(view), 3.1, [share_notes("along the path", undrawn(path))]) as (figure, body):
+        axes = body.subplots()
+        drawn = draw_shares(axes, path.s, path)
+        _mark(axes, path)
+        axes.set_xlabel("path length in the null space, ∫‖dν‖  [rad, mixed with m]")
+        if drawn:
+            body.legend(loc="outside right center", title="value / start", title_fontsize=7.5, handlelength=3.2)
+    return figure
+
+
+def draw_shares(axes: Any, x: Vector, data: PathData | TradeOffData) -> bool:
+    """Draw H, G, V and S over ``x``, each divided by its value at the start; return whether any was drawn."""
+    curves = {name: normalized(data, name) for name in QUANTITIES}
+    drawn = {name: curve for name, curve in curves.items() if curve is not None}
+    values = np.concatenate([curve[np.isfinite(curve)] for curve in drawn.values()]) if drawn else np.ones(1)
+    log = spreads(values)
+    for name, curve in drawn.items():
+        shown = np.where(curve > 0, curve, np.nan) if log else curve
+        at_start = number(float(getattr(data, name)[_first(data, name)]))
+        every = max(len(x) // 10, 1)
+        axes.plot(x, shown, label=f"{name} / {at_start}", markevery=every, markersize=3.5, **QUANTITIES[name])
+    axes.axhline(1.0, color=GRAY, linewidth=0.6, zorder=0)
+    if log:
+        log_axis(axes)
+    else:
+        axes.set_ylim(0.0, 1.12 * max(float(values.max()), 1.0))
+    axes.grid(True)
+    axes.set_ylabel("value / value at start  [1]" + (", log" if log else ""))
+    return bool(drawn)
+
+
+def spreads(values: Vector, ratio: float = _SPREAD) -> bool:
+    """Return whether positive values spread by more than ``ratio``, so that they need a log axis."""
+    positive = values[values > 0]
+    return bool(positive.size) and float(positive.max() / positive.min()) > ratio
+
+
+def log_axis(axes: Any) -> None:
+    """Make the upright axis logarithmic, with plain numbers at few ticks."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def undrawn(data: PathData | TradeOffData) -> list[str]:
+    """Return the quantities without a curve, because they are undefined or zero at the start."""
+    return [name for name in QUANTITIES if normalized(data, name) is None]
+
+
+def normalized(path: PathData | TradeOffData, name: str) -> Vector | None:
+    """Divide a quantity by its value at the start, or by its nearest value; ``None`` where that is 0."""
+    values = np.asarray(getattr(path, name), dtype=float)
+    first = _first(path, name)
+    if first is None or not values[first] > 0:
+        return None
+    return np.asarray(values / values[first])
+
+
+def _first(path: PathData | TradeOffData, name: str) -> int | None:
+    values = np.asarray(getattr(path, name), dtype=float)
+    start = range(len(values))[path.start]
+    if np.isfinite(values[start]):
+        return start
+    finite = np.flatnonzero(np.isfinite(values))
+    return int(finite[np.argmin(np.abs(finite - start))]) if finite.size else None
+
+
+def _checked(path: PathData | None) -> PathData:
+    if path is None:
+        raise InputError("there is no path to draw", where="figure nullspace", hint="give ResultView.path")
+    sizes = {name: np.shape(getattr(path, name)) for name in ("s", *QUANTITIES)}
+    count = len(path.s)
+    if count < 2 or set(sizes.values()) != {(count,)}:
+        raise InputError(
+            f"the path's arrays have shapes {', '.join(f'{k} {v}' for k, v in sizes.items())}",
+            where="figure nullspace",
+            hint="give at least two postures and one number of each quantity for each",
+        )
+    return path
+
+
+def _mark(axes: Any, path: PathData) -> None:
+    """Draw upright lines at the start and the optimum, named above the axes."""
+    for word, index, align in (("start", path.start, "left"), ("optimum", path.optimum, "right")):
+        axes.axvline(path.s[index], **_MARK)
+        axes.annotate(
+            word, (path.s[index], 1.0), (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points",
+            ha="center" if 0.05 < _share(path, index) < 0.95 else align, fontsize=7.5,
+        )  # fmt: skip
+
+
+def _share(path: PathData, index: int) -> float:
+    length = float(path.s[-1] - path.s[0])
+    return float(path.s[index] - path.s[0]) / length if length > 0 else 0.0
+
+
+def share_notes(where: str, missing: list[str]) -> str:
+    """Return the note on the curves of :func:`draw_shares`."""
+    notes = "Each curve is divided by its value at the start; for H, V and S less is better. G is 1/effective mass."
+    if "S" in missing:
+        notes += f" S is undefined {where}."
+    others = [name for name in missing if name != "S"]
+    return notes + (f" {', '.join(others)} start at zero and cannot be divided by it." if others else "")
+
+
+def tradeoff_figure(view: ResultView) -> Figure:
+    """Draw the objective over the distance (log axis if it spreads widely), and below it H, G, V and S.
+
+    Raises:
+        InputError: The view has no trade-off.
+    """
+    data = view.tradeoff
+    if data is None:
+        raise InputError(
+            "there is no trade-off to draw", where="figure tradeoff", hint="run optimize again with `tradeoff`"
+        )
+    knee = [_KNEE] if data.knee is not None else []
+    notes = [*NOTES, *knee, share_notes("at these postures", undrawn(data))]
+    with framed(*header_lines(view), 5.6, notes) as (figure, body):
+        upper, lower = body.subplots(2, 1, sharex=True, height_ratios=[1.25, 1])
+        _objective(upper, data, view)
+        drawn = draw_shares(lower, data.within, data)
+        lower.set_xlabel("distance moved from the initial posture, at most  [rad, mixed with m]")
+        if data.knee is not None:
+            lower.axvline(data.within[data.knee], **_MARK)
+        handles = upper.get_legend_handles_labels()[0]
+        if drawn:
+            # A heading separates these entries from those of the panel below.
+            handles += [Line2D([], [], linestyle="", label="value / start:"), *lower.get_legend_handles_labels()[0]]
+        body.legend(handles=handles, loc="outside right center", handlelength=3.2)
+        body.align_ylabels([upper, lower])
+    return figure
+
+
+def _objective(axes: Any, data: TradeOffData, view: ResultView) -> None:
+    x, y = data.within, data.objective
+    log = bool((y > 0).all()) and spreads(y)
+    axes.plot(x, y, color=BLUE, linewidth=1.6, zorder=3)
+    for mask, face, label in ((data.certified, BLUE, "certified"), (~data.certified, "white", "not certified")):
+        if mask.any():
+            look = {"linestyle": "", "marker": "o", "markersize": 5, "markeredgecolor": BLUE, "zorder": 4}
+            axes.plot(x[mask], y[mask], markerfacecolor=face, label=label, **look)
+    if log:
+        log_axis(axes)
+    else:
+        # A margin above and below keeps the noise of an almost constant curve small.
+        room = 0.08 * max(float(np.ptp(y)), 1e-3 * float(np.abs(y).max()))
+        axes.set_ylim(float(y.min()) - room, float(y.max()) + 1.5 * room)
+    axes.grid(True)
+    kind = "objective" if not view.objective.normal_cone_deg else "worst objective of the cone"
+    axes.set_ylabel(f"{kind} ({view.objective.kind})  [{objective_unit(view)}]" + (", log" if log else ""))
+    axes.set_title(_title(data), parse_math=False)
+    share = axes.secondary_yaxis("right", functions=(lambda v: 1 - v / y[0], lambda r: (1 - r) * y[0]))
+    if not log:
+        share.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:.3g}".replace("-", "−")))
+        share.set_ylabel("reduction  [%]")
+    else:
+        share.set_visible(False)
+    if data.knee is None:
+        return
+    if not log:
+        ends = [0, -1]
+        axes.plot(x[ends], y[ends], color=GRAY, linewidth=0.8, linestyle=(0, (1, 2)), label="in proportion", zorder=2)
+    look = {"linestyle": "", "marker": "o", "markersize": 11, "markerfacecolor": "none", "markeredgewidth": 1.4}
+    axes.plot(x[data.knee], y[data.knee], markeredgecolor=VERMILLION, label="knee", zorder=5, **look)
+    axes.axvline(x[data.knee], **_MARK)
+
+
+def _title(data: TradeOffData) -> str:
+    """Return the gain at the knee, or at half of the distance."""
+    y, x = data.objective, data.within
+    gain = float(y[0] - y[-1])
+    if not gain > 0:
+        return "nothing is gained"
+    if data.knee is not None:
+        share, way = (y[0] - y[data.knee]) / gain, x[data.knee] / x[-1]
+        return f"knee: {100 * share:.0f} % of the gain for {100 * way:.0f} % of the distance"
+    half = float(np.interp(x[-1] / 2, x, y))
+    return f"half of the distance yields {100 * (y[0] - half) / gain:.0f} % of the gain; no knee"

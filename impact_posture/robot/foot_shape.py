@@ -1,0 +1,123 @@
+"""Contact point or sole of a foot, from the primitive collision shapes of its URDF."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.robot.guess import joints_to, upright_frames
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.spec import SupportSpec
+
+Vector = NDArray[np.float64]
+
+# Points of a foot within this distance (m) of its lowest one touch the ground with it.
+_PATCH = 2e-3
+# A patch narrower than this (m) is a point.
+_SOLE = 0.01
+# Cosine of the tilt up to which the frame of a sole counts as upright: 1°.
+_UPRIGHT = float(np.cos(np.radians(1.0)))
+
+
+def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> SupportSpec:
+    """Return a foot with its contact point or sole, as far as primitive collision shapes define them.
+
+    Args:
+        robot: The robot.
+        frame: Frame of the foot.
+        urdf: URDF with the shapes.
+        flat: Whether a foot without shapes counts as a surface.
+    """
+    data, index = upright_frames(robot), robot.frame_id(frame)
+    points = _lowest_points(robot, data, index, urdf)
+    foot = SupportSpec(frame=frame, kind="surface" if flat else "point")
+    if not len(points):
+        return foot
+    placement = data.oMf[index]
+    patch = np.array([placement.actInv(p) for p in points if p[2] <= points[:, 2].min() + _PATCH])
+    low, high = patch.min(axis=0), patch.max(axis=0)
+    size = (high - low)[:2] / 2
+    wide = len(patch) > 2 and size.min() > _SOLE / 2 and placement.rotation[2, 2] > _UPRIGHT
+    middle = (low + high) / 2 if wide else patch.mean(axis=0)
+    x, y, z, half_x, half_y = (round(float(v), 4) + 0.0 for v in (*middle, *size))
+    foot = replace(foot, offset=(x, y, z))
+    return replace(foot, kind="surface", size=(half_x, half_y)) if wide else foot
+
+
+def foot_specs(robot: Robot, feet: Sequence[str], urdf: Path) -> list[SupportSpec]:
+    """Return the feet as supports; those of two legs of six joints or more count as flat."""
+    flat = len(feet) == 2
+    return [support(robot, f, urdf, flat=flat and len(joints_to(robot, f)) > 5) for f in feet]
+
+
+def support_depth(robot: Robot, feet: Sequence[SupportSpec]) -> float:
+    """Return the depth of the center of mass in the support polygon, m; negative outside or without a polygon."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    model, q = robot.model, robot.posture()
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    center = np.array(pin.centerOfMass(model, data, q))[:2]
+    corners = [
+        data.oMf[robot.frame_id(foot.frame)].act(foot.offset + np.array([*foot.size, 0.0]) * (x, y, 0))[:2]
+        for foot in feet
+        for x, y in product((-1, 1), repeat=2)
+    ]
+    try:
+        hull = ConvexHull(np.array(corners))
+    except QhullError:
+        return -1.0
+    return -float(np.max(hull.equations[:, :2] @ center + hull.equations[:, 2]))
+
+
+def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Vector:
+    """Return the lowest points (world) of the primitive collision shapes that move with a frame, without meshes."""
+    model = robot.model
+    joint = model.frames[index].parentJoint
+    found: list[Vector] = []
+    for link in ET.parse(urdf).getroot().iter("link"):
+        name = link.get("name", "")
+        if not model.existFrame(name, pin.FrameType.BODY):
+            continue
+        body = model.getFrameId(name, pin.FrameType.BODY)
+        if model.frames[body].parentJoint != joint:
+            continue
+        for collision in link.iter("collision"):
+            at = data.oMf[body] * _origin(collision.find("origin"))
+            for shape in collision.iterfind("geometry/*"):
+                found += _bottom(shape, at)
+    return np.array(found).reshape(-1, 3)
+
+
+def _origin(tag: ET.Element | None) -> pin.SE3:
+    xyz, rpy = (_numbers(tag, key) for key in ("xyz", "rpy"))
+    return pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)
+
+
+def _numbers(tag: ET.Element | None, key: str) -> Vector:
+    words = (tag.get(key) or "").split() if tag is not None else []
+    return np.array([float(w) for w in words]) if len(words) == 3 else np.zeros(3)
+
+
+def _bottom(shape: ET.Element, at: pin.SE3) -> Sequence[Vector]:
+    """Return points of a shape that include its lowest ones; none for a mesh."""
+    if shape.tag == "sphere":
+        return [np.array(at.translation) - [0, 0, float(shape.get("radius", 0))]]
+    if shape.tag == "box":
+        half = _numbers(shape, "size") / 2
+        return [at.act(np.array(signs) * half) for signs in product((-1, 1), repeat=3)]
+    if shape.tag == "cylinder":
+        radius, half_length = float(shape.get("radius", 0)), float(shape.get("length", 0)) / 2
+        axis = np.array(at.rotation[:, 2])
+        down = np.array([0, 0, -1.0]) + axis[2] * axis
+        reach = float(np.linalg.norm(down))
+        edge = radius * down / reach if reach > 1e-9 else np.zeros(3)
+        return [np.array(at.translation) + sign * half_length * axis + edge for sign in (-1, 1)]
+    return []

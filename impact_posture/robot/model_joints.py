@@ -1,0 +1,51 @@
+"""Joints of a ``pin.Model``: which ones there are, and where they stand in ``q`` and ``ν``."""
+
+from __future__ import annotations
+
+import math
+
+import pinocchio as pin
+
+from impact_posture.errors import JointNotFound
+
+
+def is_free_flyer(model: pin.Model) -> bool:
+    """Tell whether the first joint of a model is a free-flyer."""
+    return bool(model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer")
+
+
+def joint_range(model: pin.Model) -> range:
+    """Return the indices of all joints except the universe and the free-flyer."""
+    return range(2 if is_free_flyer(model) else 1, model.njoints)
+
+
+def q_slice(model: pin.Model, index: int) -> slice:
+    """Return the entries of a joint in ``q``."""
+    return slice(int(model.idx_qs[index]), int(model.idx_qs[index] + model.nqs[index]))
+
+
+def v_slice(model: pin.Model, index: int) -> slice:
+    """Return the entries of a joint in ``ν``."""
+    return slice(int(model.idx_vs[index]), int(model.idx_vs[index] + model.nvs[index]))
+
+
+def scalar_entries(model: pin.Model, index: int, value: float) -> tuple[float, ...]:
+    """Return the entries of ``q`` of a joint with one degree of freedom: its value, or cosine and sine of it."""
+    return (value,) if model.nqs[index] == 1 else (math.cos(value), math.sin(value))
+
+
+def joint_index(model: pin.Model, joint: str, where: str) -> int:
+    """Return the index of a movable joint.
+
+    Raises:
+        JointNotFound: No movable joint has this name; carries the nearest names.
+    """
+    known = movable_joints(model)
+    if joint not in known:
+        raise JointNotFound(joint, known, where=where)
+    return int(model.getJointId(joint))
+
+
+def movable_joints(model: pin.Model) -> list[str]:
+    """Return the names of all joints except the universe and the root joint."""
+    return [str(name) for name in model.names if name not in ("universe", "root_joint")]

@@ -1,0 +1,118 @@
+"""Named postures of a model: those of its SRDF, those of ``robot.toml``, and the neutral one."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.errors import SpecError, UrdfError
+from impact_posture.robot.model_joints import joint_index, joint_range, q_slice, scalar_entries
+from impact_posture.robot.robot import Vector
+from impact_posture.robot.spec import RobotSpec
+from impact_posture.settings import Root
+
+
+def named_postures(
+    model: pin.Model, srdf: Path | None, spec: RobotSpec, root: Root, name: str
+) -> tuple[dict[str, Vector], str]:
+    """Return all named postures, shape (nq,) each, and the name of the default one.
+
+    Args:
+        model: The model, with its final limits.
+        srdf: SRDF with ``group_state`` tags, or ``None``.
+        spec: The ``robot.toml``; its postures replace those of the SRDF.
+        root: Root joint of the model.
+        name: Name of the robot.
+
+    Raises:
+        UrdfError: The SRDF cannot be read.
+        SpecError: A posture of ``robot.toml`` does not fit the model, or the default posture does not exist.
+    """
+    postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec, root, name)
+    default = spec.default_posture or next(iter(postures), "neutral")
+    postures.setdefault("neutral", _neutral(model))
+    if default not in postures:
+        raise SpecError(
+            f"default_posture '{default}' does not exist", where=name, hint=f"one of: {', '.join(postures)}"
+        )
+    return postures, default
+
+
+def states_with_base(srdf: Path | None) -> list[str]:
+    """Return the names of the ``group_state`` tags of an SRDF that contain a base pose (seven numbers of a joint)."""
+    states = ET.parse(srdf).getroot().iter("group_state") if srdf is not None else ()
+    return [
+        str(state.get("name"))
+        for state in states
+        if any(len((joint.get("value") or "").split()) == 7 for joint in state.iter("joint"))
+    ]
+
+
+def ignored_bases(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str, ...]:
+    """Return a warning about the postures whose base pose a fixed root ignores, or nothing."""
+    named = [key for key, posture in spec.postures.items() if posture.base is not None] + states_with_base(srdf)
+    if not named:
+        return ()
+    which = default if default in named else ", ".join(dict.fromkeys(named))
+    return (
+        f"the root is fixed, so the base pose of posture {which} is left out, and the root link sits at the world's "
+        "origin along its axes; `root='free-flyer'` keeps the pose",
+    )
+
+
+def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict[str, Vector]:
+    if srdf is None:
+        return {}
+    try:
+        pin.loadReferenceConfigurations(model, str(srdf), False)
+    except Exception as error:  # Pinocchio passes on whatever its XML library raises.
+        raise UrdfError(f"is no SRDF ({error})", where=str(srdf), hint="correct the SRDF") from None
+    states = {item.key(): np.array(item.data(), dtype=float) for item in model.referenceConfigurations}
+    return {name: pin.normalize(model, q) for name, q in states.items() if name not in spec.postures}
+
+
+def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> dict[str, Vector]:
+    result = {}
+    for key, posture in spec.postures.items():
+        where = f"{name} posture '{key}'"
+        q = np.array(pin.neutral(model), dtype=float)
+        if posture.base is not None and spec.model.root != "free-flyer" and root != "free-flyer":
+            raise SpecError(
+                f"posture '{key}' gives a base pose, but the root is fixed",
+                where=name,
+                hint='remove it, or write root = "free-flyer" in [model]',
+            )
+        # A floating robot that the user fixes to the world keeps its postures, with a warning about their base.
+        if posture.base is not None and root == "free-flyer":
+            norm = float(np.linalg.norm(posture.base[3:]))
+            if not (np.isfinite(posture.base).all() and abs(norm - 1) < 1e-3):
+                raise SpecError(
+                    f"base quaternion of norm {norm:.4g}", where=where, hint="give a unit quaternion x y z w"
+                )
+            q[:7] = posture.base
+        for joint, value in posture.joints.items():
+            index = joint_index(model, joint, where)
+            if model.nvs[index] != 1:
+                raise SpecError(
+                    f"posture '{key}': joint '{joint}' has {model.nvs[index]} degrees of freedom, not one number",
+                    where=name,
+                    hint="give it in an SRDF",
+                )
+            if not np.isfinite(value):
+                raise SpecError(f"posture '{key}': joint '{joint}' is {value}", where=name, hint="give a number")
+            q[q_slice(model, index)] = scalar_entries(model, index, value)
+        result[key] = np.asarray(pin.normalize(model, q))
+    return result
+
+
+def _neutral(model: pin.Model) -> Vector:
+    """Return the neutral configuration, clipped to the limits of the joints that zero violates."""
+    q = np.array(pin.neutral(model), dtype=float)
+    for i in joint_range(model):
+        if model.nqs[i] == 1:
+            k = model.idx_qs[i]
+            q[k] = np.clip(q[k], model.lowerPositionLimit[k], model.upperPositionLimit[k])
+    return q
