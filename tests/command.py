@@ -28,7 +28,6 @@ from matplotlib.figure import Figure
 
 # What the commands import when they run, once for all of them.
 import impact_posture.codegen.export
-import impact_posture.codegen.folder
 import impact_posture.experiment.figures
 import impact_posture.experiment.folders
 import impact_posture.experiment.reproduction
@@ -43,7 +42,7 @@ import impact_posture_cli.error_boundary
 import impact_posture_cli.output
 import impact_posture_cli.progress
 import impact_posture_cli.tables  # noqa: F401
-from impact_posture_cli.app import app
+from impact_posture_cli.app import COMMANDS, app, load
 
 with contextlib.suppress(ImportError):
     import mujoco  # noqa: F401
@@ -52,6 +51,8 @@ with contextlib.suppress(ImportError):
 PIL.Image.preinit()
 rich.cells.cell_len("×")
 PARSER = typer.main.get_command(app)
+for name in COMMANDS:
+    load(name)
 
 # The program that the installation puts on the path.
 (MAIN,) = (entry.load() for entry in entry_points(group="console_scripts", name="impact-posture"))
@@ -162,7 +163,6 @@ def _command(
         impact_posture.plot.snapshots.snapshots_figure = _blank
     if prepare is not None:
         prepare()
-    typer.main.get_command = lambda app: PARSER
     sys.argv = ["impact-posture", *words]
     MAIN()
 
