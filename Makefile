@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test wheel test-wheel lowest lint types docs bench study-impacts study-robustness reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-robustness reproduction calibration regression
 .PHONY: pictures clean
 
 help:
@@ -16,6 +16,7 @@ help:
 	@echo "make test-wheel  the same, then the whole suite against what was installed"
 	@echo "make lowest      the same with the lowest versions that pyproject.toml allows; PYTHON= tries another Python"
 	@echo "make bench       how fast it is on this machine: solve times, ticks, the exported kernel beside its peers"
+	@echo "make coverage    branch coverage of both packages by the suite, for the documentation"
 	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
 	@echo "make study-robustness  where each controller helps: 40 random variations of each experiment (an hour or two)"
@@ -77,6 +78,9 @@ docs: $(VENV)/.installed-docs
 
 bench: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks solve loader tsid kernel
+
+coverage: $(VENV)/.installed-test
+	$(BIN)/python -m tests.coverage_report -n $(JOBS) --dist worksteal
 
 study-impacts: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks impacts --write

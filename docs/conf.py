@@ -21,6 +21,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "api_reference",
     "cli_reference",
+    "package_structure",
 ]
 # MathJax from the wheel, so that equations show without a network; Sphinx's own default (a CDN) where it is missing.
 if importlib.util.find_spec("sphinx-mathjax-offline"):

@@ -1,0 +1,80 @@
+"""``package-structure``: files, lines and imports of each folder of the library, counted when the pages are built."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = {"impact_posture": ROOT / "impact_posture", "impact_posture_cli": ROOT / "cli"}
+SUFFIXES = {".py", ".c", ".cpp", ".hpp"}
+
+
+def part_of(module: str) -> str:
+    """The folder or module of the library that a dotted name belongs to; the command line as one part."""
+    names = module.split(".")
+    if names[0] == "impact_posture_cli":
+        return "cli"
+    return names[1] if len(names) > 1 else ""
+
+
+def imports_of(path: Path) -> set[str]:
+    """The parts that a file imports when it is loaded or when its functions run, not for annotations alone."""
+    found: set[str] = set()
+    todo: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    while todo:
+        node = todo.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
+            # `from impact_posture import tsid` names a part, too.
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            found |= {part_of(name) for name in ([node.module or ""] if "." in (node.module or "") else names)}
+        todo += ast.iter_child_nodes(node)
+    return found - {""}
+
+
+def parts() -> dict[str, tuple[int, int, set[str]]]:
+    """Files, lines and imports of each part, the largest first."""
+    found: dict[str, tuple[int, int, set[str]]] = {}
+    for package, folder in PACKAGES.items():
+        for path in sorted(p for p in folder.rglob("*") if p.suffix in SUFFIXES):
+            inner = path.relative_to(folder)
+            name = "cli" if package.endswith("cli") else inner.parts[0].removesuffix(".py")
+            if name == "__init__":
+                continue
+            files, lines, imports = found.get(name, (0, 0, set()))
+            more = imports_of(path) if path.suffix == ".py" else set()
+            found[name] = files + 1, lines + len(path.read_text(encoding="utf-8").splitlines()), imports | more
+    return dict(sorted(found.items(), key=lambda item: -item[1][1]))
+
+
+def markdown() -> str:
+    """A row for each part, and the sum."""
+    every = parts()
+    rows = ["| part | files | lines | imports |", "|---|---|---|---|"]
+    for name, (files, lines, imports) in every.items():
+        others = ", ".join(f"`{other}`" for other in every if other in imports and other != name)
+        rows.append(f"| `{name}` | {files} | {lines} | {others} |")
+    files, lines = (sum(value[k] for value in every.values()) for k in (0, 1))
+    rows.append(f"| together | {files} | {lines} | |")
+    return "\n".join(rows)
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the directive."""
+    from docutils import nodes
+    from sphinx.util.docutils import SphinxDirective
+
+    class PackageStructure(SphinxDirective):
+        """Insert :func:`markdown` where it stands."""
+
+        def run(self) -> list[nodes.Node]:
+            return self.parse_text_to_nodes(markdown())
+
+    app.add_directive("package-structure", PackageStructure)
+    return {"version": "1", "parallel_read_safe": True}
