@@ -63,7 +63,9 @@ class Chart:
         for slot in self.slots:
             angle = slot.kind.family in _ANGLES
             last = slot.x.stop - 1
-            parts += [x[slot.x.start : last], cos(x[last]), sin(x[last])] if angle else [x[slot.x]]
+            # CasADi gives an entry for the empty part of a scalar x, which a single continuous joint has.
+            parts += [x[slot.x.start : last]] if angle and last > slot.x.start else []
+            parts += [cos(x[last]), sin(x[last])] if angle else [x[slot.x]]
         return parts
 
     def quaternion_slices(self) -> list[slice]:
