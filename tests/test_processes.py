@@ -64,7 +64,7 @@ def test_a_worker_that_is_killed_is_noticed() -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         return index
 
-    with pytest.raises(WorkerDied, match="--jobs 1"), fork_map(work, 6, 2) as results:
+    with pytest.raises(WorkerDied, match="jobs=1"), fork_map(work, 6, 2) as results:
         list(results)
     with fork_map(lambda index: index, 3, 2) as results:
         assert sorted(results) == [(k, k) for k in range(3)]

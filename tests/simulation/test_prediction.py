@@ -147,7 +147,7 @@ def test_a_pushs_prediction_is_the_impulses() -> None:
 
 def free_body(name: str) -> Robot:
     found = robot(name)
-    return replace(found, spec=found.spec.model_copy(update={"propulsion": None}))
+    return replace(found, spec=replace(found.spec, propulsion=None))
 
 
 @pytest.mark.parametrize("name", ["solo8", "go2", "talos"])
