@@ -19,7 +19,7 @@ LEAST = 90.0
 # Why a file stays below.
 REASONS = {
     "cli/commands/reproduce.py": "the page for people: tests ask for JSON",
-    "impact_posture/posture/nlp.py": "a second try of IPOPT, which no test problem needs",
+    "impact_posture/posture/nlp.py": "what Ctrl-C does while IPOPT runs in the main process",
     "impact_posture/posture/solve.py": "second guesses and failures that no test problem meets",
     "impact_posture/simulation/offline.py": "an optimum that motors cannot hold: no test scenario has one",
 }
