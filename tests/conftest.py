@@ -23,6 +23,9 @@ for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
+from impact_posture.impact.contact import ImpactContact  # noqa: E402
+from impact_posture.impact.objective import ImpactObjective  # noqa: E402
+from impact_posture.robot.robot_loader import load_robot  # noqa: E402
 from tests.rounding import other_rounding  # noqa: E402
 
 # The same examples on every run and on every worker; a slow machine is no failure.
@@ -65,3 +68,31 @@ def rounding_of_this_run(request: pytest.FixtureRequest) -> Iterator[None]:
         return
     with other_rounding(seed):
         yield
+
+
+# One link about z: where it points along x, it cannot move along x at all.
+PENDULUM = """<robot name="pendulum">
+  <link name="base"/>
+  <link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="2"/>
+    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
+  <link name="tip"/>
+  <joint name="swing" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="end" type="fixed"><parent link="arm"/><child link="tip"/><origin xyz="1 0 0"/></joint>
+</robot>
+"""
+
+
+@pytest.fixture(scope="module")
+def small() -> ImpactObjective:
+    robot = load_robot("tilthex_arm")
+    return ImpactObjective(
+        robot, ImpactContact("ee", (1.0, 0.3, -0.2), (0.01, 0.02, 0.0), impulse=1.7), kind="sticking"
+    )
+
+
+@pytest.fixture
+def pendulum(tmp_path: Path) -> str:
+    path = tmp_path / "pendulum.urdf"
+    path.write_text(PENDULUM)
+    return str(path)

@@ -12,7 +12,7 @@ import typer.main
 from impact_posture.errors import FrameNotFound, InertiaError, JointNotFound, PostureError, not_one_of
 from impact_posture.impact.resolved_impact import resolve
 from impact_posture.posture.caveats import percent
-from impact_posture.posture.problem_settings import make_settings, prepare, resolved_settings
+from impact_posture.posture.problem_settings import prepare, resolved_settings
 from impact_posture.robot.postures import read_posture, write_posture
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import ImpactSettings, LoadOptions
@@ -20,6 +20,7 @@ from impact_posture_cli.app import app
 from impact_posture_cli.argv import put_right
 from impact_posture_cli.error_boundary import run
 from tests.helpers import robot
+from tests.settings import make_settings
 
 DATA = "example-robot-data:"
 B1_Z1 = f"{DATA}b1_description/urdf/b1-z1.urdf"

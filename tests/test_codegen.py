@@ -30,23 +30,10 @@ from impact_posture.settings import ObjectiveKind
 from impact_posture.toolchain import run_compiler
 from tests import exported
 from tests.exported import Exported
-from tests.tools import need, need_compiler
+from tests.tools import STRICT, need, need_compiler
 
 KINOVA = "example-robot-data:kinova_description/robots/kinova.urdf"
-STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
 UNIT = np.array([0.6, 0.0, 0.8])
-
-# One link about z: where it points along x, it cannot move along x at all.
-PENDULUM = """<robot name="pendulum">
-  <link name="base"/>
-  <link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="2"/>
-    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
-  <link name="tip"/>
-  <joint name="swing" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
-    <limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
-  <joint name="end" type="fixed"><parent link="arm"/><child link="tip"/><origin xyz="1 0 0"/></joint>
-</robot>
-"""
 
 
 @dataclass(frozen=True)
@@ -99,18 +86,6 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     written = export(objective, folder, posture=sample_postures(robot, 1, 7)[0], check=False)
     with exported.built(folder, written.prefix, STRICT) as library:
         yield Built(objective, written, library, folder)
-
-
-@pytest.fixture(scope="module")
-def small() -> ImpactObjective:
-    return CASES["tilthex_arm"].build()
-
-
-@pytest.fixture
-def pendulum(tmp_path: Path) -> str:
-    path = tmp_path / "pendulum.urdf"
-    path.write_text(PENDULUM)
-    return str(path)
 
 
 # ---- numbers ------------------------------------------------------------------------------------------------------

@@ -28,9 +28,7 @@ from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import LoadOptions
 from impact_posture.toolchain import run_compiler
 from tests import command, exported
-from tests.tools import need, need_compiler
-
-STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
+from tests.tools import STRICT, need, need_compiler
 
 JOINTS = [
     ("revolute", "1 0 0"), ("revolute", "0.6 0 0.8"), ("prismatic", "0 1 0"), ("prismatic", "0 -0.6 0.8"),

@@ -16,11 +16,12 @@ from impact_posture.errors import CompilerError, OutputError
 from impact_posture.posture import compiled
 from impact_posture.posture.nlp import build_nlp, one_blas_thread
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.problem_settings import Prepared, make_settings, prepare
+from impact_posture.posture.problem_settings import Prepared, prepare
 from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
 from impact_posture.toolchain import run_compilers
 from tests.plot.views import PENDULUM
+from tests.settings import make_settings
 from tests.tools import need, need_compiler
 
 

@@ -25,7 +25,7 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.nlp import build_nlp
 from impact_posture.posture.problem import Requirements
-from impact_posture.posture.problem_settings import make_settings, prepare
+from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import run_start, solve
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import ObjectiveKind
@@ -41,6 +41,7 @@ from tests.helpers import (
     robot,
     unit,
 )
+from tests.settings import make_settings
 from tests.tools import need_compiler
 
 pytestmark = pytest.mark.usefixtures("unoptimized")

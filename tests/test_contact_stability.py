@@ -18,11 +18,12 @@ from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.posture.kept_feet import KeptFeet
-from impact_posture.posture.problem_settings import make_settings, prepare
+from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.robot import Robot
 from tests.command import run
 from tests.helpers import assert_close, central_gradient, frame_jacobian, mass_matrix, robot
+from tests.settings import make_settings
 
 FEET = {"solo8": 4, "solo12": 4, "talos": 2}
 

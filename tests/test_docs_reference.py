@@ -14,13 +14,14 @@ import pytest
 
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.pareto import pareto_front
-from impact_posture.posture.problem_settings import make_settings, prepare
+from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.settings import ContactPose, ProblemSettings
 from impact_posture.simulation.scenario import ScenarioTable
 from impact_posture_cli.app import COMMANDS, build
+from tests.settings import make_settings
 
 DOCS = Path(__file__).parents[1] / "docs"
 

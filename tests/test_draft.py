@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import InputError, OutputError
-from impact_posture.posture.problem_settings import make_settings, prepare
+from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.draft import Draft, write_draft
 from impact_posture.robot.foot_shape import support
@@ -22,6 +22,7 @@ from impact_posture.robot.spec import RobotSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, robots_data
 from impact_posture.settings import LoadOptions
 from tests.helpers import NAMES
+from tests.settings import make_settings
 
 B1_Z1 = "example-robot-data:b1_description/urdf/b1-z1.urdf"
 FOUR = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")

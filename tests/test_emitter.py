@@ -14,9 +14,7 @@ from impact_posture.codegen.graph import CALLS, graph_of
 from impact_posture.codegen.layout import lay_out
 from impact_posture.errors import CompilerError
 from impact_posture.toolchain import run_compiler
-from tests.tools import need_compiler
-
-STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
+from tests.tools import STRICT, need_compiler
 
 
 def c_function(function: ca.Function) -> str:

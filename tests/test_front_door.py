@@ -16,9 +16,10 @@ import pytest
 import impact_posture as ip
 from impact_posture.errors import ContactError, InputError, MetricError, PostureError, SpecError
 from impact_posture.impact.evaluation import Evaluation
-from impact_posture.posture.problem_settings import make_settings, prepare
+from impact_posture.posture.problem_settings import prepare
 from impact_posture.toolchain import find_compiler
 from tests.command import run
+from tests.settings import make_settings
 from tests.test_extension import JointDistance
 
 UP = (0.0, 0.0, 1.0)

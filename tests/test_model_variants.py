@@ -26,13 +26,7 @@ from impact_posture.libraries import build_library, library_path
 from impact_posture.posture.constraint import CenterOfMassOverFeet
 from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.problem_settings import (
-    dump_settings,
-    make_settings,
-    prepare,
-    read_settings,
-    resolved_settings,
-)
+from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.robustness import Robustness, VariantOptimum, solve_robustly
 from impact_posture.posture.solve import solve
 from impact_posture.robot.model_variant import MOST_VARIANTS, Payload, between, build_model_variants
@@ -49,6 +43,7 @@ from tests.helpers import (
     robot,
     unit,
 )
+from tests.settings import make_settings
 from tests.tools import need_compiler
 
 FRAMES = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "bolt": "base_link", "talos": "gripper_right_base_link"}

@@ -14,16 +14,11 @@ from impact_posture.impact.contact import point_on
 from impact_posture.posture.certificate import certify, objective_gradients
 from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
-from impact_posture.posture.problem_settings import (
-    dump_settings,
-    make_settings,
-    prepare,
-    read_settings,
-    resolved_settings,
-)
+from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.solve import PostureSolution, distinct, solve
 from impact_posture.posture.starts import Projector, feasible_start
 from impact_posture.settings import ProblemSettings
+from tests.settings import make_settings
 
 
 def problem_of(robot: str, normal: tuple[float, float, float] = (0, 0, 1), **more: object) -> PostureProblem:

@@ -27,13 +27,7 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import build_library, library_path
 from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.problem_settings import (
-    dump_settings,
-    make_settings,
-    prepare,
-    read_settings,
-    resolved_settings,
-)
+from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.solve import solve
 from impact_posture.posture.starts import feasible_start
 from impact_posture.robot.robot import Robot
@@ -53,6 +47,7 @@ from tests.helpers import (
     robot,
     unit,
 )
+from tests.settings import make_settings
 from tests.test_dynamics import random_tree
 from tests.tools import need, need_compiler
 

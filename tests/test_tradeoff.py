@@ -23,7 +23,7 @@ from impact_posture.posture import pareto as follow
 from impact_posture.posture.pareto import pareto_front
 from impact_posture.posture.posture_distance import WithinDistance, distance, distance_gradient
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.problem_settings import make_settings, prepare
+from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.posture.starts import Projector
 from impact_posture.posture.tradeoff import TradeOff, find_knee
@@ -31,6 +31,7 @@ from impact_posture.settings import TRADEOFF_POINTS
 from impact_posture_cli.argv import fill_optional
 from tests.command import run
 from tests.helpers import central_gradient, relative, rng
+from tests.settings import make_settings
 from tests.test_posture import walk
 
 CASES: dict[str, dict[str, object]] = {

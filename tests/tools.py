@@ -11,6 +11,9 @@ import pytest
 
 from impact_posture.toolchain import find_compiler, words_of
 
+# Warnings that the generated C must not give.
+STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
+
 
 def need_compiler() -> list[str]:
     compiler = find_compiler()

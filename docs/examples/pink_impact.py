@@ -23,8 +23,9 @@ from pink.tasks import FrameTask, Task
 
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.posture.problem_settings import Prepared, make_settings, prepare
+from impact_posture.posture.problem_settings import Prepared, prepare
 from impact_posture.posture.solve import PostureSolution, solve
+from tests.settings import make_settings
 
 DT, DURATION, AT_REST = 0.01, 60.0, 1e-6  # s, s, and a norm of v
 

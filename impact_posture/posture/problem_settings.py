@@ -60,11 +60,6 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
     return validate(ProblemSettings, data | over, str(path))
 
 
-def make_settings(values: dict[str, object]) -> ProblemSettings:
-    """Check values from options."""
-    return validate(ProblemSettings, values, "options")
-
-
 def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> Prepared:
     """Resolve all defaults and build the problem; nothing is solved yet.
 

@@ -15,7 +15,8 @@ from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.points import Point
-from impact_posture.tsid.posture_tasks import JointPosture, smooth
+from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.smooth_step import smooth
 from impact_posture.tsid.state import State
 
 Array = NDArray[np.float64]

@@ -15,7 +15,8 @@ from impact_posture.simulation.task_formulations import build_formulation, end_e
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
-from impact_posture.tsid.posture_tasks import JointPosture, smooth
+from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.smooth_step import smooth
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
-from impact_posture.tsid.smooth_step import STEEPEST
-from impact_posture.tsid.smooth_step import smooth as smooth
+from impact_posture.tsid.smooth_step import STEEPEST, smooth
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Task
 

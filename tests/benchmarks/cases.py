@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.problem_settings import make_settings, prepare
+from impact_posture.posture.problem_settings import prepare
+from tests.settings import make_settings
 
 DOWN, AHEAD, ASIDE, BACK = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)
 _HANDS = ("gripper_left_base_link:-1,0,0", "gripper_right_base_link:-1,0,0")

@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 from impact_posture import plot, result_folder
-from impact_posture.posture.problem_settings import make_settings, prepare
+from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
 from impact_posture.simulation.scenario_file import scenario_path
 from tests.hostile.arena import attack
 from tests.hostile.values import TOML, spoiled
+from tests.settings import make_settings
 
 PUSH = ("small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
 STOP = ("--out", "precious", "--force")

@@ -6,9 +6,10 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from impact_posture.posture.problem_settings import Prepared, make_settings, prepare
+from impact_posture.posture.problem_settings import Prepared, prepare
 from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.settings import ProblemSettings
+from tests.settings import make_settings
 
 ROOT = Path(__file__).parents[2]
 EXPECTED = Path(__file__).with_name("expected.json")
