@@ -40,7 +40,10 @@ def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: 
     feet = ", ".join(f"{s.frame} ({s.kind})" for s in impact.supports)
     rows.append(("supports", f"{feet}; compliance {objective.compliance:.3g} 1/kg" if feet else "none"))
     rows.append(("metric", f"{metric.kind} ({metric.source})" if metric.source else metric.kind))
-    return [*rows, ("armature from", impact.robot.armature_source)]
+    from impact_posture.robot.joint_model import describe_joints
+
+    rows.append(("armature from", impact.robot.armature_source))
+    return [*rows, ("joint model", describe_joints(impact.robot))]
 
 
 def quantities(impact: ResolvedImpact) -> list[tuple[str, str, str]]:

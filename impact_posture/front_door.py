@@ -21,7 +21,7 @@ from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.impact.metric import Metric, build_metric
 from impact_posture.impact.resolved_impact import ResolvedImpact, missing_support
-from impact_posture.impact.supports import refuse_held, resolve_supports
+from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
@@ -33,10 +33,12 @@ from impact_posture.posture.robustness import Robustness, solve_robustly
 from impact_posture.posture.solve import PostureSolution, Progress
 from impact_posture.posture.tradeoff import TradeOff
 from impact_posture.result_folder import FORMATS, Written, result_view, write_result
+from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.model_variant import ModelVariant, Payload, build_model_variants
 from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import (
+    JointModel,
     MetricKind,
     ObjectiveKind,
     ProblemSettings,
@@ -65,6 +67,8 @@ class ImpactObjective(core.ImpactObjective):
         weights: Weights of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
         armature_range: Lowest and highest factor on the armature; the worst counts.
         payloads: Frame and mass in kg of payloads that the robot may carry, one at a time; the worst counts.
+        joint_model: Inertia at the joints: ``reflected``, ``link`` or ``locked``
+            (:func:`~impact_posture.robot.joint_model.with_joint_model`); ``None`` for that of the robot.
 
     Raises:
         ImpactPostureError: An argument does not fit the robot.
@@ -86,7 +90,9 @@ class ImpactObjective(core.ImpactObjective):
         weights: str | Sequence[float] | None = None,
         armature_range: tuple[float, float] | None = None,
         payloads: Sequence[tuple[str, float]] = (),
+        joint_model: JointModel | None = None,
     ) -> None:
+        robot = with_joint_model(robot, joint_model or robot.joint_model)
         given = [contact] if isinstance(contact, ImpactContact) else list(contact)
         if not given:
             raise InputError("names no contact", where="contact", hint="give an ImpactContact")
@@ -94,6 +100,7 @@ class ImpactObjective(core.ImpactObjective):
         feet = _supports(robot, supports)
         for one in (leading, *more):
             refuse_held(robot, one, feet)
+        refuse_rigid(robot, feet)
         if not isinstance(metric, Metric):
             values = weights if weights is None or isinstance(weights, str) else tuple(weights)
             metric = build_metric(robot, metric, values)

@@ -25,6 +25,8 @@ ObjectiveKind = Literal["impulse", "speed", "sticking", "energy"]
 ContactPose = Literal["full", "position", "aligned", "free", "box"]
 BaseMode = Literal["free", "level", "fixed", "box"]
 SupportKind = Literal["point", "surface"]
+JointModel = Literal["reflected", "link", "locked"]
+TransmissionKind = Literal["rigid", "elastic", "locked"]
 
 CONTACT, METRIC, ROBOT, TASK, OUTPUT = "Contact", "Measure", "Robot", "Task", "Output"
 
@@ -240,6 +242,14 @@ class ImpactSettings(RobotSettings):
             METRIC, "KIND",
         ),
     ] = "impulse"  # fmt: skip
+    joint_model: Annotated[
+        JointModel,
+        Setting(
+            "Inertia at the joints: reflected (links and rotors), link (without the rotors behind elastic "
+            "transmissions) or locked (rigid joints).",
+            METRIC, "KIND",
+        ),
+    ] = "reflected"  # fmt: skip
     normal_cone: Annotated[
         float,
         Setting(

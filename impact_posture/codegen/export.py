@@ -225,5 +225,5 @@ def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple
 
 
 def _without_contact(o: ImpactObjective) -> tuple[object, ...]:
-    models = tuple(variant.robot.model_sha256 for variant in o.model_variants)
-    return o.robot.model_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg, models
+    models = tuple(variant.robot.impact_sha256 for variant in o.model_variants)
+    return o.robot.impact_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg, models

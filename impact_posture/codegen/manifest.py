@@ -136,6 +136,7 @@ def build_manifest(
         "supports": [{"frame": s.frame, "kind": s.kind, "offset": list(s.offset)} for s in first.supports],
         "support_compliance": first.compliance if first.supports else None,
         "armature": robot.armature.tolist(),
+        "joint_model": robot.joint_model,
         "posture": None if posture is None else posture.tolist(),
         **frames[0],
         "symbols": symbols,

@@ -18,6 +18,7 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.joints import joint_quaternion, joint_spin, joint_transform
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.spatial import Spin, constant, quaternion_product
+from impact_posture.robot.model_joints import finite_armature
 
 # Spatial inertias, forces or motions by joint index.
 ByJoint = dict[int, ca.SX]
@@ -41,8 +42,12 @@ class PointOnLink:
 class Kinematics:
     """A ``pin.Model`` at the configuration ``q`` (``SX``), with optional extra inertias on its links.
 
+    Attributes:
+        locked: Velocity entries of locked joints.
+
     Args:
-        model: The model, with joints of every type that the URDF parser of Pinocchio makes.
+        model: The model, with joints of every type that the URDF parser of Pinocchio makes.  An infinite armature
+            locks a joint: it does not move in an impact.
         q: Configuration, shape (nq, 1).
         chart_x: The chart coordinates of ``q``; only :attr:`quaternions` needs them.
         extra_inertia: Constant 6×6 matrices in link coordinates that ``M`` has beside the inertias of the model.  A
@@ -84,7 +89,9 @@ class Kinematics:
             self._inertia[i] = self._constant(
                 i, "inertia", lambda j: model.inertias[j].matrix() + self._extra.get(j, 0.0)
             )
-        self._armature = self.by_joint("armature", np.array(model.armature, dtype=float))
+        armature, locked = finite_armature(model)
+        self._armature = self.by_joint("armature", armature)
+        self.locked = tuple(int(k) for k in np.flatnonzero(locked))
 
     def _constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
         """Return a constant of a joint as numbers, or as parameters where its counterparts have others."""

@@ -7,6 +7,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.robot.model_joints import finite_armature
 
 Vector = NDArray[np.float64]
 
@@ -15,12 +16,16 @@ class Numeric:
     """Kinematics, mass matrix and their tangent derivatives at one configuration at a time.
 
     Call :meth:`at` first, because the other methods use its configuration.
+
+    Attributes:
+        locked: Velocity entries of joints that an infinite armature locks, shape (nv,).
     """
 
     def __init__(self, model: pin.Model) -> None:
         # An impact has no gravity.  Without it, RNEA is exactly M(q) a.
         self.model = model.copy()
         self.model.gravity = pin.Motion.Zero()
+        self.model.armature, self.locked = finite_armature(model)
         self.data = self.model.createData()
         self.q = pin.neutral(model)
         self._zero = np.zeros(model.nv)
@@ -32,7 +37,7 @@ class Numeric:
         return self
 
     def mass_matrix(self) -> Vector:
-        """Return ``M(q)``, shape (nv, nv), armature included."""
+        """Return ``M(q)``, shape (nv, nv), armature included, as if no joint were locked."""
         upper = np.triu(pin.crba(self.model, self.data, self.q))
         return np.asarray(upper + np.triu(upper, 1).T)
 
@@ -88,6 +93,15 @@ class Numeric:
     def turning_gradient(self, point: PointOnLink, direction: Vector, covector: Vector) -> Vector:
         """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), of a world direction that turns with the link."""
         return np.asarray(self.jacobian(point)[3:].T @ _cross(direction, covector))
+
+
+def hold_locked(locked: NDArray[np.bool_], M: Vector, *jacobians: Vector) -> tuple[Vector, ...]:
+    """Return ``M`` and Jacobians of a robot whose locked entries do not move: their rows and columns are zero.
+
+    The diagonal of ``M`` is one there, so that systems with ``M`` stay regular.
+    """
+    mobile = ~locked
+    return np.where(np.outer(mobile, mobile), M, np.diag(locked.astype(float))), *(J * mobile for J in jacobians)
 
 
 def _cross(a: Vector, b: Vector) -> Vector:

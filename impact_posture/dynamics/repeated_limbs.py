@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.dynamics.joints import joint_kind
 from impact_posture.dynamics.spatial import constant
+from impact_posture.robot.model_joints import finite_armature
 
 # A limb computes with zeros where another limb has other constants.  So much more work is worth it.
 _FILL = 1.25
@@ -142,6 +143,8 @@ def _alike(model: pin.Model, one: tuple[int, ...], other: tuple[int, ...]) -> bo
     for i, j in zip(one, other, strict=True):
         kinds = [joint_kind(model.joints[k], str(model.names[k])) for k in (i, j)]
         if kinds[0].family != kinds[1].family or not np.array_equal(kinds[0].axis, kinds[1].axis):
+            return False
+        if len({bool(finite_armature(model)[1][model.idx_vs[k]]) for k in (i, j)}) > 1:
             return False
         parents = [b.index(int(model.parents[k])) if k != b[0] else -1 for k, b in ((i, one), (j, other))]
         if parents[0] != parents[1]:

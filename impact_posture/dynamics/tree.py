@@ -13,6 +13,7 @@ from functools import cached_property
 
 import casadi as ca
 
+from impact_posture.dynamics.chart import JointSlot
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
 from impact_posture.dynamics.spatial import (
     constant,
@@ -69,7 +70,10 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class _Factor:
-    """Per joint: ``U = I^A S``, ``D = SᵀU + armature``, ``D⁻¹Uᵀ`` and ``I^a = I^A − U D⁻¹ Uᵀ``."""
+    """Per joint: ``U = I^A S``, ``D = SᵀU + armature``, ``D⁻¹Uᵀ`` and ``I^a = I^A − U D⁻¹ Uᵀ``.
+
+    A locked joint has ``D⁻¹ = 0``.
+    """
 
     U: ByJoint
     D: ByJoint
@@ -184,7 +188,11 @@ class Tree(Kinematics):
             i, parent = slot.index, self._parents[slot.index]
             U[i] = ca.densify(articulated[i] @ self._S[i])
             D[i] = symmetric(self._S[i].T @ U[i] + ca.diag(ca.SX(self._armature[slot.v])))
-            if parent:
+            if slot.v.start in self.locked:
+                gain[i], reduced[i] = ca.SX(slot.kind.nv, 6), articulated[i]
+                if parent:
+                    articulated[parent] = articulated[parent] + self._inertia_to_parent(i, reduced[i])
+            elif parent:
                 gain[i] = U[i].T * (1 / D[i]) if slot.kind.nv == 1 else ldl_solve(D[i], U[i].T)
                 reduced[i] = symmetric(articulated[i] - U[i] @ gain[i])
                 articulated[parent] = articulated[parent] + self._inertia_to_parent(i, reduced[i])
@@ -215,7 +223,7 @@ class Tree(Kinematics):
         parts = []
         for slot in self.chart.slots:
             i, parent = slot.index, self._parents[slot.index]
-            rate = drive[i] * (1 / factor.D[i]) if slot.kind.nv == 1 else ldl_solve(factor.D[i], drive[i])
+            rate = self._solve_joint(slot, factor.D[i], drive[i])
             if parent:
                 before[i] = motion_to_child(self._R[i], self._p[i], velocities[parent])
                 rate = rate - factor.gain[i] @ before[i]
@@ -225,6 +233,12 @@ class Tree(Kinematics):
                 velocities[i] = ca.densify(self._S[i] @ rate)
             parts.append(rate)
         return Response(ca.densify(ca.vertcat(*parts)), velocities, before, forces, passed, tuple(wrenches))
+
+    def _solve_joint(self, slot: JointSlot, D: ca.SX, drive: ca.SX) -> ca.SX:
+        """Return ``D⁻¹u`` of a joint, zero if it is locked."""
+        if slot.v.start in self.locked:
+            return ca.SX(slot.kind.nv, 1)
+        return drive * (1 / D) if slot.kind.nv == 1 else ldl_solve(D, drive)
 
     def pair_gradient(self, x: Response, y: Response) -> ca.SX:
         """Return the tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` with all four letters held fixed, shape (nv,).

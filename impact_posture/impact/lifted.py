@@ -94,6 +94,8 @@ def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") 
         f = ca.vertcat(f, f_k)
     mass_a = tree.mass_times(a)
     momentum = mass_a - tree.generalized_force(wrenches)
+    for k in tree.locked:
+        momentum[k] = a[k]
     return UnknownJump(
         a=a,
         variables=ca.vertcat(a, f),

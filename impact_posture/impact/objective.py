@@ -140,7 +140,7 @@ class ImpactObjective:
             (
                 (self.kind, self.metric, self.supports, self.compliance),
                 (self.normal_cone_deg, self.others, self.bilateral),
-                [variant.robot.model_sha256 for variant in self.model_variants],
+                [variant.robot.impact_sha256 for variant in self.model_variants],
                 (contact.frame, contact.offset, contact.normal_frame),
                 self.scale,
             )

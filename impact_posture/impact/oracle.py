@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.numeric import Numeric, hold_locked
 from impact_posture.errors import MetricError
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.impact_case import ImpactCase
@@ -97,10 +97,9 @@ class ImpactOracle:
             return self
         self._q = np.array(q, dtype=float)
         num = self.numeric.at(self._q)
-        self.M = num.mass_matrix()
-        self.J = num.jacobian(self.point)[:3]
         parts = [num.jacobian(point)[:rows] for point, rows in self.feet]
-        self.Js = np.vstack(parts) if parts else np.zeros((0, self.robot.nv))
+        Js = np.vstack(parts) if parts else np.zeros((0, self.robot.nv))
+        self.M, self.J, self.Js = hold_locked(num.locked, num.mass_matrix(), num.jacobian(self.point)[:3], Js)
         rows, nv = self.Js.shape
         self._kkt = np.block([[self.M, -self.Js.T], [self.Js, self.compliance * np.eye(rows)]])
         self._lu = scipy.linalg.lu_factor(self._kkt)
@@ -111,7 +110,8 @@ class ImpactOracle:
     def answer(self, tau: Vector, slip: Vector | None = None) -> Answer:
         """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for vectors or columns; the slip is zero by default."""
         shape = (len(self.Js), *tau.shape[1:])
-        rhs = np.concatenate([tau, np.zeros(shape) if slip is None else slip])
+        moving = (tau.T * ~self.numeric.locked).T
+        rhs = np.concatenate([moving, np.zeros(shape) if slip is None else slip])
         found = np.asarray(scipy.linalg.lu_solve(self._lu, rhs))
         return Answer(found[: self._nv], found[self._nv :])
 
@@ -135,7 +135,7 @@ class ImpactOracle:
         ellipsoid = A.T @ self.weigh(A)
         a = A @ self.n
         H, G = float(a @ self.weigh(a)), float(self.n @ mobility @ self.n)
-        held = _HeldPoint.of(self._kkt, self.J, mobility)
+        held = _HeldPoint.of(self._kkt, self.J, mobility, ~self.numeric.locked)
         stuck, s = None, None
         if held.can_move(self.n):
             found, s = held.answer(velocity=self.n)
@@ -193,7 +193,7 @@ class ImpactOracle:
         """
         self.at(q)
         _, n = self._normals(normal)
-        held = _HeldPoint.of(self._kkt, self.J, self.J @ self.solve(self.J.T))
+        held = _HeldPoint.of(self._kkt, self.J, self.J @ self.solve(self.J.T), ~self.numeric.locked)
         if not held.can_move(n):
             raise no_sticking()
         x, s = held.answer(velocity=n)
@@ -266,10 +266,14 @@ class _HeldPoint:
     lu: tuple[Vector, Vector]
     axes: Vector
     outside: Vector
-    nv: int
+    mobile: NDArray[np.bool_]
+
+    @property
+    def nv(self) -> int:
+        return len(self.mobile)
 
     @staticmethod
-    def of(kkt: Vector, J: Vector, mobility: Vector) -> _HeldPoint:
+    def of(kkt: Vector, J: Vector, mobility: Vector, mobile: NDArray[np.bool_]) -> _HeldPoint:
         values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
         kept = values > _RANK * max(float(values[-1]), 1e-300)
         axes = np.eye(3) if kept.all() else vectors[:, kept]
@@ -278,7 +282,7 @@ class _HeldPoint:
         system[:size, :size] = kkt
         system[size:, :nv] = axes.T @ J
         system[:nv, size:] = -system[size:, :nv].T
-        return _HeldPoint(scipy.linalg.lu_factor(system), axes, vectors[:, ~kept], nv)
+        return _HeldPoint(scipy.linalg.lu_factor(system), axes, vectors[:, ~kept], mobile)
 
     def can_move(self, n: Vector) -> bool:
         """Return whether the point can move along ``n``."""
@@ -289,7 +293,7 @@ class _HeldPoint:
         right = np.zeros(len(self.lu[1]))
         size = len(right) - self.axes.shape[1]
         if tau is not None:
-            right[: self.nv] = tau
+            right[: self.nv] = tau * self.mobile
         if velocity is not None:
             right[size:] = self.axes.T @ velocity
         found = np.asarray(scipy.linalg.lu_solve(self.lu, right))

@@ -15,9 +15,10 @@ from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.contact import ImpactContact, Support, least_compliance, point_on
 from impact_posture.impact.metric import Metric, build_metric
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.supports import refuse_held, resolve_supports
+from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
 from impact_posture.parsing import parse_contact
 from impact_posture.robot.guess import feet, tips
+from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.model_variant import Payload, build_model_variants
 from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot
@@ -39,12 +40,13 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
     Raises:
         ImpactPostureError: A setting is wrong; the first fault, in one line.
     """
-    robot = load_robot(settings.robot, settings) if robot is None else robot
+    robot = with_joint_model(load_robot(settings.robot, settings) if robot is None else robot, settings.joint_model)
     q = read_posture(robot, settings.posture)
     leading, *others = _contacts(settings, robot)
     supports = resolve_supports(robot, settings.support)
     for contact in (leading, *others):
         refuse_held(robot, contact, supports)
+    refuse_rigid(robot, supports)
     least = least_compliance(robot)
     compliance = settings.support_compliance
     if compliance is not None and not (np.isfinite(compliance) and compliance >= least):
@@ -186,7 +188,7 @@ def _contact_block(single: ImpactObjective, q: Vector) -> dict[str, object]:
 
 def robot_block(robot: Robot) -> dict[str, object]:
     """Return the ``robot`` block of ``result.json``."""
-    keys = ("name", "source", "model_sha256", "nq", "nv", "joint_names", "root", "convention", "armature")
+    keys = ("name", "source", "model_sha256", "nq", "nv", "joint_names", "root", "convention", "joint_model")
     found = {key: getattr(robot, key) for key in (*keys, "armature_source", "locked")}
     return found | {
         "joint_names": list(robot.joint_names),

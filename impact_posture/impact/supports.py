@@ -65,3 +65,17 @@ def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support
                 where=f"frame {contact.frame}",
                 hint="choose another frame, name the other `support` frames, or `support=[]`",
             )
+
+
+def refuse_rigid(robot: Robot, supports: Sequence[Support]) -> None:
+    """Refuse a robot that stands with all joints locked, because only the compliance of its feet would respond.
+
+    Raises:
+        InputError: No joint of the standing robot moves.
+    """
+    if supports and np.isinf(robot.model.armature[6:]).all():
+        raise InputError(
+            f"all joints of {robot.name} are locked and its feet stay, so nothing moves in an impact",
+            where="joint_model",
+            hint="choose reflected or link, or `support=[]` for a robot off the ground",
+        )

@@ -266,4 +266,5 @@ def _armature(robot: Robot) -> str:
     if not joints.size or not joints.any():
         return "zero" if source == "none" else f"zero ({source})"
     low, high = f"{joints.min():.2g}", f"{joints.max():.2g}"
-    return f"{low if low == high else f'{low}–{high}'} kg·m² ({source})"
+    felt = "" if robot.joint_model == "reflected" else f", joint model {robot.joint_model}"
+    return f"{low if low == high else f'{low}–{high}'} kg·m² ({source}){felt}"

@@ -91,7 +91,7 @@ def _key(problem: PostureProblem) -> str:
     content = [
         ca.CasadiMeta.version(),
         f"{platform.system()} {platform.machine()}",
-        problem.robot.model_sha256,
+        problem.robot.impact_sha256,
         # Placements of frames on links are no part of the dynamics, but of every expression of a point.
         *[f"{f.name} {f.parentJoint} {f.placement.homogeneous.tolist()}" for f in problem.robot.model.frames],
         problem.objective.structure,

@@ -137,6 +137,7 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         "normal_cone": impact.objective.normal_cone_deg,
         "bilateral": impact.objective.bilateral,
         "normal_frame": impact.contact.normal_frame,
+        "joint_model": impact.robot.joint_model,
         "speed": impact.speed,
         "restitution": impact.restitution,
         **_resolved_variants(impact.objective.model_variants),

@@ -100,7 +100,8 @@ def check_mass_matrix(
         InertiaError: The matrix is singular; the message names the directions that move no inertia.
     """
     upper = np.triu(pin.crba(model, model.createData(), q))
-    M = upper + np.triu(upper, 1).T
+    moving = np.isfinite(model.armature)
+    M = (upper + np.triu(upper, 1).T)[np.ix_(moving, moving)]
     diagonal = np.diag(M)
     free = diagonal <= _TINY
     if not free.any():
@@ -111,7 +112,8 @@ def check_mass_matrix(
         # The free motion in rad and m (per s).
         motion = np.abs(scale * vectors[:, 0])
         free = motion >= 0.1 * motion.max()
-    named = [name for name, moves in zip(tangent_names, free, strict=True) if moves]
+    names = [name for name, moves in zip(tangent_names, moving, strict=True) if moves]
+    named = [name for name, moves in zip(names, free, strict=True) if moves]
     verb = "moves no inertia" if len(named) == 1 else "move no inertia together"
     raise InertiaError(
         f"the mass matrix is singular at posture '{posture}': {', '.join(named)} {verb}",

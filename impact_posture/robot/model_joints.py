@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from impact_posture.errors import JointNotFound
 
@@ -49,3 +51,13 @@ def joint_index(model: pin.Model, joint: str, where: str) -> int:
 def movable_joints(model: pin.Model) -> list[str]:
     """Return the names of all joints except the universe and the root joint."""
     return [str(name) for name in model.names if name not in ("universe", "root_joint")]
+
+
+def finite_armature(model: pin.Model) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the armature with zeros at locked joints, and which velocity entries are locked, shapes (nv,).
+
+    An infinite armature locks a joint in an impact: its velocity does not change, whatever the impulse.
+    """
+    armature = np.array(model.armature, dtype=float)
+    locked = np.isinf(armature)
+    return np.where(locked, 0.0, armature), locked

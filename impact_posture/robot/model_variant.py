@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.errors import InputError
+from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot
 
 AS_MODELED = "as modeled"
@@ -105,11 +106,13 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
             where="armature_range",
             hint="give two factors above zero, the lower first, such as 0.5 2",
         )
-    if not robot.armature.any():
+    felt = np.asarray(robot.model.armature)
+    if not felt[np.isfinite(felt)].any():
+        none = robot.armature.any() and f"no armature with the joint model '{robot.joint_model}'"
         raise InputError(
-            f"{robot.name} has no armature, so a factor changes nothing",
+            f"{robot.name} has {none or 'no armature'}, so a factor changes nothing",
             where="armature_range",
-            hint="state one with `armature` or in robot.toml",
+            hint="leave it out" if none else "state one with `armature` or in robot.toml",
         )
     return [1.0, *sorted({low, high} - {1.0})]
 
@@ -118,15 +121,16 @@ def _variant(robot: Robot, factor: float, payload: Payload | None) -> ModelVaria
     if factor == 1 and payload is None:
         return ModelVariant(AS_MODELED, robot)
     words, model = [], pin.Model(robot.model)
+    model.armature = factor * robot.armature
     if factor != 1:
         words.append(f"armature × {factor:g}")
-        model.armature = factor * robot.armature
     if payload is not None:
         words.append(f"{payload.mass:g} kg at {payload.frame}")
         frame = model.frames[robot.frame_id(payload.frame)]
         mass = pin.Inertia(payload.mass, np.array(frame.placement.translation), np.zeros((3, 3)))
         model.inertias[frame.parentJoint] = model.inertias[frame.parentJoint] + mass
-    return ModelVariant(", ".join(words), replace(robot, model=model), factor, payload)
+    stated = replace(robot, model=model, stated_armature=None)
+    return ModelVariant(", ".join(words), with_joint_model(stated, robot.joint_model), factor, payload)
 
 
 def between(variants: Sequence[ModelVariant], count: int, seed: int) -> list[Robot]:

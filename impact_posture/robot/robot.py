@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from impact_posture.errors import FrameNotFound, JointNotFound, NotWithinLimits, PostureError, PostureNotFound
 from impact_posture.robot.model_joints import joint_range, q_slice
 from impact_posture.robot.spec import RobotSpec
-from impact_posture.settings import ContactPose, RobotSettings, Root
+from impact_posture.settings import ContactPose, JointModel, RobotSettings, Root
 
 Vector = NDArray[np.float64]
 
@@ -44,6 +44,9 @@ class Robot:
         locked: Joints made rigid.
         armature_source: Source of the armature in words.
         warnings: Warnings about this model, one line each.
+        joint_model: Inertia that the impact meets at the joints
+            (:func:`~impact_posture.robot.joint_model.with_joint_model`).
+        stated_armature: Armature as stated, shape (nv,), if ``joint_model`` has changed that of ``model``.
         settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` for any other origin.
     """
 
@@ -57,6 +60,8 @@ class Robot:
     locked: tuple[str, ...] = ()
     armature_source: str = "none"
     warnings: tuple[str, ...] = ()
+    joint_model: JointModel = "reflected"
+    stated_armature: Vector | None = None
     settings: RobotSettings | None = None
 
     @property
@@ -95,8 +100,8 @@ class Robot:
 
     @cached_property
     def armature(self) -> Vector:
-        """Armature of each velocity entry, shape (nv,), kg·m² (kg for prismatic joints)."""
-        return np.array(self.model.armature, dtype=float)
+        """Armature of each velocity entry as stated, shape (nv,), kg·m² (kg for prismatic joints)."""
+        return np.array(self.model.armature if self.stated_armature is None else self.stated_armature, dtype=float)
 
     @cached_property
     def mass(self) -> float:
@@ -110,7 +115,15 @@ class Robot:
 
     @cached_property
     def model_sha256(self) -> str:
-        """Hash of the quantities that determine the dynamics: joints, placements, inertias and armature as used."""
+        """Hash of the quantities that determine the dynamics: joints, placements, inertias and armature as stated."""
+        return self._hash(self.armature)
+
+    @cached_property
+    def impact_sha256(self) -> str:
+        """The same hash with the armature that the joint model leaves to an impact."""
+        return self._hash(np.asarray(self.model.armature))
+
+    def _hash(self, armature: Vector) -> str:
         model = self.model
         content = [
             [
@@ -124,7 +137,7 @@ class Robot:
                 ]
                 for i in range(1, model.njoints)
             ],
-            _rounded(model.armature),
+            _rounded(armature),
         ]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from impact_posture.errors import SpecError
-from impact_posture.settings import ContactPose, Root, SupportKind, Vector3
+from impact_posture.settings import ContactPose, Root, SupportKind, TransmissionKind, Vector3
 from impact_posture.tables import read_toml, validate
 
 SCHEMA = "impact-posture/robot/1"
@@ -99,6 +99,31 @@ class ArmatureSpec(_Table):
 
 
 @dataclass(frozen=True)
+class JointTransmissionSpec(_Table):
+    """Transmission of one joint; a missing value is that of the whole robot."""
+
+    kind: TransmissionKind | None = None
+    stiffness: Positive | None = None
+    damping: NonNegative | None = None
+
+
+@dataclass(frozen=True)
+class TransmissionSpec(_Table):
+    """What lies between a rotor and its link; the rotor's inertia is in :class:`ArmatureSpec`.
+
+    A ``rigid`` transmission moves the rotor with the link.  An ``elastic`` one has a spring of ``stiffness`` and a
+    damper of ``damping`` between the two, N·m/rad and N·m·s/rad at the joint (N/m and N·s/m if prismatic).  A
+    ``locked`` joint cannot be driven from its link, as a worm gear.
+    """
+
+    kind: TransmissionKind | None = None
+    stiffness: Positive | None = None
+    damping: NonNegative = 0.0
+    joints: dict[str, JointTransmissionSpec] = field(default_factory=dict)
+    source: str = ""
+
+
+@dataclass(frozen=True)
 class RotorSpec(_Table):
     """A propeller: position, thrust direction, and direction of rotation (seen against the thrust)."""
 
@@ -139,6 +164,7 @@ class RobotSpec(_Table):
     constraints: ConstraintSpec = ConstraintSpec()
     limits: LimitSpec = LimitSpec()
     armature: ArmatureSpec = ArmatureSpec()
+    transmission: TransmissionSpec = TransmissionSpec()
     propulsion: PropulsionSpec | None = None
     sources: tuple[str, ...] = ()
 
@@ -160,11 +186,11 @@ def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
 
 
 def _overlay(below: dict[str, object], above: dict[str, object]) -> dict[str, object]:
-    """Merge tables; replace lists, values, and the armature as a whole."""
+    """Merge tables; replace lists, values, and armature and transmission as a whole."""
     merged = dict(below)
     for key, value in above.items():
         old = merged.get(key)
-        if isinstance(old, dict) and isinstance(value, dict) and key != "armature":
+        if isinstance(old, dict) and isinstance(value, dict) and key not in ("armature", "transmission"):
             merged[key] = _overlay(old, value)
         else:
             merged[key] = value

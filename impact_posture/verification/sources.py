@@ -13,9 +13,11 @@ from impact_posture.codegen.export import export
 from impact_posture.codegen.functions import casadi_reference, oracle_along
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.dynamics.mjcf_numeric import MujocoNumeric
+from impact_posture.dynamics.numeric import hold_locked
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import build_library, load_library
 from impact_posture.output_folder import scratch_folder
+from impact_posture.robot.model_joints import finite_armature
 from impact_posture.verification.differences import difference_gradient
 from impact_posture.verification.samples import Sample
 
@@ -119,7 +121,9 @@ class MujocoSource:
 
     def __init__(self, objective: ImpactObjective) -> None:
         self._objective = objective
-        self._numeric = MujocoNumeric(objective.robot.model)
+        model = objective.robot.model.copy()
+        model.armature, self._locked = finite_armature(model)
+        self._numeric = MujocoNumeric(model)
 
     def __call__(self, sample: Sample) -> Numbers:
         """Return the numbers at one sample; ``∇H`` by finite differences of this ``H``."""
@@ -136,7 +140,7 @@ class MujocoSource:
         contact, metric = objective.contact, objective.metric
         M, J = numeric.mass_matrix(), numeric.jacobian(contact.frame, contact.offset)[:3]
         feet = [numeric.jacobian(s.frame, s.offset)[: s.rows] for s in objective.supports]
-        Js = np.vstack([np.zeros((0, len(M))), *feet])
+        M, J, Js = hold_locked(self._locked, M, J, np.vstack([np.zeros((0, len(M))), *feet]))
         system = np.block([[M, -Js.T], [Js, objective.compliance * np.eye(len(Js))]])
         A = np.linalg.solve(system, np.vstack([J.T, np.zeros((len(Js), 3))]))[: len(M)]
         weighed = M @ A if metric.kind == "kinetic" else metric.diagonal(len(M))[:, None] * A

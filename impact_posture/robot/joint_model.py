@@ -1,0 +1,125 @@
+"""The inertia that an impact meets at the joints: with the rotors, without them, or joints that do not move.
+
+The impulse of an impact is over before a soft spring between rotor and link has turned the rotor.  Then the link alone
+answers (``M``).  A stiff transmission takes the rotor along (``M + B``, the armature), and a joint that cannot be
+driven from its link does not move at all.  Each joint model is an armature: that of the rotors, zero, or infinity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.errors import InputError
+from impact_posture.robot.inertia_checks import check_mass_matrix
+from impact_posture.robot.model_joints import joint_index, v_slice
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.spec import JointTransmissionSpec
+from impact_posture.settings import JointModel
+
+Vector = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Transmissions:
+    """Transmission of each velocity entry; a floating base has none.
+
+    Attributes:
+        stated: Whether robot.toml names the kind.
+        rigid: Whether the rotor moves with the link.
+        locked: Whether the joint cannot be driven from its link.
+        stiffness: Of the spring between rotor and link, N·m/rad (N/m if prismatic), shape (nv,); infinite where
+            none is stated.
+        damping: Of the damper beside it, N·m·s/rad (N·s/m), shape (nv,).
+    """
+
+    stated: Mask
+    rigid: Mask
+    locked: Mask
+    stiffness: Vector
+    damping: Vector
+
+    @property
+    def elastic(self) -> Mask:
+        """Whether a spring of known stiffness lies between rotor and link."""
+        return np.isfinite(self.stiffness) & ~self.rigid & ~self.locked
+
+
+def transmissions(robot: Robot) -> Transmissions:
+    """Return the ``[transmission]`` of robot.toml by velocity entry.
+
+    Raises:
+        JointNotFound: The table names a joint that the robot lacks.
+    """
+    spec, model, nv = robot.spec.transmission, robot.model, robot.nv
+    found = Transmissions(
+        *(np.zeros(nv, dtype=bool) for _ in range(3)), stiffness=np.full(nv, np.inf), damping=np.zeros(nv)
+    )
+    for joint in spec.joints:
+        if joint not in robot.locked:
+            joint_index(model, joint, f"{robot.name} [transmission.joints]")
+    for joint in robot.joint_names:
+        own = spec.joints.get(joint, JointTransmissionSpec())
+        kind, entries = own.kind or spec.kind, v_slice(model, robot.joint_id(joint))
+        found.stated[entries], found.rigid[entries], found.locked[entries] = (
+            kind is not None, kind == "rigid", kind == "locked",
+        )  # fmt: skip
+        stiffness = own.stiffness or spec.stiffness
+        if stiffness is not None:
+            found.stiffness[entries] = stiffness
+        found.damping[entries] = spec.damping if own.damping is None else own.damping
+    return found
+
+
+def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
+    """Return the robot as an impact meets it.
+
+    ``reflected`` keeps the armature at all joints.  ``link`` leaves it out, except at joints whose transmission is
+    ``rigid``, and joints whose transmission is ``locked`` do not move.  ``locked`` holds all joints, as position control
+    with stiff gears does, so that only a floating base moves.
+
+    Raises:
+        InertiaError: The mass matrix is singular without the rotors.
+        InputError: Nothing is left that moves.
+    """
+    stated = robot.armature
+    armature = stated.copy()
+    joints = np.arange(robot.nv) >= (6 if robot.floating else 0)
+    if joint_model == "link":
+        found = transmissions(robot)
+        armature = np.where(joints & ~found.rigid, 0.0, armature)
+        armature[found.locked] = np.inf
+    elif joint_model == "locked":
+        armature[joints] = np.inf
+    if (np.isinf(armature) | ~joints).all() and not robot.floating:
+        raise InputError(
+            f"all joints of {robot.name} are locked, so nothing moves in an impact",
+            where="joint_model",
+            hint="choose reflected or link",
+        )
+    if np.array_equal(armature, robot.model.armature):
+        return replace(robot, joint_model=joint_model, stated_armature=stated)
+    model = pin.Model(robot.model)
+    model.armature = armature
+    found_robot = replace(robot, model=model, joint_model=joint_model, stated_armature=stated)
+    q = robot.postures[robot.default_posture]
+    check_mass_matrix(
+        model, q, robot.tangent_names, f"{robot.source}, joint model '{joint_model}'", robot.default_posture
+    )
+    return found_robot
+
+
+def describe_joints(robot: Robot) -> str:
+    """Say in words what the impact meets at the joints."""
+    if robot.joint_model == "reflected":
+        return "reflected (links and rotors)"
+    armature = np.asarray(robot.model.armature)[6 if robot.floating else 0 :]
+    held, kept = int(np.isinf(armature).sum()), int((np.isfinite(armature) & (armature > 0)).sum())
+    parts = [f"{held} of {len(armature)} joints rigid"] if held else []
+    if robot.joint_model == "link":
+        parts.insert(0, "links without rotors" + (f", but {kept} rigid transmissions" if kept else ""))
+    return f"{robot.joint_model} ({', '.join(parts)})"
