@@ -1,8 +1,9 @@
 """The inertia that an impact meets at the joints: with the rotors, without them, or joints that do not move.
 
-The impulse of an impact is over before a soft spring between rotor and link has turned the rotor.  Then the link alone
-answers (``M``).  A stiff transmission takes the rotor along (``M + B``, the armature), and a joint that cannot be
-driven from its link does not move at all.  Each joint model is an armature: that of the rotors, zero, or infinity.
+The impulse of a short impact is over before a soft spring between rotor and link has turned the rotor.  Then the link
+alone answers (``M``).  A stiff transmission takes the rotor along (``M + B``, with the armature ``B``), and a joint
+that cannot be driven from its link does not move at all.  Each joint model is an armature: that of the rotors, zero,
+or infinity.
 """
 
 from __future__ import annotations
@@ -79,8 +80,8 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
     """Return the robot as an impact meets it.
 
     ``reflected`` keeps the armature at all joints.  ``link`` leaves it out, except at joints whose transmission is
-    ``rigid``, and joints whose transmission is ``locked`` do not move.  ``locked`` holds all joints, as position control
-    with stiff gears does, so that only a floating base moves.
+    ``rigid``, and joints whose transmission is ``locked`` do not move.  ``locked`` holds all joints, as position
+    control with stiff gears does, so that only a floating base moves.
 
     Raises:
         InertiaError: The mass matrix is singular without the rotors.
