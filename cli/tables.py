@@ -37,6 +37,8 @@ def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: 
     if any(contact.offset):
         offset = ", ".join(f"{v:g}" for v in contact.offset)
         rows.append(("contact point", f"{offset} m from {contact.frame}, in its axes"))
+    if impact.contact_stiffness is not None:
+        rows.append(("contact", impact.contact_stiffness.words))
     feet = ", ".join(f"{s.frame} ({s.kind})" for s in impact.supports)
     rows.append(("supports", f"{feet}; compliance {objective.compliance:.3g} 1/kg" if feet else "none"))
     rows.append(("metric", f"{metric.kind} ({metric.source})" if metric.source else metric.kind))

@@ -18,6 +18,7 @@ from impact_posture.codegen.export import Export, write_export
 from impact_posture.errors import InputError
 from impact_posture.impact import objective as core
 from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact_compression import ContactStiffness
 from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.impact.metric import Metric, build_metric
 from impact_posture.impact.resolved_impact import ResolvedImpact, missing_support
@@ -177,11 +178,13 @@ class PostureProblem:
             q, name = robot.check_posture(np.asarray(posture, dtype=float), where="posture"), "a configuration"
         loaded = robot.settings or RobotSettings(robot=robot.source)
         given = {field.name: getattr(loaded, field.name) for field in fields(RobotSettings)}
+        given |= {"speed": speed, "restitution": restitution, "joint_model": robot.joint_model}
         settings = validate(ProblemSettings, given | task, "PostureProblem")
         self.prepared: Prepared | None = None
         if isinstance(objective, core.ImpactObjective):
             missing = getattr(objective, "_missing", "")
-            impact = ResolvedImpact(objective, q, name, speed, restitution, missing)
+            contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
+            impact = ResolvedImpact(objective, q, name, speed, restitution, missing, contact)
             self.prepared = prepare(settings, impact)
             self.problem: CoreProblem = self.prepared.problem
         else:

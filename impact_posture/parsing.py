@@ -72,3 +72,11 @@ def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
             )
         found.append((frame, value))
     return tuple(found)
+
+
+def parse_stiffness(text: str) -> float | str:
+    """Read ``--contact-stiffness``: a number, or else the name of a material."""
+    try:
+        return float(text)
+    except ValueError:
+        return text

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from impact_posture.errors import ImpactPostureError
-from impact_posture.parsing import parse_armature, parse_contact, parse_payloads
+from impact_posture.parsing import parse_armature, parse_contact, parse_payloads, parse_stiffness
 from impact_posture.tables import STRICT
 
 Vector3 = tuple[float, float, float]
@@ -27,6 +27,10 @@ BaseMode = Literal["free", "level", "fixed", "box"]
 SupportKind = Literal["point", "surface"]
 JointModel = Literal["reflected", "link", "locked"]
 TransmissionKind = Literal["rigid", "elastic", "locked"]
+
+# Young's modulus (Pa) and Poisson's ratio of what a contact may touch: the middle of the ranges in J. M. Gere,
+# Mechanics of Materials, 5th ed. (steel; oak in bending; rubber; concrete).
+MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0.48), "ground": (24e9, 0.15)}
 
 CONTACT, METRIC, ROBOT, TASK, OUTPUT = "Contact", "Measure", "Robot", "Task", "Output"
 
@@ -91,6 +95,23 @@ def _positive(value: Any) -> bool:
 
 def _not_negative(value: float) -> bool:
     return 0 <= value < _LARGEST
+
+
+def _stiffness(value: float | str) -> bool:
+    return value in MATERIALS if isinstance(value, str) else 0 < value < _LARGEST
+
+
+def tilt_of(pose: str) -> float | None:
+    """Return DEG of the contact pose ``aligned:DEG``, or ``None`` for any other pose."""
+    kind, colon, degrees = pose.partition(":")
+    try:
+        return float(degrees) if kind == "aligned" and colon else None
+    except ValueError:
+        return None
+
+
+def _pose(value: str) -> bool:
+    return value in get_args(ContactPose) or 0 < (tilt_of(value) or 0.0) < 90
 
 
 def _share(value: float) -> bool:
@@ -224,6 +245,21 @@ class ImpactSettings(RobotSettings):
             CONTACT, holds=_share, demand="give a number from 0 to 1",
         ),
     ] = 0.0  # fmt: skip
+    contact_stiffness: Annotated[
+        str | float | None,
+        Setting(
+            f"Stiffness of the contact, or what a steel tip touches: {', '.join(MATERIALS)}.",
+            CONTACT, "N/M|MATERIAL", "not known", holds=_stiffness, parse=parse_stiffness,
+            demand=f"give N/m above zero, or one of {', '.join(MATERIALS)}",
+        ),
+    ] = None  # fmt: skip
+    contact_duration: Annotated[
+        float | None,
+        Setting(
+            "Time from touch to greatest compression, s.", CONTACT, default="not known", holds=_positive,
+            demand="give seconds above zero",
+        ),
+    ] = None  # fmt: skip
     metric: Annotated[
         MetricKind,
         Setting("Norm of the velocity jump: euclidean, kinetic or weighted.", METRIC, "KIND"),
@@ -303,10 +339,12 @@ class ProblemSettings(ImpactSettings):
         Setting("Contact frame's orientation, scalar last.", TASK, "X Y Z W", "as it is", **_NUMBER),
     ] = None
     contact_pose: Annotated[
-        ContactPose | None,
+        str | None,
         Setting(
-            "Constraint on the contact frame: full, position, aligned, free or box.",
-            TASK, "KIND", "robot.toml's, else full",
+            "Constraint on the contact frame: full, position, aligned (spin free), aligned:DEG (and tilted by up to "
+            "DEG), free or box.",
+            TASK, "KIND", "robot.toml's, else full", holds=_pose,
+            demand=f"give {', '.join(get_args(ContactPose))}, or aligned:DEG with degrees above 0 and below 90",
         ),
     ] = None  # fmt: skip
     box: Annotated[Vector3, Setting("Half extents of --contact-pose box, m.", TASK, "X Y Z", **_LENGTHS)] = (
@@ -347,6 +385,34 @@ class ProblemSettings(ImpactSettings):
     ] = None  # fmt: skip
     keep_contacts: Annotated[bool, Setting("The impact must neither lift nor slide a foot.", TASK)] = False
     friction: Annotated[float, Setting("Friction coefficient for --keep-contacts.", TASK, **_ZERO_OR_MORE)] = 0.7
+    max_force: Annotated[
+        float | None,
+        Setting(
+            "Largest peak force, N, without friction; needs --contact-stiffness or --contact-duration.", TASK,
+            default="no bound", holds=_positive, demand="give a number above zero",
+        ),
+    ] = None  # fmt: skip
+    max_joint_jump: Annotated[
+        float | None,
+        Setting(
+            "Largest velocity jump of a joint without friction, rad/s or m/s.", TASK, default="no bound",
+            holds=_positive, demand="give a number above zero",
+        ),
+    ] = None  # fmt: skip
+    max_torque: Annotated[
+        float | None,
+        Setting(
+            "Largest torque, N·m, with which the controller answers the jump; needs --velocity-gain.", TASK,
+            default="no bound", holds=_positive, demand="give a number above zero",
+        ),
+    ] = None  # fmt: skip
+    velocity_gain: Annotated[
+        float | None,
+        Setting(
+            "Gain K_d of the controller for --max-torque, N·m·s/rad.", TASK, default="not known", holds=_positive,
+            demand="give a number above zero",
+        ),
+    ] = None  # fmt: skip
     limit_margin: Annotated[
         float | None,
         Setting("Distance from the joint limits, rad or m.", TASK, default="robot.toml's", **_ZERO_OR_MORE),

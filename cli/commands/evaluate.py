@@ -26,11 +26,10 @@ def evaluate(
     """Run ``impact-posture evaluate``."""
     given.check_contact()
     from impact_posture.impact.classical_ellipsoids import classical_ellipsoids
-    from impact_posture.impact.evaluation import evaluate as evaluate_impact
     from impact_posture.impact.resolved_impact import resolve
 
     impact = resolve(given.fill(ImpactSettings, robot=robot))
-    found = evaluate_impact(impact.objective, impact.q, impact.speed, impact.restitution)
+    found = impact.evaluate()
     warnings = (*impact.warnings, *found.warnings)
     classical = classical_ellipsoids(impact.objective, impact.q)
     if json:
@@ -51,6 +50,8 @@ def evaluate(
     _ellipsoids(page, impact, {"impact Λ_c": found.ellipsoid, **classical})
     _gradient(page, impact, found)
     _jumps(page, impact, found)
+    if found.compression is not None and found.compression.line:
+        page.line(f"  {found.compression.line}")
     worst_tables(page, frames, {"value": block})
     page.gap()
     page.line(found.dominance.line)
@@ -124,6 +125,9 @@ def _jumps(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
         ("  impulse", *(number(None if j is None else j.impulse_size) for j in jumps), "N·s"),
         ("  energy lost", number(found.energy_loss), "", "J"),
     ]
+    if (squeezed := found.compression) is not None and squeezed.time is not None:
+        rows.append(("  compressed for", number(1e3 * squeezed.time), "", "ms"))
+        rows.append(("  peak force", number(squeezed.peak_force), "", "N"))
     for name, unit, values in merged_entries(impact.robot, *jumps):
         rows.append((f"  Δν {name}", *(number(value, missing="") for value in values), unit))
     page.gap()

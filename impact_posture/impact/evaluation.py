@@ -13,6 +13,7 @@ from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.classical_ellipsoids import Ellipsoid, ellipsoid_of
 from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import LARGEST, point_on
+from impact_posture.impact.contact_compression import Compression, ContactStiffness, both_models, compression
 from impact_posture.impact.contact_stability import ContactStability, contact_stability
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses
 from impact_posture.impact.objective import ImpactObjective
@@ -53,6 +54,7 @@ class Evaluation:
         frictionless: Jump without friction; ``None`` if the contact is blocked along the normal.
         sticking: Jump of a contact point that sticks; ``None`` where it does not exist.
         energy_loss: Energy that the frictionless impact dissipates, J; ``None`` if the contact is blocked.
+        compression: Compression time, peak force and the number x; ``None`` if nothing is known of them.
         dominance: Whether one light joint makes up most of H.
         without_supports: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
         compliance_effect: Relative change of H with a tenth of the compliance; ``None`` without supports.
@@ -78,6 +80,7 @@ class Evaluation:
     frictionless: Jump | None
     sticking: Jump | None
     energy_loss: float | None
+    compression: Compression | None
     dominance: Dominance
     without_supports: Scalars | None
     compliance_effect: float | None
@@ -115,6 +118,7 @@ class Evaluation:
                 "sticking": None if self.sticking is None else self.sticking.to_dict(),
                 "energy_loss": self.energy_loss,
             },
+            "compression": None if self.compression is None else self.compression.to_dict(),
             "dominance": self.dominance.to_dict(),
         }
         if self.cone is not None:
@@ -137,7 +141,13 @@ class Evaluation:
 _OWN = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pose", "free", "footing")
 
 
-def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitution: float = 0.0) -> Evaluation:
+def evaluate(
+    objective: ImpactObjective,
+    q: Vector,
+    speed: float = 1.0,
+    restitution: float = 0.0,
+    contact_stiffness: ContactStiffness | None = None,
+) -> Evaluation:
     """Compute all impact quantities at ``q`` from Pinocchio's numbers, and predict the jump of one impact.
 
     The frictionless jump is ``Δν = a (1+e) v_n / G``, with the impulse ``(1+e) v_n / G`` along n.  The jump of a
@@ -148,6 +158,7 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
         q: Configuration, shape (nq,).
         speed: Approach speed ``v_n``, m/s.
         restitution: Coefficient of restitution ``e``.
+        contact_stiffness: Elasticity of the contact, if it is known.
 
     Raises:
         InputError: The speed is negative or not finite, or the restitution lies outside [0, 1].
@@ -166,6 +177,7 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
     value = objective_value(member, q)
     cone = _worst(member, q)
     singles = objective.singles if objective.others else ()
+    squeezed = compression(objective, q, speed, contact_stiffness)
     return Evaluation(
         q=np.array(q, dtype=float),
         scalars=scalars,
@@ -188,14 +200,15 @@ def evaluate(objective: ImpactObjective, q: Vector, speed: float = 1.0, restitut
             else weighed_jump(objective, found.sticking_jump * rebound, found.sticking_impulse * rebound)
         ),
         energy_loss=None if scalars.E is None else scalars.E * speed**2 * (1 - restitution**2),
+        compression=squeezed,
         dominance=find_dominance(objective, found),
         without_supports=without_supports,
         compliance_effect=effect,
         contact_stability=contact_stability(oracle, objective.supports, q) if objective.supports else None,
-        contacts=tuple(evaluate(single, q, speed, restitution) for single in singles),
+        contacts=tuple(evaluate(single, q, speed, restitution, contact_stiffness) for single in singles),
         impulses=member.worst_case.worst(q) if isinstance(member.worst_case, ImpulseBox) else None,
         model_variants=model_variants,
-        warnings=_warnings(scalars, effect),
+        warnings=(*_warnings(scalars, effect), *_joint_model_warning(objective, q, squeezed)),
     )  # fmt: skip
 
 
@@ -215,6 +228,16 @@ def _without_supports(objective: ImpactObjective, q: Vector, H: float) -> tuple[
     alone = Scalars.of(ImpactOracle(replace(case, supports=())).quantities(q))
     stiffer = ImpactOracle(replace(case, compliance=case.compliance / 10)).quantities(q).H
     return alone, abs(stiffer - H) / H if H > 0 else 0.0
+
+
+def _joint_model_warning(objective: ImpactObjective, q: Vector, found: Compression | None) -> tuple[str, ...]:
+    """Warn where the joint model does not fit x, with the answers of both models."""
+    if found is None or found.x is None or objective.robot.joint_model in (found.fitting, "locked"):
+        return ()
+    values = {name: objective_value(other, q) for name, other in both_models(objective, q).items()}
+    listed = ", ".join(f"{value:.4g} with '{name}'" for name, value in values.items() if value is not None)
+    advice = f"`joint_model='{found.fitting}'` fits" if found.fitting else "expect a value between the two"
+    return (f"{found.line}; the objective is {listed}: {advice}",)
 
 
 def _warnings(scalars: Scalars, effect: float | None) -> tuple[str, ...]:

@@ -233,6 +233,21 @@ class ImpactOracle:
         ]
         return np.array(found).reshape(rows, self._nv)
 
+    def jump_gradient(self, q: Vector) -> Vector:
+        """Return the tangent Jacobian of ``a = M⁻¹Jᵀn``, shape (nv, nv).
+
+        Row k is ``∂a_k = p_kᵀ∂(Jᵀn − M a)`` with ``M p_k = e_k``.
+        """
+        self.at(q)
+        x = self.answer(self.J.T @ self.n)
+        adjoints = self.answer(np.eye(self._nv))
+        own = np.array(self.contact.normal)
+        rows = [
+            self.coupling(own, p, self.case.in_contact_frame) - self.inertial(Answer(p, r), x)
+            for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
+        ]
+        return np.array(rows)
+
     def coupling(self, direction: Vector, v: Vector, in_frame: bool) -> Vector:
         """Return ``∂_q directionᵀJ v``, shape (nv,), for a direction in world axes or fixed in the frame."""
         wrench = np.concatenate([direction, np.zeros(3)])

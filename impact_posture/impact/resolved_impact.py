@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.contact import ImpactContact, Support, least_compliance, point_on
+from impact_posture.impact.contact_compression import ContactStiffness
+from impact_posture.impact.evaluation import Evaluation, evaluate
 from impact_posture.impact.metric import Metric, build_metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
@@ -67,9 +69,10 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
         settings.bilateral,
         build_model_variants(robot, settings.armature_range, [Payload(*payload) for payload in settings.payload]),
     )
+    contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
     held_by = missing_support(robot) if settings.support is None and not supports else ""
     posture = settings.posture or robot.default_posture
-    return ResolvedImpact(objective, q, posture, settings.speed, settings.restitution, held_by)
+    return ResolvedImpact(objective, q, posture, settings.speed, settings.restitution, held_by, contact)
 
 
 def _contacts(settings: ImpactSettings, robot: Robot) -> list[ImpactContact]:
@@ -112,6 +115,7 @@ class ResolvedImpact:
         speed: Approach speed, m/s.
         restitution: Coefficient of restitution.
         missing_support: Hint how to state what holds a floating robot up, if nothing does; else empty.
+        contact_stiffness: Elasticity of the contact; ``None`` if it is not known.
     """
 
     objective: ImpactObjective
@@ -120,6 +124,7 @@ class ResolvedImpact:
     speed: float
     restitution: float
     missing_support: str = ""
+    contact_stiffness: ContactStiffness | None = None
 
     @property
     def robot(self) -> Robot:
@@ -140,6 +145,12 @@ class ResolvedImpact:
     def metric(self) -> Metric:
         """Weight of the jump."""
         return self.objective.metric
+
+    def evaluate(self, q: Vector | None = None) -> Evaluation:
+        """Evaluate the impact at ``q``, by default at the given posture."""
+        return evaluate(
+            self.objective, self.q if q is None else q, self.speed, self.restitution, self.contact_stiffness
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -170,6 +181,7 @@ class ResolvedImpact:
                 "bilateral": self.objective.bilateral,
                 "speed": self.speed,
                 "restitution": self.restitution,
+                "contact_stiffness": None if self.contact_stiffness is None else self.contact_stiffness.to_dict(),
             },
         }
 

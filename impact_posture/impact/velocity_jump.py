@@ -123,7 +123,7 @@ def find_dominance(objective: ImpactObjective, found: ImpactQuantities) -> Domin
     if share > 0.5:
         unit = "kg" if tangent_units(robot)[k] == "m/s" else "kg·m²"
         line = (
-            f"joint '{joint}' carries {percent} of H (armature {robot.armature[k]:.3g} of the "
+            f"joint '{joint}' carries {percent} of H (armature {robot.model.armature[k]:.3g} of the "
             f"{oracle.M[k, k]:.3g} {unit} it moves)"
         )
         if objective.metric.kind != "kinetic":

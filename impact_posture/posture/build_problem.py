@@ -15,6 +15,7 @@ from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.constraint import (
+    AxisInCone,
     CenterOfMassOverFeet,
     Constraint,
     HeldOrientation,
@@ -23,11 +24,12 @@ from impact_posture.posture.constraint import (
     PositionBox,
     base_point,
 )
+from impact_posture.posture.impact_limits import ImpactLimits
 from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.regular import pin_undetermined, regularize
 from impact_posture.robot.robot import Robot
-from impact_posture.settings import ContactPose
+from impact_posture.settings import tilt_of
 
 Vector = NDArray[np.float64]
 
@@ -47,7 +49,7 @@ def build_problem(robot: Robot, objective: Objective, given: Vector, requirement
     held = {s.frame for s in objective.supports}
     poses = (requirements.contact_pose, *requirements.other_poses)
     # Two impacts at one frame along two normals hold the frame once.
-    struck: dict[str, tuple[ImpactContact, ContactPose]] = {}
+    struck: dict[str, tuple[ImpactContact, str]] = {}
     # An objective without contacts leaves the contact pose unused.
     for contact, mode in zip(objective.contacts, poses, strict=bool(objective.contacts)):
         struck.setdefault(contact.frame, (contact, mode))
@@ -67,9 +69,11 @@ def build_problem(robot: Robot, objective: Objective, given: Vector, requirement
                 raise
             decided.append("center of mass left free: the feet span no area to keep it above")
     if isinstance(objective, ImpactObjective):
+        bounds = requirements.least_mobility, requirements.largest_jump
         if requirements.keep_contacts:
             constraints += _kept_feet(objective, numeric, requirements.friction)
-        constraints += _in_every_variant(objective, numeric, requirements.friction, constraints)
+        constraints += [ImpactLimits(single, *bounds) for single in objective.singles if _bounded(bounds)]
+        constraints += _in_every_variant(objective, numeric, requirements.friction, bounds, constraints)
     lower, upper = _bounds(robot, chart, given, requirements)
     more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
     problem = PostureProblem(
@@ -131,7 +135,7 @@ def contact_target(robot: Robot, contact: ImpactContact, numeric: Numeric, requi
 
 
 def _contact_constraints(
-    robot: Robot, contact: ImpactContact, numeric: Numeric, requirements: Requirements, mode: ContactPose
+    robot: Robot, contact: ImpactContact, numeric: Numeric, requirements: Requirements, mode: str
 ) -> list[Constraint]:
     point = point_on(robot, contact.frame)
     target = contact_target(robot, contact, numeric, requirements)
@@ -146,13 +150,20 @@ def _contact_constraints(
         return []
     if mode == "full":
         return [HeldPose(name, point, target)]
+    n = np.array(contact.normal)
+    axis = n if contact.normal_frame == "contact" else target.rotation.T @ n
     if mode == "aligned":
-        n = np.array(contact.normal)
-        axis = n if contact.normal_frame == "contact" else target.rotation.T @ n
         return [HeldPose(name, point, target, axis)]
+    if (degrees := tilt_of(mode)) is not None:
+        held = HeldPosition(f"position of {contact.frame}", point, target.translation)
+        return [held, AxisInCone(f"tilt of {contact.frame}", point, axis, target.rotation @ axis, degrees)]
     if mode == "box":
         return [PositionBox(f"position of {contact.frame}", point, target.translation, requirements.box)]
     return [HeldPosition(f"position of {contact.frame}", point, target.translation)]
+
+
+def _bounded(bounds: tuple[float, float]) -> bool:
+    return bounds[0] > 0 or np.isfinite(bounds[1])
 
 
 def _kept_feet(objective: ImpactObjective, numeric: Numeric, friction: float) -> list[Constraint]:
@@ -167,7 +178,11 @@ def _kept_feet(objective: ImpactObjective, numeric: Numeric, friction: float) ->
 
 
 def _in_every_variant(
-    objective: ImpactObjective, numeric: Numeric, friction: float, constraints: Sequence[Constraint]
+    objective: ImpactObjective,
+    numeric: Numeric,
+    friction: float,
+    bounds: tuple[float, float],
+    constraints: Sequence[Constraint],
 ) -> list[Constraint]:
     """Constraints of the other model variants that the constraints of the robot as modeled do not imply.
 
@@ -184,6 +199,8 @@ def _in_every_variant(
             found += [CenterOfMassOverFeet(c.normals, c.offsets, c.margin, loaded) for c in centers]
         if kept:
             found += [KeptFeet(single, numeric, friction, variant.name) for single in member.singles]
+        if _bounded(bounds):
+            found += [ImpactLimits(single, *bounds, variant.name) for single in member.singles]
     return found
 
 

@@ -204,6 +204,37 @@ class HeldPose(Constraint):
         return position.pose_error(model)[0], orientation.pose_error(model)[1]
 
 
+class AxisInCone(Constraint):
+    """An axis of the frame stays within a cone: ``dᵀR(q)c ≥ cos α``; the frame may turn about the axis.
+
+    Args:
+        name: Name of the constraint.
+        point: Point on the link that the frame belongs to.
+        axis: Unit axis ``c`` in the frame, shape (3,).
+        direction: Axis ``d`` of the cone, world, shape (3,).
+        degrees: Half angle α of the cone, degrees.
+    """
+
+    def __init__(self, name: str, point: PointOnLink, axis: Vector, direction: Vector, degrees: float) -> None:
+        self.name, self.point, self._degrees = name, point, degrees
+        self.parameters = np.concatenate([axis, direction])
+        self.lower, self.upper = np.array([np.cos(np.deg2rad(degrees))]), np.array([np.inf])
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return f"{self.name} at most {self._degrees:g}°, spin free"
+
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        """See :class:`Constraint`."""
+        return ca.dot(tree.rotation(self.point) @ parameters[:3], parameters[3:])
+
+    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+        """See :class:`Constraint`."""
+        axis, direction = self.parameters[:3], self.parameters[3:]
+        now = model.placement(self.point).rotation @ axis
+        return np.array([now @ direction]), (model.jacobian(self.point)[3:].T @ np.cross(now, direction))[None, :]
+
+
 class HeldTurn(Constraint):
     """The base does not turn about one of its axes: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
 

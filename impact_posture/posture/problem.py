@@ -15,7 +15,7 @@ from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.constraint import Constraint
 from impact_posture.robot.robot import Robot
-from impact_posture.settings import BaseMode, ContactPose, Vector3
+from impact_posture.settings import BaseMode, Vector3
 
 Vector = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class Requirements:
     """Demands of the task on the posture.
 
     Attributes:
-        contact_pose: Part of the pose of the leading contact frame that is held.
+        contact_pose: Part of the pose of the leading contact frame that is held, as in the setting of that name.
         other_poses: The same for each other contact frame.
         target_position: Position of the contact frame, world, meters; ``None`` for its initial position.
         target_quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
@@ -42,12 +42,14 @@ class Requirements:
         com_margin: Distance from the polygon's edges, meters.
         keep_contacts: The impact must neither lift nor slide a foot.
         friction: Friction coefficient for ``keep_contacts``.
+        least_mobility: Least G of each contact, 1/kg, for the bound on the peak force; 0 for none.
+        largest_jump: Largest jump of a joint per approach speed; infinite for no bound.
         limit_margin: Distance from the joint limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
     """
 
-    contact_pose: ContactPose = "full"
-    other_poses: tuple[ContactPose, ...] = ()
+    contact_pose: str = "full"
+    other_poses: tuple[str, ...] = ()
     target_position: Vector3 | None = None
     target_quaternion: tuple[float, float, float, float] | None = None
     box: Vector3 = (0.05, 0.05, 0.05)
@@ -60,6 +62,8 @@ class Requirements:
     com_margin: float = 0.0
     keep_contacts: bool = False
     friction: float = 0.7
+    least_mobility: float = 0.0
+    largest_jump: float = float("inf")
     limit_margin: float = 0.0
     regularization: float = 0.0
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from impact_posture.errors import InputError, SpecError
 from impact_posture.escape import toml
+from impact_posture.impact.contact_compression import ContactStiffness
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, resolve
 from impact_posture.posture.build_problem import build_problem
@@ -107,9 +108,40 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
         com_over_feet=com,
         com_asked=settings.com is not None,
         com_margin=spec.com_margin if settings.com_margin is None else settings.com_margin,
+        least_mobility=_least_mobility(settings),
+        largest_jump=_largest_jump(settings),
         limit_margin=spec.limit_margin if settings.limit_margin is None else settings.limit_margin,
         **{key: getattr(settings, key) for key in _AS_SET},
     )
+
+
+def _least_mobility(settings: ProblemSettings) -> float:
+    """Return the least G, 1/kg, with which the peak force stays within ``max_force``; 0 for no bound."""
+    if settings.max_force is None:
+        return 0.0
+    contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
+    if contact is None:
+        raise InputError(
+            "needs the elasticity of the contact",
+            where="max_force",
+            hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
+        )
+    return contact.least_mobility(settings.max_force, settings.speed)
+
+
+def _largest_jump(settings: ProblemSettings) -> float:
+    """Return the largest jump of a joint per approach speed, from ``max_joint_jump`` and ``max_torque``."""
+    if (settings.max_torque is None) != (settings.velocity_gain is None):
+        raise InputError(
+            "is gain times jump, so it needs the gain, and the gain it",
+            where="max_torque",
+            hint="give `max_torque` and `velocity_gain`, or none of them",
+        )
+    jumps = [] if settings.max_joint_jump is None else [settings.max_joint_jump]
+    if settings.max_torque is not None and settings.velocity_gain is not None:
+        jumps.append(settings.max_torque / settings.velocity_gain)
+    speed = (1 + settings.restitution) * settings.speed
+    return min(jumps) / speed if jumps and speed > 0 else float("inf")
 
 
 def resolved_settings(prepared: Prepared) -> ProblemSettings:

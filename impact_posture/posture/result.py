@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.impact.evaluation import Evaluation, evaluate
+from impact_posture.impact.evaluation import Evaluation
 from impact_posture.posture.caveats import caveats
 from impact_posture.posture.null_space_path import NullSpacePath
 from impact_posture.posture.problem_settings import Prepared
@@ -32,8 +32,7 @@ _SOLVER = (
 def evaluations(prepared: Prepared, solution: PostureSolution) -> tuple[Evaluation, Evaluation]:
     """Evaluate the impact at the initial (feasible) and at the optimal posture."""
     impact = prepared.impact
-    initial = evaluate(impact.objective, solution.initial, impact.speed, impact.restitution)
-    return initial, evaluate(impact.objective, solution.q, impact.speed, impact.restitution)
+    return impact.evaluate(solution.initial), impact.evaluate(solution.q)
 
 
 def result_document(

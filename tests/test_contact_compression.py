@@ -1,0 +1,243 @@
+"""Compression time, peak force and x, against integrated contacts; bounds on force and jump in a search."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.integrate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import Infeasible, InputError, SpecError
+from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact_compression import (
+    HERTZ_TIME,
+    ContactStiffness,
+    compression,
+    hertz_stiffness,
+    springs_along,
+)
+from impact_posture.impact.evaluation import evaluate
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.constraint import AxisInCone
+from impact_posture.posture.impact_limits import ImpactLimits
+from impact_posture.posture.problem_settings import prepare
+from impact_posture.posture.solve import solve
+from impact_posture.robot.joint_model import with_joint_model
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.spec import TransmissionSpec
+from impact_posture.settings import MATERIALS
+from tests.command import run
+from tests.helpers import central_gradient, random_configurations, relative, robot
+from tests.settings import make_settings
+
+masses, speeds = st.floats(0.05, 500.0), st.floats(0.01, 20.0)
+
+
+def touch(power: float, stiffness: float, mass: float, speed: float) -> tuple[float, float]:
+    """Integrate ``m δ̈ = −k δ^p`` from touch to rest: T and the force there."""
+    # In units of the greatest compression and of the time to cross it.
+    depth = ((power + 1) * mass * speed**2 / (2 * stiffness)) ** (1 / (power + 1))
+    ratio = stiffness * depth**power * depth / (mass * speed**2)
+
+    def rest(t: float, y: np.ndarray) -> float:
+        return float(y[1])
+
+    rest.terminal = True  # type: ignore[attr-defined]
+    run_ = scipy.integrate.solve_ivp(
+        lambda t, y: [y[1], -ratio * max(y[0], 0.0) ** power],
+        (0, 10),
+        [0.0, 1.0],
+        events=rest,
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    return float(run_.t[-1]) * depth / speed, stiffness * (float(run_.y[0, -1]) * depth) ** power
+
+
+@settings(max_examples=20, deadline=None)
+@given(mass=masses, speed=speeds, stiffness=st.floats(1e2, 1e8))
+def test_time_and_force_are_those_of_an_integrated_contact(mass: float, speed: float, stiffness: float) -> None:
+    for contact, power in ((ContactStiffness(linear=stiffness), 1.0), (ContactStiffness(hertz=stiffness), 1.5)):
+        time, force = touch(power, stiffness, mass, speed)
+        assert contact.compression_time(1 / mass, speed) == pytest.approx(time, rel=1e-6)
+        assert contact.peak_force(1 / mass, speed) == pytest.approx(force, rel=1e-6)
+        # A contact of that T and G has the impulse mv, whatever its law.
+        alike = ContactStiffness(duration=time)
+        assert alike.peak_force(1 / mass, speed) == pytest.approx(np.pi / 2 * mass * speed / time)
+        for one in (contact, alike):
+            least = one.least_mobility(force, speed)
+            assert one.peak_force(least, speed) == pytest.approx(force, rel=1e-9)
+
+
+def test_the_constant_of_hertz_and_the_materials() -> None:
+    assert pytest.approx(scipy.integrate.quad(lambda z: 1 / np.sqrt(1 - z**2.5), 0, 1)[0], rel=1e-9) == HERTZ_TIME
+    # Two steel bodies: E* is half the plane-strain modulus of one.
+    E, nu = MATERIALS["steel"]
+    assert hertz_stiffness("steel") == pytest.approx(4 / 3 * E / (2 * (1 - nu**2)) * 0.1)
+    order = sorted(MATERIALS, key=hertz_stiffness)
+    assert order == ["rubber", "wood", "ground", "steel"]
+
+
+def elastic(name: str, stiffness: float = 12000.0) -> Robot:
+    found = robot(name)
+    return replace(found, spec=replace(found.spec, transmission=TransmissionSpec("elastic", stiffness)))
+
+
+@pytest.mark.parametrize(
+    ("name", "frame"), [("panda", "panda_hand_tcp"), ("tilthex_arm", "ee"), ("talos", "gripper_right_base_link")]
+)
+def test_x_from_plain_matrices(name: str, frame: str) -> None:
+    found = elastic(name)
+    supports = tuple(Support.from_spec(s) for s in found.spec.supports)
+    objective = ImpactObjective(found, ImpactContact(frame, (0.3, 0.1, 1.0)), supports=supports)
+    contact = ContactStiffness(linear=3e5)
+    for q in random_configurations(found.model, 2, name, "x"):
+        oracle = objective.oracle.at(q)
+        joints = slice(6 if found.floating else 0, None)
+        M = oracle.M - np.diag(found.armature) + oracle.Js.T @ oracle.Js / objective.compliance
+        j = oracle.n @ oracle.J
+        G, C = j @ np.linalg.solve(M, j), np.sum(j[joints] ** 2) / 12000.0
+        made = springs_along(objective.case, q)
+        assert made is not None and made == pytest.approx((G, C), rel=1e-6)
+        told = compression(objective, q, 0.7, contact)
+        assert told is not None and told.x == pytest.approx(np.pi / 2 / np.sqrt(3e5 * G) * np.sqrt(G / C), rel=1e-6)
+        assert told.peak_force == pytest.approx(0.7 * np.sqrt(3e5 / objective.oracle.quantities(q).G))
+        table = compression(objective, q, 0.7, None)
+        assert table is not None and table.x is None and list(table.by_material) == list(MATERIALS)
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "fits"), [(1e8, "link"), (1e6, None), (1e3, "reflected")]
+)  # fmt: skip
+def test_a_joint_model_that_does_not_fit_is_named_with_both_answers(stiffness: float, fits: str | None) -> None:
+    found = elastic("panda")
+    contact = ImpactContact("panda_hand_tcp", (0, 0, 1))
+    values = {
+        name: ImpactObjective(with_joint_model(found, name), contact).oracle.quantities(found.posture()).H  # type: ignore[arg-type]
+        for name in ("link", "reflected")
+    }
+    for name in values:
+        objective = ImpactObjective(with_joint_model(found, name), contact)  # type: ignore[arg-type]
+        told = evaluate(objective, found.posture(), contact_stiffness=ContactStiffness(linear=stiffness))
+        assert told.compression is not None and told.compression.fitting == fits
+        lines = [line for line in told.warnings if line.startswith("x =")]
+        assert len(lines) == (fits != name)
+        if lines:
+            assert all(f"{value:.4g} with '{other}'" in lines[0] for other, value in values.items())
+
+
+def test_nothing_is_told_where_nothing_is_known() -> None:
+    found = robot("tilthex_arm")
+    objective = ImpactObjective(found, ImpactContact("ee", (0, 0, 1)))
+    assert evaluate(objective, found.posture()).compression is None
+    told = evaluate(objective, found.posture(), contact_stiffness=ContactStiffness(linear=1e5)).compression
+    assert told is not None and told.x is None and told.peak_force is not None and not told.line
+
+
+# ---- bounds in a search -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "more"),
+    [("tilthex_arm", {}), ("solo12", {"frame": "base_link"}), ("panda", {"contact_pose": "aligned:25"})],
+)
+def test_the_bounds_hold_and_cost(name: str, more: dict[str, object]) -> None:
+    asked = {"robot": name, "normal": (0.0, 0.0, 1.0), "contact_stiffness": 1e5, "speed": 0.8, "starts": 3, **more}
+    plain = prepare(make_settings(asked))
+    free = solve(plain.problem, starts=3, compile="off")
+    before, after = plain.impact.evaluate(free.initial), plain.impact.evaluate(free.q)
+    assert before.compression is not None and after.compression is not None
+    assert (
+        after.compression.peak_force is not None
+        and before.frictionless is not None
+        and after.frictionless is not None
+    )
+    joints = slice(6 if plain.impact.robot.floating else 0, None)
+    force, jump = 0.97 * after.compression.peak_force, 0.97 * np.abs(after.frictionless.velocity[joints]).max()
+    bounded = prepare(make_settings({**asked, "max_force": force, "max_torque": 3.0 * jump, "velocity_gain": 3.0}))
+    (limits,) = (c for c in bounded.problem.constraints if isinstance(c, ImpactLimits))
+    model, numeric = plain.impact.robot.model, Numeric(plain.impact.robot.model)
+    _, jacobian = limits.evaluate(numeric.at(free.q))
+    measured = central_gradient(lambda q: limits.evaluate(numeric.at(q))[0], model, free.q, 1e-4)
+    assert relative(jacobian, measured) < 1e-5
+    found = solve(bounded.problem, starts=3, compile="off")
+    told = bounded.impact.evaluate(found.q)
+    assert found.certificate.holds()
+    assert told.compression is not None and told.compression.peak_force is not None and told.frictionless is not None
+    assert told.compression.peak_force <= force * (1 + 1e-6)
+    assert np.abs(told.frictionless.velocity[joints]).max() <= jump * (1 + 1e-6)
+    assert told.H >= after.H * (1 - 1e-9), "a bound never helps"
+
+
+def _value_at(constraint: AxisInCone, numeric: Numeric, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    return constraint.evaluate(numeric.at(q))[0]
+
+
+def test_a_tool_that_may_tilt_does_at_least_as_well() -> None:
+    asked = {"robot": "panda", "normal": (0.0, 0.0, 1.0), "starts": 4}
+    values = []
+    for pose in ("aligned", "aligned:10", "aligned:30"):
+        prepared = prepare(make_settings({**asked, "contact_pose": pose}))
+        found = solve(prepared.problem, starts=4, compile="off")
+        assert found.certificate.holds()
+        values.append(prepared.problem.objective.value(found.q))
+        for constraint in prepared.problem.constraints:
+            if isinstance(constraint, AxisInCone):
+                degrees = float(pose.partition(":")[2])
+                numeric = Numeric(prepared.problem.robot.model)
+                assert constraint.evaluate(numeric.at(found.q))[0][0] >= np.cos(np.deg2rad(degrees)) - 1e-9
+                jacobian = constraint.evaluate(numeric.at(found.q))[1]
+                tilt = partial(_value_at, constraint, numeric)
+                measured = central_gradient(tilt, prepared.problem.robot.model, found.q, 1e-4)
+                assert relative(jacobian, measured, scale=1.0) < 1e-9
+    assert values[0] * (1 + 1e-9) >= values[1] >= values[2] * (1 - 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "words"),
+    [
+        ({"max_force": 10.0}, InputError, "needs the elasticity"),
+        ({"max_torque": 1.0}, InputError, "gain"),
+        ({"velocity_gain": 1.0}, InputError, "gain"),
+        ({"contact_stiffness": "iron"}, SpecError, "steel, wood"),
+        ({"contact_stiffness": -1.0}, SpecError, "above zero"),
+        ({"contact_stiffness": 1e5, "contact_duration": 0.1}, InputError, "one of the two"),
+        ({"contact_duration": 0.0}, SpecError, "above zero"),
+        ({"contact_pose": "aligned:90"}, SpecError, "aligned:DEG"),
+        ({"contact_pose": "aligned:nan"}, SpecError, "aligned:DEG"),
+        ({"max_force": 1.0, "contact_stiffness": "steel"}, Infeasible, "bounds on the impact"),
+    ],
+)
+def test_refusals(values: dict[str, object], error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        solve(prepare(make_settings({"robot": "tilthex_arm", "normal": (0.0, 0.0, 1.0), **values})).problem, starts=1)
+
+
+def test_the_commands(tmp_path: Path) -> None:
+    config = tmp_path / "robot.toml"
+    config.write_text(
+        'schema = "impact-posture/robot/1"\n[transmission]\nkind = "elastic"\nstiffness = 14000\nsource = "assumed"\n'
+    )
+    told = run("evaluate", "panda", "--normal", 0, 0, 1, "--config", config, "--contact-stiffness", "wood")
+    assert "peak force" in told.stdout and "x = 0.06" in told.stdout and "--joint-model link fits" in told.stderr
+    out = tmp_path / "out"
+    asked = ("--contact-stiffness", 1e5, "--max-force", 180, "--max-joint-jump", 3, "--starts", 2, "--no-codegen")
+    done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, *asked, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "effective mass at most" in done.stdout
+    document = json.loads((out / "result.json").read_text())
+    assert document["optimal"]["compression"]["peak_force"] <= 180 * (1 + 1e-6)
+    again = json.loads(
+        run("optimize", out / "problem.toml", "--no-codegen", "--out", tmp_path / "b", "--json").stdout
+    )
+    assert again["optimal"]["H"] == pytest.approx(document["optimal"]["H"], rel=1e-8)
+    failed = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--max-force", 1, "--contact-stiffness", "steel")
+    assert failed.returncode == 3 and "bounds on the impact" in failed.stderr
