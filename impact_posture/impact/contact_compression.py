@@ -74,8 +74,7 @@ class ContactStiffness:
             return self.duration
         if self.linear is not None:
             return pi / 2 / sqrt(self.linear * G)
-        assert self.hertz is not None  # noqa: S101 (narrows types)
-        return HERTZ_TIME * (5 * speed**2 / (4 * self.hertz * G)) ** 0.4 / speed if speed > 0 else float("inf")
+        return HERTZ_TIME * self._depth(G, speed) / speed if speed > 0 else float("inf")
 
     def peak_force(self, G: float, speed: float) -> float:
         """Return the force at greatest compression, N."""
@@ -83,8 +82,11 @@ class ContactStiffness:
             return pi / 2 * speed / (G * self.duration)
         if self.linear is not None:
             return speed * sqrt(self.linear / G)
-        assert self.hertz is not None  # noqa: S101 (narrows types)
-        return self.hertz * (5 * speed**2 / (4 * self.hertz * G)) ** 0.6
+        return (self.hertz or 0.0) * self._depth(G, speed) ** 1.5
+
+    def _depth(self, G: float, speed: float) -> float:
+        """The greatest compression of a Hertzian contact, m."""
+        return float((5 * speed**2 / (4 * (self.hertz or 0.0) * G)) ** 0.4)
 
     def least_mobility(self, force: float, speed: float) -> float:
         """Return the least G, 1/kg, with which the peak force stays at most ``force``."""

@@ -69,10 +69,10 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
         settings.bilateral,
         build_model_variants(robot, settings.armature_range, [Payload(*payload) for payload in settings.payload]),
     )
-    contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
+    stiffness = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
     held_by = missing_support(robot) if settings.support is None and not supports else ""
     posture = settings.posture or robot.default_posture
-    return ResolvedImpact(objective, q, posture, settings.speed, settings.restitution, held_by, contact)
+    return ResolvedImpact(objective, q, posture, settings.speed, settings.restitution, held_by, stiffness)
 
 
 def _contacts(settings: ImpactSettings, robot: Robot) -> list[ImpactContact]:

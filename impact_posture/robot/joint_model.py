@@ -57,9 +57,8 @@ def transmissions(robot: Robot) -> Transmissions:
         JointNotFound: The table names a joint that the robot lacks.
     """
     spec, model, nv = robot.spec.transmission, robot.model, robot.nv
-    found = Transmissions(
-        *(np.zeros(nv, dtype=bool) for _ in range(3)), stiffness=np.full(nv, np.inf), damping=np.zeros(nv)
-    )
+    none = np.zeros(nv, dtype=bool)
+    found = Transmissions(none, none.copy(), none.copy(), np.full(nv, np.inf), np.zeros(nv))
     for joint in spec.joints:
         if joint not in robot.locked:
             joint_index(model, joint, f"{robot.name} [transmission.joints]")
