@@ -82,7 +82,7 @@ class ContactStiffness:
             return pi / 2 * speed / (G * self.duration)
         if self.linear is not None:
             return speed * sqrt(self.linear / G)
-        return (self.hertz or 0.0) * self._depth(G, speed) ** 1.5
+        return float((self.hertz or 0.0) * self._depth(G, speed) ** 1.5)
 
     def _depth(self, G: float, speed: float) -> float:
         """The greatest compression of a Hertzian contact, m."""
@@ -92,7 +92,7 @@ class ContactStiffness:
         """Return the least G, 1/kg, with which the peak force stays at most ``force``."""
         # The force falls with a power of G.
         power = 1.0 if self.duration is not None else 0.5 if self.linear is not None else 0.6
-        return (self.peak_force(1.0, speed) / force) ** (1 / power)
+        return float((self.peak_force(1.0, speed) / force) ** (1 / power))
 
     @property
     def words(self) -> str:
