@@ -39,6 +39,7 @@ from impact_posture.robot.model_variant import ModelVariant, Payload, build_mode
 from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import (
+    Against,
     JointModel,
     MetricKind,
     ObjectiveKind,
@@ -260,10 +261,35 @@ class PostureResult:
         return self.problem.prepared
 
     def trade_off(
-        self, points: int = 16, *, compile: CompileMode = "auto", progress: Progress | None = None
+        self,
+        points: int = 16,
+        against: Against = "distance",
+        *,
+        compile: CompileMode = "auto",
+        progress: Progress | None = None,
     ) -> PostureResult:
-        """Return the same result with the best objective within each of ``points`` distances from the start."""
-        curve = pareto_front(self.solution, points, compile=compile, progress=progress)
+        """Return the same result with the best objective within each of ``points`` prices.
+
+        Args:
+            points: Number of points.
+            against: The price: the ``distance`` from the start, or the peak ``force`` of the impact.
+            compile: Whether to compile the program.
+            progress: Called with the solves done and planned.
+
+        Raises:
+            InputError: The force is asked for, but the elasticity of the contact is not known.
+        """
+        force = None
+        if against == "force":
+            impact = self._prepared.impact
+            if impact.contact_stiffness is None:
+                raise InputError(
+                    "force needs the elasticity of the contact",
+                    where="tradeoff_against",
+                    hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
+                )
+            force = impact.contact_stiffness, impact.speed
+        curve = pareto_front(self.solution, points, force=force, compile=compile, progress=progress)
         return PostureResult(self.problem, self.solution, self.robustness, curve)
 
     def save(

@@ -24,6 +24,7 @@ from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
 from impact_posture.processes import fork_map
 from impact_posture.robot.postures import write_posture
+from impact_posture.settings import Against
 
 # Matplotlib is imported where something is drawn, because the import takes longer than a small problem.
 if TYPE_CHECKING:
@@ -150,11 +151,11 @@ def _view(
         speed=impact.speed,
         restitution=impact.restitution,
         path=PathData(s=path.s, H=path.H, G=path.G, V=path.V, S=path.S),
-        tradeoff=_tradeoff_data(document.get("tradeoff", [])),
+        tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
     )
 
 
-def _tradeoff_data(points: Sequence[dict[str, Any]]) -> TradeOffData | None:
+def _tradeoff_data(points: Sequence[dict[str, Any]], against: Against) -> TradeOffData | None:
     """Return the ``tradeoff`` of a ``result.json`` as arrays; ``None`` for fewer than two points."""
     from impact_posture.plot import TradeOffData
 
@@ -163,7 +164,8 @@ def _tradeoff_data(points: Sequence[dict[str, Any]]) -> TradeOffData | None:
     keys = ("within", "distance", "objective", "H", "G", "V", "S")
     columns = {key: np.array([np.nan if p[key] is None else p[key] for p in points], dtype=float) for key in keys}
     knee = next((k for k, p in enumerate(points) if p["knee"]), None)
-    return TradeOffData(**columns, certified=np.array([bool(p["certified"]) for p in points]), knee=knee)
+    certified = np.array([bool(p["certified"]) for p in points])
+    return TradeOffData(**columns, certified=certified, knee=knee, against=against)
 
 
 def _write_json(path: Path, document: dict[str, object]) -> None:

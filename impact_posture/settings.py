@@ -25,6 +25,7 @@ ObjectiveKind = Literal["impulse", "speed", "sticking", "energy"]
 ContactPose = Literal["full", "position", "aligned", "free", "box"]
 BaseMode = Literal["free", "level", "fixed", "box"]
 SupportKind = Literal["point", "surface"]
+Against = Literal["distance", "force"]
 JointModel = Literal["reflected", "link", "locked"]
 TransmissionKind = Literal["rigid", "elastic", "locked"]
 
@@ -426,6 +427,12 @@ class ProblemSettings(ImpactSettings):
             TASK, "[K]", holds=_not_negative, demand="give a whole number, zero or more",
         ),
     ] = 0  # fmt: skip
+    tradeoff_against: Annotated[
+        Against,
+        Setting(
+            "What --tradeoff bounds: the distance from the start, or the peak force of the impact.", TASK, "WHAT"
+        ),
+    ] = "distance"  # fmt: skip
     starts: Annotated[
         int, Setting("Number of starting points of the search.", OUTPUT, holds=_positive, demand="give 1 or more")
     ] = 16

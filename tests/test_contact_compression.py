@@ -28,6 +28,7 @@ from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.constraint import AxisInCone
 from impact_posture.posture.impact_limits import ImpactLimits
+from impact_posture.posture.pareto import pareto_front
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.joint_model import with_joint_model
@@ -201,9 +202,32 @@ def test_a_tool_that_may_tilt_does_at_least_as_well() -> None:
     assert values[0] * (1 + 1e-9) >= values[1] >= values[2] * (1 - 1e-9)
 
 
+@pytest.mark.parametrize("name", ["tilthex_arm", "panda"])
+def test_the_front_of_jump_and_force_is_that_of_searches_with_a_bound(name: str) -> None:
+    asked = {"robot": name, "normal": (0.0, 0.0, 1.0), "objective": "speed", "contact_stiffness": 1e5, "speed": 0.6}
+    more = {"contact_pose": "aligned:30"} if name == "panda" else {}
+    prepared = prepare(make_settings({**asked, **more}))
+    found = solve(prepared.problem, starts=4, compile="off")
+    contact = ContactStiffness(linear=1e5)
+    curve = pareto_front(found, 4, force=(contact, 0.6), compile="off")
+    assert curve.against == "force" and all(point.certified for point in curve.points)
+    forces, values = ([getattr(p, key) for p in curve.points] for key in ("distance", "objective"))
+    assert forces == sorted(forces) and values == sorted(values, reverse=True)
+    for point in curve.points:
+        assert point.distance == pytest.approx(0.6 * np.sqrt(1e5 / point.G)) and point.distance <= point.within + 1e-6
+    assert values[-1] == pytest.approx(prepared.problem.objective.value(found.q), rel=1e-6)
+    middle = curve.points[2]
+    bounded = prepare(make_settings({**asked, **more, "max_force": middle.within}))
+    again = solve(bounded.problem, starts=4, compile="off")
+    assert middle.objective <= bounded.problem.objective.value(again.q) * (1 + 1e-6), (
+        "another search finds nothing better"
+    )
+
+
 @pytest.mark.parametrize(
     ("values", "error", "words"),
     [
+        ({"tradeoff": 3, "tradeoff_against": "force"}, InputError, "needs the elasticity"),
         ({"max_force": 10.0}, InputError, "needs the elasticity"),
         ({"max_torque": 1.0}, InputError, "gain"),
         ({"velocity_gain": 1.0}, InputError, "gain"),
@@ -230,11 +254,13 @@ def test_the_commands(tmp_path: Path) -> None:
     assert "peak force" in told.stdout and "x = 0.06" in told.stdout and "--joint-model link fits" in told.stderr
     out = tmp_path / "out"
     asked = ("--contact-stiffness", 1e5, "--max-force", 180, "--max-joint-jump", 3, "--starts", 2, "--no-codegen")
+    asked = (*asked, "--tradeoff", 2, "--tradeoff-against", "force")
     done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, *asked, "--out", out)
     assert done.returncode == 0, done.stderr
-    assert "effective mass at most" in done.stdout
+    assert "effective mass at most" in done.stdout and "the best posture within a peak force (N)" in done.stdout
     document = json.loads((out / "result.json").read_text())
     assert document["optimal"]["compression"]["peak_force"] <= 180 * (1 + 1e-6)
+    assert document["tradeoff_against"] == "force" and document["tradeoff"][-1]["distance"] <= 180 * (1 + 1e-6)
     again = json.loads(
         run("optimize", out / "problem.toml", "--no-codegen", "--out", tmp_path / "b", "--json").stdout
     )

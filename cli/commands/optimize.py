@@ -67,7 +67,7 @@ def optimize(
         )
     if settings.tradeoff:
         with progress("solving", "points", shown=shown) as advance:
-            result = result.trade_off(settings.tradeoff, compile=compile, progress=advance)
+            result = result.trade_off(settings.tradeoff, settings.tradeoff_against, compile=compile, progress=advance)
     if not json:
         # The result comes first, because figures and C code take longer.
         _summarize(page, prepared, result.solution, result.document)
@@ -104,6 +104,7 @@ def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
     """Refuse options that have no effect without another option."""
     for name, used, hint in (
         ("box", settings.contact_pose == "box", "--contact-pose box"),
+        ("tradeoff_against", bool(settings.tradeoff), "--tradeoff"),
         ("base_box", settings.base == "box", "--base box"),
         ("com_margin", settings.com is not False, "--com"),
         ("friction", settings.keep_contacts, "--keep-contacts"),
@@ -176,24 +177,29 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
         f"optima: {optima}{more}"
     )
     if "tradeoff" in document:
-        _tradeoff(page, document["tradeoff"], [n for n in document["notes"] if n.startswith("trade-off:")])
+        _tradeoff(page, document, [n for n in document["notes"] if n.startswith("trade-off:")])
     # The warnings of the robot were printed before the solver started.
     page.warnings(document["warnings"][len(prepared.impact.warnings) :])
 
 
-def _tradeoff(page: Page, points: list[dict[str, Any]], notes: list[str]) -> None:
-    """Show the trade-off between the objective and the distance."""
+def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
+    """Show the trade-off between the objective and the distance or force."""
     from impact_posture.posture.caveats import percent
 
+    points = document["tradeoff"]
     page.gap()
-    page.line("trade-off: the best posture within a distance from the initial one (rad, mixed with m)")
+    digits = 3 if document["tradeoff_against"] == "distance" else 1
+    bound = {"distance": "a distance from the initial one (rad, mixed with m)", "force": "a peak force (N)"}
+    page.line(f"trade-off: the best posture within {bound[document['tradeoff_against']]}")
     first, last = points[0]["objective"], points[-1]["objective"]
     rows = []
     for point in points:
         gain = percent((first - point["objective"]) / (first - last)) if last < first else ""
         marks = (["knee"] if point["knee"] else []) + ([] if point["certified"] else ["not certified"])
         keys = ("objective", "H", "G", "V", "S")
-        rows.append((f"  {point['within']:.3f}", gain, *(number(point[key]) for key in keys), ", ".join(marks)))
+        rows.append(
+            (f"  {point['within']:.{digits}f}", gain, *(number(point[key]) for key in keys), ", ".join(marks))
+        )
     head = ("  within", "gain", "objective", "H", "G", "V", "S", "")
     page.table(head, rows, right=range(7))
     for note in notes:

@@ -17,12 +17,14 @@ from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import BLUE, GRAY, GREEN, INK, PURPLE, VERMILLION, framed
 from impact_posture.plot.view import PathData, ResultView, TradeOffData, header_lines, number, objective_unit
 
-NOTES = (
-    "Each point is the best posture found that moves at most so far from the initial one (joint angles, sliding "
-    "joints and base taken together); lines between points only join them. Hollow: not certified as an optimum.",
-)
+NOTES = {
+    "distance": "Each point is the best posture found that moves at most so far from the initial one (joint angles, "
+    "sliding joints and base taken together)",
+    "force": "Each point is the best posture found whose impact has at most this peak force",
+}
+_LINES = "; lines between points only join them. Hollow: not certified as an optimum."
 _KNEE = (
-    "The knee is the point whose share of the gain exceeds its share of the distance most, marked only if that is by "
+    "The knee is the point whose share of the gain exceeds its share of the {} most, marked only if that is by "
     "1/3 or more (a parabola reaches 1/4)."
 )
 
@@ -151,6 +153,13 @@ def share_notes(where: str, missing: list[str]) -> str:
     return notes + (f" {', '.join(others)} start at zero and cannot be divided by it." if others else "")
 
 
+_BOUNDS = {
+    "distance": "distance moved from the initial posture, at most  [rad, mixed with m]",
+    "force": "peak force of the impact without friction, at most  [N]",
+}
+_EXTRA = {"distance": "distance", "force": "extra force"}
+
+
 def tradeoff_figure(view: ResultView) -> Figure:
     """Draw the objective over the distance (log axis if it spreads widely), and below it H, G, V and S.
 
@@ -162,13 +171,13 @@ def tradeoff_figure(view: ResultView) -> Figure:
         raise InputError(
             "there is no trade-off to draw", where="figure tradeoff", hint="run optimize again with `tradeoff`"
         )
-    knee = [_KNEE] if data.knee is not None else []
-    notes = [*NOTES, *knee, share_notes("at these postures", undrawn(data))]
+    knee = [_KNEE.format(_EXTRA[data.against])] if data.knee is not None else []
+    notes = [NOTES[data.against] + _LINES, *knee, share_notes("at these postures", undrawn(data))]
     with framed(*header_lines(view), 5.6, notes) as (figure, body):
         upper, lower = body.subplots(2, 1, sharex=True, height_ratios=[1.25, 1])
         _objective(upper, data, view)
         drawn = draw_shares(lower, data.within, data)
-        lower.set_xlabel("distance moved from the initial posture, at most  [rad, mixed with m]")
+        lower.set_xlabel(_BOUNDS[data.against])
         if data.knee is not None:
             lower.axvline(data.within[data.knee], **_MARK)
         handles = upper.get_legend_handles_labels()[0]
@@ -216,12 +225,12 @@ def _objective(axes: Any, data: TradeOffData, view: ResultView) -> None:
 
 def _title(data: TradeOffData) -> str:
     """Return the gain at the knee, or at half of the distance."""
-    y, x = data.objective, data.within
+    y, x = data.objective, data.within - data.within[0]
     gain = float(y[0] - y[-1])
     if not gain > 0:
         return "nothing is gained"
     if data.knee is not None:
         share, way = (y[0] - y[data.knee]) / gain, x[data.knee] / x[-1]
-        return f"knee: {100 * share:.0f} % of the gain for {100 * way:.0f} % of the distance"
+        return f"knee: {100 * share:.0f} % of the gain for {100 * way:.0f} % of the {_EXTRA[data.against]}"
     half = float(np.interp(x[-1] / 2, x, y))
-    return f"half of the distance yields {100 * (y[0] - half) / gain:.0f} % of the gain; no knee"
+    return f"half of the {_EXTRA[data.against]} yields {100 * (y[0] - half) / gain:.0f} % of the gain; no knee"

@@ -21,6 +21,7 @@ from impact_posture.impact.scalars import objective_value
 from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.impact.worst_case import SingleImpact
 from impact_posture.robot.robot import Robot
+from impact_posture.settings import Against
 
 Vector = NDArray[np.float64]
 
@@ -54,11 +55,11 @@ class PathData:
 
 @dataclass(frozen=True, eq=False)
 class TradeOffData:
-    """Best posture within each distance from the initial posture, which comes first.
+    """Best posture within each distance from the initial posture, which comes first, or within each peak force.
 
     Attributes:
-        within: The bounds on the distance (rad mixed with m), increasing, shape (k,).
-        distance: Distance of each posture, at most ``within``, shape (k,).
+        within: The bounds on the distance (rad mixed with m) or force (N), increasing, shape (k,).
+        distance: Distance or force of each posture, at most ``within``, shape (k,).
         objective: Objective of each posture, shape (k,).
         H: ``nᵀΛ_c n``, shape (k,).
         G: ``1/m_eff`` along the normal, 1/kg, shape (k,).
@@ -66,6 +67,7 @@ class TradeOffData:
         S: The sticking counterpart of V, shape (k,); NaN where it does not exist.
         certified: Whether the certificate of each posture holds, shape (k,).
         knee: Index of the knee, if there is one.
+        against: What the points bound.
     """
 
     within: Vector
@@ -77,6 +79,7 @@ class TradeOffData:
     S: Vector
     certified: NDArray[np.bool_]
     knee: int | None = None
+    against: Against = "distance"
 
     @property
     def start(self) -> int:

@@ -25,7 +25,9 @@ Vector = NDArray[np.float64]
 
 
 class ImpactLimits(Constraint):
-    """``G(q) ≥ G_min`` and ``|a_i(q)| ≤ b G(q)`` at every joint, each scaled so that its bound is 1.
+    """``G(q) ≥ G_min`` and ``|a_i(q)|/G(q) ≤ b`` at every joint.
+
+    The bounds are bounds of the rows, so one program serves all of them.
 
     Args:
         objective: The impact; the normal of its leading contact counts.
@@ -43,9 +45,9 @@ class ImpactLimits(Constraint):
         self._joints = np.flatnonzero(moving) if np.isfinite(jump) else np.zeros(0, dtype=int)
         self._least, self._jump = least_mobility, jump
         self.parameters = np.array(objective.contact.normal)
-        force = [np.inf] if least_mobility > 0 else []
-        self.upper = np.concatenate([force, np.ones(len(self._joints))])
-        self.lower = np.concatenate([np.ones(len(force)), -np.ones(len(self._joints))])
+        force = [least_mobility] if least_mobility > 0 else []
+        self.lower = np.array([*force, *[-jump] * len(self._joints)])
+        self.upper = np.array([*[np.inf] * len(force), *[jump] * len(self._joints)])
 
     def describe(self) -> str:
         """See :class:`Constraint`."""
@@ -57,7 +59,7 @@ class ImpactLimits(Constraint):
     @property
     def structure(self) -> str:
         """See :class:`Constraint`."""
-        content = repr((self._least, self._jump, self._objective.structure))
+        content = repr((self._least > 0, self._joints.tolist(), self._objective.structure))
         return f"{super().structure}:{hashlib.sha256(content.encode()).hexdigest()[:16]}"
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
@@ -68,8 +70,8 @@ class ImpactLimits(Constraint):
         impact = impact_at(case, parameters)
         found = heavy.respond(wrenches=[impact])
         G = ca.dot(heavy.link_force(impact), found.velocities[impact.point.joint])
-        rows = [G / self._least] if self._least > 0 else []
-        return ca.densify(ca.vertcat(*rows, *[found.a[int(k)] / (self._jump * G) for k in self._joints]))
+        rows = [G] if self._least > 0 else []
+        return ca.densify(ca.vertcat(*rows, *[found.a[int(k)] / G for k in self._joints]))
 
     def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
         """See :class:`Constraint`."""
@@ -77,13 +79,13 @@ class ImpactLimits(Constraint):
         found, slope = oracle.quantities(model.q), oracle.gradient_G(model.q)
         values, gradients = [], []
         if self._least > 0:
-            values.append(found.G / self._least)
-            gradients.append(slope / self._least)
+            values.append(found.G)
+            gradients.append(slope)
         if len(self._joints):
             jumps = oracle.jump_gradient(model.q)
             for k in self._joints:
-                values.append(found.jump[k] / (self._jump * found.G))
-                gradients.append((jumps[k] - found.jump[k] / found.G * slope) / (self._jump * found.G))
+                values.append(found.jump[k] / found.G)
+                gradients.append((jumps[k] - found.jump[k] / found.G * slope) / found.G)
         return np.array(values), np.array(gradients).reshape(len(values), -1)
 
     def row_name(self, row: int) -> str:

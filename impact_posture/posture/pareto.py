@@ -1,17 +1,17 @@
-"""The Pareto front of objective and distance: the best objective within each distance from the initial posture.
+"""The Pareto front of objective and distance from the initial posture, or of objective and peak force.
 
 ::
 
-    f(d) = min over q  objective(q)    subject to the problem's constraints and ‖q ⊖ q₀‖ ≤ d
+    f(d) = min over q  objective(q)    subject to the problem's constraints and price(q) ≤ d
 
-for a series of distances d from zero to that of the optimum.  The distance is that of
-:func:`~impact_posture.posture.posture_distance.distance_squared`.  It is a bound and not a penalty, because the
-minimizers of ``objective + w·distance²`` reach the convex hull of the curve only.
+for a series of prices d from the least to that of the optimum.  The price is the distance ‖q ⊖ q₀‖ of
+:func:`~impact_posture.posture.posture_distance.distance_squared`, or the peak force of the impact.  It is a bound and
+not a penalty, because the minimizers of ``objective + w·price`` reach the convex hull of the curve only.
 
-One program, with the distance as the bound of a row, is solved along two paths: outward from the initial posture and
-inward from the optimum.  Each solve starts at the end of the previous solve.  The best certified end at each distance
-counts.  If the end at the next distance was found on another path, that path is tried here as well.  So the curve is
-the lower envelope of the paths.  It falls only because better postures were found.
+One program, with the price as the bound of a row, is solved along two paths: outward from the posture at the least
+price and inward from the optimum.  Each solve starts at the end of the previous solve.  The best certified end at
+each price counts.  If the end at the next price was found on another path, that path is tried here as well.  So the
+curve is the lower envelope of the paths.  It falls only because better postures were found.
 """
 
 from __future__ import annotations
@@ -21,17 +21,16 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import InputError, MetricError
+from impact_posture.impact.contact_compression import ContactStiffness
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.nlp import PostureNLP, build_nlp
-from impact_posture.posture.posture_distance import WithinDistance, distance
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.solve import PostureSolution, Progress, run_start
+from impact_posture.posture.rulers import DistanceRuler, ForceRuler, Ruler
+from impact_posture.posture.solve import PostureSolution, Progress, run_start, solve
 from impact_posture.posture.tradeoff import TradeOff, TradePoint, find_knee
 
 Vector = NDArray[np.float64]
@@ -44,45 +43,71 @@ _EQUAL = 1e-9
 _RISE = 1e-6
 # Number of other optima with a path of their own, and rounds of trying the paths of neighbors.
 _PATHS, _ROUNDS = 3, 3
+# Starts of the search for the posture with the least force.
+_FORCE_STARTS = 8
 
 
 def pareto_front(
     solution: PostureSolution,
     points: int = 16,
     *,
+    force: tuple[ContactStiffness, float] | None = None,
     compile: CompileMode = "auto",
     progress: Progress | None = None,
 ) -> TradeOff:
-    """Follow the curve in ``points`` equal steps from the initial posture to the distance of the optimum.
+    """Follow the curve in ``points`` equal steps from the least price to that of the optimum.
 
     The regularization is left out, because it is a price on the distance that is bounded here.
 
+    Args:
+        solution: The solved problem.
+        points: Number of steps.
+        force: Contact and approach speed (m/s) whose peak force is the price; ``None`` for the distance.
+        compile: Whether to compile the program.
+        progress: Called with the solves done and planned.
+
     Raises:
-        InputError: The number of points is below 1.
+        InputError: The number of points is below 1, or there are several contacts whose forces would compete.
     """
     if points < 1:
         raise InputError(f"the number of points is {points}", where="tradeoff", hint="give 1 or more")
     problem = solution.problem
-    chart = Chart(problem.robot.model)
-    whole = distance(chart, solution.q, solution.initial)
-    bounded = _bounded(problem, solution.initial)
-    if whole < _STILL:
-        curve = _Curve(bounded, None, solution.initial, [0.0])
-        return curve.finish(solution, 0.0, 0.0, ["trade-off: the optimum is the initial posture, nothing to trade"])
+    ruler = _ruler(solution, force, compile)
+    least, most = ruler.measure(ruler.nearest), ruler.measure(solution.q)
+    bounded = _bounded(problem, ruler)
+    if most - least < _STILL * max(1.0, least):
+        curve = _Curve(bounded, None, ruler, [least])
+        return curve.finish(solution, 0.0, 0.0, [f"trade-off: {ruler.nothing}, nothing to trade"])
     nlp = build_nlp(bounded, compile=compile, starts=2 * points)
     began = time.perf_counter()
-    curve = _Curve(bounded, nlp, solution.initial, [float(r) for r in whole * np.arange(points + 1) / points])
+    levels = [float(v) for v in least + (most - least) * np.arange(points + 1) / points]
+    curve = _Curve(bounded, nlp, ruler, levels)
     curve.follow(solution, progress)
     return curve.finish(solution, time.perf_counter() - began, nlp.build_time_s, [])
 
 
-def _bounded(problem: PostureProblem, center: Vector) -> PostureProblem:
+def _ruler(solution: PostureSolution, force: tuple[ContactStiffness, float] | None, compile: CompileMode) -> Ruler:
+    problem = solution.problem
+    if force is None:
+        return DistanceRuler(problem.robot.model, solution.initial)
+    objective, (contact, speed) = problem.impact, force
+    if objective.others:
+        raise InputError(
+            "is of one contact, and there are several", where="tradeoff_against", hint="give one `contact`"
+        )
+    # E = 1/(2G), and the force falls as G rises.
+    lightest = replace(objective, kind="energy", normal_cone_deg=0.0, model_variants=())
+    found = solve(replace(problem, objective=lightest), starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])
+    return ForceRuler(objective, contact, speed, found.q)
+
+
+def _bounded(problem: PostureProblem, ruler: Ruler) -> PostureProblem:
     """The problem with the bound as its last constraint, and without its regularization."""
-    ball = WithinDistance(Chart(problem.robot.model), center, 1.0)
+    row = ruler.bound(1.0)
     return replace(
         problem,
         requirements=replace(problem.requirements, regularization=0.0),
-        constraints=(*problem.constraints, ball),
+        constraints=(*problem.constraints, row),
         rows=(*problem.rows, (0,)) if problem.rows else (),
     )
 
@@ -103,25 +128,24 @@ class _Found:
 class _Curve:
     """The curve during the search."""
 
-    def __init__(self, problem: PostureProblem, nlp: PostureNLP | None, initial: Vector, radii: list[float]) -> None:
-        self._problem, self._nlp, self._initial, self._radii = problem, nlp, initial, radii
-        self._chart = Chart(problem.robot.model)
-        self._scale = problem.objective.value(initial)
-        self._best: list[_Found | None] = [None] * len(radii)
+    def __init__(self, problem: PostureProblem, nlp: PostureNLP | None, ruler: Ruler, levels: list[float]) -> None:
+        self._problem, self._nlp, self._ruler, self._levels = problem, nlp, ruler, levels
+        self._scale = problem.objective.value(ruler.nearest)
+        self._best: list[_Found | None] = [None] * len(levels)
         self._tried: set[tuple[int, bytes]] = set()
         self.solves = 0
-        self._take(0, "outward", initial)
+        self._take(0, "outward", ruler.nearest)
 
     def follow(self, solution: PostureSolution, progress: Progress | None) -> None:
-        """Solve outward from the initial posture, and inward from the optimum and from nearer optima."""
-        last = len(self._radii) - 1
+        """Solve outward from the least price, and inward from the optimum and from cheaper optima."""
+        last = len(self._levels) - 1
         planned = 2 * last
         self._take(last, "inward", solution.q)
         paths = [("inward", last, solution.q)]
         for number, optimum in enumerate(solution.optima[1 : 1 + _PATHS]):
-            away = distance(self._chart, optimum.q, self._initial)
-            if away <= self._radii[last]:
-                k = int(np.searchsorted(self._radii, away))
+            price = self._ruler.measure(optimum.q)
+            if price <= self._levels[last]:
+                k = int(np.searchsorted(self._levels, price))
                 paths.append((f"optimum {number}", k, optimum.q))
                 self._take(k, paths[-1][0], optimum.q)
                 planned += k - 1
@@ -134,7 +158,7 @@ class _Curve:
             for inner in range(k - 1, 0, -1):
                 q = self._solve(inner, path, q)
                 step()
-        q = self._initial
+        q = self._ruler.nearest
         for k in range(1, last + 1):
             q = self._solve(k, "outward", q)
             step()
@@ -156,17 +180,15 @@ class _Curve:
         return better
 
     def _solve(self, k: int, path: str, start: Vector) -> Vector:
-        """Solve within radius ``k``, from ``start`` or from its nearest point towards the initial posture."""
-        radius = self._radii[k]
+        """Solve within level ``k``, from ``start`` or from a posture nearby that is within it."""
+        level = self._levels[k]
         key = (k, start.tobytes())
         if self._nlp is None or key in self._tried:
             return start
         self._tried.add(key)
-        away = distance(self._chart, start, self._initial)
-        if away > radius:
-            start = np.array(pin.interpolate(self._problem.robot.model, self._initial, start, radius / away))
+        start = self._ruler.within(start, level)
         try:
-            record, certificate = run_start(replace(self._nlp, problem=self._at(radius)), start, self._scale)
+            record, certificate = run_start(replace(self._nlp, problem=self._at(level)), start, self._scale)
             self._take(k, path, record.q, certificate)
         except MetricError:
             # This path led to a posture where the objective does not exist.
@@ -175,12 +197,12 @@ class _Curve:
             self.solves += 1
         return record.q if certificate.holds() else start
 
-    def _at(self, radius: float) -> PostureProblem:
-        ball = WithinDistance(self._chart, self._initial, radius)
-        return replace(self._problem, constraints=(*self._problem.constraints[:-1], ball))
+    def _at(self, level: float) -> PostureProblem:
+        bound = self._ruler.bound(level)
+        return replace(self._problem, constraints=(*self._problem.constraints[:-1], bound))
 
     def _take(self, k: int, path: str, q: Vector, certificate: Certificate | None = None) -> None:
-        """Keep a posture if it satisfies the constraints and is the best within radius ``k``."""
+        """Keep a posture if it satisfies the constraints and is the best within level ``k``."""
         found = _Found(path, self._point(k, q, certificate))
         feasible = replace(found.point.certificate, stationarity=0.0, complementarity=0.0).holds()
         own = self._best[k]
@@ -189,11 +211,11 @@ class _Curve:
             self._best[k] = found
 
     def _point(self, k: int, q: Vector, certificate: Certificate | None = None) -> TradePoint:
-        problem = self._at(self._radii[k])
+        problem = self._at(self._levels[k])
         found = problem.impact.oracle.quantities(q)
         return TradePoint(
-            within=self._radii[k],
-            distance=distance(self._chart, q, self._initial),
+            within=self._levels[k],
+            distance=self._ruler.measure(q),
             q=q,
             objective=problem.objective.value(q),
             H=found.H,
@@ -201,14 +223,15 @@ class _Curve:
             V=found.V,
             S=found.S,
             certificate=certificate or certify(problem, q, self._scale),
+            first=k == 0,
         )
 
     def finish(self, solution: PostureSolution, solve: float, build: float, notes: list[str]) -> TradeOff:
         """Return the curve as it is now."""
         points: list[TradePoint] = []
         for k, found in enumerate(self._best):
-            # If no solve ended on the constraints, the posture of the previous distance satisfies them.
-            before = points[-1].q if points else self._initial
+            # If no solve ended on the constraints, the posture of the previous level satisfies them.
+            before = points[-1].q if points else self._ruler.nearest
             points.append(self._point(k, before) if found is None else found.point)
         best = solution.problem.objective.value(solution.q)
         open_ = [f"{p.within:.3g}" for p in points if not p.certified]
@@ -229,4 +252,4 @@ class _Curve:
                 "more `starts` may find it, too"
             )
         knee = find_knee(np.array([p.distance for p in points]), np.array([p.objective for p in points]))
-        return TradeOff(tuple(points), knee, self.solves, solve, build, tuple(notes))
+        return TradeOff(tuple(points), knee, self.solves, solve, build, tuple(notes), self._ruler.against)

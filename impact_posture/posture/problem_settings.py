@@ -117,15 +117,19 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
 
 def _least_mobility(settings: ProblemSettings) -> float:
     """Return the least G, 1/kg, with which the peak force stays within ``max_force``; 0 for no bound."""
-    if settings.max_force is None:
-        return 0.0
+    for name, asked in (
+        ("max_force", settings.max_force is not None),
+        ("tradeoff_against", settings.tradeoff > 0 and settings.tradeoff_against == "force"),
+    ):
+        if asked and settings.contact_stiffness is None and settings.contact_duration is None:
+            raise InputError(
+                "needs the elasticity of the contact",
+                where=name,
+                hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
+            )
     contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
-    if contact is None:
-        raise InputError(
-            "needs the elasticity of the contact",
-            where="max_force",
-            hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
-        )
+    if settings.max_force is None or contact is None:
+        return 0.0
     return contact.least_mobility(settings.max_force, settings.speed)
 
 

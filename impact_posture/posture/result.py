@@ -47,7 +47,7 @@ def result_document(
     fault = [solution.compiler_fault] if solution.compiler_fault else []
     found = caveats(prepared, solution.initial, solution.q)
     warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *found)
-    curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list()}
+    curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list(), "tradeoff_against": tradeoff.against}
     return {
         "schema": SCHEMA,
         **impact.to_dict(solution.initial),

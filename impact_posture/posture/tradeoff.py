@@ -1,4 +1,4 @@
-"""The trade-off of objective against distance from the initial posture: its points and its knee."""
+"""The trade-off of objective against distance from the initial posture, or against force: its points and its knee."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.posture.certificate import Certificate
+from impact_posture.settings import Against
 from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
@@ -19,18 +20,19 @@ KNEE = 1 / 3
 
 @dataclass(frozen=True, eq=False)
 class TradePoint:
-    """The best posture found within one distance.
+    """The best posture found within one bound.
 
     Attributes:
-        within: The bound on the distance from the initial posture (rad mixed with m).
-        distance: Distance of the posture, less than ``within`` if more distance gains nothing.
+        within: The bound on the distance from the initial posture (rad mixed with m), or on the peak force (N).
+        distance: Distance or force of the posture, less than ``within`` if more gains nothing.
         q: Posture, shape (nq,).
         objective: Objective at the posture.
         H: Squared jump per squared impulse.
         G: Inverse effective mass, 1/kg.
         V: Squared jump per squared approach speed.
         S: The same if the contact sticks, ``None`` where undefined.
-        certificate: Certificate of the problem with the bound; its stationarity has no meaning at distance zero.
+        certificate: Certificate of the problem with the bound; its stationarity has no meaning at the first point.
+        first: Whether this is the one posture at the least distance or force.
     """
 
     within: float
@@ -42,31 +44,33 @@ class TradePoint:
     V: float
     S: float | None
     certificate: Certificate
+    first: bool = False
 
     @property
     def certified(self) -> bool:
-        """Whether the certificate holds; at distance zero, whether the posture satisfies the constraints."""
+        """Whether the certificate holds; of the first point, whether the posture satisfies the constraints."""
         found = self.certificate
-        return replace(found, stationarity=0.0, complementarity=0.0).holds() if not self.within else found.holds()
+        return replace(found, stationarity=0.0, complementarity=0.0).holds() if self.first else found.holds()
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
         finite = self.V if np.isfinite(self.V) else None
         values = json_block(self) | {"V": finite, "certified": self.certified}
-        return {key: value for key, value in values.items() if key != "certificate"}
+        return {key: value for key, value in values.items() if key not in ("certificate", "first")}
 
 
 @dataclass(frozen=True, eq=False)
 class TradeOff:
-    """The best objective within each distance from the initial posture.
+    """The best objective within each distance from the initial posture, or within each peak force.
 
     Attributes:
-        points: Points by distance, the initial posture first.
+        points: Points by distance or force, the posture with the least first.
         knee: Index of the point at the knee (:func:`find_knee`), or ``None``.
         solves: Runs of the solver.
         solve_time_s: Wall time of these runs.
         build_time_s: Time to build the program.
         notes: Notes for the user about the curve.
+        against: What the points bound.
     """
 
     points: tuple[TradePoint, ...]
@@ -75,6 +79,7 @@ class TradeOff:
     solve_time_s: float
     build_time_s: float
     notes: tuple[str, ...]
+    against: Against = "distance"
 
     def to_list(self) -> list[dict[str, object]]:
         """Return the ``tradeoff`` block of ``result.json``."""

@@ -1,0 +1,93 @@
+"""What a trade-off bounds: the distance from the initial posture, or the peak force of the impact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.impact.contact_compression import ContactStiffness
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.impact_limits import ImpactLimits
+from impact_posture.posture.posture_distance import WithinDistance, distance
+from impact_posture.settings import Against
+
+Vector = NDArray[np.float64]
+
+
+class Ruler(Protocol):
+    """A price of a posture that may be bounded.
+
+    Attributes:
+        against: Name of the price in options and files.
+        nearest: The posture at the least price, shape (nq,).
+        nothing: What to say if the optimum has the least price.
+    """
+
+    against: Against
+    nearest: Vector
+    nothing: str
+
+    def measure(self, q: Vector) -> float:
+        """Return the price of ``q``."""
+        ...
+
+    def bound(self, level: float) -> Constraint:
+        """Return the constraint that the price is at most ``level``; one program serves all levels."""
+        ...
+
+    def within(self, q: Vector, level: float) -> Vector:
+        """Return a start for the program with this bound, from a posture that may exceed it."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceRuler:
+    """The distance from the initial posture, rad mixed with m."""
+
+    model: pin.Model
+    nearest: Vector
+    against: Against = "distance"
+    nothing: str = "the optimum is the initial posture"
+
+    def measure(self, q: Vector) -> float:
+        """See :class:`Ruler`."""
+        return distance(Chart(self.model), q, self.nearest)
+
+    def bound(self, level: float) -> Constraint:
+        """See :class:`Ruler`."""
+        return WithinDistance(Chart(self.model), self.nearest, level)
+
+    def within(self, q: Vector, level: float) -> Vector:
+        """See :class:`Ruler`."""
+        away = self.measure(q)
+        return q if away <= level else np.array(pin.interpolate(self.model, self.nearest, q, level / away))
+
+
+@dataclass(frozen=True, eq=False)
+class ForceRuler:
+    """The peak force of the impact without friction, N, which falls as G rises."""
+
+    objective: ImpactObjective
+    contact: ContactStiffness
+    speed: float
+    nearest: Vector
+    against: Against = "force"
+    nothing: str = "the optimum has the least force"
+
+    def measure(self, q: Vector) -> float:
+        """See :class:`Ruler`."""
+        return self.contact.peak_force(self.objective.oracle.quantities(q).G, self.speed)
+
+    def bound(self, level: float) -> Constraint:
+        """See :class:`Ruler`."""
+        return ImpactLimits(self.objective, self.contact.least_mobility(level, self.speed), float("inf"))
+
+    def within(self, q: Vector, level: float) -> Vector:
+        """See :class:`Ruler`."""
+        return q
