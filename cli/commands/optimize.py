@@ -106,7 +106,6 @@ def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
         ("box", settings.contact_pose == "box", "--contact-pose box"),
         ("base_box", settings.base == "box", "--base box"),
         ("com_margin", settings.com is not False, "--com"),
-        ("friction", settings.keep_contacts, "--keep-contacts"),
     ):
         if name in given.values and not used:
             raise typer.BadParameter(f"does nothing without {hint}", param_hint=f"'--{name.replace('_', '-')}'")
