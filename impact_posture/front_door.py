@@ -59,7 +59,7 @@ class ImpactObjective(core.ImpactObjective):
         contact: Contact of the impact, or several contacts that act at once.  A contact without an offset at the
             contact frame of robot.toml takes the offset from there.
         metric: ``euclidean``, ``kinetic`` or ``weighted``, or a :class:`~impact_posture.impact.metric.Metric`.
-        kind: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S) or ``energy`` (E).
+        kind: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy`` (E).
         supports: Feet that stay, as ``FRAME[:point|surface]``; ``None`` for those of robot.toml, ``()`` for none.
         compliance: ε of the supports, 1/kg; 0 for 1e-4 over the robot's mass.
         normal_cone_deg: Half angle of the cone of normals whose worst counts, degrees.

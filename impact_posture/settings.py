@@ -21,7 +21,7 @@ Vector3 = tuple[float, float, float]
 Root = Literal["free-flyer", "fixed"]
 NormalFrame = Literal["world", "contact"]
 MetricKind = Literal["euclidean", "kinetic", "weighted"]
-ObjectiveKind = Literal["impulse", "speed", "sticking", "energy"]
+ObjectiveKind = Literal["impulse", "speed", "sticking", "coulomb", "energy"]
 ContactPose = Literal["full", "position", "aligned", "free", "box"]
 BaseMode = Literal["free", "level", "fixed", "box"]
 SupportKind = Literal["point", "surface"]
@@ -35,6 +35,8 @@ MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0
 
 CONTACT, METRIC, ROBOT, TASK, OUTPUT = "Contact", "Measure", "Robot", "Task", "Output"
 
+# Coulomb coefficient of an ordinary surface.
+FRICTION = 0.7
 # Number of distances of --tradeoff without a number.
 TRADEOFF_POINTS = 16
 _LARGEST = float("inf")
@@ -261,6 +263,13 @@ class ImpactSettings(RobotSettings):
             demand="give seconds above zero",
         ),
     ] = None  # fmt: skip
+    friction: Annotated[
+        float,
+        Setting(
+            "Friction coefficient: of the impact's jump with friction, and of the feet for --keep-contacts.",
+            CONTACT, "MU", **_ZERO_OR_MORE,
+        ),
+    ] = FRICTION  # fmt: skip
     metric: Annotated[
         MetricKind,
         Setting("Norm of the velocity jump: euclidean, kinetic or weighted.", METRIC, "KIND"),
@@ -275,7 +284,7 @@ class ImpactSettings(RobotSettings):
         ObjectiveKind,
         Setting(
             "impulse (jump per impulse, H), speed (jump per approach speed without friction, V), "
-            "sticking (without slip, S) or energy (E).",
+            "sticking (without slip, S), coulomb (with --friction: sticks or slips, C) or energy (E).",
             METRIC, "KIND",
         ),
     ] = "impulse"  # fmt: skip
@@ -385,7 +394,6 @@ class ProblemSettings(ImpactSettings):
         ),
     ] = None  # fmt: skip
     keep_contacts: Annotated[bool, Setting("The impact must neither lift nor slide a foot.", TASK)] = False
-    friction: Annotated[float, Setting("Friction coefficient for --keep-contacts.", TASK, **_ZERO_OR_MORE)] = 0.7
     max_force: Annotated[
         float | None,
         Setting(

@@ -12,6 +12,7 @@ from impact_posture_cli.tables import alone_line, contact_names, impact_rows, qu
 
 if TYPE_CHECKING:
     from impact_posture.impact.classical_ellipsoids import Ellipsoid
+    from impact_posture.impact.coulomb_contacts import CoulombJump
     from impact_posture.impact.evaluation import Evaluation
     from impact_posture.impact.resolved_impact import ResolvedImpact
 
@@ -79,6 +80,7 @@ def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     values = ("value",) if free is None else ("standing", "free")
     page.table(("", *values, "unit", "meaning"), rows, right=tuple(range(1, 1 + len(values))))
     letters = {"impulse": f"λ̄²H, λ̄ = {impact.contact.impulse:g} N·s", "speed": "V", "sticking": "S", "energy": "E"}
+    letters["coulomb"] = f"C, μ = {impact.contact.friction:g}"
     kind = impact.objective.kind
     if impact.objective.others:
         letters["impulse"] = "the largest ‖Δν‖² within the bounds on the impulses"
@@ -119,11 +121,11 @@ def _gradient(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
 def _jumps(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     from impact_posture.impact.velocity_jump import merged_entries
 
-    jumps = (found.frictionless, found.sticking)
+    jumps = (found.frictionless, found.coulomb, found.sticking)
     rows = [
         ("  ‖Δν‖", *(number(None if j is None else j.norm) for j in jumps), "jump"),
         ("  impulse", *(number(None if j is None else j.impulse_size) for j in jumps), "N·s"),
-        ("  energy lost", number(found.energy_loss), "", "J"),
+        ("  energy lost", number(found.energy_loss), "", "", "J"),
     ]
     if (squeezed := found.compression) is not None and squeezed.time is not None:
         rows.append(("  compressed for", number(1e3 * squeezed.time), "", "ms"))
@@ -132,4 +134,14 @@ def _jumps(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
         rows.append((f"  Δν {name}", *(number(value, missing="") for value in values), unit))
     page.gap()
     title = f"  at {found.speed:g} m/s, e = {found.restitution:g}"
-    page.table((title, "no friction", "sticking", "unit"), rows, right=(1, 2))
+    page.table((title, "no friction", f"μ = {impact.contact.friction:g}", "sticking", "unit"), rows, right=(1, 2, 3))
+    if found.coulomb is not None:
+        page.line(f"  with friction μ = {impact.contact.friction:g} the contact point {_slip(found.coulomb)}")
+    names = contact_names(impact.objective.contacts)
+    for name, one in zip(names, found.together or (), strict=False):
+        page.line(f"  all at once, with friction: {name} {_slip(one)}, impulse {number(one.impulse_size)} N·s")
+
+
+def _slip(jump: CoulombJump) -> str:
+    direction = jump.slip_direction
+    return "sticks" if direction is None else f"slides along {vector(direction)}"

@@ -107,7 +107,6 @@ def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
         ("tradeoff_against", bool(settings.tradeoff), "--tradeoff"),
         ("base_box", settings.base == "box", "--base box"),
         ("com_margin", settings.com is not False, "--com"),
-        ("friction", settings.keep_contacts, "--keep-contacts"),
     ):
         if name in given.values and not used:
             raise typer.BadParameter(f"does nothing without {hint}", param_hint=f"'--{name.replace('_', '-')}'")

@@ -130,6 +130,7 @@ def build_manifest(
         },
         "objective": first.name,
         "objective_units": first.units,
+        "objective_kink": first.impact_kind.kink,
         "normal_cone_deg": first.normal_cone_deg,
         "scenarios": [variant.to_dict() for variant in first.model_variants],
         "several": joint,
@@ -157,6 +158,7 @@ def _contact_block(contact: ImpactContact) -> dict[str, Any]:
         "normal": list(contact.normal),
         "normal_frame": contact.normal_frame,
         "impulse_bound": contact.impulse,
+        "friction": contact.friction,
     }
 
 

@@ -195,6 +195,8 @@ def _worst_note(objective: ImpactObjective) -> str:
         note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)
     if objective.normal_cone_deg or objective.model_variants:
         note += ".  Where several are as bad, grad is the subgradient at one of them"
+    if objective.kind == "coulomb":
+        note += f", friction {objective.contact.friction:.9g}; {objective.impact_kind.kink}"
     return note
 
 

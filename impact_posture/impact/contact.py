@@ -12,7 +12,7 @@ from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import SupportSpec
-from impact_posture.settings import NormalFrame, SupportKind, Vector3
+from impact_posture.settings import FRICTION, NormalFrame, SupportKind, Vector3
 
 Vector = NDArray[np.float64]
 
@@ -37,9 +37,10 @@ class ImpactContact:
         offset: Contact point from the frame's origin, in the frame, meters.
         normal_frame: Axes of ``normal``: the world, or the contact frame, with which the normal turns.
         impulse: Largest impulse λ̄ along the normal, N·s.
+        friction: Coulomb coefficient μ.
 
     Raises:
-        ContactError: The normal is zero, or the normal, offset or impulse is not finite.
+        ContactError: The normal is zero, a number is not finite, or the friction is negative.
     """
 
     frame: str
@@ -47,6 +48,7 @@ class ImpactContact:
     offset: Vector3 = (0.0, 0.0, 0.0)
     normal_frame: NormalFrame = "world"
     impulse: float = 1.0
+    friction: float = FRICTION
 
     def __post_init__(self) -> None:
         n = np.array(self.normal, dtype=float)
@@ -66,6 +68,10 @@ class ImpactContact:
                 f"with an impulse bound of {self.impulse:g} the objective λ̄²H is beyond double precision",
                 where="impulse",
                 hint=f"give {1 / LARGEST:g} to {LARGEST:g} N·s",
+            )
+        if not 0 <= self.friction <= LARGEST:
+            raise ContactError(
+                f"the coefficient is {self.friction:g}", where="friction", hint=f"give 0 to {LARGEST:g}"
             )
         # Divide by the largest entry first, because squares of long vectors overflow.  A unit normal stays as it is,
         # so that a copy of a contact equals it to the last digit.

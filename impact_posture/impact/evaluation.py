@@ -15,6 +15,7 @@ from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import LARGEST, point_on
 from impact_posture.impact.contact_compression import Compression, ContactStiffness, both_models, compression
 from impact_posture.impact.contact_stability import ContactStability, contact_stability
+from impact_posture.impact.coulomb_contacts import CoulombJump, coulomb_jump, coulomb_jumps
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
@@ -53,6 +54,9 @@ class Evaluation:
         restitution: Coefficient of restitution of the predicted jumps.
         frictionless: Jump without friction; ``None`` if the contact is blocked along the normal.
         sticking: Jump of a contact point that sticks; ``None`` where it does not exist.
+        coulomb: Jump with the friction of the contact, sticking or sliding; ``None`` where it does not exist.
+        together: Jump with friction of the plastic impact of several contacts at once, with the impulse and slip of
+            each contact; ``None`` for one contact, for contacts that can pull, or where it was not found.
         energy_loss: Energy that the frictionless impact dissipates, J; ``None`` if the contact is blocked.
         compression: Compression time, peak force and the number x; ``None`` if nothing is known of them.
         dominance: Whether one light joint makes up most of H.
@@ -79,6 +83,8 @@ class Evaluation:
     restitution: float
     frictionless: Jump | None
     sticking: Jump | None
+    coulomb: CoulombJump | None
+    together: tuple[CoulombJump, ...] | None
     energy_loss: float | None
     compression: Compression | None
     dominance: Dominance
@@ -116,6 +122,7 @@ class Evaluation:
                 "restitution": self.restitution,
                 "frictionless": None if self.frictionless is None else self.frictionless.to_dict(),
                 "sticking": None if self.sticking is None else self.sticking.to_dict(),
+                "coulomb": None if self.coulomb is None else self.coulomb.to_dict(),
                 "energy_loss": self.energy_loss,
             },
             "compression": None if self.compression is None else self.compression.to_dict(),
@@ -130,6 +137,7 @@ class Evaluation:
         if self.impulses is not None:
             block["worst_impulses"] = self.impulses.to_dict()
             blocks = [contact.to_dict() for contact in self.contacts]
+            block["coulomb_together"] = None if self.together is None else [one.to_dict() for one in self.together]
             block["by_contact"] = [{key: one[key] for key in _OWN if key in one} for one in blocks]
         if self.model_variants:
             block["by_scenario"] = [variant.to_dict() for variant in self.model_variants]
@@ -151,7 +159,8 @@ def evaluate(
     """Compute all impact quantities at ``q`` from Pinocchio's numbers, and predict the jump of one impact.
 
     The frictionless jump is ``Δν = a (1+e) v_n / G``, with the impulse ``(1+e) v_n / G`` along n.  The jump of a
-    contact that sticks is ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``.
+    contact that sticks is ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``.  :mod:`impact_posture.impact.coulomb` has that with
+    the friction of the contact.
 
     Args:
         objective: Robot, contact, metric, kind and supports.
@@ -199,6 +208,8 @@ def evaluate(
             None if found.sticking_jump is None or found.sticking_impulse is None
             else weighed_jump(objective, found.sticking_jump * rebound, found.sticking_impulse * rebound)
         ),
+        coulomb=None if scalars.E is None else coulomb_jump(objective, q, rebound),
+        together=coulomb_jumps(objective, q, speed) if objective.others else None,
         energy_loss=None if scalars.E is None else scalars.E * speed**2 * (1 - restitution**2),
         compression=squeezed,
         dominance=find_dominance(objective, found),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.kernel import ImpactKernel
-from impact_posture.impact.lifted import Lifted, UnknownJump, impact_at, unknown_jump, weighed
+from impact_posture.impact.lifted import Guess, Lifted, UnknownJump, impact_at, unknown_jump, weighed
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities, no_sticking
 
 Vector = NDArray[np.float64]
@@ -29,6 +29,7 @@ class ImpactKind(ABC):
         symbol: Scalar that it is a multiple of: H, G, V, S or E.
         units: Units in words.
         adds_up: Whether the impulses of several contacts at once are known, so that their jumps add up.
+        kink: Where the value has a kink, and which gradient it has there; empty where it is smooth.
         no_cone: Reason why no exact worst case over a cone of normals exists.
     """
 
@@ -36,6 +37,7 @@ class ImpactKind(ABC):
     symbol: ClassVar[str]
     units: ClassVar[str]
     adds_up: ClassVar[bool] = False
+    kink: ClassVar[str] = ""
     no_cone: ClassVar[str] = "it is no quadratic form of the normal"
 
     def factor(self, case: ImpactCase) -> float:
@@ -56,6 +58,10 @@ class ImpactKind(ABC):
     def gradient(self, oracle: ImpactOracle, q: Vector) -> Vector:
         """Return the tangent gradient from Pinocchio's numbers, shape (nv,)."""
         return np.asarray(self.factor(oracle.case) * getattr(oracle, f"gradient_{self.symbol}")(q))
+
+    def subgradients(self, oracle: ImpactOracle, q: Vector, within: float) -> tuple[Vector, Vector]:
+        """Return gradients, shape (k, nv), and gaps of their values, shape (k,): one where the value is smooth."""
+        return self.gradient(oracle, q)[None, :], np.zeros(1)
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Return value and tangent gradient (nv) in the symbols of a kernel."""
@@ -79,10 +85,10 @@ class ImpactKind(ABC):
         jump = self.unknowns(case, tree, n)
         return Lifted(jump.variables, jump.residual, self.lifted_value(case, jump))
 
-    def guess(self, oracle: ImpactOracle, q: Vector) -> Vector:
+    def guess(self, oracle: ImpactOracle, q: Vector) -> Guess:
         """Return the unknowns of :meth:`lift` that solve its equations at ``q``."""
         a, impulse = self.jump(oracle.quantities(q))
-        return np.concatenate([oracle.with_support_impulses(a), impulse])
+        return Guess.unbounded(np.concatenate([oracle.with_support_impulses(a), impulse]))
 
 
 class QuadraticKind(ImpactKind):

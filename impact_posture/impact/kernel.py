@@ -106,6 +106,16 @@ class ImpactKernel:
         adjoint = self.tree.respond(tau=self._weigh(jump.a, jump.velocities))
         return 2 * self.tree.pair_gradient(jump, adjoint) + self._metric_gradient(jump.velocities)
 
+    def adjoint_velocity(self, x: Response) -> ca.SX:
+        """Return ``JM⁻¹Wa`` of a response, world, shape (3,)."""
+        free = self.tree.respond(tau=self._weigh(x.a, x.velocities))
+        return self.tree.point_velocity(self.point, free.velocities)[:3]
+
+    def reacting_gradient(self, x: Response, r: Wrench) -> ca.SX:
+        """Return the gradient of ``aᵀWa``, shape (nv,), of an impulse ``p`` with ``∂pᵀJM⁻¹Wa = rᵀ∂B p``."""
+        adjoint = self.tree.respond(tau=self._weigh(x.a, x.velocities), wrenches=self._alike(r))
+        return 2 * self.tree.pair_gradient(x, adjoint) + self._metric_gradient(x.velocities)
+
     @cached_property
     def grad_G(self) -> ca.SX:
         """``∂_q[2nᵀJa − aᵀMa]``, shape (nv,)."""
@@ -176,11 +186,8 @@ class ImpactKernel:
     def grad_S(self) -> ca.SX:
         """``2 ∂_q[sᵀJb + rᵀJa − bᵀMa]`` (and ``−2rᵀn(q)`` for a normal that turns with the robot), shape (nv,)."""
         x = self._sticking
-        weighed = self._weigh(x.a, x.velocities)
-        free = self.tree.respond(tau=weighed)
-        r = -self._mobility_inverse @ self.tree.point_velocity(self.point, free.velocities)[:3]
-        adjoint = self.tree.respond(tau=weighed, wrenches=self._alike(self._force(r)))
-        gradient = 2 * self.tree.pair_gradient(x, adjoint) + self._metric_gradient(x.velocities)
+        r = -self._mobility_inverse @ self.adjoint_velocity(x)
+        gradient = self.reacting_gradient(x, self._force(r))
         if self.case.in_contact_frame:
             gradient = gradient - 2 * self.tree.turning_gradient(self.point, self.world_normal, r)
         return gradient

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from impact_posture.impact.coulomb_kind import CoulombKind
 from impact_posture.impact.energy_kind import EnergyKind
 from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.impulse_kind import ImpulseKind
@@ -13,5 +14,6 @@ KINDS: dict[ObjectiveKind, ImpactKind] = {
     "impulse": ImpulseKind(),
     "speed": SpeedKind(),
     "sticking": StickingKind(),
+    "coulomb": CoulombKind(),
     "energy": EnergyKind(),
 }

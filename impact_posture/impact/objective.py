@@ -80,13 +80,13 @@ class Objective(Minimized, Protocol):
 
 @dataclass(frozen=True)
 class ImpactObjective:
-    """Impulse ``λ̄²H``, speed ``V``, sticking ``S`` or energy ``E`` of an impact, in its worst case.
+    """Impulse ``λ̄²H``, speed ``V``, sticking ``S``, coulomb ``C`` or energy ``E`` of an impact, in its worst case.
 
     Attributes:
         robot: The robot.
         contact: Point and normal of the impact.
         metric: Weight of the jump.
-        kind: ``impulse``, ``speed``, ``sticking`` or ``energy``.
+        kind: ``impulse``, ``speed``, ``sticking``, ``coulomb`` or ``energy``.
         supports: Feet that stay on the ground.
         compliance: ε of the supports, 1/kg.
         normal_cone_deg: Half angle of the cone of normals whose worst counts, degrees; 0 for the contact's normal.
@@ -142,7 +142,7 @@ class ImpactObjective:
                 (self.normal_cone_deg, self.others, self.bilateral),
                 [variant.robot.impact_sha256 for variant in self.model_variants],
                 (contact.frame, contact.offset, contact.normal_frame),
-                self.scale,
+                (self.scale, contact.friction),
             )
         )
 
@@ -269,7 +269,7 @@ class ImpactObjective:
         """Return the objective at ``q`` from Pinocchio's numbers.
 
         Raises:
-            MetricError: The kind is ``sticking`` and S does not exist at ``q``.
+            MetricError: The kind is ``sticking`` or ``coulomb`` and has no value at ``q``.
         """
         return self.worst_case.value(q)
 

@@ -99,7 +99,7 @@ def _contact(
     if offset is None:
         offset = robot.spec.contact.offset if frame == robot.spec.contact.frame else (0.0, 0.0, 0.0)
     bound = settings.impulse if impulse is None else impulse
-    contact = ImpactContact(frame, normal, offset, settings.normal_frame, bound)
+    contact = ImpactContact(frame, normal, offset, settings.normal_frame, bound, settings.friction)
     point_on(robot, contact.frame, contact.offset)
     return contact
 
@@ -195,6 +195,7 @@ def _contact_block(single: ImpactObjective, q: Vector) -> dict[str, object]:
         "normal": single.oracle.at(q).n.tolist(),
         "normal_frame": contact.normal_frame,
         "impulse_bound": contact.impulse,
+        "friction": contact.friction,
     }
 
 

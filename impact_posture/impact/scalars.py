@@ -91,7 +91,7 @@ def objective_value(objective: ImpactObjective, q: Vector) -> float | None:
     if objective.model_variants:
         values = [objective_value(member, q) for member in objective.by_variant]
         return None if None in values else max(v for v in values if v is not None)
-    if isinstance(objective.worst_case, SingleImpact):
+    if isinstance(objective.worst_case, SingleImpact) and objective.kind != "coulomb":
         scalars = Scalars.of(objective.oracle.quantities(q))
         alone: float | None = getattr(scalars, objective.impact_kind.symbol)
         return None if alone is None else objective.scale * alone

@@ -119,7 +119,7 @@ class SingleImpact:
 
     def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
         """See :class:`Minimized`."""
-        return Subgradients(self.gradient(q)[None, :], np.zeros(1))
+        return Subgradients(*self.kind.subgradients(self.oracle, q, within))
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """See :class:`WorstCase`."""
@@ -131,7 +131,7 @@ class SingleImpact:
 
     def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
         """See :class:`Minimized`."""
-        return Guess.unbounded(self.kind.guess(self.oracle, q))
+        return self.kind.guess(self.oracle, q)
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,7 @@ def _check(robot: Robot, requirements: Requirements) -> None:
         value = getattr(requirements, name)
         if not (np.isfinite(value) and value >= 0):
             raise InputError(f"is {value:g}", where=name, hint="give a number ≥ 0")
-    if not (np.isfinite(requirements.friction) and requirements.friction > 0):
+    if requirements.keep_contacts and not (np.isfinite(requirements.friction) and requirements.friction > 0):
         raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
     quaternion = requirements.target_quaternion
     if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):

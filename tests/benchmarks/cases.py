@@ -61,6 +61,7 @@ _ALL = (
     Case("tilthex_arm, wall", "tilthex_arm", BACK),
     Case("talos, wall", "talos", BACK),
     Case("solo12, wall", "solo12", BACK),
+    Case("hextilt, wall", "hextilt", BACK),
 )  # fmt: skip
 CASES = {case.name: case for case in _ALL}
 

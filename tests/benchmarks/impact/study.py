@@ -17,7 +17,9 @@ from tests.benchmarks.cases import CASES, Case
 from tests.benchmarks.core import Vector
 from tests.benchmarks.impact.surface import Measured, NoImpact, Scene, Surface
 
-OBJECTIVES = {"impulse": "H", "speed": "V", "sticking": "S", "energy": "E"}
+OBJECTIVES = {"impulse": "H", "speed": "V", "sticking": "S", "coulomb": "C", "energy": "E"}
+# What more a problem needs for an objective.
+_MORE: dict[str, dict[str, object]] = {"coulomb": {"friction": 0.3}}
 # A contact point that leaves with more tangential speed than this share of v_n has slid.
 SLID = 0.01
 # Cases by robot, with what random postures keep of the contact frame, and words.
@@ -28,10 +30,11 @@ STUDIED: dict[str, tuple[Case, str, str]] = {
         ("panda", "position", "bolted down, the hand's tip onto a table"),
         ("talos, wall", "position", "stands on two feet, a hand against a wall"),
         ("solo12, wall", "free", "stands on four feet, the base against a wall"),
+        ("hextilt, wall", "position", "flies as one body, the arm's end against a wall"),
     )
 }
-# Without friction, two everyday surfaces, and one on which nothing slides.
-FRICTIONS = (0.0, 0.3, 0.8, np.inf)
+# Without friction, ice, two everyday surfaces, and one on which nothing slides.
+FRICTIONS = (0.0, 0.1, 0.3, 0.8, np.inf)
 # What else an impact may differ in: words, and the surface but for its friction.
 VARIATIONS = (
     ("0.1 m/s", Surface(speed=0.1)),
@@ -56,11 +59,19 @@ class Outcome:
     predicted: ImpactQuantities
     measured: Measured
     speed: float
+    coulomb: Vector  # predicted jump per approach speed with the friction of the surface
+
+    def value(self, objective: str) -> float:
+        """The value of an objective."""
+        if objective == "coulomb":
+            return float(self.coulomb @ self.coulomb)
+        return float(getattr(self.predicted, OBJECTIVES[objective]))
 
     def deviation(self, objective: str) -> float:
-        """``‖Δν − predicted Δν‖`` over its size, for ``speed`` or ``sticking``: the vector, whatever the metric."""
+        """``‖Δν − predicted Δν‖`` over its size, for all but ``impulse`` and ``energy``, whatever the metric."""
         o, rebound = self.predicted, (1 + self.measured.restitution) * self.speed
-        predicted = rebound * (o.jump / o.G if objective == "speed" else np.asarray(o.sticking_jump))
+        jumps = {"speed": o.jump / o.G, "sticking": o.sticking_jump, "coulomb": self.coulomb}
+        predicted = rebound * np.asarray(jumps[objective])
         return float(np.linalg.norm(self.measured.jump - predicted) / np.linalg.norm(predicted))
 
     @property
@@ -73,7 +84,7 @@ class Outcome:
 
         ``impulse`` is given the measured normal impulse; the others approach speed and measured restitution.
         """
-        m, value, v = self.measured, getattr(self.predicted, OBJECTIVES[objective]), self.speed
+        m, value, v = self.measured, self.value(objective), self.speed
         if objective == "impulse":
             return self.per_impulse / float(np.sqrt(value))
         if objective == "energy":
@@ -92,7 +103,7 @@ class Row:
 
     def rank(self, objective: str, of: Callable[[Outcome], float] = lambda o: o.measured.size) -> float:
         """Spearman's rank correlation of something measured, by default the jump, with an objective's value."""
-        values = [getattr(o.predicted, OBJECTIVES[objective]) for o in self.outcomes]
+        values = [o.value(objective) for o in self.outcomes]
         return float(scipy.stats.spearmanr([of(o) for o in self.outcomes], values).statistic)
 
     def ratios(self, objective: str) -> Vector:
@@ -151,7 +162,8 @@ class Dropped:
         left_out, outcomes = Counter(self.left_out), []
         for scene, predicted in self.scenes:
             try:
-                outcomes.append(Outcome(predicted, scene.hit(surface), surface.speed))
+                coulomb = scene.with_friction(surface.friction)
+                outcomes.append(Outcome(predicted, scene.hit(surface), surface.speed, coulomb))
             except NoImpact as reason:
                 left_out[str(reason)] += 1
         return Row(self.robot, surface, tuple(outcomes), left_out)
@@ -171,7 +183,7 @@ def choices(robot: str, starts: int = 16) -> list[Choice] | ImpactPostureError:
     """Optimize each objective with the defaults of the command, and drop the robot in what comes out."""
     found: list[Choice] = []
     for objective in OBJECTIVES:
-        problem = STUDIED[robot][0].problem(objective=objective)
+        problem = STUDIED[robot][0].problem(objective=objective, **_MORE.get(objective, {}))
         try:
             solution = solve(problem, starts=starts, jobs=1)
         except ImpactPostureError as error:

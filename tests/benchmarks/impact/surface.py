@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import pinocchio as pin
 from impact_posture.dynamics.mjcf import Mjcf, build_mjcf, import_mujoco, pose
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
+from impact_posture.impact.coulomb import coulomb_impact
 from impact_posture.impact.objective import ImpactObjective
 from tests.benchmarks.core import Vector
 
@@ -18,6 +19,8 @@ from tests.benchmarks.core import Vector
 _FINE, _PATIENCE = 50, 40
 # Rate at which friction and supports stop a velocity, over that of the contact; friction where nothing slides.
 _GRIP, _STICKY = 10.0, 10.0
+# Friction that stands for any amount in a prediction.
+_STICKS = 1e6
 # Iterations on Coulomb's law within one step.
 _INNER = 20
 # Steps without a force after which the contact is over.
@@ -79,7 +82,7 @@ class Scene:
 
     def __init__(self, objective: ImpactObjective, q: Vector) -> None:
         self._mujoco = import_mujoco()
-        self._robot, self._q = objective.robot, q
+        self._robot, self._q, self._objective = objective.robot, q, objective
         # The oracle is shared and moves on: keep what it says of this posture.
         oracle = objective.oracle.at(q)
         self._M, self._J, self._Js, self._n = (np.array(x) for x in (oracle.M, oracle.J, oracle.Js, oracle.n))
@@ -106,6 +109,11 @@ class Scene:
         if np.abs(J @ found - wanted).max() > 1e-6:
             raise NoImpact("cannot move along the normal alone")
         return np.asarray(found)
+
+    def with_friction(self, friction: float) -> Vector:
+        """The predicted jump per approach speed with friction, plastic, shape (nv,)."""
+        contact = replace(self._objective.contact, friction=min(friction, _STICKS))
+        return coulomb_impact(replace(self._objective, contact=contact).oracle, self._q).jump
 
     def hit(self, surface: Surface) -> Measured:
         """Fly into the surface and out again.

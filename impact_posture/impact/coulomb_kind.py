@@ -1,0 +1,109 @@
+"""The kind ``coulomb``: the squared jump at a given approach speed with friction, sticking or sliding."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.tree import Tree
+from impact_posture.errors import MetricError
+from impact_posture.impact.coulomb import NO_FRICTION, coulomb_direction, coulomb_gradient, coulomb_impact
+from impact_posture.impact.impact_case import ImpactCase
+from impact_posture.impact.impact_kind import ImpactKind
+from impact_posture.impact.kernel import ImpactKernel, frozen_directions
+from impact_posture.impact.lifted import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump
+from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
+
+Vector = NDArray[np.float64]
+
+# Slip times distance from the edge of the cone is zero, and at most this in the program, which needs an inside.
+_CORNER = 1e-10
+
+
+class CoulombKind(ImpactKind):
+    """``C = ‖M⁻¹Jᵀp‖²_W/v²``: the squared jump at a given approach speed with the friction ``μ`` of the contact.
+
+    The impulse ``p`` is that of :mod:`impact_posture.impact.coulomb`.  ``C`` is ``S`` where the contact point sticks,
+    and ``V`` without friction.  It is continuous, with a kink where the contact point begins to slip.
+    """
+
+    name, symbol = "coulomb", "C"
+    units = "jump² per (m/s)² of approach, with friction"
+    kink = "where the contact point begins to slip, grad is that of sticking"
+    no_cone = "coulomb is no quadratic form of the normal: the exact worst case over a cone is not known for it"
+
+    def value(self, oracle: ImpactOracle, q: Vector) -> float:
+        """Return the value from Pinocchio's numbers; see the base for errors."""
+        jump = coulomb_impact(oracle, q).jump
+        return float(jump @ oracle.weigh(jump))
+
+    def gradient(self, oracle: ImpactOracle, q: Vector) -> Vector:
+        """Return the tangent gradient from Pinocchio's numbers, shape (nv,); at the kink, that of sticking."""
+        return coulomb_gradient(oracle, q, coulomb_impact(oracle, q))
+
+    def subgradients(self, oracle: ImpactOracle, q: Vector, within: float) -> tuple[Vector, Vector]:
+        """Return the gradient, and that of the other branch where both nearly tie and the value is the larger.
+
+        Where the value is the smaller of both, no optimum lies at the kink.
+        """
+        sides = [coulomb_impact(oracle, q)]
+        with suppress(MetricError):
+            sides.append(coulomb_impact(oracle, q, other=True))
+        gaps = [self.value(oracle, q) - float(side.jump @ oracle.weigh(side.jump)) for side in sides]
+        near = [k for k, gap in enumerate(gaps) if k == 0 or 0 <= gap <= within]
+        return np.array([coulomb_gradient(oracle, q, sides[k]) for k in near]), np.array([gaps[k] for k in near])
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """Return value and tangent gradient (nv) in the symbols of a kernel; at the kink, that of sticking."""
+        case, n = k.case, k.n
+        if case.contact.friction <= NO_FRICTION:
+            return k.V, k.grad_V
+        R = k.tree.rotation(k.point) if case.in_contact_frame else ca.SX.eye(3)
+        B = R.T @ k.mobility @ R
+        direction, K = coulomb_direction(B, n, case.contact.friction)
+        x = k.answer([impact_at(case, direction / ca.dot(B @ n, direction))])
+        value = k.product(x, x)
+        r = -value * n - K @ (R.T @ k.adjoint_velocity(x) - value * (B @ n))
+        return value, k.reacting_gradient(x, impact_at(case, r))
+
+    def unknowns(self, case: ImpactCase, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
+        """Return the jump under ``λ(n − μd)``; the last unknowns are ``λ``, ``d``, ``κ`` (slip) and ``o = 1 − ‖d‖²``.
+
+        ``M a − J_sᵀf − λJᵀ(n − μd) = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``, ``(Ja)_t = κd``.
+        """
+        size, d = ca.SX.sym(f"lam{label}"), ca.SX.sym(f"d{label}", 3)
+        slip, inside = ca.SX.sym(f"kappa{label}"), ca.SX.sym(f"o{label}")
+        jump = unknown_jump(case, tree, impact_at(case, size * (n - case.contact.friction * d)), label)
+        axes = in_world(case, tree, ca.SX.eye(3))
+        moved = axes.T @ jump.contact_velocity
+        # Friction is not determined where the contact point can never move, and zero here.
+        idle = axes.T @ ca.SX(frozen_directions(case.robot, case.point)) @ axes @ d
+        along, out = ca.dot(n, moved), ca.dot(n, d)
+        slides = moved - along * n - slip * (d - n * out) - n * out - idle
+        equations = ca.vertcat(along - 1, slides, inside + ca.dot(d, d) - 1)
+        return jump.with_impulse(ca.vertcat(size, d, slip, inside), equations)
+
+    def lift(self, case: ImpactCase, tree: Tree, n: ca.SX) -> Lifted:
+        """Return the value under the equations of :meth:`unknowns` and ``κ ≥ 0``, ``o ≥ 0``, ``κo = 0``."""
+        jump = self.unknowns(case, tree, n)
+        slip, inside = jump.variables[-2], jump.variables[-1]
+        return Lifted(jump.variables, jump.residual, self.lifted_value(case, jump), slip * inside - _CORNER)
+
+    def jump(self, found: ImpactQuantities) -> tuple[Vector, Vector]:
+        """Return the frictionless jump, which :meth:`guess` replaces."""
+        return found.jump / found.G, np.array([1 / found.G, 0, 0, 0, 0, 1])
+
+    def guess(self, oracle: ImpactOracle, q: Vector) -> Guess:
+        """Return the unknowns of :meth:`lift` that solve its equations at ``q``; ``κ`` and ``o`` are ≥ 0."""
+        found, friction = coulomb_impact(oracle, q), oracle.contact.friction
+        n, p = oracle.n, found.impulse
+        size, slip = float(n @ p), float(np.linalg.norm(found.slip))
+        d = (n - p / size) / friction if found.sticks and friction > NO_FRICTION else found.slip / max(slip, 1e-300)
+        axes = oracle.numeric.placement(oracle.point).rotation if oracle.case.in_contact_frame else np.eye(3)
+        values = [oracle.with_support_impulses(found.jump), [size], axes.T @ d, [slip, max(1 - d @ d, 0.0)]]
+        guess = Guess.unbounded(np.concatenate(values))
+        guess.lower[-2:] = 0.0
+        return guess
