@@ -22,6 +22,7 @@ Root = Literal["free-flyer", "fixed"]
 NormalFrame = Literal["world", "contact"]
 MetricKind = Literal["euclidean", "kinetic", "weighted"]
 ObjectiveKind = Literal["impulse", "speed", "sticking", "coulomb", "energy"]
+ObjectiveChoice = Literal["impulse", "speed", "sticking", "coulomb", "energy", "auto"]
 ContactPose = Literal["full", "position", "aligned", "free", "box"]
 BaseMode = Literal["free", "level", "fixed", "box"]
 SupportKind = Literal["point", "surface"]
@@ -281,10 +282,10 @@ class ImpactSettings(RobotSettings):
         ),
     ] = None  # fmt: skip
     objective: Annotated[
-        ObjectiveKind,
+        ObjectiveChoice,
         Setting(
-            "impulse (jump per impulse, H), speed (jump per approach speed without friction, V), "
-            "sticking (without slip, S), coulomb (with --friction: sticks or slips, C) or energy (E).",
+            "impulse (jump per impulse, H), speed (jump per approach speed without friction, V), sticking (without "
+            "slip, S), coulomb (with --friction: sticks or slips, C), energy (E), or auto (by speed and friction).",
             METRIC, "KIND",
         ),
     ] = "impulse"  # fmt: skip

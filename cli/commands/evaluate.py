@@ -46,6 +46,8 @@ def evaluate(
     normals = [one.normal for one in found.contacts or (found,)]
     page.title(f"{impact.robot.name} at {', '.join(c.frame for c in impact.objective.contacts)}")
     page.pairs([("posture", impact.posture), *impact_rows(impact, normals, axes)])
+    if impact.choice:
+        page.line(impact.choice)
     _scalars(page, impact, found)
     alone_line(page, frames, "H, G, V, S, E, ellipsoid, gradient and jumps")
     _ellipsoids(page, impact, {"impact Λ_c": found.ellipsoid, **classical})

@@ -129,6 +129,8 @@ def _announce(page: Page, prepared: Prepared) -> None:
     if variants:
         rows.append(("model variants", "; ".join(v.name for v in variants)))
     page.pairs(rows)
+    if impact.choice:
+        page.line(impact.choice)
     page.gap()
     page.line("constraints")
     for line in problem.describe():
@@ -144,6 +146,10 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
 
     initial, optimal = document["initial"], document["optimal"]
     impact, blocks = prepared.impact, {"before": initial, "after": optimal}
+    page.line(document["verdict"]["line"], style="bold")
+    for line in document["verdict"]["advice"]:
+        page.line(f"  {line}")
+    page.gap()
     minimized = ("objective", "", f"what was minimized ({impact.objective.kind})")
     rows = [
         (f"  {key}", number(initial[key]), number(optimal[key]), unit, words)

@@ -224,7 +224,7 @@ def springs_along(case: ImpactCase, q: Vector) -> tuple[float, float] | None:
     return (oracle.quantities(q).G, compliance) if compliance > 0 else None
 
 
-def both_models(objective: ImpactObjective, q: Vector) -> dict[JointModel, ImpactObjective]:
+def both_models(objective: ImpactObjective) -> dict[JointModel, ImpactObjective]:
     """Return the same objective for the links alone and for links with rotors."""
     names: tuple[JointModel, ...] = ("link", "reflected")
     return {name: replace(objective, robot=with_joint_model(objective.robot, name)) for name in names}

@@ -245,7 +245,7 @@ def _joint_model_warning(objective: ImpactObjective, q: Vector, found: Compressi
     """Warn where the joint model does not fit x, with the answers of both models."""
     if found is None or found.x is None or objective.robot.joint_model in (found.fitting, "locked"):
         return ()
-    values = {name: objective_value(other, q) for name, other in both_models(objective, q).items()}
+    values = {name: objective_value(other, q) for name, other in both_models(objective).items()}
     listed = ", ".join(f"{value:.4g} with '{name}'" for name, value in values.items() if value is not None)
     advice = f"`joint_model='{found.fitting}'` fits" if found.fitting else "expect a value between the two"
     return (f"{found.line}; the objective is {listed}: {advice}",)

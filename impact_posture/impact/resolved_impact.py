@@ -25,7 +25,7 @@ from impact_posture.robot.model_variant import Payload, build_model_variants
 from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.settings import ImpactSettings, Vector3
+from impact_posture.settings import ImpactSettings, ObjectiveKind, Vector3
 
 Vector = NDArray[np.float64]
 
@@ -57,11 +57,12 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
             where="support_compliance",
             hint=f"give at least {least:.3g}, 1e-6 over the mass, because rounding outweighs stiffer feet below it",
         )
+    kind, choice = _choose(settings, several=bool(others))
     objective = ImpactObjective(
         robot,
         leading,
         build_metric(robot, settings.metric, settings.weights),
-        settings.objective,
+        kind,
         supports,
         compliance or 0.0,
         settings.normal_cone,
@@ -72,7 +73,26 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
     stiffness = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
     held_by = missing_support(robot) if settings.support is None and not supports else ""
     posture = settings.posture or robot.default_posture
-    return ResolvedImpact(objective, q, posture, settings.speed, settings.restitution, held_by, stiffness)
+    return ResolvedImpact(objective, q, posture, settings.speed, settings.restitution, held_by, stiffness, choice)
+
+
+def _choose(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
+    """Return the objective of the settings; for ``auto`` with the reason in words."""
+    if settings.objective != "auto":
+        return settings.objective, ""
+    if several:
+        return "impulse", "objective impulse: of several contacts at once, only bounds on the impulses are given"
+    if settings.speed == 0:
+        return "impulse", "objective impulse: there is no approach speed"
+    at = f"at {settings.speed:g} m/s with friction {settings.friction:g}"
+    if settings.normal_cone:
+        return (
+            "sticking",
+            f"objective sticking: {at}, the jump with friction has no worst case over a cone of normals",
+        )
+    if settings.friction == 0:
+        return "speed", f"objective speed: {at} the contact slips freely"
+    return "coulomb", f"objective coulomb: {at} the impact itself decides whether the contact sticks or slips"
 
 
 def _contacts(settings: ImpactSettings, robot: Robot) -> list[ImpactContact]:
@@ -116,6 +136,7 @@ class ResolvedImpact:
         restitution: Coefficient of restitution.
         missing_support: Hint how to state what holds a floating robot up, if nothing does; else empty.
         contact_stiffness: Elasticity of the contact; ``None`` if it is not known.
+        choice: Why ``auto`` chose this objective; empty if the user did.
     """
 
     objective: ImpactObjective
@@ -125,6 +146,7 @@ class ResolvedImpact:
     restitution: float
     missing_support: str = ""
     contact_stiffness: ContactStiffness | None = None
+    choice: str = ""
 
     @property
     def robot(self) -> Robot:

@@ -29,24 +29,18 @@ def percent(share: float) -> str:
 
 
 def notes_on_impacts(objective: Objective, initial: Vector, q: Vector) -> list[str]:
-    """Return notes on contacts that lock, and on jumps that fall per impulse but grow per approach speed."""
+    """Return notes on contacts that lock."""
     notes: list[str] = []
     if not isinstance(objective, ImpactObjective):
         return notes
     for single in objective.singles:
-        start, end = single.oracle.quantities(initial), single.oracle.quantities(q)
-        before, after = start.G, end.G
+        before, after = (single.oracle.quantities(posture).G for posture in (initial, q))
         where = f" at {single.contact.frame}" if objective.others else ""
         if after < _LOCKED * before:
             notes.append(
                 f"the contact{where} is nearly locked along the normal there: its effective mass is "
                 f"{before / max(after, 1e-300):.3g} times that of the start, and so is the impulse at a given "
-                "approach speed; compare V and S, or minimize them (`objective='speed'`, sticking)"
-            )
-        elif objective.kind == "impulse" and not objective.others and end.V > start.V * (1 + 1e-3):
-            notes.append(
-                f"at a given approach speed without friction the jump grows: V {start.V:.4g} to {end.V:.4g}; "
-                "`objective='speed'` minimizes that"
+                "approach speed; compare V and S, or minimize them (`objective='auto'`)"
             )
     return notes
 

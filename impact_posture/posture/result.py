@@ -17,6 +17,7 @@ from impact_posture.posture.problem_settings import Prepared
 from impact_posture.posture.robustness import Robustness
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
+from impact_posture.posture.verdict import verdict
 from impact_posture.tables import json_block
 from impact_posture.version import __version__
 
@@ -50,6 +51,7 @@ def result_document(
     curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list(), "tradeoff_against": tradeoff.against}
     return {
         "schema": SCHEMA,
+        "verdict": verdict(impact, initial, optimal).to_dict(),
         **impact.to_dict(solution.initial),
         "constraints": prepared.problem.describe(),
         "initial": {"given_q": prepared.problem.given.tolist(), "moved": solution.moved, **initial.to_dict()},
@@ -65,7 +67,7 @@ def result_document(
             "optima": [json_block(optimum) for optimum in solution.optima],
         },
         **curve,
-        "notes": [*solution.notes, *(tradeoff.notes if tradeoff else ())],
+        "notes": [*filter(None, [impact.choice]), *solution.notes, *(tradeoff.notes if tradeoff else ())],
         "warnings": list(dict.fromkeys(warnings)),
         "versions": versions(),
     }

@@ -1,0 +1,137 @@
+"""The verdict on an optimal posture: what happens to jump, impulse and force at the stated speed, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import sqrt
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.impact.contact_compression import both_models
+from impact_posture.impact.coulomb_contacts import CoulombJump, coulomb_jump
+from impact_posture.impact.evaluation import Evaluation
+from impact_posture.impact.resolved_impact import ResolvedImpact
+from impact_posture.impact.velocity_jump import Jump
+from impact_posture.tables import json_block
+
+Vector = NDArray[np.float64]
+Outcome = Literal["better", "better at the price of force", "no better", "worse", "unknown"]
+
+# A change below this share is none.
+_SAME = 0.01
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the optimal posture changes at the stated approach speed, with the stated friction.
+
+    Attributes:
+        outcome: The verdict in a few words.
+        line: The verdict in a sentence.
+        jump: Relative change of ``‖Δν‖_W``; ``None`` where it is not known.
+        impulse: Relative change of the size of the impulse.
+        peak_force: Relative change of the peak force without friction.
+        advice: What would do better, or which joint model fits; one line each.
+    """
+
+    outcome: Outcome
+    line: str
+    jump: float | None
+    impulse: float | None
+    peak_force: float | None
+    advice: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return json_block(self) | {"advice": list(self.advice)}
+
+
+def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Verdict:
+    """Compare the predicted jumps of the initial and the optimal posture.
+
+    The jump is that with the friction of the contact.  The peak force is that of the stated contact, or that of a
+    linear contact of any stiffness, ``F ∝ √m``.
+    """
+    pair = _jump(before), _jump(after)
+    if impact.speed <= 0 or pair[0] is None or pair[1] is None:
+        why = "there is no approach speed" if impact.speed <= 0 else "the contact cannot move along the normal"
+        return Verdict("unknown", f"no verdict: {why}.", None, None, None, ())
+    jump, impulse = _change(pair[0].norm, pair[1].norm), _change(pair[0].impulse_size, pair[1].impulse_size)
+    force = _force_change(before, after)
+    heavier = max(impulse, force or 0.0) > _SAME
+    outcome: Outcome = "better at the price of force" if heavier else "better"
+    if jump > _SAME:
+        outcome = "worse"
+    elif jump > -_SAME:
+        outcome = "no better"
+    parts = [f"the jump {_words(jump)} ({pair[0].norm:.3g} to {pair[1].norm:.3g}{_slip(pair[1])})"]
+    parts.append(f"the impulse {_words(impulse)} ({pair[0].impulse_size:.3g} to {pair[1].impulse_size:.3g} N·s)")
+    if force is not None:
+        parts.append(f"the peak force {_words(force)}{_newtons(before, after)}")
+    contact = f"with friction {impact.contact.friction:g}" if isinstance(pair[1], CoulombJump) else "without friction"
+    line = f"verdict: {outcome}. At {impact.speed:g} m/s {contact} {', '.join(parts[:-1])} and {parts[-1]}."
+    advice = (*_better_objective(impact, outcome, force or 0.0), *_other_joint_model(impact, before, after))
+    return Verdict(outcome, line, jump, impulse, force, advice)
+
+
+def _jump(found: Evaluation) -> Jump | None:
+    return found.together[0] if found.together else found.coulomb or found.frictionless
+
+
+def _change(before: float, after: float) -> float:
+    return after / before - 1 if before > 0 else 0.0
+
+
+def _words(change: float) -> str:
+    if abs(change) <= _SAME:
+        return "stays"
+    size = f"{100 * abs(change):.0f} %" if change < 1 else f"a factor of {1 + change:.3g}"
+    return f"{'falls' if change < 0 else 'grows'} by {size}"
+
+
+def _slip(jump: Jump) -> str:
+    return "" if not isinstance(jump, CoulombJump) else ", sticking" if jump.sticks else ", slipping"
+
+
+def _force_change(before: Evaluation, after: Evaluation) -> float | None:
+    if before.contacts or before.scalars.E is None or after.scalars.E is None:
+        return None
+    first, second = before.compression, after.compression
+    if first and second and first.peak_force is not None and second.peak_force is not None:
+        return _change(first.peak_force, second.peak_force)
+    return sqrt(before.scalars.G / after.scalars.G) - 1
+
+
+def _newtons(before: Evaluation, after: Evaluation) -> str:
+    first, second = before.compression, after.compression
+    if not (first and second) or first.peak_force is None or second.peak_force is None:
+        return " (linear contact)"
+    return f" ({first.peak_force:.3g} to {second.peak_force:.3g} N)"
+
+
+def _better_objective(impact: ResolvedImpact, outcome: Outcome, force: float) -> Iterator[str]:
+    objective = impact.objective
+    if outcome in ("worse", "no better") and objective.kind != "coulomb" and not objective.others:
+        kind = "sticking" if objective.normal_cone_deg else "coulomb"
+        if kind != objective.kind:
+            yield f"`objective='{kind}'` minimizes this jump; '{objective.kind}' minimizes another quantity"
+    if outcome == "better at the price of force" and force > _SAME:
+        yield "`max_force` bounds the force"
+
+
+def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iterator[str]:
+    """Say what the joint models make of it that fit x better than the one chosen."""
+    found = after.compression
+    if found is None or found.x is None or impact.robot.joint_model in (found.fitting, "locked"):
+        return
+    rebound = (1 + impact.restitution) * impact.speed
+    for name, objective in both_models(impact.objective).items():
+        if name == impact.robot.joint_model or found.fitting not in (None, name):
+            continue
+        jumps = [coulomb_jump(objective, one.q, rebound) for one in (before, after)]
+        if jumps[0] is not None and jumps[1] is not None:
+            change = _words(_change(jumps[0].norm, jumps[1].norm))
+            yield f"with joint model '{name}' (x = {found.x:.2g}) the jump {change}"
