@@ -29,9 +29,14 @@ class Ruler(Protocol):
         nothing: What to say if the optimum has the least price.
     """
 
-    against: Against
-    nearest: Vector
-    nothing: str
+    @property
+    def against(self) -> Against: ...
+
+    @property
+    def nearest(self) -> Vector: ...
+
+    @property
+    def nothing(self) -> str: ...
 
     def measure(self, q: Vector) -> float:
         """Return the price of ``q``."""
