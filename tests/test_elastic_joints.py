@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import fields, replace
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import JointTransmissionSpec, TransmissionSpec
 from impact_posture.settings import MetricKind, NormalFrame
-from tests.arms import TIP, X, Y, Z, arm
+from tests.arms import TIP, Y, arm, seven_joints
 from tests.helpers import (
     Vector,
     assert_close,
@@ -45,13 +44,6 @@ def on_springs(found: Robot, table: TransmissionSpec) -> Robot:
 def springs(stiffness: float, damping: float = 0.0, **joints: JointTransmissionSpec) -> TransmissionSpec:
     """Springs at all joints but those given."""
     return TransmissionSpec("elastic", stiffness, damping, joints)
-
-
-@functools.cache
-def seven_joints() -> Robot:
-    """An arm of our own: seven hinges, bent."""
-    bent = [0.3, -0.7, 0.5, 1.1, -0.4, 0.8, 0.2]
-    return arm([Z, Y, Z, Y, Z, Y, X], bent, floating=False, rods=[(0.02, 0.01, -0.15)] * 7)
 
 
 class Setup(NamedTuple):
