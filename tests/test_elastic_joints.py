@@ -355,6 +355,14 @@ def test_contact_that_cannot_move() -> None:
 def test_extreme_but_allowed_numbers_answer() -> None:
     """Soft and stiff at both ends: a finite answer, or one line."""
     case, q, _ = setup("arm")
+    for inertia in (1e-14, 1e-9, 1e6, 1e18, 1e40):
+        model = pin.Model(case.robot.model)
+        model.armature = np.full(model.nv, inertia)
+        heavy = replace(case, robot=replace(case.robot, model=model))
+        try:
+            assert np.isfinite(elastic_response(heavy, q, 1e5).peak_jump_norm)
+        except ImpactPostureError as error:
+            assert "\n" not in str(error)
     for K, D in ((1e-300, 0.0), (1e-3, 1e6), (1e9, 1e-9), (1e20, 0.0), (150.0, 1e300)):
         for stiffness in (1.0, 1e12):
             made = replace(case, robot=on_springs(case.robot, springs(K, D)))

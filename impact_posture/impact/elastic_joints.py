@@ -94,8 +94,8 @@ def elastic_response(case: ImpactCase, q: Vector, stiffness: float, speed: float
 class ElasticImpact:
     """Response to a contact of given stiffness, and its tangent gradient, by the matrix exponential.
 
-    The armature is that stated for the robot, whatever its joint model, and the springs are those of the
-    ``[transmission]`` of robot.toml.  A metric W = M weighs the links and the rotors of rigid joints.
+    The armature is that stated for the robot, whatever its joint model, and the springs are those of robot.toml
+    ``[transmission]``.  A metric W = M weighs the links and the rotors of rigid joints.
 
     Args:
         case: Robot, contact, metric and supports.
@@ -136,8 +136,8 @@ class ElasticImpact:
         c = self._compression(q, stiffness)
         oracle, m, nv = self.oracle, len(self.joints), len(c.columns.a)
         force, impulse = c.force(c.state), c.impulse(c.state)
-        x = c.columns.a @ impulse
-        rotor, torque, peak = x.copy(), np.zeros(nv), np.zeros(nv)
+        x, torque, peak = c.columns.a @ impulse, np.zeros(nv), np.zeros(nv)
+        rotor = x.copy()
         rotor[self.joints], torque[self.joints] = impulse[:m] / self.rotors, force[:m]
         peak_square, peak[self.joints] = c.peaks()
         square, softness = float(x @ oracle.weigh(x)), self._compliance()
@@ -192,11 +192,8 @@ class ElasticImpact:
         oracle = self.oracle.at(q)
         rows = np.vstack([np.eye(oracle.robot.nv)[self.joints], -oracle.n @ oracle.J])
         if oracle.quantities(q).blocked:
-            raise ContactError(
-                "the contact cannot move along its normal",
-                where=f"frame {oracle.contact.frame}",
-                hint="choose another frame, normal or posture",
-            )
+            where, hint = f"frame {oracle.contact.frame}", "choose another frame, normal or posture"
+            raise ContactError("the contact cannot move along its normal", where=where, hint=hint)
         columns = oracle.answer(-rows.T)
         A = np.diag(np.append(1 / self.rotors, 0.0)) - rows @ columns.a
         kappa, d = np.append(self.kappa, float(stiffness)), np.append(self.d, 0.0)
@@ -225,7 +222,11 @@ class _Compression:
 
     def __init__(self, mobility: Vector, columns: Answer, kappa: Vector, d: Vector, oracle: ImpactOracle) -> None:
         self.mobility, self.columns, self.kappa, self.d, self._oracle = mobility, columns, kappa, d, oracle
-        self._L = np.linalg.cholesky(mobility)
+        try:
+            self._L = np.linalg.cholesky(mobility)
+        except np.linalg.LinAlgError:
+            hint = "correct [armature] of robot.toml"
+            raise InputError("rotors are too heavy for their links", where="elastic joints", hint=hint) from None
         R = np.sqrt(kappa)[:, None] * self._L
         self._generator = np.block([[np.zeros_like(R), R], [-R.T, -(self._L.T * d) @ self._L]])
         self._fastest = float(np.linalg.norm(self._generator, 2))
@@ -248,24 +249,22 @@ class _Compression:
         """Return the first root ``T`` of ``p = δ̇/v``, and the state there.
 
         ``|p̈| ≤ kG``, because the energy of the second derivative of ``c`` starts at ``k²v²G/2`` and never grows.  So
-        ``p(t+h) ≥ p + ṗh − kGh²/2``, and steps to the root of that parabola pass no root of ``p``.  They converge
-        as those of Newton's method.
+        ``p(t+h) ≥ p + ṗh − kGh²/2``.  Steps to its root pass no root of ``p`` and converge quadratically.
         """
         bound = float(self.kappa[-1] * self.mobility[-1, -1])
         row, t, state = self._row, 0.0, self._start
-        while True:
-            p, rate = float(row @ state), float(row @ self._generator @ state)
-            step = 2 * p / (math.sqrt(rate**2 + 2 * bound * max(p, 0.0)) - rate)
-            if not step > 1e-15 * t:
-                return t, state
+        while (p := float(row @ state)) > 0:
+            rate = float(row @ self._generator @ state)
+            root = math.sqrt(rate**2 + 2 * bound * p)
+            step = 2 * p / (root - rate) if rate < 0 else (root + rate) / bound
+            if step <= 1e-15 * t:
+                break
             t += step
             if t * self._fastest > _LONGEST:
-                raise InputError(
-                    "joints are too stiff or too damped for a contact as soft as this one",
-                    where="contact stiffness",
-                    hint="state a rigid transmission, or raise the contact stiffness",
-                )
+                what = "joints are too stiff or too damped for a contact as soft as this one"
+                raise InputError(what, where="contact stiffness", hint="raise it, or state a rigid transmission")
             state = scipy.linalg.expm(step * self._generator) @ state
+        return t, state
 
     def peaks(self) -> tuple[float, Vector]:
         """Return the largest ``‖ẋ‖²_W`` and the largest ``|τ|`` of each spring, by cubics between exact samples."""
