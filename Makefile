@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-robustness reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-robustness reproduction calibration regression
 .PHONY: pictures clean
 
 help:
@@ -18,6 +18,7 @@ help:
 	@echo "make bench       how fast it is on this machine: solve times, ticks, the exported kernel beside its peers"
 	@echo "make coverage    branch coverage of both packages by the suite, for the documentation"
 	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
+	@echo "make study-elastic  which inertia arms with elastic joints meet a contact with, against MuJoCo"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
 	@echo "make study-robustness  where each controller helps: 40 random variations of each experiment (an hour or two)"
 	@echo "make calibration    the simulated world's restitution, law by law"
@@ -84,6 +85,9 @@ coverage: $(VENV)/.installed-test
 
 study-impacts: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks impacts --write
+
+study-elastic: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks elastic --write
 
 reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks reproduction --write

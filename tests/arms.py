@@ -63,3 +63,9 @@ def arm(
 def yaw_and_pitches() -> Robot:
     """Yaw, pitch, pitch, pitch below a hexarotor: nothing but the base rolls the tip."""
     return arm([Z, Y, Y, Y], [0.3, -0.8, 1.2, -0.5], floating=True)
+
+
+def seven_joints() -> Robot:
+    """Seven hinges between rods of 0.15 m and 0.2 kg on a fixed base, bent."""
+    bent = [0.3, -0.7, 0.5, 1.1, -0.4, 0.8, 0.2]
+    return arm([Z, Y, Z, Y, Z, Y, X], bent, floating=False, rods=[(0.02, 0.01, -0.15)] * 7)

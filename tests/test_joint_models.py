@@ -63,7 +63,7 @@ def with_some_locked(found: Robot, count: int = 2) -> Robot:
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_the_armature_of_each_joint_model(name: str) -> None:
-    found = robot(name)
+    found = stated(robot(name))
     joints = slice(6 if found.floating else 0, None)
     reflected, link = with_joint_model(found, "reflected"), with_joint_model(found, "link")
     np.testing.assert_array_equal(reflected.model.armature, found.armature)
@@ -83,7 +83,7 @@ def test_the_armature_of_each_joint_model(name: str) -> None:
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_links_alone_are_the_robot_without_armature(name: str, kind: ObjectiveKind) -> None:
-    found = robot(name)
+    found = stated(robot(name))
     bare = pin.Model(found.model)
     bare.armature = np.zeros(found.nv)
     mine = objective(with_joint_model(found, "link"), FRAMES[name], kind)

@@ -64,6 +64,7 @@ STUDIES = {
         Study("digits", "digits", "the digits that double precision keeps with feet; random postures", 3),
         Study("restitution", "restitution", "rebound of each contact law", target="calibration"),
         Study("impacts", "impact.page", "objectives against impacts in MuJoCo; postures", 30, target="study-impacts"),
+        Study("elastic", "elastic.study", "arms with elastic joints in MuJoCo; postures", 20, target="study-elastic"),
         Study("robustness", "robustness.study", "where each controller helps; draws", 40, target="study-robustness"),
         Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
     )
