@@ -27,7 +27,7 @@ ContactPose = Literal["full", "position", "aligned", "free", "box"]
 BaseMode = Literal["free", "level", "fixed", "box"]
 SupportKind = Literal["point", "surface"]
 Against = Literal["distance", "force"]
-JointModel = Literal["reflected", "link", "locked"]
+JointModel = Literal["reflected", "link", "locked", "elastic"]
 TransmissionKind = Literal["rigid", "elastic", "locked"]
 
 # Young's modulus (Pa) and Poisson's ratio of what a contact may touch: the middle of the ranges in J. M. Gere,
@@ -293,7 +293,7 @@ class ImpactSettings(RobotSettings):
         JointModel,
         Setting(
             "Inertia at the joints: reflected (links and rotors), link (without the rotors behind elastic "
-            "transmissions) or locked (rigid joints).",
+            "transmissions), locked (rigid joints) or elastic (rotors on springs; evaluate only).",
             METRIC, "KIND",
         ),
     ] = "reflected"  # fmt: skip

@@ -252,6 +252,22 @@ def test_the_commands(tmp_path: Path) -> None:
     )
     told = run("evaluate", "panda", "--normal", 0, 0, 1, "--config", config, "--contact-stiffness", "wood")
     assert "peak force" in told.stdout and "x = 0.06" in told.stdout and "--joint-model link fits" in told.stderr
+    between = ("panda", "--normal", 0, 0, 1, "--config", config, "--joint-model", "elastic")
+    document = json.loads(run("evaluate", *between, "--contact-stiffness", 1e6, "--json").stdout)["evaluation"]
+    alone = {
+        name: json.loads(run("evaluate", *between[:-1], name, "--json").stdout)["evaluation"]["V"]
+        for name in ("link", "reflected")
+    }
+    assert alone["reflected"] < document["elastic"]["value"] < alone["link"]
+    shown = run("evaluate", *between, "--contact-stiffness", 1e6)
+    assert "elastic joints on 1e+06 N/m" in shown.stdout and "largest torque of panda_joint4" in shown.stdout
+    for asked, words in (
+        (("evaluate", *between), "add --contact-stiffness"),
+        (("optimize", *between, "--contact-stiffness", 1e6), "evaluate the optimum with elastic"),
+        (("evaluate", "ur5", *between[1:5], "--joint-model", "elastic", "--contact-stiffness", 1e6), "spring"),
+    ):
+        failed = run(*asked)
+        assert failed.returncode == 1 and words in failed.stderr and "Traceback" not in failed.stderr
     out = tmp_path / "out"
     asked = ("--contact-stiffness", 1e5, "--max-force", 180, "--max-joint-jump", 3, "--starts", 2, "--no-codegen")
     asked = (*asked, "--tradeoff", 2, "--tradeoff-against", "force")

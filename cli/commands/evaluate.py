@@ -13,6 +13,7 @@ from impact_posture_cli.tables import alone_line, contact_names, impact_rows, qu
 if TYPE_CHECKING:
     from impact_posture.impact.classical_ellipsoids import Ellipsoid
     from impact_posture.impact.coulomb_contacts import CoulombJump
+    from impact_posture.impact.elastic_joints import ElasticResponse
     from impact_posture.impact.evaluation import Evaluation
     from impact_posture.impact.resolved_impact import ResolvedImpact
 
@@ -53,6 +54,8 @@ def evaluate(
     _ellipsoids(page, impact, {"impact Λ_c": found.ellipsoid, **classical})
     _gradient(page, impact, found)
     _jumps(page, impact, found)
+    if found.elastic is not None:
+        _elastic(page, impact, found.elastic)
     if found.compression is not None and found.compression.line:
         page.line(f"  {found.compression.line}")
     worst_tables(page, frames, {"value": block})
@@ -147,3 +150,24 @@ def _jumps(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
 def _slip(jump: CoulombJump) -> str:
     direction = jump.slip_direction
     return "sticks" if direction is None else f"slides along {vector(direction)}"
+
+
+def _elastic(page: Page, impact: ResolvedImpact, found: ElasticResponse) -> None:
+    from impact_posture.impact.velocity_jump import largest_entries, tangent_units
+
+    rows = [
+        ("  ‖Δν‖ of the links at greatest compression", number(found.jump_norm), "jump"),
+        ("  largest ‖Δν‖ of the links", number(found.peak_jump_norm), "jump"),
+        ("  impulse", number(found.impulse), "N·s"),
+        ("  compressed for", number(1e3 * found.duration), "ms"),
+        ("  peak force", number(found.force), "N"),
+    ]
+    rows += [(f"  Δν {name}", number(value), unit) for name, value, unit in largest_entries(impact.robot, found.jump)]
+    units = {"rad/s": "N·m", "m/s": "N"}
+    named = zip(impact.robot.tangent_names, tangent_units(impact.robot), found.peak_torque, strict=True)
+    largest = sorted(
+        ((name, units[unit], value) for name, unit, value in named if value > 0), key=lambda row: -row[2]
+    )
+    rows += [(f"  largest torque of {name}", number(value), unit) for name, unit, value in largest[:5]]
+    page.gap()
+    page.table((f"  elastic joints on {found.stiffness:.3g} N/m", "", "unit"), rows, right=(1,))

@@ -88,6 +88,10 @@ class ContactStiffness:
         """The greatest compression of a Hertzian contact, m."""
         return float((5 * speed**2 / (4 * (self.hertz or 0.0) * G)) ** 0.4)
 
+    def linear_stiffness(self, G: float, speed: float) -> float:
+        """Return k, N/m, of the linear contact that is compressed for the same time."""
+        return self.linear or (pi / 2 / self.compression_time(G, speed)) ** 2 / G
+
     def least_mobility(self, force: float, speed: float) -> float:
         """Return the least G, 1/kg, with which the peak force stays at most ``force``."""
         # The force falls with a power of G.

@@ -24,7 +24,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pinocchio as pin
 import scipy.linalg
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
@@ -33,8 +32,8 @@ from impact_posture.errors import ContactError, InputError
 from impact_posture.impact.contact import LARGEST
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.oracle import Answer, ImpactOracle
-from impact_posture.robot.inertia_checks import check_mass_matrix
-from impact_posture.robot.joint_model import transmissions
+from impact_posture.robot.joint_model import transmissions, with_joint_model
+from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
 
@@ -85,6 +84,11 @@ class ElasticResponse:
     torque: Vector
     peak_torque: Vector
 
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content; ``None`` for a compliance ratio without a bound."""
+        ratio = self.compliance_ratio if math.isfinite(self.compliance_ratio) else None
+        return json_block(self) | {"compliance_ratio": ratio}
+
 
 def elastic_response(case: ImpactCase, q: Vector, stiffness: float, speed: float = 1.0) -> ElasticResponse:
     """Return the response of a robot with elastic joints to one contact; see :class:`ElasticImpact`."""
@@ -106,23 +110,11 @@ class ElasticImpact:
     """
 
     def __init__(self, case: ImpactCase) -> None:
-        robot, found = case.robot, transmissions(case.robot)
-        # A rotor without inertia holds nothing against its spring.
-        elastic = found.elastic & (robot.armature > 0)
-        if not elastic.any():
-            raise InputError(
-                f"no joint of {robot.name} has a rotor on a spring of known stiffness",
-                where="elastic joints",
-                hint="state stiffness in robot.toml [transmission] and the inertia of the rotors in [armature]",
-            )
-        model = pin.Model(robot.model)
-        model.armature = np.where(found.locked, np.inf, np.where(elastic, 0.0, robot.armature))
-        where, posture = f"{robot.source}, links on springs", robot.default_posture
-        check_mass_matrix(model, robot.postures[posture], robot.tangent_names, where, posture)
-        self.joints = np.flatnonzero(elastic)
+        robot, found = with_joint_model(case.robot, "elastic"), transmissions(case.robot)
+        self.joints = np.flatnonzero(found.elastic & (robot.armature > 0))
         self.rotors = robot.armature[self.joints]
         self.kappa, self.d = found.stiffness[self.joints], found.damping[self.joints]
-        self.oracle = ImpactOracle(replace(case, robot=replace(robot, model=model, stated_armature=robot.armature)))
+        self.oracle = ImpactOracle(replace(case, robot=robot))
 
     def response(self, q: Vector, stiffness: float, speed: float = 1.0) -> ElasticResponse:
         """Return the response at ``q``, shape (nq,), to a contact of ``stiffness`` in N/m at ``speed`` in m/s.

@@ -16,6 +16,7 @@ from impact_posture.impact.contact import LARGEST, point_on
 from impact_posture.impact.contact_compression import Compression, ContactStiffness, both_models, compression
 from impact_posture.impact.contact_stability import ContactStability, contact_stability
 from impact_posture.impact.coulomb_contacts import CoulombJump, coulomb_jump, coulomb_jumps
+from impact_posture.impact.elastic_joints import ElasticResponse, elastic_response
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
@@ -59,6 +60,7 @@ class Evaluation:
             each contact; ``None`` for one contact, for contacts that can pull, or where it was not found.
         energy_loss: Energy that the frictionless impact dissipates, J; ``None`` if the contact is blocked.
         compression: Compression time, peak force and the number x; ``None`` if nothing is known of them.
+        elastic: Response of links, rotors and springs to the contact; only with the joint model ``elastic``.
         dominance: Whether one light joint makes up most of H.
         without_supports: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
         compliance_effect: Relative change of H with a tenth of the compliance; ``None`` without supports.
@@ -87,6 +89,7 @@ class Evaluation:
     together: tuple[CoulombJump, ...] | None
     energy_loss: float | None
     compression: Compression | None
+    elastic: ElasticResponse | None
     dominance: Dominance
     without_supports: Scalars | None
     compliance_effect: float | None
@@ -126,6 +129,7 @@ class Evaluation:
                 "energy_loss": self.energy_loss,
             },
             "compression": None if self.compression is None else self.compression.to_dict(),
+            "elastic": None if self.elastic is None else self.elastic.to_dict(),
             "dominance": self.dominance.to_dict(),
         }
         if self.cone is not None:
@@ -212,6 +216,7 @@ def evaluate(
         together=coulomb_jumps(objective, q, speed) if objective.others else None,
         energy_loss=None if scalars.E is None else scalars.E * speed**2 * (1 - restitution**2),
         compression=squeezed,
+        elastic=_elastic(objective, q, speed, contact_stiffness),
         dominance=find_dominance(objective, found),
         without_supports=without_supports,
         compliance_effect=effect,
@@ -241,9 +246,25 @@ def _without_supports(objective: ImpactObjective, q: Vector, H: float) -> tuple[
     return alone, abs(stiffer - H) / H if H > 0 else 0.0
 
 
+def _elastic(
+    objective: ImpactObjective, q: Vector, speed: float, contact: ContactStiffness | None
+) -> ElasticResponse | None:
+    """Return the response of elastic joints to the stated contact, if the joint model asks for it."""
+    if objective.robot.joint_model != "elastic":
+        return None
+    if contact is None:
+        raise InputError(
+            "elastic needs the elasticity of the contact",
+            where="joint_model",
+            hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
+        )
+    G = objective.oracle.quantities(q).G
+    return elastic_response(objective.case, q, contact.linear_stiffness(G, speed), speed)
+
+
 def _joint_model_warning(objective: ImpactObjective, q: Vector, found: Compression | None) -> tuple[str, ...]:
     """Warn where the joint model does not fit x, with the answers of both models."""
-    if found is None or found.x is None or objective.robot.joint_model in (found.fitting, "locked"):
+    if found is None or found.x is None or objective.robot.joint_model in (found.fitting, "locked", "elastic"):
         return ()
     values = {name: objective_value(other, q) for name, other in both_models(objective).items()}
     listed = ", ".join(f"{value:.4g} with '{name}'" for name, value in values.items() if value is not None)

@@ -72,6 +72,12 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
         ImpactPostureError: A setting is wrong; the first fault, in one line.
     """
     impact = resolve(settings) if impact is None else impact
+    if impact.robot.joint_model == "elastic":
+        raise InputError(
+            "elastic predicts the impact at one posture",
+            where="joint_model",
+            hint="optimize with link or reflected, as the number x says, and evaluate the optimum with elastic",
+        )
     if settings.q is not None:
         impact = replace(impact, q=impact.robot.check_posture(np.array(settings.q), where="q"))
     if impact.missing_support:

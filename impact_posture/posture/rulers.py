@@ -30,13 +30,19 @@ class Ruler(Protocol):
     """
 
     @property
-    def against(self) -> Against: ...
+    def against(self) -> Against:
+        """See the attributes."""
+        ...
 
     @property
-    def nearest(self) -> Vector: ...
+    def nearest(self) -> Vector:
+        """See the attributes."""
+        ...
 
     @property
-    def nothing(self) -> str: ...
+    def nothing(self) -> str:
+        """See the attributes."""
+        ...
 
     def measure(self, q: Vector) -> float:
         """Return the price of ``q``."""

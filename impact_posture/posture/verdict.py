@@ -125,7 +125,7 @@ def _better_objective(impact: ResolvedImpact, outcome: Outcome, force: float) ->
 def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iterator[str]:
     """Say what the joint models make of it that fit x better than the one chosen."""
     found = after.compression
-    if found is None or found.x is None or impact.robot.joint_model in (found.fitting, "locked"):
+    if found is None or found.x is None or impact.robot.joint_model in (found.fitting, "locked", "elastic"):
         return
     rebound = (1 + impact.restitution) * impact.speed
     for name, objective in both_models(impact.objective).items():
