@@ -15,6 +15,7 @@ from impact_posture_cli.settings_options import Given, with_settings
 from impact_posture_cli.tables import alone_line, contact_names, impact_rows, quantities, worst_lines, worst_tables
 
 if TYPE_CHECKING:
+    from impact_posture.impact.resolved_impact import ResolvedImpact
     from impact_posture.posture.problem_settings import Prepared
     from impact_posture.posture.solve import PostureSolution
     from impact_posture.result_folder import Written
@@ -155,6 +156,7 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
         (f"  {key}", number(initial[key]), number(optimal[key]), unit, words)
         for key, unit, words in (minimized, *quantities(impact))
     ]
+    rows += _impulse_and_force(impact, initial, optimal)
     page.table(("", *blocks, "unit", "meaning"), rows, right=(1, 2))
     frames = contact_names(impact.objective.contacts)
     alone_line(page, frames, "H, G, V, S, E")
@@ -185,6 +187,22 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
         _tradeoff(page, document, [n for n in document["notes"] if n.startswith("trade-off:")])
     # The warnings of the robot were printed before the solver started.
     page.warnings(document["warnings"][len(prepared.impact.warnings) :])
+
+
+def _impulse_and_force(
+    impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]
+) -> list[tuple[str, str, str, str, str]]:
+    """Return the rows of the impulse with friction and of the peak force without, where they are known."""
+    jumps = [block["jump"]["coulomb"] for block in (initial, optimal)]
+    forces = [(block["compression"] or {}).get("peak_force") for block in (initial, optimal)]
+    at, rows = f"at {impact.speed:g} m/s", []
+    if None not in jumps and impact.speed:
+        sizes = [sum(v * v for v in jump["impulse"]) ** 0.5 for jump in jumps]
+        words = f"impulse {at}, friction {impact.contact.friction:g}"
+        rows.append(("  impulse", number(sizes[0]), number(sizes[1]), "N·s", words))
+    if None not in forces:
+        rows.append(("  force", number(forces[0]), number(forces[1]), "N", f"peak force {at}, no friction"))
+    return rows
 
 
 def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
