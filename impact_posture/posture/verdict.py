@@ -34,7 +34,7 @@ class Verdict:
         jump: Relative change of ``‖Δν‖_W``; ``None`` where it is not known.
         impulse: Relative change of the size of the impulse.
         peak_force: Relative change of the peak force without friction.
-        advice: What would do better, or which joint model fits; one line each.
+        advice: The jump without friction, what would do better, or which joint model fits; one line each.
     """
 
     outcome: Outcome
@@ -73,7 +73,11 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
         parts.append(f"the peak force {_words(force)}{_newtons(before, after)}")
     contact = f"with friction {impact.contact.friction:g}" if isinstance(pair[1], CoulombJump) else "without friction"
     line = f"verdict: {outcome}. At {impact.speed:g} m/s {contact} {', '.join(parts[:-1])} and {parts[-1]}."
-    advice = (*_better_objective(impact, outcome, force or 0.0), *_other_joint_model(impact, before, after))
+    advice = (
+        *_without_friction(before, after, jump),
+        *_better_objective(impact, outcome, force or 0.0),
+        *_other_joint_model(impact, before, after),
+    )
     return Verdict(outcome, line, jump, impulse, force, advice)
 
 
@@ -110,6 +114,15 @@ def _newtons(before: Evaluation, after: Evaluation) -> str:
     if not (first and second) or first.peak_force is None or second.peak_force is None:
         return " (linear contact)"
     return f" ({first.peak_force:.3g} to {second.peak_force:.3g} N)"
+
+
+def _without_friction(before: Evaluation, after: Evaluation, jump: float) -> Iterator[str]:
+    """Say the jump without friction where it changes the other way."""
+    if before.frictionless is None or after.frictionless is None or before.contacts:
+        return
+    change = _change(before.frictionless.norm, after.frictionless.norm)
+    if abs(change) > _SAME and (change > 0) != (jump > 0):
+        yield f"without friction the jump {_words(change)}"
 
 
 def _better_objective(impact: ResolvedImpact, outcome: Outcome, force: float) -> Iterator[str]:
