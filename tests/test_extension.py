@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
 from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
 
 import casadi as ca
 import numpy as np
@@ -13,6 +22,8 @@ import impact_posture as ip
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
+from impact_posture.experiment.batch import Store
+from impact_posture.experiment.reproduction import reproduce
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.lifted import Guess, Lifted
 from impact_posture.impact.objective import Objective
@@ -23,16 +34,16 @@ from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.solve import solve
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.controller_factory import ControllerFactory, Mode
-from impact_posture.simulation.driver import Driver
+from impact_posture.simulation.controller_factory import GROUP
 from impact_posture.simulation.run import run
-from impact_posture.simulation.scenario import Setup
-from impact_posture.simulation.scenario_objective import interpreted
-from impact_posture.simulation.task_formulations import nominal_posture
-from impact_posture.tsid.state import State
 
+from .command import refused
+from .experiments.conftest import shortened as cut
 from .helpers import Vector, robot
-from .simulation.factories import needs_mujoco, shortened
+from .simulation.factories import controller_factory, factory, needs_mujoco, shortened
+
+COMMAND = Path(sys.executable).parent / "impact-posture"
+EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "setback"
 
 
 @dataclass(frozen=True)
@@ -105,27 +116,28 @@ def test_another_objective_with_another_constraint(name: str) -> None:
         null_space_path(problem, start, solution.q)
 
 
-class JointAngle(ip.tsid.Task):
-    """The angle of a joint with one number in ``q``: ``e = target − q_j``."""
+@pytest.fixture
+def setback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The package docs/examples/setback, as installed: a module, and metadata with the entry points that it states."""
+    shutil.copy(EXAMPLE / "setback.py", tmp_path)
+    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    added = [f"{name} = {value}" for name, value in project["entry-points"][GROUP].items()]
+    # Of other packages: one cannot be imported, one makes something else.
+    added += ["gone = setback_gone:make", "number = setback:len", "odd = setback:Vector"]
+    metadata = tmp_path / "setback-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: setback\nVersion: 1.0\n", encoding="utf-8")
+    (metadata / "entry_points.txt").write_text("\n".join([f"[{GROUP}]", *added]), encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "setback", raising=False)
+    return importlib.import_module("setback")
 
-    def __init__(self, robot: Robot, joint: str, target: float, kp: float, weight: float = 1.0) -> None:
-        super().__init__(f"angle of {joint}", 1, kp=kp, weight=weight)
-        index = robot.joint_id(joint)
-        self.target, self.entry = target, int(robot.model.idx_qs[index])
-        self.row = np.eye(robot.nv)[[int(robot.model.idx_vs[index])]]
 
-    def error(self, state: State) -> Vector:
-        return np.array([self.target - state.q[self.entry]])
-
-    def jacobian(self, state: State) -> Vector:
-        return self.row
-
-
-def test_another_task_in_the_controller() -> None:
+def test_another_task_in_the_controller(setback: ModuleType) -> None:
     """A critically damped joint: ``e(t) = e₀ (1 + ωt) exp(−ωt)`` with ``ω = √K_p``."""
     arm, dt, omega = robot("panda"), 1e-3, 6.0
     q, v = arm.posture(), np.zeros(arm.nv)
-    task = JointAngle(arm, "panda_joint4", q[3] + 0.2, omega**2)
+    task = setback.JointAngle(arm, "panda_joint4", q[3] + 0.2, omega**2)
     controller = ip.tsid.Controller(arm, ip.tsid.TaskFormulation(((task,),), posture=ip.tsid.JointPosture(arm)))
     controller.reset(q, v)
     for k in range(500):
@@ -138,45 +150,9 @@ def test_another_task_in_the_controller() -> None:
         q = np.array(pin.integrate(arm.model, q, dt * v))
 
 
-class SetbackDriver(Driver):
-    """Bend a joint before the impact, by a task in the cost that others do not have."""
-
-    def __init__(self, setup: Setup, joint: str, by: float) -> None:
-        super().__init__(setup, nominal_posture(setup))
-        formulation = self.controller.formulation
-        self.task, self.by = JointAngle(setup.robot, joint, 0.0, kp=60.0, weight=200.0), by
-        self.controller = ip.tsid.Controller(
-            setup.robot,
-            replace(formulation, weighted=(*formulation.weighted, self.task)),
-            period=setup.scenario.control.period,
-        )
-        self.bent = False
-
-    def reset(self, q: Vector) -> ip.tsid.Command:
-        self.task.target, self.bent = float(q[self.task.entry]), False
-        return super().reset(q)
-
-    def brace(self) -> None:
-        self.task.target += self.by
-        self.bent = True
-
-    @property
-    def level(self) -> float:
-        return float(self.bent)
-
-
-class SetbackFactory(ControllerFactory):
-    """The controllers of the package and ``setback``."""
-
-    def driver(self, name: str, mode: Mode = "live", gain: float | None = None) -> Driver:
-        if name != "setback":
-            return super().driver(name, mode, gain)
-        return SetbackDriver(self.setup, self.setup.robot.joint_names[-1], -0.15)
-
-
-def test_another_controller_lives_through_a_scenario() -> None:
+def test_another_controller_lives_through_a_scenario(setback: ModuleType) -> None:
     needs_mujoco()
-    made = SetbackFactory(shortened("aerial-vertical"), gradient_of=interpreted)
+    made = controller_factory(shortened("aerial-vertical"))
     (bent,), (nominal,) = run(made, "setback"), run(made, "nominal")
     begin = nominal.of("impact")[0].begin
     before = [found.series.q[np.searchsorted(found.series.t, begin) - 2] for found in (bent, nominal)]
@@ -185,3 +161,48 @@ def test_another_controller_lives_through_a_scenario() -> None:
     for found, level in ((bent, 1.0), (nominal, 0.0)):
         assert found.away is None and found.of("impact")[0].touched
         assert found.series.level[-1] == level
+
+
+def test_the_installed_command_runs_a_registered_controller(setback: ModuleType, tmp_path: Path) -> None:
+    """Two faults that only the other package can correct, and a misspelt name, are one line each."""
+    needs_mujoco()
+    scenario = tmp_path / "aerial.toml"
+    scenario.write_text(cut("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05), encoding="utf-8")
+
+    def simulated(controller: str) -> subprocess.CompletedProcess[str]:
+        words = [COMMAND, "simulate", scenario, "--controller", controller, "--json", "--out", controller]
+        path = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        return subprocess.run(words, cwd=tmp_path, env=path, capture_output=True, text=True, check=False)
+
+    done = simulated("setback")
+    assert (done.returncode, done.stderr) == (0, "")
+    found = json.loads(done.stdout)
+    assert (found["controller"], found["status"], found["warnings"]) == ("setback", "completed", [])
+    for name, words in (
+        ("setbakc", ("no controller 'setbakc'", "did you mean setback?")),
+        ("gone", ("controller 'gone' (setback_gone:make)", "No module named 'setback_gone'")),
+    ):
+        refused(simulated(name), 1, *words)
+
+
+@pytest.mark.parametrize(("name", "words"), [("odd", "cannot be made: TypeError"), ("number", "makes a int")])
+def test_what_another_package_makes_must_be_a_driver(setback: ModuleType, name: str, words: str) -> None:
+    needs_mujoco()
+    setback.len = lambda *given: len(given)
+    with pytest.raises(InputError, match=words) as caught:
+        factory("aerial-vertical").driver(name)
+    assert "\n" not in caught.value.line and f"controller '{name}'" in caught.value.line
+
+
+def test_a_registered_controller_is_compared_and_runs_again(setback: ModuleType, tmp_path: Path) -> None:
+    """A stored run of it does not count, because its code may be another."""
+    needs_mujoco()
+    scenario = tmp_path / "aerial.toml"
+    scenario.write_text(cut("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05), encoding="utf-8")
+    plan, store = {str(scenario): ["nominal", "setback"]}, Store(tmp_path / "store")
+    first = reproduce(plan, seeds=1, store=store)
+    assert [row.status for row in first.rows] == ["completed", "completed"]
+    setback.SetbackDriver.brace = setback.Driver.brace
+    again = reproduce(plan, seeds=1, store=store)
+    totals = [[row.metrics["q_total_impact"].mean for row in found.rows] for found in (first, again)]
+    assert totals[0][0] == totals[1][0] != totals[0][1] != totals[1][1]

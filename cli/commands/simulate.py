@@ -22,7 +22,8 @@ Controller = Annotated[
     str,
     typer.Option(
         "--controller", rich_help_panel=RUN,
-        help="nominal, robust, robust-speed, robust-sticking, posture, stiff, invariant or walker.",
+        help="nominal, robust, robust-speed, robust-sticking, posture, stiff, invariant, walker, or the name that an "
+        "installed package has registered.",
     ),
 ]  # fmt: skip
 RunSeed = Annotated[int, typer.Option("--seed", min=0, rich_help_panel=RUN, help="Seed of the sensors' noise.")]
@@ -140,7 +141,9 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
             which = f" (push {event['sign']:+d})" if several else ""
             page.line(f"  t = {event['time']:.2f} s: {event['status']}{which}: {event['what']}")
     page.gap()
-    notes = [document["offline"]["note"]] if document["offline"] and document["offline"]["note"] else []
+    notes = list(document["warnings"])
+    if document["offline"] and document["offline"]["note"]:
+        notes.append(document["offline"]["note"])
     if document["metrics"] is not None and not document["metrics"]["rested"]:
         notes.append("the robot was not at rest before the push: its own motion is in what is measured")
     page.warnings(notes)

@@ -111,6 +111,7 @@ def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
         "prediction": _mean_prediction([p for part in parts for p in part["prediction"]]) if completed else None,
         "runs": parts,
         "offline": factory.offline if job.controller == "posture" else None,
+        "warnings": factory.warnings,
         "model_sha256": factory.setup.robot.model_sha256,
         "versions": versions() | {"mujoco": metadata.version("mujoco")},
     }

@@ -5,11 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import metadata
 from typing import Literal, get_args
 
 import numpy as np
 
-from impact_posture.errors import ControllerNotFound, InputError
+from impact_posture.errors import (
+    CompilerError,
+    ControllerNotFound,
+    ImpactPostureError,
+    InputError,
+    ManifestMismatch,
+    OutputError,
+    SpecError,
+)
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.baselines import (
@@ -22,7 +31,7 @@ from impact_posture.simulation.baselines import (
 from impact_posture.simulation.driver import Driver, PostureDriver, RobustDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
 from impact_posture.simulation.scenario import Setup
-from impact_posture.simulation.scenario_objective import Gradient, compiled, scenario_objective
+from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
 from impact_posture.simulation.task_formulations import base_weight, nominal_posture
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
@@ -44,6 +53,8 @@ MEANING: dict[str, str] = {
     "walker": "the gradient's flow as reference of the posture task",
 }
 _KINDS: dict[str, ObjectiveKind] = {"robust-speed": "speed", "robust-sticking": "sticking"}
+# Entry points by which other installed packages add controllers.
+GROUP = "impact_posture.controllers"
 
 
 @dataclass(eq=False)
@@ -54,13 +65,15 @@ class ControllerFactory:
         setup: The experiment.
         free: Whether gradients and the offline optimum ignore the feet.
         gradient_of: Makes the gradient of an objective, compiled or interpreted.
+        warnings: Why gradients of the last driver are interpreted although they should have been compiled.
     """
 
     setup: Setup
     free: bool = False
     gradient_of: Callable[[ImpactObjective], Gradient] = compiled
+    warnings: list[str] = field(default_factory=list)
     _objectives: dict[ObjectiveKind, ImpactObjective] = field(default_factory=dict)
-    _gradients: dict[ObjectiveKind, Gradient] = field(default_factory=dict)
+    _gradients: dict[ObjectiveKind, tuple[Gradient, tuple[str, ...]]] = field(default_factory=dict)
 
     def objective(self, kind: ObjectiveKind = "impulse") -> ImpactObjective:
         """Return an objective for the impact of the scenario."""
@@ -69,10 +82,16 @@ class ControllerFactory:
         return self._objectives[kind]
 
     def gradient(self, kind: ObjectiveKind = "impulse") -> Gradient:
-        """Return the gradient of an objective."""
+        """Return the gradient of an objective, interpreted if it cannot be compiled or loaded (:attr:`warnings`)."""
         if kind not in self._gradients:
-            self._gradients[kind] = self.gradient_of(self.objective(kind))
-        return self._gradients[kind]
+            try:
+                self._gradients[kind] = self.gradient_of(self.objective(kind)), ()
+            except (CompilerError, OutputError, SpecError, ManifestMismatch) as error:
+                warning = f"the gradient is interpreted, not compiled, which is slower: {error.line}"
+                self._gradients[kind] = interpreted(self.objective(kind)), (warning,)
+        found, warnings = self._gradients[kind]
+        self.warnings += warnings
+        return found
 
     @cached_property
     def offline(self) -> OfflinePosture:
@@ -82,6 +101,9 @@ class ControllerFactory:
     def driver(self, name: str, mode: Mode = "live", gain: float | None = None) -> Driver:
         """Make a controller.
 
+        A name that is not of this package is looked up among the entry points :data:`GROUP` of the installed
+        packages.  Such a controller is made by a function of this factory, the mode and the gain; the name runs it.
+
         Args:
             name: Name of the controller.
             mode: ``live`` keeps the impact-robust term on through the impact, ``held`` holds the reached posture.
@@ -89,13 +111,14 @@ class ControllerFactory:
 
         Raises:
             ControllerNotFound: There is no such controller.
-            InputError: There is no such mode, or the controller has no term to hold.
+            InputError: There is no such mode, the controller has no term to hold, or another package fails.
         """
-        if name not in CONTROLLERS:
-            raise ControllerNotFound(name, CONTROLLERS, hint=f"one of: {', '.join(CONTROLLERS)}")
+        self.warnings.clear()
         modes = get_args(Mode)
         if mode not in modes:
             raise InputError(f"there is no mode '{mode}'", where="--mode", hint=f"one of: {', '.join(modes)}")
+        if name not in CONTROLLERS:
+            return self._driver_from_outside(name, mode, gain)
         if mode == "held" and not (name.startswith("robust") or name == "walker"):
             raise InputError(f"'{name}' has no term to hold", where="--mode", hint="only robust… and walker have one")
         setup, robot, gains = self.setup, self.setup.robot, self.setup.scenario.control.posture
@@ -125,3 +148,22 @@ class ControllerFactory:
         if name == "walker":
             return WalkerDriver(setup, FlowPosture(robot, robust, base, gains.weight))
         return RobustDriver(setup, robust)
+
+    def _driver_from_outside(self, name: str, mode: Mode, gain: float | None) -> Driver:
+        """Make a controller of another installed package."""
+        added = metadata.entry_points(group=GROUP)
+        if name not in added.names:
+            known = (*CONTROLLERS, *sorted(added.names))
+            raise ControllerNotFound(name, known, hint=f"one of: {', '.join(known)}")
+        where = f"controller '{name}' ({added[name].value})"
+        try:
+            driver = added[name].load()(self, mode, gain)
+        except ImpactPostureError:
+            raise
+        except Exception as error:
+            # The code of another package may raise anything.
+            words = f"cannot be made: {type(error).__name__}: {error}"
+            raise InputError(words, where=where, hint="correct or remove the package that adds it") from error
+        if not isinstance(driver, Driver):
+            raise InputError(f"makes a {type(driver).__name__}", where=where, hint="return a simulation.driver.Driver")
+        return driver

@@ -23,7 +23,7 @@ from impact_posture.libraries import cache_folder, is_cached, library_path, sour
 from impact_posture.progress import tell
 from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.scenario import Setup
-from impact_posture.toolchain import find_compiler
+from impact_posture.toolchain import find_compiler, no_compiler
 
 Array = NDArray[np.float64]
 Gradient = Callable[[Array], tuple[float, Array]]
@@ -58,14 +58,15 @@ def interpreted(objective: ImpactObjective) -> Gradient:
 
 
 def compiled(objective: ImpactObjective) -> Gradient:
-    """Return the same from the C export, which is built once and cached, or interpreted without a compiler.
+    """Return the same from the C export, which is built once and cached.
 
     Raises:
-        CompilerError: The compiler failed, or its result computes other numbers.
+        CompilerError: There is no compiler, it failed, or its result computes other numbers.
         OutputError: The cache folder cannot be written, or other users can write it.
+        SpecError: The library cannot be loaded, for example because another machine built it.
     """
     if find_compiler() is None:
-        return interpreted(objective)
+        raise no_compiler("gradient")
     folder = cache_folder("gradients") / _key(objective)
     with _locked(folder.with_suffix(".lock")):
         if not is_cached(library_path(folder, "impact")):

@@ -54,6 +54,25 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
     assert again == found
 
 
+def test_simulate_without_a_compiler(aerial: Path, tmp_path: Path) -> None:
+    """One warning, and the numbers that the compiled gradient gives."""
+    asked = ("simulate", aerial, "--controller", "robust", "--format", "png", "--out")
+    bare = {"PATH": str(tmp_path), "CC": ""}
+    done = start(*asked, "bare", cwd=tmp_path, env=bare)
+    assert done.returncode == 0
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("warning: the gradient is interpreted, not compiled, which is slower: ")
+    assert "no C compiler found" in line
+    assert start(*asked, "quiet", "--quiet", cwd=tmp_path, env=bare).stderr == ""
+    assert start(*asked, "whole", cwd=tmp_path).returncode == 0
+    totals = []
+    for folder, warnings in (("bare", 1), ("quiet", 1), ("whole", 0)):
+        found = json.loads((tmp_path / folder / "run.json").read_text())
+        assert len(found["warnings"]) == warnings
+        totals.append(found["metrics"]["q_total_impact"])
+    assert totals[0] == totals[1] == pytest.approx(totals[2], rel=1e-3)
+
+
 def test_simulate_for_people(push: Path, tmp_path: Path) -> None:
     done = start("simulate", str(push), "--controller", "robust", "--mode", "held", "--format", "png", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -105,7 +124,7 @@ def test_contacts_are_counted_against_what_was_asked_for(capsys: pytest.CaptureF
     event = {"status": "lost contact", "time": 1.25, "what": "2 of 5 contacts were never made", "sign": 1}
     found = {"scenario": "mine", "seed": 0, "status": "lost contact", "metrics": None, "events": [event],
              "windows": [{"kind": "dwell"}], "runs": [{"ticks": 900, "metrics": numbers}],
-             "offline": None}  # fmt: skip
+             "offline": None, "warnings": []}  # fmt: skip
     _show(Page(), found, "nominal", Path("there"))
     said = " ".join(capsys.readouterr().out.split())
     assert "contacts 3 of 5" in said and "relaxed 7 of 900 ticks" in said and "held 2 ticks" in said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import hashlib
 import os
 import subprocess
 import sys
@@ -20,8 +21,11 @@ from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
+from impact_posture.libraries import seal_path
 from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation import scenario_objective as module
+from impact_posture.simulation.controller_factory import ControllerFactory
+from impact_posture.simulation.driver import RobustDriver
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import compiled, interpreted, scenario_objective
@@ -204,13 +208,47 @@ def test_a_damaged_build_is_done_again(builds: list[Path]) -> None:
     assert len(builds) == 2
 
 
-def test_without_a_compiler_it_is_interpreted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(module, "find_compiler", lambda: None)
-    objective = objective_of("ur5", "tool0", "impulse", False)
-    q = near(objective, "none")
-    assert compiled(objective)(q)[0] == pytest.approx(objective.value(q), rel=1e-9)
-    assert not (tmp_path / "cache").exists()
+@pytest.mark.parametrize("fault", ["no compiler", "no cache", "failing compiler", "foreign library"])
+def test_what_cannot_be_compiled_or_loaded_is_interpreted(
+    fault: str, builds: list[Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """With one warning, however often the gradient is asked for; the numbers are the same."""
+    needs_mujoco()
+    setup = factory("aerial-vertical").setup
+    if fault == "no compiler":
+        monkeypatch.setenv("PATH", str(tmp_path))
+        monkeypatch.delenv("CC", raising=False)
+    elif fault == "no cache":
+        (tmp_path / "file").touch()
+        monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "file"))
+    elif fault == "failing compiler":
+        monkeypatch.setenv("CC", "false")
+    else:
+        write: Callable[..., Any] = module.write_export
+
+        def elsewhere(objectives: Any, folder: Path, **options: Any) -> Any:
+            """Another machine that shares the folder builds it: the library is whole, but of no use here."""
+            written = write(objectives, folder, **options)
+            written.library.unlink()
+            written.library.write_text("of another machine")
+            seal_path(written.library).write_text(hashlib.sha256(written.library.read_bytes()).hexdigest())
+            return written
+
+        monkeypatch.setattr(module, "write_export", elsewhere)
+    made = ControllerFactory(setup)
+    expected = interpreted(made.objective())
+    driver = made.driver("robust")
+    assert isinstance(driver, RobustDriver) and len(made.warnings) == 1
+    assert "the gradient is interpreted, not compiled, which is slower: " in made.warnings[0]
+    assert "\n" not in made.warnings[0]
+    for k in range(3):
+        q = near(made.objective(), fault, k)
+        value, gradient = made.gradient()(q)
+        np.testing.assert_array_equal(np.r_[value, gradient], np.r_[expected(q)[0], expected(q)[1]])
+    made.driver("robust")
+    assert len(made.warnings) == 1
+    made.driver("nominal")
+    assert not made.warnings
 
 
 def test_a_cache_that_cannot_be_written_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
