@@ -19,6 +19,7 @@ from impact_posture.tsid.frame_tasks import EndEffector, FrameAligned, FramePose
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.qp import EQUALITY
 from impact_posture.tsid.rank import SINGULAR
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Task
@@ -322,12 +323,20 @@ SWEEPS: dict[str, tuple[Callable[[], tuple[Robot, TaskFormulation]], list[float]
 }
 
 
-def swept(name: str, count: int, indices: Vector | None = None) -> tuple[Vector, set[Status], Controller]:
+def swept(
+    name: str,
+    count: int,
+    indices: Vector | None = None,
+    torque: float = np.inf,
+    look: Callable[[Controller, Command], None] = lambda controller, command: None,
+) -> tuple[Vector, set[Status], Controller]:
     """Accelerations at ``count`` states on the way through the singular posture; all targets are a bit ahead."""
     make, through, along = SWEEPS[name]
     r, formulation = make()
     controller, state = Controller(r, formulation), State(r, formulation.points)
     controller.reset(r.posture(), np.zeros(r.nv))
+    if torque < np.inf:
+        controller.actuators.lower[:], controller.actuators.upper[:] = -torque, torque
     found, seen, way = [], set(), np.linspace(-1.0, 1.0, count)
     for k in range(count) if indices is None else indices:
         q, v = r.posture(), np.zeros(r.nv)
@@ -339,6 +348,7 @@ def swept(name: str, count: int, indices: Vector | None = None) -> tuple[Vector,
                 task.reset(state)
             turn_away(task, AHEAD.get(name, 0.01) * np.array([0.3, 0.2, -1.0, 0.5, -0.4, 0.3]))
         command = controller.tick(k * DT, q, v)
+        look(controller, command)
         found.append(command.acceleration)
         seen.add(command.status)
     return np.array(found), seen, controller
@@ -355,6 +365,31 @@ def test_a_slow_sweep_through_a_singular_posture_is_continuous(name: str) -> Non
     asked = max(float(np.linalg.norm(b)) for _, b in levels_of(controller))
     length = min(float(np.linalg.norm(J, axis=1).max()) for J, _ in levels_of(controller))
     assert np.abs(fine).max() < len(controller.formulation.levels) * 3 * asked / (SINGULAR * length)
+
+
+@pytest.mark.parametrize(("name", "torque"), [("wrist", 1.0), ("two levels", 0.3)])
+def test_a_relaxed_answer_is_damped_alike(name: str, torque: float) -> None:
+    """Where limits are reached near a singularity, quadprog finds the same minimum of the damped cost."""
+    quadprog, damped = pytest.importorskip("quadprog"), []
+
+    def look(controller: Controller, command: Command) -> None:
+        qp, given, solved = controller.assembly.rank.qp, controller.assembly.qp, controller._outcome.solved
+        if command.status is not Status.RELAXED or qp is given or np.array_equal(qp.H, given.H):
+            return
+        assert solved is not None
+        damped.append(command)
+        equations = qp.sense[qp.n :] == EQUALITY
+        rows, reached = qp.A[equations], qp.A[equations] @ solved.z
+        below, above = -qp.A[~equations], qp.A[~equations]
+        low, high = qp.lower[qp.n :][~equations], qp.upper[qp.n :][~equations]
+        C = np.vstack([rows, -below[np.isfinite(low)], -above[np.isfinite(high)]])
+        d = np.concatenate([reached, low[np.isfinite(low)], -high[np.isfinite(high)]])
+        d[rows.shape[0] :] -= 1e-9 * (1 + np.abs(d[rows.shape[0] :]))
+        best = quadprog.solve_qp(qp.H, -qp.g, C.T, d, rows.shape[0])[0]
+        np.testing.assert_allclose(solved.z, best, rtol=0, atol=1e-4 * (1 + np.abs(best).max()))
+
+    swept(name, 201, torque=torque, look=look)
+    assert len(damped) > 20
 
 
 @pytest.mark.parametrize("name", SWEEPS)
