@@ -118,7 +118,7 @@ def test_another_objective_with_another_constraint(name: str) -> None:
 
 @pytest.fixture
 def setback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The package docs/examples/setback, as installed: a module, and metadata with the entry points that it states."""
+    """The package docs/examples/setback, as installed: a module, and metadata with its entry points."""
     shutil.copy(EXAMPLE / "setback.py", tmp_path)
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     added = [f"{name} = {value}" for name, value in project["entry-points"][GROUP].items()]

@@ -13,16 +13,9 @@ import pytest
 
 from impact_posture.errors import ImpactPostureError, InputError, ScenarioNotFound, SpecError
 from impact_posture.simulation.actuator_command import ActuatorCommand
+from impact_posture.simulation.control import Gains, StanceGains
 from impact_posture.simulation.reference import Reference
-from impact_posture.simulation.scenario import (
-    Bounds,
-    Gains,
-    RepeatedContacts,
-    Scenario,
-    SinglePush,
-    StanceGains,
-    set_up,
-)
+from impact_posture.simulation.scenario import Bounds, RepeatedContacts, Scenario, SinglePush, set_up
 from impact_posture.simulation.scenario_file import known_scenarios, read_scenario
 
 DOCS = Path(__file__).parents[1] / "docs"

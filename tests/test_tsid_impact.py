@@ -29,6 +29,7 @@ from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task_formulation import TaskFormulation, aerial_formulation, legged_formulation
 from tests.helpers import central_gradient, rng, robot
+from tests.step_bounds import level_bound, step_bound
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run
 from tests.tools import need_compiler
 
@@ -194,11 +195,11 @@ def test_the_course_of_an_impact_makes_no_step(exported: dict[str, ImpactGradien
         state = State(robot(ARM), controller.formulation.points).update(q, v)
         before = posture.desired(state)
         level = posture.activation.level
-        bound = posture.step_bound(state, DT)
+        bound = step_bound(posture, state, DT)
         command = controller.tick(k * DT, q, v)
         # At the same state: what ramps and fades alone change, and the gradient's new value.
         step = float(np.abs(posture.desired(controller.state) - before).max())
-        allowed = max(bound, posture.step_bound(state, DT)) + 0.05 * max(level, posture.activation.level)
+        allowed = max(bound, step_bound(posture, state, DT)) + 0.05 * max(level, posture.activation.level)
         assert step <= allowed + 1e-9, (k, step, allowed)
         largest = max(largest, step)
         phases.append(posture.activation.phase)
@@ -240,7 +241,7 @@ def test_levels_move_no_faster_than_their_bound() -> None:
         for _ in range(int(generator.integers(20, 150))):
             before = activation.level
             after = activation.advance(DT)
-            assert abs(after - before) <= activation.step_bound(DT) + 1e-15
+            assert abs(after - before) <= level_bound(activation, DT) + 1e-15
             if activation.phase is Phase.FREE:
                 break
     with pytest.raises(InputError):

@@ -23,6 +23,7 @@ from impact_posture.tsid.task_formulation import (
     legged_formulation,
 )
 from tests.helpers import rng, robot
+from tests.step_bounds import level_bound
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits
 
 ANSWERED = (Status.SOLVED, Status.RELAXED)
@@ -199,7 +200,7 @@ def test_clocks_that_stand_jump_and_run_backwards() -> None:
     """No time passes backwards, none faster than ten periods a tick, and afterwards all is as before."""
     controller, posture = bracing("tilthex_arm", "strict")
     q, v = controller.robot.posture(), np.zeros(controller.robot.nv)
-    level, longest = 0.0, posture.activation.step_bound(10 * DT)
+    level, longest = 0.0, level_bound(posture.activation, 10 * DT)
     for t in (0.0, 1.0, 1.0, -5.0, -4.999, 1e9, 1e9 + 1.0, -1e300, 0.0):
         assert controller.tick(t, q, v).status is Status.SOLVED
         assert level <= posture.activation.level <= level + longest

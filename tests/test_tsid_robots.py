@@ -31,6 +31,7 @@ from impact_posture.tsid.task_formulation import (
     legged_formulation,
 )
 from tests.helpers import NAMES, rng, robot
+from tests.step_bounds import step_bound
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run
 from tests.test_tsid_never_fails import ANSWERED, PROGRAMS, bracing, program_of, well
 
@@ -163,9 +164,9 @@ def test_events_at_odd_moments_make_no_step(name: str, kind: str, spring: Spring
         assert np.abs(posture.desired(state) - before)[base:].max() <= 1e-9
         dt = float(generator.choice([0.0, DT, DT, 4 * DT, 1.0]))
         t += dt
-        allowed = posture.step_bound(state, min(dt, 10 * DT))
+        allowed = step_bound(posture, state, min(dt, 10 * DT))
         controller.tick(t, q, v)
-        allowed = max(allowed, posture.step_bound(state, min(dt, 10 * DT)))
+        allowed = max(allowed, step_bound(posture, state, min(dt, 10 * DT)))
         steps.append(float(np.abs(posture.desired(state) - before)[base:].max()))
         # What `follow` moves the target by comes on top: its own time constant, not a ramp.
         follows = 20.0 * 2.0 * min(dt, 10 * DT) / 0.5 if spring == "follow" else 0.0

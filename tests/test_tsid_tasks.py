@@ -29,6 +29,7 @@ from tests.helpers import (
     rng,
     robot,
 )
+from tests.step_bounds import step_bound
 
 H = 1e-6
 
@@ -229,7 +230,7 @@ def test_posture_fades_without_a_step() -> None:
     for k in range(260):
         if k == 90:
             task.move_to(r.posture(), 0.1)
-        bound = task.step_bound(state, 1e-3)
+        bound = step_bound(task, state, 1e-3)
         task.advance(state, 1e-3)
         now = task.desired(state)
         # Two base orientations are blended by their logarithms, joints exactly.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +13,14 @@ from impact_posture.simulation.contact_forces import ShapeTruth
 Array = NDArray[np.float64]
 
 
-class Commands(Protocol):
-    """Any object with joint torques and rotor speeds, such as the command of a controller."""
-
-    @property
-    def torque(self) -> Array:
-        """Joint torques, N·m (N for prismatic joints), shape (joints,), in the order of ν."""
-
-    @property
-    def rotor_speed(self) -> Array:
-        """Rotor speeds in the unit of ``speed_max`` in robot.toml, shape (rotors,)."""
-
-
 @dataclass(frozen=True, eq=False)
 class ActuatorCommand:
-    """Joint torques and rotor speeds (:class:`Commands`)."""
+    """Joint torques and rotor speeds, without what else the command of a controller holds.
+
+    Attributes:
+        torque: Joint torques, N·m (N for prismatic joints), shape (joints,), in the order of ν.
+        rotor_speed: Rotor speeds in the unit of ``speed_max`` in robot.toml, shape (rotors,).
+    """
 
     torque: Array
     rotor_speed: Array

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.driver import Driver, RobustDriver
 from impact_posture.simulation.reference import ReferencePoint
@@ -13,16 +14,13 @@ from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient
 from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.controller import Command
-from impact_posture.tsid.impact_robust import ImpactRobustPosture
+from impact_posture.tsid.impact_robust import ImpactRobustPosture, curvature, curvature_scale
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.smooth_step import smooth
 from impact_posture.tsid.state import State
 
 Array = NDArray[np.float64]
-
-# Step of the central differences of the gradient, rad.
-_STEP = 1e-5
 
 
 class StiffPosture(JointPosture):
@@ -56,23 +54,21 @@ class StiffPosture(JointPosture):
             kp: ``K_p``, 1/s².
             base_weight: Weight of the base entries in the cost.
             weight: Weight of the other entries.
+
+        Raises:
+            InputError: A gain is negative or not finite.
         """
         super().__init__(robot, kp=kp, weight=weight, base_weight=base_weight)
+        if not 0 <= K < np.inf:
+            raise InputError("the gain K is out of range", where=self.name, hint="give a number from zero up")
         self._gradient, self._K = gradient, K
-        # Only its scale λ is used, which the impact-robust term would have.
-        self._like = ImpactRobustPosture(robot, gradient, K=K, kp=kp)
         self.stiffness, self.damping = np.diag(self.kp), np.diag(self.kd)
 
     def stiffen(self, state: State, redundancy: Array) -> None:
-        """Measure the curvature at a state (``redundancy`` as in :meth:`ImpactRobustPosture.normalize`)."""
-        self._like.normalize(state, redundancy)
-        columns = []
-        for unit in np.eye(state.nv):
-            ahead = np.array(self._gradient(pin.integrate(self._model, state.q, _STEP * unit))[1])
-            behind = np.array(self._gradient(pin.integrate(self._model, state.q, -_STEP * unit))[1])
-            columns.append((ahead - behind) / (2 * _STEP))
-        curvature = np.column_stack(columns)
-        added = self._K / self._like.scale * (curvature + curvature.T) / 2
+        """Measure the curvature at a state, with the scale λ of an impact-robust term (:func:`curvature_scale`)."""
+        scale = curvature_scale(self._gradient, self._model, state.q, redundancy, self.name)
+        hessian = curvature(self._gradient, self._model, state.q, np.eye(state.nv))
+        added = self._K / scale * (hessian + hessian.T) / 2
         if self._robot.floating:
             added[:6], added[:, :6] = 0.0, 0.0
         values, vectors = np.linalg.eigh(added)
@@ -151,11 +147,6 @@ class WalkerDriver(RobustDriver):
     """Nominal controller whose posture reference flows down the gradient."""
 
     posture: FlowPosture
-
-    @property
-    def term(self) -> ImpactRobustPosture:
-        """The impact-robust term whose activation switches the flow."""
-        return self.posture.term
 
     def reset(self, q: Array) -> Command:
         """Begin at rest, and measure the scale of the term there."""

@@ -36,11 +36,7 @@ from impact_posture.simulation.task_formulations import base_weight, nominal_pos
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 
-ControllerName = Literal[
-    "nominal", "robust", "robust-speed", "robust-sticking", "posture", "stiff", "invariant", "walker"
-]
 Mode = Literal["live", "held"]
-CONTROLLERS: tuple[ControllerName, ...] = get_args(ControllerName)
 # Descriptions for tables and help.
 MEANING: dict[str, str] = {
     "nominal": "TSID with the start posture",
@@ -52,6 +48,7 @@ MEANING: dict[str, str] = {
     "invariant": "nominal, feedback projected on the impact-invariant subspace around the impact",
     "walker": "the gradient's flow as reference of the posture task",
 }
+CONTROLLERS = tuple(MEANING)
 _KINDS: dict[str, ObjectiveKind] = {"robust-speed": "speed", "robust-sticking": "sticking"}
 # Entry points by which other installed packages add controllers.
 GROUP = "impact_posture.controllers"
@@ -146,8 +143,8 @@ class ControllerFactory:
             activation=Activation(ramp=term.ramp, live=mode == "live"),
         )
         if name == "walker":
-            return WalkerDriver(setup, FlowPosture(robot, robust, base, gains.weight))
-        return RobustDriver(setup, robust)
+            return WalkerDriver(setup, FlowPosture(robot, robust, base, gains.weight), robust)
+        return RobustDriver(setup, robust, robust)
 
     def _driver_from_outside(self, name: str, mode: Mode, gain: float | None) -> Driver:
         """Make a controller of another installed package."""
@@ -165,5 +162,5 @@ class ControllerFactory:
             words = f"cannot be made: {type(error).__name__}: {error}"
             raise InputError(words, where=where, hint="correct or remove the package that adds it") from error
         if not isinstance(driver, Driver):
-            raise InputError(f"makes a {type(driver).__name__}", where=where, hint="return a simulation.driver.Driver")
+            raise InputError(f"makes a {type(driver).__name__}", where=where, hint="return a Driver")
         return driver

@@ -87,13 +87,16 @@ class Driver:
 
 
 class RobustDriver(Driver):
-    """Impact-robust controller, whose posture task has the impact-robust term from :meth:`brace` on."""
+    """Impact-robust controller, which uses the impact-robust term from :meth:`brace` on.
 
-    @property
-    def term(self) -> ImpactRobustPosture:
-        """The impact-robust term."""
-        assert isinstance(self.posture, ImpactRobustPosture)  # noqa: S101 (the controller factory gives one)
-        return self.posture
+    Attributes:
+        term: The impact-robust term, which is the posture task or part of it.
+    """
+
+    def __init__(self, setup: Setup, posture: JointPosture, term: ImpactRobustPosture) -> None:
+        """Build the tasks of the scenario around a posture task with a term."""
+        super().__init__(setup, posture)
+        self.term = term
 
     def brace(self) -> None:
         """Switch the term on."""

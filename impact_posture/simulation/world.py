@@ -11,16 +11,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
-from impact_posture.errors import InputError, PostureError, SimulationDiverged
+from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import hover
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.actuator_command import Commands, Push, Truth
+from impact_posture.simulation.actuator_command import ActuatorCommand, Push, Truth
 from impact_posture.simulation.contact_forces import ContactLog
 from impact_posture.simulation.rotors import Rotors, Vibration
 from impact_posture.simulation.scene import Scene
 from impact_posture.simulation.sensor_noise import Reading, SensorNoise
 from impact_posture.simulation.world_builder import BuiltScene, build_scene
+from impact_posture.tsid.controller import Command
+from impact_posture.tsid.state import checked_velocity
 
 Array = NDArray[np.float64]
 
@@ -122,11 +124,7 @@ class World:
             InputError: The rotor speeds do not fit the robot.
         """
         q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False, where="reset")
-        v = np.zeros(self.robot.nv) if v is None else np.asarray(v, dtype=float)
-        if v.shape != (self.robot.nv,) or not np.isfinite(v).all():
-            raise PostureError(
-                f"no velocity of {self.robot.name}", where="reset", hint=f"give {self.robot.nv} finite numbers"
-            )
+        v = checked_velocity(self.robot, np.zeros(self.robot.nv) if v is None else v)
         self._mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[:] = self._layout.qpos(q)
         self._data.qvel[:] = self._layout.qvel(q, v)
@@ -166,7 +164,7 @@ class World:
         force = np.array(push.force, dtype=float)
         self._pushes.append(_ActivePush(body, point.position, force, self._steps + steps))
 
-    def step(self, command: Commands, count: int = 1) -> None:
+    def step(self, command: Command | ActuatorCommand, count: int = 1) -> None:
         """Take physics steps under one command.
 
         Args:
@@ -255,7 +253,7 @@ class World:
             place = data.xpos[push.body] + data.xmat[push.body].reshape(3, 3) @ push.point
             self._mujoco.mj_applyFT(self._model, data, push.force, np.zeros(3), place, push.body, data.qfrc_applied)
 
-    def _checked(self, command: Commands) -> tuple[Array, Array]:
+    def _checked(self, command: Command | ActuatorCommand) -> tuple[Array, Array]:
         speed, torque = np.asarray(command.rotor_speed, dtype=float), np.asarray(command.torque, dtype=float)
         if speed.shape != (self._count,) or torque.shape != self._effort.shape:
             raise InputError(

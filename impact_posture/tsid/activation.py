@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 
 from impact_posture.errors import InputError
-from impact_posture.tsid.smooth_step import STEEPEST, smooth
+from impact_posture.tsid.smooth_step import smooth
 
 
 class Phase(Enum):
@@ -31,7 +31,7 @@ class Activation:
 
     The goal is 0 in FREE, 1 in BRACE and 0 in RELEASE, which ends in FREE.  In CONTACT it is 1 if ``live``, and 0 if
     the robot holds the reached posture during the impact.  Within ``dt`` the level moves by at most
-    ``1.5 dt/ramp`` (:meth:`step_bound`) in every phase.
+    ``1.5 dt/ramp`` in every phase.
 
     Attributes:
         phase: The present phase.
@@ -80,7 +80,3 @@ class Activation:
         if self.phase is Phase.RELEASE and self._x == 0.0:
             self.phase = Phase.FREE
         return self.level
-
-    def step_bound(self, dt: float) -> float:
-        """Return the largest change of the level within ``dt`` seconds."""
-        return min(1.0, STEEPEST * dt / self.ramp)

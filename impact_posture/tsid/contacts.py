@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -99,14 +99,6 @@ def support_contacts(robot: Robot, *, friction: float = 0.7) -> tuple[SupportCon
     )
 
 
-@dataclass
-class _ContactAnchor:
-    """Place of a contact at reset."""
-
-    position: Array = field(default_factory=lambda: np.zeros(3))
-    rotation: Array = field(default_factory=lambda: np.eye(3))
-
-
 class ContactStack:
     """Stack contacts to ``J ν̇ = a`` and ``lower ≤ cone · f``, with forces ``f`` in world axes.
 
@@ -129,7 +121,8 @@ class ContactStack:
         self.rows, self.size = stacked_rows(sizes.tolist())
         self.J = np.zeros((self.size, robot.nv))
         self.a, self._drift, self._e, self._v = np.zeros((4, self.size))
-        self._home = [_ContactAnchor() for _ in contacts]
+        # Position and rotation of each contact at reset.
+        self._home = [(np.zeros(3), np.eye(3)) for _ in contacts]
         self._kp, self._kd = (np.repeat([getattr(c, key) for c in contacts], sizes) for key in ("kp", "kd"))
         self.weight = np.repeat([c.weight or 0.0 for c in contacts], sizes)
         self.hard = np.repeat(np.array([c.weight is None for c in contacts], dtype=bool), sizes)
@@ -140,7 +133,7 @@ class ContactStack:
         """Hold the present places from now on."""
         for k, (contact, rows, cone_rows) in enumerate(zip(self.contacts, self.rows, self.cone_rows, strict=True)):
             here = state.at(contact.point)
-            self._home[k] = _ContactAnchor(here.position.copy(), here.rotation.copy())
+            self._home[k] = here.position.copy(), here.rotation.copy()
             self.cone[cone_rows, rows] = contact.cone(here.rotation)
             self.least[cone_rows.start] = contact.least
 
@@ -148,15 +141,15 @@ class ContactStack:
         """Move to the present state."""
         if not self.size:
             return
-        for contact, rows, home in zip(self.contacts, self.rows, self._home, strict=True):
+        for contact, rows, (position, rotation) in zip(self.contacts, self.rows, self._home, strict=True):
             here, size = state.at(contact.point), contact.size
             self.J[rows] = here.jacobian[:size]
             self._drift[rows] = here.drift[:size]
             self._v[rows] = here.velocity[:size]
             e = self._e[rows]
-            np.subtract(home.position, here.position, out=e[:3])
+            np.subtract(position, here.position, out=e[:3])
             if size == 6:
-                e[3:] = here.rotation @ pin.log3(here.rotation.T @ home.rotation)
+                e[3:] = here.rotation @ pin.log3(here.rotation.T @ rotation)
         np.multiply(self._kp, self._e, out=self.a)
         self._v *= self._kd
         self.a -= self._v

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.errors import InputError, PostureError
+from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.assembly import Assembly
@@ -17,7 +17,7 @@ from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.qp import EQUALITY, Solver
 from impact_posture.tsid.relaxation import Outcome, Relaxed, missed, solve
-from impact_posture.tsid.state import State
+from impact_posture.tsid.state import State, checked_velocity
 from impact_posture.tsid.task import Task
 from impact_posture.tsid.task_formulation import TaskFormulation
 
@@ -130,9 +130,13 @@ class Controller:
         self.actuators = Actuators(robot)
         self.assembly = Assembly(robot, formulation, self.actuators)
         n, m = self.assembly.qp.n, self.assembly.qp.m
-        dense = robot.nv if formulation.weighted and robot.nv >= _LARGE else 0
-        self._solver = _solver(n, m, dense)
+        self._solver: Solver = DaqpSolver(n, m)
         self._aside = DaqpSolver(n, m)
+        if formulation.weighted and robot.nv >= _LARGE:
+            # Imported here, because SciPy takes long to import and only humanoids need it.
+            from impact_posture.tsid.whitened import WhitenedSolver
+
+            self._solver = WhitenedSolver(n, m, robot.nv)
         self._tasks = formulation.tasks
         # Most tasks have no memory to advance.
         self._advancing = [task for task in self._tasks if type(task).advance is not Task.advance]
@@ -151,11 +155,7 @@ class Controller:
             PostureError: ``q`` is no configuration of the robot, or ``v`` is no velocity.
         """
         q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False)
-        v = np.asarray(v, dtype=float)
-        if v.shape != (self.robot.nv,) or not np.isfinite(v).all():
-            raise PostureError(
-                f"no velocity of {self.robot.name}", where="reset", hint=f"give {self.robot.nv} finite numbers"
-            )
+        v = checked_velocity(self.robot, v)
         state, assembly = self.state, self.assembly
         state.push(None)
         state.update(q, v)
@@ -286,13 +286,3 @@ class Controller:
         rotors = self.actuators.rotors
         speeds = self.actuators.rotor_speeds(u[:rotors])
         return Command(u, u[rotors:], speeds, status, acceleration, forces)
-
-
-def _solver(n: int, m: int, dense: int) -> Solver:
-    """Return DAQP, or DAQP on whitened QPs if the first ``dense`` variables have a dense cost."""
-    if not dense:
-        return DaqpSolver(n, m)
-    # Imported here, because SciPy takes long to import and only humanoids need it.
-    from impact_posture.tsid.whitened import WhitenedSolver
-
-    return WhitenedSolver(n, m, dense)

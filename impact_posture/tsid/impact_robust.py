@@ -72,6 +72,8 @@ class ImpactRobustPosture(JointPosture):
     ``q_des``.  It is faded in while the term fades out.
 
     Attributes:
+        K: Gain, 1/s².
+        scale: ``λ``, in the objective's unit per rad².
         activation: The state machine.
         value: ``H`` (or the objective) at the last evaluation.
         term: ``−K s(q) ∇H/λ`` there, bounded, at full level, shape (nv,).
@@ -124,8 +126,7 @@ class ImpactRobustPosture(JointPosture):
         super().__init__(robot, target, name=name, kp=kp, kd=kd, weight=weight, base_weight=base_weight)
         if not (K >= 0 and reach > 0 and follow > 0 and 0 <= fade[0] < fade[1] and every >= 1 and (scale or 1) > 0):
             raise InputError("a gain of the impact-robust term is out of range", where=name, hint="see its docstring")
-        self._K, self._scale, self._factor = float(K), 1.0 if scale is None else float(scale), np.zeros(())
-        self._set_factor()
+        self.K, self.scale = float(K), 1.0 if scale is None else float(scale)
         self.activation = activation or Activation()
         self.spring, self.reach, self.every = spring, float(reach), int(every)
         if kd is None:
@@ -140,26 +141,6 @@ class ImpactRobustPosture(JointPosture):
         self._count, self._hold = 0, False
         self.value, self.term, self.failed = 0.0, np.zeros(robot.nv), False
         self._spare = np.zeros(robot.nv)
-
-    @property
-    def K(self) -> float:
-        """Gain, 1/s²."""
-        return self._K
-
-    @K.setter
-    def K(self, value: float) -> None:
-        self._K = float(value)
-        self._set_factor()
-
-    @property
-    def scale(self) -> float:
-        """``λ``, in the objective's unit per rad²."""
-        return self._scale
-
-    @scale.setter
-    def scale(self, value: float) -> None:
-        self._scale = float(value)
-        self._set_factor()
 
     # ---- phases of an impact ------------------------------------------------------------------------------------
 
@@ -188,30 +169,14 @@ class ImpactRobustPosture(JointPosture):
         self.value = self._function(state.q)[0]
 
     def normalize(self, state: State, redundancy: Array) -> None:
-        """Measure ``λ`` at ``state``: the spectral norm of ``Zᵀ∇²H Z`` with ``Z`` = ``redundancy``, shape (nv, r).
-
-        ``λ`` is at least a thousandth of ``H`` per rad², because a flat ``H`` leaves nothing to gain.  A ``scale``
-        given to the constructor is kept.
+        """Measure ``λ`` at ``state`` (:func:`curvature_scale`).  A ``scale`` given to the constructor is kept.
 
         Raises:
             MetricError: The gradient does not exist there, or ``H`` and its curvature vanish.
         """
         if not self._measure:
             return
-        Z = redundancy if redundancy.shape[1] else np.eye(state.nv)
-        columns = []
-        for z in Z.T:
-            ahead, behind = (
-                np.array(self._function(pin.integrate(self._model, state.q, step * z))[1]) for step in (_STEP, -_STEP)
-            )
-            columns.append(Z.T @ (ahead - behind) / (2 * _STEP))
-        curvature = float(np.linalg.norm(np.column_stack(columns), 2))
-        scale = max(curvature, _FLAT * abs(self._function(state.q)[0]))
-        if not (np.isfinite(scale) and scale > 0):
-            raise MetricError(
-                "the objective vanishes with its curvature", where=self.name, hint="start elsewhere, or give `scale`"
-            )
-        self.scale = scale
+        self.scale = curvature_scale(self._function, self._model, state.q, redundancy, self.name)
 
     def advance(self, state: State, dt: float) -> None:
         """Advance ramps, fades and a following ``q_des``; evaluate the gradient when it is due."""
@@ -246,21 +211,12 @@ class ImpactRobustPosture(JointPosture):
             return None
         return self.term if level == 1 else level * self.term
 
-    def step_bound(self, state: State, dt: float) -> float:
-        """Return the largest change of an entry of ``ν̇*`` within ``dt`` by ramps and fades alone (``q``, ν, ∇H held).
-
-        It is ``1.5 dt/ramp·(K·reach + K_p|q_des ⊖ q|)`` for the level, plus the posture's own fade.
-        """
-        released = self.spring == "release"
-        pull = float(np.max(np.abs(self.kp * self.error(state)))) if released else 0.0
-        return self.activation.step_bound(dt) * (self.K * self.reach + pull) + super().step_bound(state, dt)
-
     def _evaluate(self, state: State) -> None:
         """Evaluate the term at ``state``; keep the previous one where the gradient does not exist."""
-        term, bound = self._spare, self._K * self.reach
+        term, bound = self._spare, self.K * self.reach
         try:
             value, gradient = self._function(state.q)
-            np.multiply(gradient, self._factor, out=term)
+            np.multiply(gradient, -self.K / self.scale, out=term)
         except Exception:
             # A user's function may raise anything, but the tick must go on.  `failed` reports it.
             self.failed = True
@@ -288,6 +244,30 @@ class ImpactRobustPosture(JointPosture):
                 if distance < band:
                     term[k] = push * smooth(distance / band) if distance > 0 else 0.0
 
-    def _set_factor(self) -> None:
-        # An array without dimensions, because NumPy multiplies by it faster than by a float.
-        self._factor[...] = -self._K / self._scale
+
+def curvature(gradient: Gradient, model: pin.Model, q: Array, directions: Array) -> Array:
+    """Return ``∇²H Z`` at ``q`` by central differences of the gradient, for directions ``Z`` of shape (nv, r)."""
+    # A gradient may return the same buffer every time.
+    ahead, behind = (
+        np.column_stack([np.array(gradient(pin.integrate(model, q, step * z))[1]) for z in directions.T])
+        for step in (_STEP, -_STEP)
+    )
+    return np.asarray((ahead - behind) / (2 * _STEP))
+
+
+def curvature_scale(gradient: Gradient, model: pin.Model, q: Array, redundancy: Array, name: str) -> float:
+    """Return ``λ`` at ``q``: the spectral norm of ``Zᵀ∇²H Z`` with ``Z`` = ``redundancy``, shape (nv, r).
+
+    It is at least a thousandth of ``H`` per rad², because a flat ``H`` leaves nothing to gain.  Without redundancy,
+    ``Z`` is the identity.
+
+    Raises:
+        MetricError: The gradient does not exist there, or ``H`` and its curvature vanish.
+    """
+    Z = redundancy if redundancy.shape[1] else np.eye(model.nv)
+    scale = max(float(np.linalg.norm(Z.T @ curvature(gradient, model, q, Z), 2)), _FLAT * abs(gradient(q)[0]))
+    if not (np.isfinite(scale) and scale > 0):
+        raise MetricError(
+            "the objective vanishes with its curvature", where=name, hint="start elsewhere, or give `scale`"
+        )
+    return scale

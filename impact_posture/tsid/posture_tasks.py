@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
-from impact_posture.tsid.smooth_step import STEEPEST, smooth
+from impact_posture.tsid.smooth_step import smooth
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Task
 
@@ -119,13 +119,6 @@ class JointPosture(Task):
         if more is not None:
             wanted += more
         return wanted
-
-    def step_bound(self, state: State, dt: float) -> float:
-        """Return the largest change of an entry of ``ν̇*`` within ``dt`` by a fade alone (``q``, ν held)."""
-        if self._blend >= 1:
-            return 0.0
-        way = pin.difference(self._model, state.q, self._next) - pin.difference(self._model, state.q, self._target)
-        return float(np.max(self.kp * np.abs(way))) * STEEPEST * dt / self._over
 
     def _fade_to(self, target: Array, over: float) -> None:
         """Fade to a valid configuration without checks, because a tick must not raise."""

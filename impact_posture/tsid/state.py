@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, PostureError
 from impact_posture.robot.robot import Robot, unit_parts
 from impact_posture.tsid.points import Point, PointKinematics, PointState
 from impact_posture.tsid.ranges import JointRanges
@@ -156,3 +156,15 @@ class State:
         if self._base is None:
             raise InputError("the base is fixed", where=self.robot.name, hint="use a robot with a floating base")
         return self._base
+
+
+def checked_velocity(robot: Robot, v: ArrayLike) -> Array:
+    """Return ν at a reset as an array of shape (nv,).
+
+    Raises:
+        PostureError: It has another shape or is not finite.
+    """
+    v = np.asarray(v, dtype=float)
+    if v.shape != (robot.nv,) or not np.isfinite(v).all():
+        raise PostureError(f"no velocity of {robot.name}", where="reset", hint=f"give {robot.nv} finite numbers")
+    return v

@@ -11,11 +11,11 @@ import pytest
 
 from impact_posture.errors import SpecError
 from impact_posture.simulation.actuator_command import ActuatorCommand
+from impact_posture.simulation.control import EndEffectorGains, Gains
 from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory, Mode
 from impact_posture.simulation.driver import MOVE, Driver, PostureDriver
 from impact_posture.simulation.offline import OfflinePosture
 from impact_posture.simulation.reference import ReferencePoint
-from impact_posture.simulation.scenario import EndEffectorGains, Gains
 from impact_posture.simulation.task_formulations import nominal_posture
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.frame_tasks import FramePose

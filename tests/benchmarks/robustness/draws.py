@@ -15,16 +15,8 @@ from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.starts import Projector
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.simulation.scenario import (
-    Control,
-    Gains,
-    RepeatedContacts,
-    Scenario,
-    Setup,
-    SinglePush,
-    StanceGains,
-    set_up,
-)
+from impact_posture.simulation.control import Control, Gains, StanceGains
+from impact_posture.simulation.scenario import RepeatedContacts, Scenario, Setup, SinglePush, set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
 from impact_posture.simulation.world import build_world
