@@ -43,37 +43,15 @@ def _mean(value: Interval | None) -> float:
     return value.mean if value else 0.0
 
 
-@dataclass(frozen=True)
-class Targets:
-    """Targets that a row misses.
+def missed_targets(row: Row) -> dict[str, str] | None:
+    """Return the targets that a row misses, each with what the row has instead.
 
-    Attributes:
-        missed: Names of the targets.
+    The nominal controller and a row without reduction have ``None``.
     """
-
-    missed: tuple[str, ...]
-
-    @property
-    def met(self) -> bool:
-        """Whether the row meets all targets."""
-        return not self.missed
-
-    @property
-    def words(self) -> str:
-        """Description of what the row has instead."""
-        return ", ".join(_TARGETS[name][1] for name in self.missed)
-
-    def to_dict(self) -> dict[str, bool]:
-        """Return whether each target, and all of them, are met."""
-        return {**{name: name not in self.missed for name in _TARGETS}, "met": self.met}
-
-
-def targets_of(row: Row) -> Targets | None:
-    """Compare a row with its targets.  The nominal controller and a row without reduction have ``None``."""
     if row.reduction is None or row.recovery is None or row.controller == "nominal":
         return None
     paper = PAPER[row.scenario].reduction if row.scenario in PAPER else 0.0
-    return Targets(tuple(name for name, (misses, _) in _TARGETS.items() if misses(row, paper)))
+    return {name: instead for name, (misses, instead) in _TARGETS.items() if misses(row, paper)}
 
 
 def best_of(rows: Sequence[Row]) -> Row | None:
@@ -81,8 +59,8 @@ def best_of(rows: Sequence[Row]) -> Row | None:
 
     The smaller of the two reductions counts, within the window and until the recovery ends.
     """
-    tried = [(row, targets) for row in rows if (targets := targets_of(row)) is not None and row.rested]
-    met = [row for row, targets in tried if targets.met] or [row for row, _ in tried]
+    tried = [(row, missed) for row in rows if (missed := missed_targets(row)) is not None and row.rested]
+    met = [row for row, missed in tried if not missed] or [row for row, _ in tried]
     return max(met, key=lambda row: min(_mean(row.reduction), _mean(row.recovery)), default=None)
 
 
@@ -149,10 +127,12 @@ class Reproduction:
         """Return the content of ``reproduction.json``."""
         rows = []
         for row in self.rows:
-            targets = targets_of(row)
+            missed, targets = missed_targets(row), None
+            if missed is not None:
+                targets = {name: name not in missed for name in _TARGETS} | {"met": not missed}
             more = {
                 "paper": PAPER.get(row.scenario),
-                "targets": None if targets is None else targets.to_dict(),
+                "targets": targets,
                 "best": row is self.best(row.scenario),
             }
             rows.append(jsonable(row) | jsonable(more))

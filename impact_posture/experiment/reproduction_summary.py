@@ -8,7 +8,7 @@ import numpy as np
 
 from impact_posture.escape import markdown
 from impact_posture.experiment.paper import PAPER
-from impact_posture.experiment.reproduction import Reproduction, targets_of
+from impact_posture.experiment.reproduction import Reproduction, missed_targets
 from impact_posture.experiment.statistics import Interval, Row
 from impact_posture.simulation.controller_factory import MEANING
 
@@ -210,16 +210,15 @@ def status_text(row: Row) -> str:
 
 def targets_text(row: Row) -> str:
     """Return whether the targets are met, or which are not."""
-    targets = targets_of(row)
-    if targets is None:
+    missed = missed_targets(row)
+    if missed is None:
         return ""
-    return "met" if targets.met else "missed: " + ", ".join(targets.missed)
+    return "missed: " + ", ".join(missed) if missed else "met"
 
 
 def _missed(row: Row) -> str:
-    """Return the missed targets in words."""
-    targets = targets_of(row)
-    return "" if targets is None else targets.words
+    """Return what the row has instead of the targets that it misses."""
+    return ", ".join((missed_targets(row) or {}).values())
 
 
 def _total(row: Row | None) -> str:

@@ -21,13 +21,7 @@ from impact_posture.errors import (
 )
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.settings import ObjectiveKind
-from impact_posture.simulation.baselines import (
-    FlowPosture,
-    InvariantDriver,
-    StiffDriver,
-    StiffPosture,
-    WalkerDriver,
-)
+from impact_posture.simulation.baselines import FlowPosture, InvariantDriver, StiffDriver, StiffPosture, WalkerDriver
 from impact_posture.simulation.driver import Driver, PostureDriver, RobustDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
 from impact_posture.simulation.scenario import Setup

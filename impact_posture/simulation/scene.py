@@ -69,9 +69,7 @@ class Surface(ContactLaw):
         super().__post_init__()
         if not np.abs(self.normal).max() > 1e-9:
             raise InputError(
-                "the normal has no direction",
-                where=f"surface '{self.name}'",
-                hint="give three numbers, not all zero",
+                "the normal has no direction", where=f"surface '{self.name}'", hint="give three numbers, not all zero"
             )
 
 

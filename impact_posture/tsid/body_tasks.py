@@ -24,10 +24,6 @@ class _BaseTurn(TargetTask[Array]):
         """Return the rows of the base's ω, shape (size, nv)."""
         return np.eye(self.size, state.nv, 3)
 
-    def drift(self, state: State) -> Array:
-        """Return zero, because the base's angular velocity is part of ν."""
-        return np.zeros(self.size)
-
 
 class Tilt(_BaseTurn):
     """Regulate the reduced attitude of the base, the direction of its z axis; yaw stays free (2 × nv).

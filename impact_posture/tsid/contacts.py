@@ -89,11 +89,7 @@ def support_contacts(robot: Robot, *, friction: float = 0.7) -> tuple[SupportCon
     """
     return tuple(
         SupportContact(
-            Point(s.frame, s.offset),
-            s.kind,
-            s.size,
-            friction=friction,
-            weight=None if s.kind == "surface" else 1e4,
+            Point(s.frame, s.offset), s.kind, s.size, friction=friction, weight=None if s.kind == "surface" else 1e4
         )
         for s in robot.spec.supports
     )

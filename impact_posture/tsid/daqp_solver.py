@@ -10,6 +10,8 @@ from impact_posture.tsid.qp import QP, Solved
 # Exit flag of DAQP for a program without a solution; 1 and 2 (soft constraints are active) are solutions.  -6
 # (dependent equations) does not count, because DAQP also returns it for bounds that were active before.
 _NONE = -1
+# Largest violation of a bound, and largest number of iterations for one program.
+_SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000}
 
 
 class DaqpSolver:
@@ -18,18 +20,11 @@ class DaqpSolver:
     After a reset, equal programs give bitwise equal answers.
     """
 
-    def __init__(self, n: int, m: int, *, tolerance: float = 1e-9, iterations: int = 1000) -> None:
-        """Allocate a workspace for ``n`` variables and ``m`` rows.
-
-        Args:
-            n: Number of variables.
-            m: Number of rows.
-            tolerance: Largest violation of a bound.
-            iterations: Largest number of iterations for one program.
-        """
+    def __init__(self, n: int, m: int) -> None:
+        """Allocate a workspace for ``n`` variables and ``m`` rows."""
         self._flag = 1
         self._model = daqp.Model()
-        self._model.settings = {"primal_tol": tolerance, "iter_limit": iterations}
+        self._model.settings = _SETTINGS
         # The first program only sets the dimensions.  None of its bounds can be active.
         blank, upper = QP.empty(n, m), np.full(n + m, 1e30)
         self._model.setup(blank.H, blank.g, blank.A, upper, -upper, blank.sense)

@@ -43,28 +43,24 @@ def lexicographic(levels: Sequence[Level]) -> Array | None:
         Shape (n,), to about six digits; ``None`` if the solver gave up.
     """
     given = [level for level in levels if level.lower.size]
-    A, lower, upper, sense = [], [], [], []
+    blocks = []
     for level in given:
-        equal = level.lower == level.upper
-        rows, low, high = level.A, level.lower, level.upper
+        equal, rows, low, high = level.lower == level.upper, level.A, level.lower, level.upper
         if equal.all():
             rows, low = balanced(rows, low)
             high = low
-        A.append(rows)
-        lower.append(low)
-        upper.append(high)
-        sense.append(np.where(equal, EQUALITY, INEQUALITY).astype(np.int32))
-    low, high = np.concatenate(lower), np.concatenate(upper)
+        blocks.append((rows, low, high, np.where(equal, EQUALITY, INEQUALITY).astype(np.int32)))
+    A, low, high, sense = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     bounds = np.abs(np.concatenate([low, high]))
     scale = max(1.0, float(np.max(bounds, where=np.isfinite(bounds), initial=0.0)) / _LARGEST)
     ends = np.cumsum([level.lower.size for level in given], dtype=np.int32)
     z, _, flag, _ = daqp.solve(
         None,
         None,
-        np.ascontiguousarray(np.vstack(A)),
+        np.ascontiguousarray(A),
         np.clip(high / scale, -1e30, 1e30),
         np.clip(low / scale, -1e30, 1e30),
-        np.concatenate(sense),
+        sense,
         ends,
     )
     z = scale * np.asarray(z)

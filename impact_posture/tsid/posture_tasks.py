@@ -24,6 +24,8 @@ class JointPosture(Task):
     A new ``q_des`` is faded in (:meth:`move_to`), hence ``ν̇*`` does not jump.
     """
 
+    constant = True
+
     def __init__(
         self,
         robot: Robot,
@@ -57,7 +59,7 @@ class JointPosture(Task):
         self._given = None if target is None else robot.check_posture(np.asarray(target), limits=False)
         self._target = robot.posture() if self._given is None else self._given.copy()
         self._next, self._blend, self._over = self._target.copy(), 1.0, 1.0
-        self._eye, self._zero = np.eye(robot.nv), np.zeros(robot.nv)
+        self._eye = np.eye(robot.nv)
 
     @property
     def target(self) -> Array:
@@ -101,10 +103,6 @@ class JointPosture(Task):
     def jacobian(self, state: State) -> Array:
         """Return the identity."""
         return self._eye
-
-    def drift(self, state: State) -> Array:
-        """Return zero."""
-        return self._zero
 
     def pull(self, state: State) -> Array:
         """Return ``K_p (q_des ⊖ q)``, shape (nv,); a fresh array."""

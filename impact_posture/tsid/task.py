@@ -39,7 +39,7 @@ class Task(ABC):
 
     points: Sequence[Point] = ()
     constant = False
-    """Whether ``J`` never changes and ``J̇ν`` is zero.  A stack then evaluates them only once."""
+    """Whether ``J`` never changes and ``J̇ν`` is zero.  A stack then evaluates ``J`` only once."""
 
     def __init__(
         self, name: str, size: int, *, kp: ArrayLike = 0.0, kd: ArrayLike | None = None, weight: ArrayLike = 1.0
@@ -72,6 +72,8 @@ class Task(ABC):
 
     def drift(self, state: State) -> Array:
         """Return ``J̇ν``, shape (k,)."""
+        if self.constant:
+            return np.zeros(self.size)
         ahead = np.array(self.jacobian(state.displaced(_STEP)))
         behind = np.array(self.jacobian(state.displaced(-_STEP)))
         return np.asarray((ahead - behind) @ state.v / (2 * _STEP))
@@ -130,12 +132,7 @@ class TargetTask(Task, Generic[Target]):
     rows: int
 
     def __init__(
-        self,
-        *,
-        name: str | None = None,
-        kp: ArrayLike = 100.0,
-        kd: ArrayLike | None = None,
-        weight: ArrayLike = 1.0,
+        self, *, name: str | None = None, kp: ArrayLike = 100.0, kd: ArrayLike | None = None, weight: ArrayLike = 1.0
     ) -> None:
         super().__init__(name or self.title, self.rows, kp=kp, kd=kd, weight=weight)
         self.target: Target | None = self.default_target()

@@ -158,10 +158,7 @@ def legged_formulation(
         raise InputError(
             "has no supports", where=robot.name, hint="name [[supports]] in robot.toml, or give contacts"
         )
-    weighted = (
-        center_of_mass or CenterOfMass(kp=kp, weight=10.0),
-        base or BaseOrientation(kp=kp, weight=1.0),
-    )
+    weighted = (center_of_mass or CenterOfMass(kp=kp, weight=10.0), base or BaseOrientation(kp=kp, weight=1.0))
     return TaskFormulation((), weighted, posture, contacts, force_point, law)
 
 
