@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
@@ -36,29 +38,19 @@ class StiffPosture(JointPosture):
         damping: ``D`` after a reset, 1/s, shape (nv, nv).
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        gradient: Gradient,
-        K: float,
-        kp: ArrayLike,
-        base_weight: float | None,
-        weight: ArrayLike = 1.0,
-    ) -> None:
+    def __init__(self, robot: Robot, gradient: Gradient, K: float, **options: Any) -> None:
         """Set the gradient, whose curvature counts, and the gains.
 
         Args:
             robot: The robot.
             gradient: ``q → (H, ∇H)``.
             K: ``K_r``, 1/s².
-            kp: ``K_p``, 1/s².
-            base_weight: Weight of the base entries in the cost.
-            weight: Weight of the other entries.
+            options: As of :class:`~impact_posture.tsid.posture_tasks.JointPosture`; the damping is not used.
 
         Raises:
             InputError: A gain is negative or not finite.
         """
-        super().__init__(robot, kp=kp, weight=weight, base_weight=base_weight)
+        super().__init__(robot, **options)
         if not 0 <= K < np.inf:
             raise InputError("the gain K is out of range", where=self.name, hint="give a number from zero up")
         self._gradient, self._K = gradient, K
@@ -106,11 +98,9 @@ class FlowPosture(JointPosture):
         term: The impact-robust term whose gradient, scale, bound and activation are used.  It is no task itself.
     """
 
-    def __init__(
-        self, robot: Robot, term: ImpactRobustPosture, base_weight: float | None, weight: ArrayLike = 1.0
-    ) -> None:
-        """Set the gains of the term."""
-        super().__init__(robot, kp=term.kp, kd=term.kd, weight=weight, base_weight=base_weight)
+    def __init__(self, robot: Robot, term: ImpactRobustPosture) -> None:
+        """Set the gains and weights of the term."""
+        super().__init__(robot, kp=term.kp, kd=term.kd, weight=term.weight)
         self.term = term
         self._flow = np.zeros(robot.nv)
         self._basis: Array | None = None

@@ -8,8 +8,6 @@ from functools import cached_property
 from importlib import metadata
 from typing import Literal, get_args
 
-import numpy as np
-
 from impact_posture.errors import (
     CompilerError,
     ControllerNotFound,
@@ -26,7 +24,7 @@ from impact_posture.simulation.driver import Driver, PostureDriver, RobustDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
-from impact_posture.simulation.task_formulations import base_weight, nominal_posture
+from impact_posture.simulation.task_formulations import nominal_posture, posture_options
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 
@@ -112,33 +110,22 @@ class ControllerFactory:
             return self._driver_from_outside(name, mode, gain)
         if mode == "held" and not (name.startswith("robust") or name == "walker"):
             raise InputError(f"'{name}' has no term to hold", where="--mode", hint="only robust… and walker have one")
-        setup, robot, gains = self.setup, self.setup.robot, self.setup.scenario.control.posture
+        setup, robot = self.setup, self.setup.robot
         if name == "posture":
             return PostureDriver(setup, nominal_posture(setup), self.offline.q)
         if name == "nominal":
             return Driver(setup, nominal_posture(setup))
         if name == "invariant":
             return InvariantDriver(setup, nominal_posture(setup))
-        term = setup.scenario.control.robust
-        K = term.gain if gain is None else gain
-        gradient, base = self.gradient(_KINDS.get(name, "impulse")), base_weight(setup)
+        term, gradient = setup.scenario.control.robust, self.gradient(_KINDS.get(name, "impulse"))
+        K, options = term.gain if gain is None else gain, posture_options(setup)
         if name == "stiff":
-            return StiffDriver(setup, StiffPosture(robot, gradient, K, gains.kp, base, gains.weight))
-        robust = ImpactRobustPosture(
-            robot,
-            gradient,
-            K=K,
-            kp=gains.kp,
-            # All controllers have the same damping.
-            kd=2 * np.sqrt(gains.kp) if gains.kd is None else gains.kd,
-            weight=gains.weight,
-            base_weight=base,
-            fade=term.fade,
-            activation=Activation(ramp=term.ramp, live=mode == "live"),
-        )
-        if name == "walker":
-            return WalkerDriver(setup, FlowPosture(robot, robust, base, gains.weight), robust)
-        return RobustDriver(setup, robust, robust)
+            return StiffDriver(setup, StiffPosture(robot, gradient, K, **options))
+        activation = Activation(ramp=term.ramp, live=mode == "live")
+        robust = ImpactRobustPosture(robot, gradient, K=K, fade=term.fade, activation=activation, **options)
+        posture = FlowPosture(robot, robust) if name == "walker" else robust
+        driver = WalkerDriver if name == "walker" else RobustDriver
+        return driver(setup, posture, robust)
 
     def _driver_from_outside(self, name: str, mode: Mode, gain: float | None) -> Driver:
         """Make a controller of another installed package."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import SpecError
@@ -39,12 +42,12 @@ def end_effector_task(setup: Setup) -> EndEffector | None:
     mass, frame = scenario.control.apparent_mass, scenario.shape.frame
     impedance = None if mass is None else Impedance(mass)
     point = Point(frame, scenario.shape.offset)
-    common = {"name": "end effector", "impedance": impedance, "kp": gains.kp, "kd": gains.kd, "weight": gains.weight}
+    options: dict[str, Any] = {"kp": gains.kp, "kd": gains.kd, "weight": gains.weight, "impedance": impedance}
     if gains.pose == "aligned":
         placed = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, frame))
-        return FrameAligned(point, placed.rotation.T @ scenario.normal, **common)  # type: ignore[arg-type]
+        return FrameAligned(point, placed.rotation.T @ scenario.normal, name="end effector", **options)
     kind = FramePose if gains.pose == "full" else FramePosition
-    return kind(point, **common)  # type: ignore[arg-type]
+    return kind(point, name="end effector", **options)
 
 
 def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffector | None) -> TaskFormulation:
@@ -73,15 +76,19 @@ def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffe
     return TaskFormulation((), (*weighted, *tasks), posture, contacts, force_point=felt, force_weight=cost)
 
 
-def base_weight(setup: Setup) -> float | None:
-    """Return the weight of the base entries in the posture task: 0 for a floating base, which other tasks control."""
-    return 0.0 if setup.robot.floating else None
+def posture_options(setup: Setup) -> dict[str, Any]:
+    """Return the options of the posture task, with the same damping for all controllers.
+
+    The base of a floating robot has no weight in this task, because other tasks control it.
+    """
+    gains, base = setup.scenario.control.posture, 0.0 if setup.robot.floating else None
+    kd = 2 * np.sqrt(gains.kp) if gains.kd is None else gains.kd
+    return {"kp": gains.kp, "kd": kd, "weight": gains.weight, "base_weight": base}
 
 
 def nominal_posture(setup: Setup) -> JointPosture:
     """Return the posture task that holds the start posture."""
-    gains = setup.scenario.control.posture
-    return JointPosture(setup.robot, kp=gains.kp, kd=gains.kd, weight=gains.weight, base_weight=base_weight(setup))
+    return JointPosture(setup.robot, **posture_options(setup))
 
 
 def _check_gains(setup: Setup) -> None:
