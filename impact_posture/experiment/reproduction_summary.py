@@ -51,7 +51,9 @@ def scenario_table(rows: Sequence[Row]) -> str:
     )
     lines = []
     for row in rows:
-        cells = [row.controller, markdown(status_text(row))]
+        whole = row.completed == row.runs
+        status = row.status if whole else f"{row.status}, {row.completed} of {row.runs} completed"
+        cells = [row.controller, markdown(status)]
         if row.metrics:
             cells += [
                 _total(row),
@@ -201,11 +203,6 @@ def _plus_minus(value: Interval, decimals: int, factor: int = 1) -> str:
 def reduction_text(row: Row | None) -> str:
     """Return the reduction of a row in percent."""
     return percent(None if row is None or row.controller == "nominal" else row.reduction)
-
-
-def status_text(row: Row) -> str:
-    """Return ``completed``, or the gravest status and how many runs completed."""
-    return row.status if row.completed == row.runs else f"{row.status}, {row.completed} of {row.runs} completed"
 
 
 def targets_text(row: Row) -> str:

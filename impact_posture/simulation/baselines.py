@@ -96,6 +96,7 @@ class FlowPosture(JointPosture):
 
     Attributes:
         term: The impact-robust term whose gradient, scale, bound and activation are used.  It is no task itself.
+        basis: ``Z``, shape (nv, r); without it, nothing flows.
     """
 
     def __init__(self, robot: Robot, term: ImpactRobustPosture) -> None:
@@ -103,29 +104,25 @@ class FlowPosture(JointPosture):
         super().__init__(robot, kp=term.kp, kd=term.kd, weight=term.weight)
         self.term = term
         self._flow = np.zeros(robot.nv)
-        self._basis: Array | None = None
+        self.basis: Array | None = None
 
     def reset(self, state: State) -> None:
         """Hold the present posture."""
         super().reset(state)
         self.term.reset(state)
-        self._basis = None
+        self.basis = None
         self._flow[:] = 0.0
-
-    def lead(self, basis: Array) -> None:
-        """Flow within the columns of ``basis``, shape (nv, r), from now on."""
-        self._basis = basis
 
     def advance(self, state: State, dt: float) -> None:
         """Move ``q_des``."""
         super().advance(state, dt)
         self.term.advance(state, dt)
         level = self.term.activation.level
-        if self._basis is None or level <= 0:
+        if self.basis is None or level <= 0:
             self._flow[:] = 0.0
             return
         wanted = level * self.term.term / np.maximum(self.kd, 1e-9)
-        self._flow = self._basis @ (self._basis.T @ wanted)
+        self._flow = self.basis @ (self.basis.T @ wanted)
         self._target[:] = pin.integrate(self._model, self._target, dt * self._flow)
 
     def desired(self, state: State) -> Array:
@@ -142,8 +139,8 @@ class WalkerDriver(RobustDriver):
         """Begin at rest, and measure the scale of the term there."""
         command = super().reset(q)
         state = self.controller.state
-        self._free = self.controller.assembly.redundancy(state)
-        self.term.normalize(state, self._free)
+        self.posture.basis = self.controller.assembly.redundancy(state)
+        self.term.normalize(state, self.posture.basis)
         self._ticks = 0
         return command
 
@@ -151,9 +148,8 @@ class WalkerDriver(RobustDriver):
         """Return the command.  The redundancy is computed as often as the gradient."""
         if self.level > 0:
             if self._ticks % self.term.every == 0:
-                self._free = self.controller.assembly.redundancy(self.controller.state)
+                self.posture.basis = self.controller.assembly.redundancy(self.controller.state)
             self._ticks += 1
-        self.posture.lead(self._free)
         return super().tick(reading, reference)
 
     def hold(self) -> None:

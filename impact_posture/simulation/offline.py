@@ -23,6 +23,8 @@ from impact_posture.tsid.controller import Status
 
 Array = NDArray[np.float64]
 
+# Share of the limits that holding a posture may take.
+SHARE = 0.8
 # Number of distances on the way to the optimum at which postures are tried, farthest first.
 _POINTS = 16
 # Distance from the joint stops, rad (m), because a robot on a stop braces on it.
@@ -57,46 +59,42 @@ class OfflinePosture:
     note: str = ""
 
 
-def offline_posture(
-    setup: Setup, objective: ImpactObjective, *, starts: int = 16, seed: int = 0, share: float = 0.8
-) -> OfflinePosture:
+def offline_posture(setup: Setup, objective: ImpactObjective, *, starts: int = 16) -> OfflinePosture:
     """Optimize the posture for the impact of a scenario, but only as far as the motors can hold it.
 
     The end effector stays where it starts, as far as its task holds it.  The base of a robot that flies stays level.
     The feet of a robot that stands stay where they are, with the center of mass above them.  The result is on the
     trade-off between objective and distance from the start.  It is the farthest posture that a nominal controller
-    holds at rest with at most ``share`` of every torque limit and of the range of the rotors.
+    holds at rest with at most :data:`SHARE` of every torque limit and of the range of the rotors.
 
     Args:
         setup: The experiment.
         objective: The objective.
         starts: Number of starts of the optimizer.
-        seed: Seed of its random starts.
-        share: Share of the limits that holding the posture may take.
 
     Raises:
         Infeasible, SolverFailed: As :func:`impact_posture.posture.solve.solve`.
     """
     tell("looking for the offline posture")
-    solution = _solve(setup, objective, starts, seed)
+    solution = _solve(setup, objective, starts)
     initial = objective.value(solution.initial)
-    if holds(setup, solution.q, share):
+    if holds(setup, solution.q):
         value, far = objective.value(solution.q), distance(Chart(setup.robot.model), solution.q, solution.initial)
         return OfflinePosture(solution.q, value, initial, value, far, far)
     curve = pareto_front(solution, _POINTS, progress=_tell)
     whole, optimum = curve.points[-1].distance, curve.points[-1].objective
     for point in reversed(curve.points):
-        if point.certified and holds(setup, point.q, share):
+        if point.certified and holds(setup, point.q):
             note = (
-                f"the optimum is {whole:.2f} rad (m) away and the motors cannot hold it with {100 * share:.0f} % of "
+                f"the optimum is {whole:.2f} rad (m) away and the motors cannot hold it with {100 * SHARE:.0f} % of "
                 f"their torque: the best posture within {point.distance:.2f} is taken"
             )
             return OfflinePosture(point.q, point.objective, initial, optimum, point.distance, whole, note)
-    note = f"no better posture can be held with {100 * share:.0f} % of the motors' torque: the start is kept"
+    note = f"no better posture can be held with {100 * SHARE:.0f} % of the motors' torque: the start is kept"
     return OfflinePosture(solution.initial, initial, initial, optimum, 0.0, whole, note)
 
 
-def _solve(setup: Setup, objective: ImpactObjective, starts: int, seed: int) -> PostureSolution:
+def _solve(setup: Setup, objective: ImpactObjective, starts: int) -> PostureSolution:
     """Return the optimum as far from the stops and from the edges of the feet as the start allows."""
     robot, control = setup.robot, setup.scenario.control
     stands = control.footing is not None
@@ -111,7 +109,7 @@ def _solve(setup: Setup, objective: ImpactObjective, starts: int, seed: int) -> 
         try:
             wanted = replace(requirements, limit_margin=stops, com_margin=edges if stands else 0.0)
             problem = build_problem(robot, objective, setup.q, wanted)
-            return solve(problem, starts=starts, seed=seed, jobs=1, progress=_tell)
+            return solve(problem, starts=starts, jobs=1, progress=_tell)
         except (Infeasible, SolverFailed):
             if edges == 0.0:
                 raise
@@ -122,8 +120,8 @@ def _tell(done: int, total: int) -> None:
     tell("looking for the offline posture", done / total)
 
 
-def holds(setup: Setup, q: Array, share: float) -> bool:
-    """Whether a nominal controller rests at ``q`` with at most ``share`` of the limits."""
+def holds(setup: Setup, q: Array) -> bool:
+    """Whether a nominal controller rests at ``q`` with at most :data:`SHARE` of the limits."""
     driver = Driver(setup, nominal_posture(setup))
     command = driver.reset(q)
     if command.status is not Status.SOLVED:
@@ -132,4 +130,4 @@ def holds(setup: Setup, q: Array, share: float) -> bool:
     middle = np.where(np.isfinite(limits.upper + limits.lower), (limits.upper + limits.lower) / 2, 0.0)
     half = np.where(np.isfinite(limits.upper), limits.upper - middle, np.inf)
     still = float(np.abs(command.acceleration).max()) < _STILL
-    return bool((np.abs(command.u - middle) <= share * half).all()) and still
+    return bool((np.abs(command.u - middle) <= SHARE * half).all()) and still

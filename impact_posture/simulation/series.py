@@ -99,9 +99,9 @@ class Series:
         first, last = np.searchsorted(self.t, [begin + _SAME, end + _SAME], side="right")
         return slice(int(first), int(last))
 
-    def save(self, path: Path, **more: Any) -> None:
+    def save(self, path: Path) -> None:
         """Write as NPZ."""
-        np.savez_compressed(path, **vars(self), **more)
+        np.savez_compressed(path, **vars(self))
 
     @staticmethod
     def load(path: Path) -> Series:

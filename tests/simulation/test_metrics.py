@@ -179,7 +179,7 @@ def test_metrics_are_json() -> None:
 def test_a_series_comes_back_from_its_file(tmp_path: Path) -> None:
     setup = factory("aerial-vertical").setup
     series = by_hand(setup, 20, v=np.random.default_rng(0).normal(size=(20, 9)))
-    series.save(tmp_path / "series.npz", more=np.arange(3))
+    series.save(tmp_path / "series.npz")
     again = Series.load(tmp_path / "series.npz")
     for name, column in fields_of(series).items():
         np.testing.assert_array_equal(getattr(again, name), column)
