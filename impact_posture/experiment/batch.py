@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -16,7 +15,7 @@ from typing import Any
 from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError, SpecError
 from impact_posture.experiment.jobs import SCHEMA, Job, controller_factory, execute
 from impact_posture.libraries import source_key
-from impact_posture.output_folder import is_ours, write_record
+from impact_posture.output_folder import is_ours, write_record, write_whole
 from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.processes import fork_map
 from impact_posture.simulation.controller_factory import CONTROLLERS
@@ -42,10 +41,18 @@ class Store:
         self.folder = folder
 
     def make(self) -> None:
-        """Make the folder if it does not exist."""
-        with suppress(FileExistsError):
-            self.folder.mkdir(parents=True)
-            write_record(self.folder, "runs")
+        """Make the folder if it does not exist.
+
+        Raises:
+            OutputError: It cannot be made.
+        """
+        try:
+            with suppress(FileExistsError):
+                self.folder.mkdir(parents=True)
+                write_record(self.folder, "runs")
+        except OSError as error:
+            words = f"cannot be written ({error.strerror or error})"
+            raise OutputError(words, where=str(self.folder), hint="free space or choose another --out") from error
 
     def remove(self) -> None:
         """Remove the folder, if :meth:`make` made it."""
@@ -82,18 +89,9 @@ class Store:
         Raises:
             OutputError: It cannot be written.
         """
-        path = self._path(job)
-        beside = path.with_suffix(f".{os.getpid()}.part")
-        try:
-            self.make()
-            text = json.dumps(document)
-            beside.write_text(f"{_seal(job, text)}\n{text}", encoding="utf-8")
-            os.replace(beside, path)
-        except OSError as error:
-            words = error.strerror or str(error)
-            raise OutputError(
-                f"cannot be written ({words})", where=str(path), hint="free space or choose another --out"
-            ) from error
+        self.make()
+        text = json.dumps(document)
+        write_whole(self._path(job), f"{_seal(job, text)}\n{text}")
 
     def _path(self, job: Job) -> Path:
         return self.folder / f"{job.name}.json"

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import ImpactPostureError
-from impact_posture.robot.robot import Robot
+from impact_posture.impact.contact import point_on
 from impact_posture.simulation.actuator_command import Truth
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient
@@ -24,13 +24,9 @@ def feet_of(setup: Setup) -> tuple[str, ...]:
     scenario, robot = setup.scenario, setup.robot
     if scenario.control.footing is None:
         return ()
-    held = {_joint(robot, support.frame) for support in robot.spec.supports}
+    held = {point_on(robot, support.frame).joint for support in robot.spec.supports}
     hits = None if scenario.contacts is None else scenario.contacts.frame
-    return tuple(s.frame for s in scenario.shapes if s.frame != hits and _joint(robot, s.frame) in held)
-
-
-def _joint(robot: Robot, frame: str) -> int:
-    return int(robot.model.frames[robot.frame_id(frame)].parentJoint)
+    return tuple(s.frame for s in scenario.shapes if s.frame != hits and point_on(robot, s.frame).joint in held)
 
 
 class Recorder:
