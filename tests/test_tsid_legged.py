@@ -113,7 +113,7 @@ def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray, solver: 
     add(np.eye(nj, nv, 6), (posture.kp * away - posture.kd * v)[6:], 0.1)
 
     forces, wrenches, hard = [], [], []
-    for contact, home in zip(formulation.contacts, controller.assembly.contacts._home, strict=True):
+    for contact, (position, rotation) in zip(formulation.contacts, controller.assembly.contacts._home, strict=True):
         index, offset = r.frame_id(contact.point.frame), np.array(contact.point.offset)
         J = frame_jacobian(model, q, index, offset)
         step = 1e-6
@@ -123,9 +123,9 @@ def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray, solver: 
         drift = (ahead - behind) @ v / (2 * step)
         pin.framesForwardKinematics(model, data, q)
         place = data.oMf[index].act(offset)
-        e = np.concatenate([home.position - place, np.zeros(3)])
+        e = np.concatenate([position - place, np.zeros(3)])
         turn = data.oMf[index].rotation
-        e[3:] = turn @ pin.log3(turn.T @ home.rotation)
+        e[3:] = turn @ pin.log3(turn.T @ rotation)
         a = contact.kp * e - contact.kd * J @ v - drift
         if contact.kind == "point":
             add(J[:3], a[:3], contact.weight or 0.0)
