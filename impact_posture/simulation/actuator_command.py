@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from impact_posture.arrays import Array
 from impact_posture.settings import Vector3
 from impact_posture.simulation.contact_forces import ShapeTruth
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

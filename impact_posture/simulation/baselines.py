@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.driver import Driver, RobustDriver
@@ -21,8 +21,6 @@ from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.smooth_step import smooth
 from impact_posture.tsid.state import State
-
-Array = NDArray[np.float64]
 
 
 class StiffPosture(JointPosture):

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from impact_posture.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

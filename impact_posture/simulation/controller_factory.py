@@ -8,15 +8,7 @@ from functools import cached_property
 from importlib import metadata
 from typing import Literal, get_args
 
-from impact_posture.errors import (
-    CompilerError,
-    ControllerNotFound,
-    ImpactPostureError,
-    InputError,
-    ManifestMismatch,
-    OutputError,
-    SpecError,
-)
+from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.baselines import FlowPosture, InvariantDriver, StiffDriver, StiffPosture, WalkerDriver
@@ -75,7 +67,8 @@ class ControllerFactory:
         if kind not in self._gradients:
             try:
                 self._gradients[kind] = self.gradient_of(self.objective(kind)), ()
-            except (CompilerError, OutputError, SpecError, ManifestMismatch) as error:
+            except InputError as error:
+                # A fault of the objective itself is raised again.
                 warning = f"the gradient is interpreted, not compiled, which is slower: {error.line}"
                 self._gradients[kind] = interpreted(self.objective(kind)), (warning,)
         found, warnings = self._gradients[kind]

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.sensor_noise import Reading
@@ -17,8 +17,6 @@ from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.smooth_step import smooth
-
-Array = NDArray[np.float64]
 
 # Time in which references move to a new posture, s.
 MOVE = 1.0

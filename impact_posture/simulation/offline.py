@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
@@ -20,8 +20,6 @@ from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.task_formulations import nominal_posture
 from impact_posture.tsid.controller import Status
-
-Array = NDArray[np.float64]
 
 # Share of the limits that holding a posture may take.
 SHARE = 0.8

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import ImpactPostureError
 from impact_posture.impact.contact import point_on
 from impact_posture.simulation.actuator_command import Truth
@@ -12,8 +12,6 @@ from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient
 from impact_posture.simulation.series import STATUSES, Series
 from impact_posture.tsid.controller import Command
-
-Array = NDArray[np.float64]
 
 # Ticks from one evaluation of the metric to the next.  The metric is only drawn.
 _EVERY = 10

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.robot.actuation import thrust_limits
 from impact_posture.robot.spec import PropulsionSpec
-
-Array = NDArray[np.float64]
 
 
 class Rotors:

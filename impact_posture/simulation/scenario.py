@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError, SpecError
 from impact_posture.progress import tell
 from impact_posture.robot.actuation import allocation
@@ -24,7 +24,6 @@ from impact_posture.simulation.scene import Finite, FiniteVector, Scene, Shape, 
 from impact_posture.simulation.world import World, build_world
 from impact_posture.tables import Checked
 
-Array = NDArray[np.float64]
 SCHEMA = "impact-posture/scenario/1"
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.codegen.export import write_export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import CompilerError, MetricError, OutputError
@@ -25,7 +25,6 @@ from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.scenario import Setup
 from impact_posture.toolchain import find_compiler, no_compiler
 
-Array = NDArray[np.float64]
 Gradient = Callable[[Array], tuple[float, Array]]
 
 

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.scene import Sensors
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

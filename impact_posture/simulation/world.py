@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.errors import InputError, SimulationDiverged
@@ -23,8 +24,6 @@ from impact_posture.simulation.sensor_noise import Reading, SensorNoise
 from impact_posture.simulation.world_builder import BuiltScene, build_scene
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.state import checked_velocity
-
-Array = NDArray[np.float64]
 
 # No robot is so far away or so fast, m, m/s, rad/s, and no torque so large, N·m.
 _RUNAWAY = 1e6

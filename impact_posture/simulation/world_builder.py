@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.mjcf import Mjcf, build_mjcf, import_mujoco
 from impact_posture.dynamics.numeric import Numeric
@@ -19,8 +19,6 @@ from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import actuation_matrix
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.scene import Physics, Scene, Shape, Surface
-
-Array = NDArray[np.float64]
 
 # Families with the same velocities, in the same axes, in Pinocchio and MuJoCo.
 _DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")

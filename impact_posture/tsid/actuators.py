@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.robot.actuation import actuation_matrix, thrust_limits
 from impact_posture.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 class Actuators:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.contacts import ContactStack
@@ -14,8 +14,6 @@ from impact_posture.tsid.rank import LevelRank
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import TaskStack
 from impact_posture.tsid.task_formulation import TaskFormulation
-
-Array = NDArray[np.float64]
 
 # Weight of an acceleration that no task weighs, because the cost always needs a minimum.
 _IDLE = 1e-8

@@ -6,13 +6,11 @@ import math
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import TargetTask
-
-Array = NDArray[np.float64]
 
 
 class _BaseTurn(TargetTask[Array]):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import SupportKind
@@ -16,8 +16,6 @@ from impact_posture.tsid.friction import point_cone, surface_cone, to_world
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.qp import stacked_rows
 from impact_posture.tsid.state import State
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
@@ -20,8 +21,6 @@ from impact_posture.tsid.relaxation import Outcome, Relaxed, missed, solve
 from impact_posture.tsid.state import State, checked_velocity
 from impact_posture.tsid.task import Task
 from impact_posture.tsid.task_formulation import TaskFormulation
-
-Array = NDArray[np.float64]
 
 # Longest time step of ramps, in periods.  Longer pauses between ticks count as this.
 _LONGEST = 10

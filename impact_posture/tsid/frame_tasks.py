@@ -8,14 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.tsid.points import Point, PointState
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Target, TargetTask
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

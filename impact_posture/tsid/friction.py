@@ -5,11 +5,9 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import ContactError
-
-Array = NDArray[np.float64]
 
 
 def point_cone(friction: float) -> Array:

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.tsid.qp import EQUALITY, INEQUALITY
-
-Array = NDArray[np.float64]
 
 # Bounds are scaled below this, because the tolerances of DAQP are absolute.
 _LARGEST = 1e4

@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
@@ -19,7 +20,6 @@ from impact_posture.tsid.ranges import JointRanges
 from impact_posture.tsid.smooth_step import smooth
 from impact_posture.tsid.state import State
 
-Array = NDArray[np.float64]
 Gradient = Callable[[Array], tuple[float, Array]]
 Spring = Literal["keep", "release", "follow"]
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.ranges import JointRanges
 from impact_posture.tsid.state import State
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 # p @ _SHIFT, shape (6, 6), holds -[p]x upper right, which shifts a body's velocity from the origin to p.
 _SHIFT = np.zeros((3, 6, 6))

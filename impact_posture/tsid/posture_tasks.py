@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.smooth_step import smooth
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Task
-
-Array = NDArray[np.float64]
 
 
 class JointPosture(Task):

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from impact_posture.arrays import Array
 
 # Codes of DAQP for the types of constraints.
 INEQUALITY, EQUALITY = 0, 5

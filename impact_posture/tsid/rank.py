@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.tsid.qp import EQUALITY, INEQUALITY, QP
 from impact_posture.tsid.smooth_step import smooth
-
-Array = NDArray[np.float64]
 
 # Singular value of a level's rows, over the length of its longest row, below which a direction is damped.  The
 # shipped robots stay above 0.03 in their postures.

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.hierarchy import Level, lexicographic
 from impact_posture.tsid.qp import EQUALITY, INEQUALITY, QP, Solved, Solver
-
-Array = NDArray[np.float64]
 
 # Miss that counts, relative to the terms of a row, because the hierarchy is solved to about six digits.
 _OFF = 1e-6

@@ -6,14 +6,13 @@ from collections.abc import Iterable
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError, PostureError
 from impact_posture.robot.robot import Robot, unit_parts
 from impact_posture.tsid.points import Point, PointKinematics, PointState
 from impact_posture.tsid.ranges import JointRanges
-
-Array = NDArray[np.float64]
 
 
 class State:

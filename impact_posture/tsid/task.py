@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.qp import stacked_rows
 from impact_posture.tsid.state import State
 
-Array = NDArray[np.float64]
 Target = TypeVar("Target")
 
 # Time step of central differences along the motion, s.  Truncation and rounding stay far below a tick's tolerance.
