@@ -29,10 +29,6 @@ from impact_posture.tsid.state import checked_velocity
 _RUNAWAY = 1e6
 
 
-def _ignore(message: str) -> None:
-    """Ignore a MuJoCo warning, because the state already shows the problem."""
-
-
 @dataclass(frozen=True, eq=False)
 class _Sample:
     """What the sensors see after a step."""
@@ -177,9 +173,9 @@ class World:
         self._check_ready()
         speed, self._torques = self._checked(command)
         self._data.ctrl[self._count :] = self._torques
-        # MuJoCo itself would write a warning to a log file in the working directory.
+        # MuJoCo itself would write a warning to a log file in the working directory.  The state shows the problem.
         before = self._mujoco.get_mju_user_warning()
-        self._mujoco.set_mju_user_warning(_ignore)
+        self._mujoco.set_mju_user_warning(lambda message: None)
         try:
             for _ in range(count):
                 self._advance(speed)

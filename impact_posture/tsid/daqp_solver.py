@@ -10,6 +10,8 @@ from impact_posture.tsid.qp import QP, Solved
 # Exit flag of DAQP for a program without a solution; 1 and 2 (soft constraints are active) are solutions.  -6
 # (dependent equations) does not count, because DAQP also returns it for bounds that were active before.
 _NONE = -1
+# Flag of a program that could not be solved for another reason.
+FAILED = 0
 # Largest violation of a bound, and largest number of iterations for one program.
 _SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000}
 

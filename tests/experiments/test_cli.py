@@ -57,7 +57,7 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
 def test_simulate_without_a_compiler(aerial: Path, tmp_path: Path) -> None:
     """One warning, and the numbers that the compiled gradient gives."""
     asked = ("simulate", aerial, "--controller", "robust", "--format", "png", "--out")
-    bare = {"PATH": str(tmp_path), "CC": ""}
+    bare = {"PATH": str(tmp_path), "CC": "", "IMPACT_POSTURE_CACHE": str(tmp_path / "cache")}
     done = start(*asked, "bare", cwd=tmp_path, env=bare)
     assert done.returncode == 0
     (line,) = done.stderr.splitlines()
