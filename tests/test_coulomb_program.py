@@ -52,6 +52,24 @@ def test_solutions_are_certified(
         assert problem.objective.value(solution.q) <= problem.objective.value(solution.initial) * (1 + 1e-9)
 
 
+@pytest.mark.parametrize(
+    ("robot", "normal", "friction", "before", "after"),
+    (
+        ("tilthex_arm", (-1.0, 0.0, 0.0), 0.3, 1.832476420, 1.821036553),
+        ("panda", (0.0, 0.0, 1.0), 0.2, 4.373473173, 4.366444388),
+        ("solo12", (-1.0, 0.0, 0.0), 0.3, 76.36203324, 64.56751610),
+    ),
+)
+def test_known_results(
+    robot: str, normal: tuple[float, float, float], friction: float, before: float, after: float
+) -> None:
+    """C at the initial posture and at the optimum, as they once came out."""
+    problem = problem_of(robot, normal, friction)
+    solution = solve(problem, starts=3, jobs=1, compile="never")
+    assert problem.objective.value(solution.initial) == pytest.approx(before, rel=1e-8)
+    assert problem.objective.value(solution.q) == pytest.approx(after, rel=1e-6)
+
+
 def test_its_ends_are_the_solutions_of_speed_and_of_sticking() -> None:
     for friction, other in ((0.0, "speed"), (50.0, "sticking")):
         problem = problem_of("tilthex_arm", (-1.0, 0.0, 0.0), friction)
