@@ -265,12 +265,8 @@ class ImpactSettings(RobotSettings):
         ),
     ] = None  # fmt: skip
     friction: Annotated[
-        float,
-        Setting(
-            "Friction coefficient: of the impact's jump with friction, and of the feet for --keep-contacts.",
-            CONTACT, "MU", **_ZERO_OR_MORE,
-        ),
-    ] = FRICTION  # fmt: skip
+        float, Setting("Friction of the impact, and of the feet for --keep-contacts.", CONTACT, **_ZERO_OR_MORE)
+    ] = FRICTION
     metric: Annotated[
         MetricKind,
         Setting("Norm of the velocity jump: euclidean, kinetic or weighted.", METRIC, "KIND"),

@@ -65,6 +65,7 @@ CASES = {
     "tilthex_arm": Case("tilthex_arm", "ee", kind="sticking"),
     "panda": Case("panda", "panda_hand_tcp", metric="weighted"),
     "kinova": Case(KINOVA, "j2s6s200_end_effector", kind="energy"),
+    "solo12-standing": Case("solo12", "base_link", supported=True, kind="coulomb"),
     "hextilt": Case("hextilt", "flying_arm_5__gripper", metric="kinetic", in_frame=True),
 }
 

@@ -42,10 +42,10 @@ def assert_coulomb(B: Vector, n: Vector, friction: float, impulse: Vector, toler
     # Rounding of the velocity after the impact.
     scale = float(np.linalg.norm(B) * np.linalg.norm(impulse)) + 1
     assert abs(n @ after) <= tolerance * scale
-    assert normal > 0 and size <= friction * normal + tolerance * (1 + normal)
+    assert normal > 0 and size <= friction * normal + tolerance * (1 + normal + size)
     if slip > tolerance * scale:
-        assert abs(size - friction * normal) <= tolerance * (1 + normal)
-        assert np.linalg.norm(tangential * slip + after * friction * normal) <= tolerance * scale * (1 + normal)
+        assert abs(size - friction * normal) <= tolerance * (1 + normal + size)
+        assert np.linalg.norm(tangential * slip + after * friction * normal) <= tolerance * scale * (1 + normal + size)
     # The change of energy: impulse times mean velocity of the point.
     assert impulse @ (after - n) / 2 <= tolerance * scale
 

@@ -10,13 +10,16 @@ import pytest
 
 from impact_posture.codegen.export import export
 from impact_posture.codegen.manifest import sample_postures
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.coulomb import coulomb_impact
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.nlp import build_nlp
-from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import run_start, solve
 from impact_posture.posture.starts import feasible_start
+from tests.arms import TIP, Y, arm
 from tests.command import refused, run
 from tests.exported import built
 from tests.helpers import assert_close
@@ -49,6 +52,24 @@ def test_solutions_are_certified(
         assert problem.objective.value(solution.q) <= problem.objective.value(solution.initial) * (1 + 1e-9)
 
 
+@pytest.mark.parametrize(
+    ("robot", "normal", "friction", "before", "after"),
+    (
+        ("tilthex_arm", (-1.0, 0.0, 0.0), 0.3, 1.832476420, 1.821036553),
+        ("panda", (0.0, 0.0, 1.0), 0.2, 4.373473173, 4.366444388),
+        ("solo12", (-1.0, 0.0, 0.0), 0.3, 76.36203324, 64.56751610),
+    ),
+)
+def test_known_results(
+    robot: str, normal: tuple[float, float, float], friction: float, before: float, after: float
+) -> None:
+    """C at the initial posture and at the optimum, as they once came out."""
+    problem = problem_of(robot, normal, friction)
+    solution = solve(problem, starts=3, jobs=1, compile="never")
+    assert problem.objective.value(solution.initial) == pytest.approx(before, rel=1e-8)
+    assert problem.objective.value(solution.q) == pytest.approx(after, rel=1e-6)
+
+
 def test_its_ends_are_the_solutions_of_speed_and_of_sticking() -> None:
     for friction, other in ((0.0, "speed"), (50.0, "sticking")):
         problem = problem_of("tilthex_arm", (-1.0, 0.0, 0.0), friction)
@@ -79,6 +100,16 @@ def test_an_optimum_on_the_verge_of_slipping_is_certified_by_both_sides() -> Non
     sides = problem.objective.subgradients(q, 1e-6 * scale)
     assert len(sides.gradients) == 2
     assert np.abs(sides.gradients[0] - sides.gradients[1]).max() > 1e-3 * scale
+
+
+def test_planar_robots_are_optimized() -> None:
+    """Nothing holds the friction across the plane, in the program as little as in the robot."""
+    found = arm([Y, Y, Y, Y], [0.3, 0.7, -0.5, 0.4], floating=False)
+    for friction in (0.0, 0.05, 0.3, 3.0):
+        contact = ImpactContact(TIP, (0.6, 0.0, 0.8), friction=friction)
+        objective = ImpactObjective(found, contact, kind="coulomb")
+        problem = build_problem(found, objective, found.posture(), Requirements(contact_pose="position"))
+        assert solve(problem, starts=2, jobs=1, compile="never").certificate.holds()
 
 
 def test_exported_code_agrees_and_names_the_gradient_at_the_switch(tmp_path: Path) -> None:

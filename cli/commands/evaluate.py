@@ -133,8 +133,8 @@ def _jumps(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
         ("  energy lost", number(found.energy_loss), "", "", "J"),
     ]
     if (squeezed := found.compression) is not None and squeezed.time is not None:
-        rows.append(("  compressed for", number(1e3 * squeezed.time), "", "ms"))
-        rows.append(("  peak force", number(squeezed.peak_force), "", "N"))
+        rows.append(("  compressed for", number(1e3 * squeezed.time), "", "", "ms"))
+        rows.append(("  peak force", number(squeezed.peak_force), "", "", "N"))
     for name, unit, values in merged_entries(impact.robot, *jumps):
         rows.append((f"  Δν {name}", *(number(value, missing="") for value in values), unit))
     page.gap()

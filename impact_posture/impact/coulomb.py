@@ -38,14 +38,14 @@ class CoulombImpact:
         jump: Velocity jump, shape (nv,).
         impulse: Impulse of the surface on the robot, world, shape (3,).
         slip: Velocity of the contact point after the impact, world, shape (3,); zero if it sticks.
-        reaction: ``K``, shape (3, 3), world, of ``∂w = K ∂B (n − w)``.
+        sigma: ``σ``, 1/kg; zero if it sticks, infinite without friction.
     """
 
     sticks: bool
     jump: Vector
     impulse: Vector
     slip: Vector
-    reaction: Vector
+    sigma: float
 
 
 def coulomb_impact(oracle: ImpactOracle, q: Vector, *, other: bool = False) -> CoulombImpact:
@@ -70,8 +70,7 @@ def coulomb_impact(oracle: ImpactOracle, q: Vector, *, other: bool = False) -> C
     if (excess(0.0) <= 0) != other:
         if found.sticking_impulse is None or found.sticking_jump is None:
             raise no_sticking()
-        inverse = (tangents / values) @ tangents.T
-        return CoulombImpact(True, found.sticking_jump, found.sticking_impulse, np.zeros(3), inverse)
+        return CoulombImpact(True, found.sticking_jump, found.sticking_impulse, np.zeros(3), 0.0)
     w, sigma = np.zeros(3), np.inf
     if friction > NO_FRICTION:
         least = -float(values[0]) * (1 - _RANK) if other and values.size else 0.0
@@ -81,29 +80,26 @@ def coulomb_impact(oracle: ImpactOracle, q: Vector, *, other: bool = False) -> C
         sigma = float(scipy.optimize.brentq(excess, least, most, xtol=1e-300, rtol=1e-15))
         w = tangents @ (g / (values + sigma))
     impulse = (n - w) / float(n @ B @ (n - w))
-    across = np.cross(n, w / max(friction, NO_FRICTION))
-    reaction = np.outer(across, across) / (across @ B @ across + sigma)
-    return CoulombImpact(False, oracle.solve(oracle.J.T @ impulse), impulse, B @ impulse - n, reaction)
+    return CoulombImpact(False, oracle.solve(oracle.J.T @ impulse), impulse, B @ impulse - n, sigma)
 
 
 def coulomb_gradient(oracle: ImpactOracle, q: Vector, impact: CoulombImpact) -> Vector:
-    """Return the tangent gradient of ``‖Δν‖²_W`` at unit approach speed, shape (nv,), of an impact at ``q``.
+    """Return the tangent gradient of ``C = ‖Δν‖²_W`` at unit approach speed, shape (nv,), of an impact at ``q``.
 
-    Adjoint of the impulse ``p``, as for S: ``2 ∂_q[pᵀJb + rᵀJa − bᵀMa]`` with ``Mb = Wa + Jᵀr`` and
-    ``r = −(Cn + K(JM⁻¹Wa − C JM⁻¹Jᵀn))``, where ``C`` is the value and ``n, p, r`` turn with the contact's normal.
+    With the impulse ``p`` and ``∂w = K ∂B (n − w)`` it is ``∂_q pᵀΛ_c p + 2 ∂_q rᵀBp`` for fixed ``p`` and
+    ``r = −(Cn + K(JM⁻¹Wa − C Bn))``, all in the axes of the normal.
     """
-    if impact.sticks:
-        return oracle.gradient_S(q)
-    found = oracle.quantities(q)
-    x = oracle.answer(oracle.J.T @ impact.impulse)
-    weighed = oracle.weigh(x.a)
-    value, n = float(x.a @ weighed), found.normal
-    r = -value * n - impact.reaction @ (oracle.J @ oracle.solve(weighed) - value * found.mobility @ n)
-    y = oracle.answer(weighed + oracle.J.T @ r)
-    turns = oracle.case.in_contact_frame
-    axes = oracle.numeric.placement(oracle.point).rotation if turns else np.eye(3)
-    coupled = oracle.coupling(axes.T @ impact.impulse, y.a, turns) + oracle.coupling(axes.T @ r, x.a, turns)
-    return np.asarray(2 * (coupled - oracle.inertial(y, x)) + oracle.metric_gradient(x.a))
+    if impact.sticks or not np.isfinite(impact.sigma):
+        return oracle.gradient_S(q) if impact.sticks else oracle.gradient_V(q)
+    found, p, weighed = oracle.quantities(q), impact.impulse, oracle.weigh(impact.jump)
+    n, B, value = found.normal, found.mobility, float(impact.jump @ weighed)
+    e = np.cross(n, p)
+    K = np.outer(e, e) / (e @ B @ e + impact.sigma * e @ e)
+    r = -value * n - K @ (oracle.J @ oracle.solve(weighed) - value * B @ n)
+    turned = oracle.numeric.placement(oracle.point).rotation.T if oracle.case.in_contact_frame else np.eye(3)
+    step = float(np.linalg.norm(p) / np.linalg.norm(r))
+    above, below = (oracle.gradient_G(q, turned @ (p + sign * step * r)) for sign in (1, -1))
+    return np.asarray(oracle.gradient_H(q, turned @ p) + (above - below) / (2 * step))
 
 
 def coulomb_direction(B: ca.SX, n: ca.SX, friction: float | ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -1,12 +1,8 @@
 """Velocity jumps with Coulomb friction, at one contact and at several contacts at once.
 
-Several contacts meet their surfaces in one plastic impact.  With ``B = JM⁻¹Jᵀ`` of all contacts, the impulses ``p_i``
-and the velocities ``u = u⁻ + Bp`` of the contact points after it satisfy at every contact
-
-    ``0 ≤ p_n ⊥ u_n ≥ 0``,  ``‖p_t‖ ≤ μ p_n``,  ``u_t = −κ p_t`` with ``κ ≥ 0`` and ``κ(μ p_n − ‖p_t‖) = 0``.
-
-That is ``p_i = P(p_i − ρ(u_i + μ‖u_t‖n_i))`` with ``P`` the projection onto the friction cone.
-Block Gauss–Seidel iterates it.  For one contact the solution is that of :mod:`impact_posture.impact.coulomb`.
+Several contacts obey ``0 ≤ p_n ⊥ u_n ≥ 0``, ``‖p_t‖ ≤ μ p_n``, ``u_t = −κ p_t``, ``0 ≤ κ ⊥ μ p_n − ‖p_t‖ ≥ 0`` each, with
+impulses ``p_i`` and the velocities ``u = u⁻ + Bp`` after the impact.  Block Gauss–Seidel iterates their fixed point
+``p_i = P(p_i − ρ(u_i + μ‖u_t‖n_i))``, with ``P`` the projection onto the friction cone.
 """
 
 from __future__ import annotations

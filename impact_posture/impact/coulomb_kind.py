@@ -13,7 +13,7 @@ from impact_posture.errors import MetricError
 from impact_posture.impact.coulomb import NO_FRICTION, coulomb_direction, coulomb_gradient, coulomb_impact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_kind import ImpactKind
-from impact_posture.impact.kernel import ImpactKernel, frozen_directions
+from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
 
@@ -79,10 +79,8 @@ class CoulombKind(ImpactKind):
         jump = unknown_jump(case, tree, impact_at(case, size * (n - case.contact.friction * d)), label)
         axes = in_world(case, tree, ca.SX.eye(3))
         moved = axes.T @ jump.contact_velocity
-        # Friction is not determined where the contact point can never move, and zero here.
-        idle = axes.T @ ca.SX(frozen_directions(case.robot, case.point)) @ axes @ d
         along, out = ca.dot(n, moved), ca.dot(n, d)
-        slides = moved - along * n - slip * (d - n * out) - n * out - idle
+        slides = moved - along * n - slip * (d - n * out) - n * out
         equations = ca.vertcat(along - 1, slides, inside + ca.dot(d, d) - 1)
         return jump.with_impulse(ca.vertcat(size, d, slip, inside), equations)
 
@@ -103,7 +101,8 @@ class CoulombKind(ImpactKind):
         size, slip = float(n @ p), float(np.linalg.norm(found.slip))
         d = (n - p / size) / friction if found.sticks and friction > NO_FRICTION else found.slip / max(slip, 1e-300)
         axes = oracle.numeric.placement(oracle.point).rotation if oracle.case.in_contact_frame else np.eye(3)
-        values = [oracle.with_support_impulses(found.jump), [size], axes.T @ d, [slip, max(1 - d @ d, 0.0)]]
+        ends = np.array([slip, max(1 - float(d @ d), 0.0)])
+        values = (oracle.with_support_impulses(found.jump), np.array([size]), axes.T @ d, ends)
         guess = Guess.unbounded(np.concatenate(values))
         guess.lower[-2:] = 0.0
         return guess

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -13,7 +14,9 @@ from impact_posture.errors import ImpactPostureError, InputError
 from tests.benchmarks.core import Request, Vector, machine, say, table
 from tests.benchmarks.impact.study import (
     FRICTIONS,
+    LIGHTEST,
     OBJECTIVES,
+    PICKED_FOR,
     SLID,
     STUDIED,
     VARIATIONS,
@@ -144,11 +147,15 @@ def _convex_row(row: Row) -> list[str]:
 
 
 def _variations(dropped: Sequence[Dropped], postures: int) -> Iterator[str]:
-    """Speed, restitution, stiffness: all robots in one row, without friction and sticking."""
+    """Speed, restitution, stiffness, without friction and sticking; the lightest robot has its own rows."""
     few = [replace(robot, scenes=robot.scenes[:_FEW]) for robot in dropped]
     body, gone = [], []
-    for words, surface in (("as above", Surface()), *VARIATIONS):
-        smooth, sticky = ([robot.on(replace(surface, friction=mu)) for robot in few] for mu in (0.0, np.inf))
+    parts = ("", [r for r in few if r.robot != LIGHTEST]), (f", {LIGHTEST}", [r for r in few if r.robot == LIGHTEST])
+    for (variation, surface), (own, part) in product((("as above", Surface()), *VARIATIONS), parts):
+        if not part:
+            continue
+        words = variation + own
+        smooth, sticky = ([robot.on(replace(surface, friction=mu)) for robot in part] for mu in (0.0, np.inf))
         both = [*smooth, *sticky]
         lasts, rebound = (np.concatenate([row.measured(k) for row in both]) for k in ("duration", "restitution"))
         cells = [words, f"{np.median(lasts * 1e3):.2g}", _range(rebound)]
@@ -160,6 +167,7 @@ def _variations(dropped: Sequence[Dropped], postures: int) -> Iterator[str]:
         gone += [f"Left out, at {words}:", "", *_left_out(left), ""] if left else []
     yield from ("### Speed, rebound, stiffness", "")
     yield f"The first {min(_FEW, postures)} postures of each robot; the rank is the lowest of the robots'."
+    yield f"{LIGHTEST}, whose arm is light, has rows of its own."
     yield from ("", *table([*_VARIED.split("|"), "left out"], body), "", *gone)
 
 
@@ -172,7 +180,7 @@ def _picks(robots: Sequence[str]) -> Iterator[str]:
     head += [
         f"{what}, {_friction(Surface(mu))}" for what in ("impulse in N·s", "loss in J") for mu in (smooth, sticks)
     ]
-    yield from ("### What each objective picks", "")
+    yield from ("### What each objective picks", "", f"`coulomb` is minimized for μ = {PICKED_FOR:g}.", "")
     picked = [choice for some in found.values() if isinstance(some, list) for choice in some]
     yield from table(head, [_choice(choice) for choice in picked])
     yield ""
