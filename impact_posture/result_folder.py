@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,8 +12,6 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from impact_posture.codegen.export import Export, export
-from impact_posture.codegen.naming import products
 from impact_posture.errors import CompilerError, SpecError
 from impact_posture.escape import file_name
 from impact_posture.output_folder import whole_folder, write_record
@@ -26,8 +24,9 @@ from impact_posture.processes import fork_map
 from impact_posture.robot.postures import write_posture
 from impact_posture.settings import Against
 
-# Matplotlib is imported where something is drawn, because the import takes longer than a small problem.
+# Matplotlib and the C export are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
+    from impact_posture.codegen.export import Export
     from impact_posture.plot import ResultView, TradeOffData
 
 FORMATS = ("png",)
@@ -67,6 +66,7 @@ def write_result(
     formats: Sequence[str] = FORMATS,
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
+    finish: Finish | None = None,
 ) -> Written:
     """Write the result folder, whole or not at all.
 
@@ -81,6 +81,7 @@ def write_result(
         formats: Formats of the figures.
         jobs: Processes that draw and compile side by side.
         progress: Called with ``(done, all)`` after each figure and after the C code.
+        finish: :func:`finish_result` of this problem, in another process; in this one by default.
 
     Raises:
         OutputError: The folder exists without ``force``, or cannot be written.
@@ -93,28 +94,71 @@ def write_result(
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff))  # type: ignore[arg-type]
         _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
         (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
-        # The C code comes first, because it takes longest.
-        tasks: list[Callable[[], Any]] = [partial(_export, prepared, solution, folder / "c")] if codegen else []
-        tasks += _drawings(_view(prepared, solution.initial, solution.q, path, document), folder, formats)
-        with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
-            for done, (index, result) in enumerate(results, start=1):
-                if codegen and index == 0:
-                    made, failure = result
-                if progress:
-                    progress(done, len(tasks))
+        order = FinishRequest(folder, solution.initial, solution.q, path, document, codegen, formats, jobs)
+        for done, count, exported in (finish or partial(finish_result, prepared))(order):
+            if exported is not None:
+                made, failure = exported
+            if progress:
+                progress(done, count)
     return Written(out, made, failure)
 
 
-def _export(prepared: Prepared, solution: PostureSolution, folder: Path) -> tuple[Export, str]:
+@dataclass(frozen=True)
+class FinishRequest:
+    """What figures and C code need beside the problem; it can be sent to another process.
+
+    Attributes:
+        folder: The result folder.
+        initial: The feasible start, shape (nq,).
+        optimal: The best certified posture, shape (nq,).
+        path: The path between them.
+        document: The content of ``result.json``.
+        codegen: Export, build and check the C code, too.
+        formats: Formats of the figures.
+        jobs: Processes that draw and compile side by side.
+    """
+
+    folder: Path
+    initial: np.ndarray
+    optimal: np.ndarray
+    path: NullSpacePath
+    document: dict[str, Any]
+    codegen: bool
+    formats: Sequence[str]
+    jobs: int
+
+
+# The number of finished files, the number of all files, and the C export when it is what was finished.
+Finished = tuple[int, int, "tuple[Export, str] | None"]
+Finish = Callable[[FinishRequest], Iterator[Finished]]
+
+
+def finish_result(prepared: Prepared, order: FinishRequest) -> Iterator[Finished]:
+    """Draw the figures of a result and export its C code; yield after each."""
+    # The C code comes first, because it takes longest.
+    tasks: list[Callable[[], Any]] = []
+    if order.codegen:
+        tasks.append(partial(_export, prepared, order.optimal, order.folder / "c"))
+    view = _view(prepared, order.initial, order.optimal, order.path, order.document)
+    tasks += _drawings(view, order.folder, order.formats)
+    with fork_map(lambda index: tasks[index](), len(tasks), order.jobs) as results:
+        for done, (index, result) in enumerate(results, start=1):
+            yield done, len(tasks), result if order.codegen and index == 0 else None
+
+
+def _export(prepared: Prepared, optimal: np.ndarray, folder: Path) -> tuple[Export, str]:
     """Write the C export; return it and the reason if it could not be built."""
+    from impact_posture.codegen.export import export
+    from impact_posture.codegen.naming import products
+
     folder.mkdir()
     failure = ""
     try:
-        made = export(prepared.impact.objective, folder, posture=solution.q)
+        made = export(prepared.impact.objective, folder, posture=optimal)
     except CompilerError as error:
         # The posture is kept although the compiler failed. The command line reports the error.
         failure = error.line
-        made = export(prepared.impact.objective, folder, posture=solution.q, force=True, check=False)
+        made = export(prepared.impact.objective, folder, posture=optimal, force=True, check=False)
     # A record of its own lets the export be replaced alone, with the products of its Makefile.
     write_record(folder, "export", products(made.prefix))
     return made, failure
