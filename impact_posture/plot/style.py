@@ -216,7 +216,7 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
             path.parent.mkdir(parents=True, exist_ok=True)
             with scratch_folder(path.parent) as beside, style():
                 if extension == "png":
-                    # It is drawn already, and `savefig` would draw it twice again.  A higher level costs time for 3 %.
+                    # It is drawn already, and `savefig` would draw it twice.  A higher level takes long for 3 %.
                     look = {"format": "png", "dpi": figure.dpi, "pil_kwargs": {"compress_level": 3}}
                     imsave(beside / path.name, canvas.buffer_rgba(), **look)
                 else:
