@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -15,9 +14,6 @@ from impact_posture.processes import fork_server
 if TYPE_CHECKING:
     from impact_posture.result_folder import Finish
     from impact_posture.settings import ProblemSettings
-
-# The other process yields to the solver where they compete.
-_NICE = 5
 
 
 @contextmanager
@@ -38,7 +34,6 @@ def early_writer(settings: ProblemSettings, jobs: int) -> Iterator[Finish | None
 
 
 def _load(settings: ProblemSettings) -> Finish:
-    os.nice(_NICE)
     import impact_posture.codegen.export
     import impact_posture.plot  # noqa: F401 (the import is what takes long)
     from impact_posture.posture.problem_settings import prepare
