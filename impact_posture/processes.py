@@ -14,7 +14,8 @@ from typing import Any, NoReturn, TypeVar
 
 from impact_posture.errors import WorkerDied
 
-_Request, _Result = TypeVar("_Request"), TypeVar("_Result")
+_Request = TypeVar("_Request")
+_Result = TypeVar("_Result")
 
 # Signals by which a user or a system ends a process.  A closed terminal sends SIGHUP.
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from impact_posture.plot import ResultView, TradeOffData
 
 FORMATS = ("png",)
+
+FinishRequest = tuple[Path, np.ndarray, np.ndarray, NullSpacePath, dict[str, Any], bool, Sequence[str], int]
+Finished = tuple[int, int, "tuple[Export, str] | None"]
+Finish = Callable[[FinishRequest], Iterator[Finished]]
 # Exceptions from reading a changed or incomplete result.
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, EOFError, BadZipFile, RecursionError)
 
@@ -94,8 +98,8 @@ def write_result(
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff))  # type: ignore[arg-type]
         _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
         (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
-        order = FinishRequest(folder, solution.initial, solution.q, path, document, codegen, formats, jobs)
-        for done, count, exported in (finish or partial(finish_result, prepared))(order):
+        request = (folder, solution.initial, solution.q, path, document, codegen, formats, jobs)
+        for done, count, exported in (finish or partial(finish_result, prepared))(request):
             if exported is not None:
                 made, failure = exported
             if progress:
@@ -103,47 +107,24 @@ def write_result(
     return Written(out, made, failure)
 
 
-@dataclass(frozen=True)
-class FinishRequest:
-    """What figures and C code need beside the problem; it can be sent to another process.
+def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finished]:
+    """Draw the figures of a result and export its C code; yield after each.
 
-    Attributes:
-        folder: The result folder.
-        initial: The feasible start, shape (nq,).
-        optimal: The best certified posture, shape (nq,).
-        path: The path between them.
-        document: The content of ``result.json``.
-        codegen: Export, build and check the C code, too.
-        formats: Formats of the figures.
-        jobs: Processes that draw and compile side by side.
+    Args:
+        prepared: The problem.
+        request: The folder, the postures before and after, the path between them, the content of ``result.json``,
+            whether to export, the formats of the figures, and the number of processes.  It can be sent to a process.
+
+    Yields:
+        The number of finished files, the number of all files, and what :func:`_export` returns if it has ended.
     """
-
-    folder: Path
-    initial: np.ndarray
-    optimal: np.ndarray
-    path: NullSpacePath
-    document: dict[str, Any]
-    codegen: bool
-    formats: Sequence[str]
-    jobs: int
-
-
-# The number of finished files, the number of all files, and the C export when it is what was finished.
-Finished = tuple[int, int, "tuple[Export, str] | None"]
-Finish = Callable[[FinishRequest], Iterator[Finished]]
-
-
-def finish_result(prepared: Prepared, order: FinishRequest) -> Iterator[Finished]:
-    """Draw the figures of a result and export its C code; yield after each."""
+    folder, initial, optimal, path, document, codegen, formats, jobs = request
     # The C code comes first, because it takes longest.
-    tasks: list[Callable[[], Any]] = []
-    if order.codegen:
-        tasks.append(partial(_export, prepared, order.optimal, order.folder / "c"))
-    view = _view(prepared, order.initial, order.optimal, order.path, order.document)
-    tasks += _drawings(view, order.folder, order.formats)
-    with fork_map(lambda index: tasks[index](), len(tasks), order.jobs) as results:
+    tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
+    tasks += _drawings(_view(prepared, initial, optimal, path, document), folder, formats)
+    with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
         for done, (index, result) in enumerate(results, start=1):
-            yield done, len(tasks), result if order.codegen and index == 0 else None
+            yield done, len(tasks), result if codegen and index == 0 else None
 
 
 def _export(prepared: Prepared, optimal: np.ndarray, folder: Path) -> tuple[Export, str]:
@@ -184,7 +165,7 @@ def _view(
     path: NullSpacePath,
     document: dict[str, Any],
 ) -> ResultView:
-    from impact_posture.plot import PathData, ResultView
+    from impact_posture.plot import ResultView
 
     impact = prepared.impact
     return ResultView(
@@ -194,7 +175,7 @@ def _view(
         q_optimal=optimal,
         speed=impact.speed,
         restitution=impact.restitution,
-        path=PathData(s=path.s, H=path.H, G=path.G, V=path.V, S=path.S),
+        path=path,
         tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
     )
 

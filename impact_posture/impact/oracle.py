@@ -309,7 +309,7 @@ class _HeldPoint:
             right[: self.nv] = tau * self.mobile
         if velocity is not None:
             right[size:] = self.axes.T @ velocity
-        found = np.linalg.solve(self.system, right)
+        found = np.asarray(np.linalg.solve(self.system, right), dtype=np.float64)
         return Answer(found[: self.nv], found[self.nv : size]), np.asarray(self.axes @ found[size:])
 
 

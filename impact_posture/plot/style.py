@@ -171,9 +171,10 @@ def _measure_once(axes: Any) -> None:
 
     The space around a flat panel depends on its ticks, which stay as they are after the first round.
     """
-    measure, around = axes.get_tightbbox, []
+    measure = axes.get_tightbbox
+    around: list[Any] = []
 
-    def get_tightbbox(renderer: Any = None, **more: Any) -> Bbox:
+    def get_tightbbox(renderer: Any = None, **more: Any) -> Any:
         if axes.name != "3d" and len(around) == 2:
             axes.apply_aspect()
             return Bbox.from_extents(*(axes.bbox.extents + around[-1]))
@@ -217,8 +218,8 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
             with scratch_folder(path.parent) as beside, style():
                 if extension == "png":
                     # It is drawn already, and `savefig` would draw it twice.  A higher level takes long for 3 %.
-                    look = {"format": "png", "dpi": figure.dpi, "pil_kwargs": {"compress_level": 3}}
-                    imsave(beside / path.name, canvas.buffer_rgba(), **look)
+                    quick = {"compress_level": 3}
+                    imsave(beside / path.name, canvas.buffer_rgba(), format="png", dpi=figure.dpi, pil_kwargs=quick)
                 else:
                     # Without a date, so that the same result gives the same file.
                     metadata = {"Date" if extension == "svg" else "CreationDate": None}
