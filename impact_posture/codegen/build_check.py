@@ -112,7 +112,7 @@ def _cached_library(export_dir: Path, prefix: str) -> Path | None:
     A humanoid takes seconds to compile, and the optimal posture is the only difference between many exports.
     """
     source = (export_dir / f"{prefix}.c").read_text(encoding="utf-8")
-    content = [re.sub(rf"^const \w+ {prefix}_posture.*?;$", "", source, flags=re.DOTALL | re.MULTILINE)]
+    content = [re.sub(rf"^const \w+ {prefix}_(posture|manifest)\[.*?;$", "", source, flags=re.DOTALL | re.MULTILINE)]
     content += [platform.machine(), *(find_compiler() or ()), *words_of("CFLAGS")]
     try:
         library = cache_folder("exports") / f"{source_key(content)}.so"
