@@ -20,8 +20,14 @@ class PictureFormat(StrEnum):
     pdf = "pdf"
 
 
-def _option(*names: str, panel: str, help: str, **more: Any) -> Any:
+def option(*names: str, panel: str, help: str, **more: Any) -> Any:
+    """Return an option of a panel of the help."""
     return typer.Option(*names, help=help, rich_help_panel=panel, **more)
+
+
+def out_option(help: str, default: str = "") -> Any:
+    """Return the option of the folder to write."""
+    return option("--out", metavar="DIR", panel=OUTPUT, show_default=default or True, help=help)
 
 
 RobotName = Annotated[
@@ -38,40 +44,32 @@ RobotOrResult = Annotated[
 
 FrameList = Annotated[
     list[str] | None,
-    _option(
+    option(
         "--frame", metavar="F", panel=CONTACT, show_default="the robot's",
         help="Contact frame; repeatable: several frames in one library.",
     ),
 ]  # fmt: skip
-Out = Annotated[
-    str | None,
-    _option("--out", metavar="DIR", panel=OUTPUT, show_default="./ROBOT-FRAME", help="Result folder."),
-]
-Force = Annotated[bool, _option("--force", panel=OUTPUT, help="Replace an existing result folder.")]
+Out = Annotated[str | None, out_option("Result folder.", "./ROBOT-FRAME")]
+Force = Annotated[bool, option("--force", panel=OUTPUT, help="Replace an existing result folder.")]
 Prefix = Annotated[
     str | None,
-    _option(
-        "--prefix", metavar="NAME", panel=OUTPUT, show_default="ROBOT_FRAME", help="What the C names begin with."
-    ),
+    option("--prefix", metavar="NAME", panel=OUTPUT, show_default="ROBOT_FRAME", help="What the C names begin with."),
 ]
-ExportOut = Annotated[
-    str | None,
-    _option("--out", metavar="DIR", panel=OUTPUT, show_default="./PREFIX-c", help="Folder of the C code."),
-]
-Float = Annotated[bool, _option("--float", panel=OUTPUT, help="Compute in float instead of double.")]
+ExportOut = Annotated[str | None, out_option("Folder of the C code.", "./PREFIX-c")]
+Float = Annotated[bool, option("--float", panel=OUTPUT, help="Compute in float instead of double.")]
 Portable = Annotated[
     bool,
-    _option("--portable", panel=OUTPUT, help="Plain C99 without vectors, for compilers other than GCC and Clang."),
+    option("--portable", panel=OUTPUT, help="Plain C99 without vectors, for compilers other than GCC and Clang."),
 ]
 CompileLibrary = Annotated[
-    bool, _option("--compile", panel=OUTPUT, help="Build the shared library and compare it with other libraries.")
+    bool, option("--compile", panel=OUTPUT, help="Build the shared library and compare it with other libraries.")
 ]
-NoCodegen = Annotated[bool, _option("--no-codegen", panel=OUTPUT, help="Leave the C export out.")]
-Json = Annotated[bool, _option("--json", panel=OUTPUT, help="One JSON document on standard output.")]
-Quiet = Annotated[bool, _option("--quiet", "-q", panel=OUTPUT, help="The result alone: no warnings, no progress.")]
-Jobs = Annotated[int, _option("--jobs", panel=OUTPUT, min=1, help="Processes that search.")]
-Compile = Annotated[CompileMode, _option("--compile", panel=OUTPUT, help="Whether the program becomes machine code.")]
+NoCodegen = Annotated[bool, option("--no-codegen", panel=OUTPUT, help="Leave the C export out.")]
+Json = Annotated[bool, option("--json", panel=OUTPUT, help="One JSON document on standard output.")]
+Quiet = Annotated[bool, option("--quiet", "-q", panel=OUTPUT, help="The result alone: no warnings, no progress.")]
+Jobs = Annotated[int, option("--jobs", panel=OUTPUT, min=1, help="Processes that search.")]
+Compile = Annotated[CompileMode, option("--compile", panel=OUTPUT, help="Whether the program becomes machine code.")]
 Formats = Annotated[
     list[PictureFormat] | None,
-    _option("--format", panel=OUTPUT, show_default="png", help="Of the pictures: png, svg or pdf; repeatable."),
+    option("--format", panel=OUTPUT, show_default="png", help="Of the pictures: png, svg or pdf; repeatable."),
 ]

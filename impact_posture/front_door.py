@@ -9,12 +9,11 @@ from collections.abc import Sequence
 from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.codegen.export import Export, write_export
 from impact_posture.errors import InputError
 from impact_posture.impact import objective as core
 from impact_posture.impact.contact import ImpactContact, Support
@@ -33,7 +32,7 @@ from impact_posture.posture.result import result_document
 from impact_posture.posture.robustness import Robustness, solve_robustly
 from impact_posture.posture.solve import PostureSolution, Progress
 from impact_posture.posture.tradeoff import TradeOff
-from impact_posture.result_folder import FORMATS, Written, result_view, write_result
+from impact_posture.result_folder import FORMATS, Finish, Written, result_view, write_result
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.model_variant import ModelVariant, Payload, build_model_variants
 from impact_posture.robot.postures import read_posture
@@ -47,6 +46,10 @@ from impact_posture.settings import (
     RobotSettings,
 )
 from impact_posture.tables import validate
+
+# The C export and the pictures are imported where they are used, because that takes longer than a small problem.
+if TYPE_CHECKING:
+    from impact_posture.codegen.export import Export
 
 Vector = NDArray[np.float64]
 
@@ -126,6 +129,8 @@ class ImpactObjective(core.ImpactObjective):
             build: Whether to build and check the library, if a C compiler is installed.
             options: Options ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
         """
+        from impact_posture.codegen.export import write_export
+
         return write_export([self], Path(out), build=build, **options)
 
 
@@ -301,6 +306,7 @@ class PostureResult:
         formats: Sequence[str] = FORMATS,
         jobs: int = 2,
         progress: Progress | None = None,
+        finish: Finish | None = None,
     ) -> Written:
         """Write the result folder: result.json, problem.toml, posture.json, pictures and C code; whole or not at all.
 
@@ -311,6 +317,7 @@ class PostureResult:
             formats: Formats of the pictures: ``png``, ``svg``, ``pdf``.
             jobs: Processes that draw and compile side by side.
             progress: Called after each figure and after the C code with the numbers done and in all.
+            finish: What draws and compiles; :func:`~impact_posture.early_writer.early_writer` by the command line.
 
         Returns:
             The folder, the export in it, and the reason if its C code could not be built.
@@ -320,7 +327,7 @@ class PostureResult:
         """
         return write_result(
             self._prepared, self.solution, self.document, Path(out), tradeoff=self.tradeoff, force=force,
-            codegen=codegen, formats=formats, jobs=jobs, progress=progress,
+            codegen=codegen, formats=formats, jobs=jobs, progress=progress, finish=finish,
         )  # fmt: skip
 
     def plot(
@@ -333,6 +340,8 @@ class PostureResult:
 
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
         """Write the C code as :meth:`ImpactObjective.export` does, with the optimal posture as a constant."""
+        from impact_posture.codegen.export import write_export
+
         objective = self.problem.problem.impact
         return write_export([objective], Path(out), posture=self.q, build=build, **options)
 

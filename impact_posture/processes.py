@@ -7,13 +7,14 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from typing import Any, NoReturn, TypeVar
 
 from impact_posture.errors import WorkerDied
 
+_Request = TypeVar("_Request")
 _Result = TypeVar("_Result")
 
 # Signals by which a user or a system ends a process.  A closed terminal sends SIGHUP.
@@ -140,44 +141,74 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
     Raises:
         OSError: The system cannot fork.
     """
-    reader, writer = multiprocessing.Pipe(duplex=False)
+
+    def begin() -> Callable[[None], Iterable[_Result]]:
+        result = function()
+        return lambda _: [result]
+
+    with fork_server(begin) as ask:
+        yield lambda: next(ask(None))
+
+
+@contextmanager
+def fork_server(
+    begin: Callable[[], Callable[[_Request], Iterable[_Result]]],
+) -> Iterator[Callable[[_Request], Iterator[_Result]]]:
+    """Start ``begin()`` in a copy of this process, and yield a function that sends one request to what it returns.
+
+    So the copy can do what needs no request, such as imports, while this process finds out what to request.  The
+    function yields the results as they come.  Exceptions of the copy are raised there.  The copy does not outlive
+    the block, and not the iteration.
+
+    Raises:
+        OSError: The system cannot fork.
+    """
+    ours, theirs = multiprocessing.Pipe()
     with signals_held():
         parent, child = os.getpid(), os.fork()
         if child == 0:
+            ours.close()
             _depend(parent)
-            _answer(function, writer)
-    writer.close()
-
-    def collect() -> _Result:
-        try:
-            good, answer = reader.recv()
-        except EOFError:
-            raise OSError("a process that was forked has died") from None
-        if not good:
-            raise answer
-        result: _Result = answer
-        return result
+            _serve(begin, theirs)
+    theirs.close()
+    running = [child]
 
     def kill() -> None:
         with suppress(ProcessLookupError, ChildProcessError):
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
+            for pid in running:
+                os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)
+        running.clear()
+
+    def ask(request: _Request) -> Iterator[_Result]:
+        # What the copy writes may lie in a folder that is removed on a signal.  So the copy must end before that.
+        with undone(kill):
+            try:
+                ours.send(request)
+                while (message := ours.recv()) is not None:
+                    good, result = message
+                    if not good:
+                        raise result
+                    yield result
+            except (EOFError, BrokenPipeError, ConnectionResetError):
+                raise OSError("a process that was forked has died") from None
 
     with undone(kill):
         try:
-            yield collect
+            yield ask
         finally:
-            reader.close()
+            ours.close()
 
 
-def _answer(function: Callable[[], Any], writer: Any) -> NoReturn:
-    """Run in the copy: send the result, and end without the clean-up of the original."""
+def _serve(begin: Callable[[], Callable[[Any], Iterable[Any]]], channel: Any) -> NoReturn:
+    """Run in the copy: send the results, and end without the clean-up of the original."""
     try:
         try:
-            answer = (True, function())
+            for result in begin()(channel.recv()):
+                channel.send((True, result))
+            channel.send(None)
         except BaseException as error:
-            answer = (False, error)
-        writer.send(answer)
+            channel.send((False, error))
     finally:
         os._exit(0)
 

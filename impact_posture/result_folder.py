@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,8 +12,6 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from impact_posture.codegen.export import Export, export
-from impact_posture.codegen.naming import products
 from impact_posture.errors import CompilerError, SpecError
 from impact_posture.escape import file_name
 from impact_posture.output_folder import whole_folder, write_record
@@ -26,11 +24,16 @@ from impact_posture.processes import fork_map
 from impact_posture.robot.postures import write_posture
 from impact_posture.settings import Against
 
-# Matplotlib is imported where something is drawn, because the import takes longer than a small problem.
+# Matplotlib and the C export are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
+    from impact_posture.codegen.export import Export
     from impact_posture.plot import ResultView, TradeOffData
 
 FORMATS = ("png",)
+
+FinishRequest = tuple[Path, np.ndarray, np.ndarray, NullSpacePath, dict[str, Any], bool, Sequence[str], int]
+Finished = tuple[int, int, "tuple[Export, str] | None"]
+Finish = Callable[[FinishRequest], Iterator[Finished]]
 # Exceptions from reading a changed or incomplete result.
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, EOFError, BadZipFile, RecursionError)
 
@@ -67,6 +70,7 @@ def write_result(
     formats: Sequence[str] = FORMATS,
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
+    finish: Finish | None = None,
 ) -> Written:
     """Write the result folder, whole or not at all.
 
@@ -81,6 +85,7 @@ def write_result(
         formats: Formats of the figures.
         jobs: Processes that draw and compile side by side.
         progress: Called with ``(done, all)`` after each figure and after the C code.
+        finish: :func:`finish_result` of this problem, in another process; in this one by default.
 
     Raises:
         OutputError: The folder exists without ``force``, or cannot be written.
@@ -93,28 +98,48 @@ def write_result(
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff))  # type: ignore[arg-type]
         _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
         (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
-        # The C code comes first, because it takes longest.
-        tasks: list[Callable[[], Any]] = [partial(_export, prepared, solution, folder / "c")] if codegen else []
-        tasks += _drawings(_view(prepared, solution.initial, solution.q, path, document), folder, formats)
-        with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
-            for done, (index, result) in enumerate(results, start=1):
-                if codegen and index == 0:
-                    made, failure = result
-                if progress:
-                    progress(done, len(tasks))
+        request = (folder, solution.initial, solution.q, path, document, codegen, formats, jobs)
+        for done, count, exported in (finish or partial(finish_result, prepared))(request):
+            if exported is not None:
+                made, failure = exported
+            if progress:
+                progress(done, count)
     return Written(out, made, failure)
 
 
-def _export(prepared: Prepared, solution: PostureSolution, folder: Path) -> tuple[Export, str]:
+def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finished]:
+    """Draw the figures of a result and export its C code; yield after each.
+
+    Args:
+        prepared: The problem.
+        request: The folder, the postures before and after, the path between them, the content of ``result.json``,
+            whether to export, the formats of the figures, and the number of processes.  It can be sent to a process.
+
+    Yields:
+        The number of finished files, the number of all files, and what :func:`_export` returns if it has ended.
+    """
+    folder, initial, optimal, path, document, codegen, formats, jobs = request
+    # The C code comes first, because it takes longest.
+    tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
+    tasks += _drawings(_view(prepared, initial, optimal, path, document), folder, formats)
+    with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
+        for done, (index, result) in enumerate(results, start=1):
+            yield done, len(tasks), result if codegen and index == 0 else None
+
+
+def _export(prepared: Prepared, optimal: np.ndarray, folder: Path) -> tuple[Export, str]:
     """Write the C export; return it and the reason if it could not be built."""
+    from impact_posture.codegen.export import export
+    from impact_posture.codegen.naming import products
+
     folder.mkdir()
     failure = ""
     try:
-        made = export(prepared.impact.objective, folder, posture=solution.q)
+        made = export(prepared.impact.objective, folder, posture=optimal)
     except CompilerError as error:
         # The posture is kept although the compiler failed. The command line reports the error.
         failure = error.line
-        made = export(prepared.impact.objective, folder, posture=solution.q, force=True, check=False)
+        made = export(prepared.impact.objective, folder, posture=optimal, force=True, check=False)
     # A record of its own lets the export be replaced alone, with the products of its Makefile.
     write_record(folder, "export", products(made.prefix))
     return made, failure
@@ -140,7 +165,7 @@ def _view(
     path: NullSpacePath,
     document: dict[str, Any],
 ) -> ResultView:
-    from impact_posture.plot import PathData, ResultView
+    from impact_posture.plot import ResultView
 
     impact = prepared.impact
     return ResultView(
@@ -150,7 +175,7 @@ def _view(
         q_optimal=optimal,
         speed=impact.speed,
         restitution=impact.restitution,
-        path=PathData(s=path.s, H=path.H, G=path.G, V=path.V, S=path.S),
+        path=path,
         tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
     )
 

@@ -390,3 +390,22 @@ def test_command_refuses(tmp_path: Path, arguments: tuple[str, ...], code: int, 
     done = call(tmp_path, *arguments)
     assert done.returncode == code and said in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_one_library_checks_a_source_with_any_posture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    need_compiler()
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
+    objective = ImpactObjective(load_robot("panda"), ImpactContact("panda_link8", (0, 0, 1)))
+    made = []
+    for number, posture in enumerate(sample_postures(objective.robot, 2, 0)):
+        (folder := tmp_path / str(number)).mkdir()
+        made.append(export(objective, folder, posture=posture))
+    assert made[0].agreement == made[1].agreement and made[0].manifest != made[1].manifest
+    (library,) = (tmp_path / "cache" / "exports").glob("*.so")
+    # A damaged library is built again, and where nothing can be kept one is built beside.
+    library.unlink()
+    library.write_bytes(b"")
+    assert export(objective, folder, posture=posture, force=True).agreement == made[0].agreement
+    assert library.stat().st_size > 1000
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", "/proc/nothing")
+    assert export(objective, folder, posture=posture, force=True).agreement == made[0].agreement

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
+import scipy
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.contact import point_on
-from impact_posture.posture.certificate import certify, objective_gradients
+from impact_posture.posture.certificate import certify, nonnegative_least_squares, objective_gradients
 from impact_posture.posture.null_space_path import null_space_path
-from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
+from impact_posture.posture.problem import PostureProblem, equality_jacobian, null_space, rank
 from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.solve import PostureSolution, distinct, solve
 from impact_posture.posture.starts import Projector, feasible_start
@@ -133,6 +134,23 @@ def test_certificate_refuses_a_multiplier_of_the_wrong_sign() -> None:
     line = walk(problem, problem.given, 0.02, 400), walk(problem, problem.given, -0.02, 400)
     ends = [part[-1] for part in line if len(part) > 5]
     assert ends and all(not certify(problem, end, scale).holds() for end in ends)
+
+
+def test_multipliers_and_free_motions_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(0)
+    for case in range(300):
+        rows, columns = rng.integers(1, 20, 2)
+        matrix, right = rng.normal(size=(rows, columns)), rng.normal(size=rows)
+        if case % 3 == 0 and columns > 1:
+            # Repeated columns have many solutions, all with the same residual.
+            matrix[:, 1] = matrix[:, 0]
+        found, (_, least) = nonnegative_least_squares(matrix, right), scipy.optimize.nnls(matrix, right)
+        assert found.min() >= 0
+        assert np.linalg.norm(matrix @ found - right) == pytest.approx(least, abs=1e-12)
+        free, own = null_space(matrix), scipy.linalg.null_space(matrix, rcond=1e-7)
+        np.testing.assert_allclose(free @ free.T, own @ own.T, atol=1e-12)
+    assert not nonnegative_least_squares(np.zeros((3, 2)), np.ones(3)).any()
+    np.testing.assert_array_equal(null_space(np.zeros((0, 3))), np.eye(3))
 
 
 def test_objective_gradient_with_regularization_is_that_of_the_programme() -> None:

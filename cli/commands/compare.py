@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Processes, ScenarioName, Seeds, rows_table
 from impact_posture_cli.output import Page, print_json
@@ -20,13 +19,7 @@ Controllers = Annotated[
         help="Names as in simulate; robust:held holds the reached posture, robust:free leaves the feet away.",
     ),
 ]  # fmt: skip
-Out = Annotated[
-    str | None,
-    typer.Option(
-        "--out", metavar="DIR", rich_help_panel=OUTPUT, show_default="none",
-        help="Folder for comparison.json and figures.",
-    ),
-]  # fmt: skip
+Out = Annotated[str | None, options.out_option("Folder for comparison.json and figures.", "none")]
 
 
 def compare(

@@ -44,43 +44,49 @@ def optimize(
     """Run ``impact-posture optimize``."""
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
-    from impact_posture.front_door import PostureProblem
-    from impact_posture.front_door import optimize as solve
-    from impact_posture.output_folder import check_output
-    from impact_posture.posture.problem_settings import prepare
-    from impact_posture.result_folder import FORMATS, default_out
+    from impact_posture.early_writer import early_writer
 
-    page = Page(quiet=quiet or json)
-    prepared = prepare(settings)
-    folder = Path(out) if out else default_out(prepared)
-    check_output(folder, force=force, kind="result")
-    if not json:
-        _announce(page, prepared)
-    shown = not (quiet or json)
-    with progress("solving", "starts", shown=shown, first="building the expressions") as advance:
-        result = solve(
-            PostureProblem.of(prepared),
-            starts=settings.starts,
-            seed=settings.seed,
-            jobs=jobs,
-            compile=compile,
-            progress=advance,
-        )
-    if settings.tradeoff:
-        with progress("solving", "points", shown=shown) as advance:
-            result = result.trade_off(settings.tradeoff, settings.tradeoff_against, compile=compile, progress=advance)
-    if not json:
-        # The result comes first, because figures and C code take longer.
-        _summarize(page, prepared, result.solution, result.document)
-    with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
-        written = result.save(
-            folder,
-            force=force,
-            codegen=not no_codegen,
-            formats=format or FORMATS,
-            jobs=jobs,
-            progress=advance,
-        )
+    with early_writer(settings, jobs) as finish:
+        from impact_posture.front_door import PostureProblem
+        from impact_posture.front_door import optimize as solve
+        from impact_posture.output_folder import check_output
+        from impact_posture.posture.problem_settings import prepare
+        from impact_posture.result_folder import FORMATS, default_out
+
+        page = Page(quiet=quiet or json)
+        prepared = prepare(settings)
+        folder = Path(out) if out else default_out(prepared)
+        check_output(folder, force=force, kind="result")
+        if not json:
+            _announce(page, prepared)
+        shown = not (quiet or json)
+        with progress("solving", "starts", shown=shown, first="building the expressions") as advance:
+            result = solve(
+                PostureProblem.of(prepared),
+                starts=settings.starts,
+                seed=settings.seed,
+                jobs=jobs,
+                compile=compile,
+                progress=advance,
+            )
+        if settings.tradeoff:
+            with progress("solving", "points", shown=shown) as advance:
+                result = result.trade_off(
+                    settings.tradeoff, settings.tradeoff_against, compile=compile, progress=advance
+                )
+        if not json:
+            # The result comes first, because figures and C code take longer.
+            _summarize(page, prepared, result.solution, result.document)
+        with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
+            written = result.save(
+                folder,
+                force=force,
+                codegen=not no_codegen,
+                formats=format or FORMATS,
+                jobs=jobs,
+                progress=advance,
+                finish=finish,
+            )
     if written.compiler_error:
         page.warnings([f"the C code in c/ is written but could not be built: {written.compiler_error}"])
     if json:

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Processes, Seeds, rows_table
 from impact_posture_cli.output import Page, print_json
@@ -23,10 +22,7 @@ Scenarios = Annotated[
     list[str] | None,
     typer.Option("--scenario", rich_help_panel=RUN, show_default="all four", help="That one only; repeatable."),
 ]
-Out = Annotated[
-    str,
-    typer.Option("--out", metavar="DIR", rich_help_panel=OUTPUT, help="Folder of the results."),
-]
+Out = Annotated[str, options.out_option("Folder of the results.")]
 
 
 def reproduce(

@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from impact_posture.settings import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Mode, ScenarioName
 from impact_posture_cli.output import Page, complain, number, print_json
@@ -50,11 +49,8 @@ Sign = Annotated[
 ]
 Out = Annotated[
     str | None,
-    typer.Option(
-        "--out", metavar="DIR", rich_help_panel=OUTPUT, show_default="./SCENARIO-CONTROLLER",
-        help="Folder for run.json, the time series and the figures.",
-    ),
-]  # fmt: skip
+    options.out_option("Folder for run.json, the time series and the figures.", "./SCENARIO-CONTROLLER"),
+]
 
 
 def simulate(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import platform
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +15,25 @@ from impact_posture.codegen.functions import Reference, Vector, casadi_reference
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.reader import read_manifest
-from impact_posture.errors import CompilerError
+from impact_posture.errors import CompilerError, OutputError
 from impact_posture.impact.contact import heavy_feet_rounding
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.libraries import build_library, library_path, load_library
+from impact_posture.libraries import (
+    build_library,
+    cache_folder,
+    is_cached,
+    library_path,
+    load_library,
+    seal_path,
+    source_key,
+)
 from impact_posture.output_folder import scratch_folder
+from impact_posture.toolchain import find_compiler, words_of
 
 # The oracle factorizes another matrix.  Feet at compliance ε cost digits there (condition about 1/ε).
 _ORACLE_TOLERANCE = 1e-5
+# Number of libraries in the cache. The oldest go first.
+_CACHED = 16
 # C function → the reference's names of its results.
 _RESULTS = {
     "eval": ("H", "grad"),
@@ -69,9 +82,9 @@ def compile_and_check(
     manifest, _ = read_manifest(export_dir / f"{prefix}.json")
     real, worst = REALS[manifest["real"]], 0.0
     with scratch_folder() as folder:
-        library = load_library(
-            build_library(export_dir, prefix, library_path(export_dir if keep else folder, prefix))
-        )
+        if keep or (built := _cached_library(export_dir, prefix)) is None:
+            built = build_library(export_dir, prefix, library_path(export_dir if keep else folder, prefix))
+        library = load_library(built)
         for v in named_objectives(objectives, prefix):
             own = v.objective
             # Beside an objective of several contacts, each frame has one of its own.
@@ -91,6 +104,27 @@ def compile_and_check(
                     )
                 worst = max(worst, found)
     return worst
+
+
+def _cached_library(export_dir: Path, prefix: str) -> Path | None:
+    """Return the library of a source that was built before, or build it now; ``None`` if the cache cannot be written.
+
+    A humanoid takes seconds to compile, and the optimal posture is the only difference between many exports.
+    """
+    source = (export_dir / f"{prefix}.c").read_text(encoding="utf-8")
+    content = [re.sub(rf"^const \w+ {prefix}_(posture|manifest)\[.*?;$", "", source, flags=re.DOTALL | re.MULTILINE)]
+    content += [platform.machine(), *(find_compiler() or ()), *words_of("CFLAGS")]
+    try:
+        library = cache_folder("exports") / f"{source_key(content)}.so"
+        if not is_cached(library):
+            build_library(export_dir, prefix, library)
+        library.touch()
+        for old in sorted(library.parent.glob("*.so"), key=lambda path: path.stat().st_mtime)[:-_CACHED]:
+            old.unlink()
+            seal_path(old).unlink(missing_ok=True)
+    except (OutputError, OSError):
+        return None
+    return library
 
 
 def largest_difference(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
@@ -23,6 +24,8 @@ Reference = Callable[[Vector, Vector], dict[str, Vector]]
 """Quantities at a configuration ``q`` (nq,) and a normal ``n`` (3,), by name, each a flat array."""
 
 
+# The manifest and the check of the same export need the same references.
+@lru_cache(maxsize=8)
 def casadi_reference(objective: ImpactObjective) -> Reference:
     """Return the quantities of an export as CasADi interprets them.
 
@@ -34,7 +37,7 @@ def casadi_reference(objective: ImpactObjective) -> Reference:
     outputs = {} if objective.others else {"H": k.H, "grad": k.grad_H}
     outputs |= {"objective": value, "objective_grad": gradient}
     outputs |= {} if objective.others else {"jump": k.jump.a, "G": k.G, "V": k.V, "ellipsoid": k.ellipsoid}
-    function = ca.Function("reference", [k.q, k.n], [*outputs.values()], ["q", "n"], [*outputs], {"cse": True})
+    function = ca.Function("reference", [k.q, k.n], [*outputs.values()], ["q", "n"], [*outputs])
 
     def evaluate(q: Vector, n: Vector) -> dict[str, Vector]:
         return {name: np.array(x, dtype=float).ravel() for name, x in zip(outputs, function(q, n), strict=True)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import casadi as ca
 
@@ -42,11 +43,13 @@ CALLS = {
     ca.OP_OR: "(double)({0} != 0.0 || {1} != 0.0)",
     ca.OP_IF_ELSE_ZERO: "({0} != 0.0 ? {1} : 0.0)",
 }
+# Sums and products; those of one operand take it twice.
+_PAIRS = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_SQ: "*", ca.OP_TWICE: "+"}
+_SINGLE = {ca.OP_NEG: "neg", ca.OP_INV: "inv"}
 SINE, COSINE = CALLS[ca.OP_SIN], CALLS[ca.OP_COS]
 
 
-@dataclass(frozen=True)
-class Node:
+class Node(NamedTuple):
     """One operation.
 
     Attributes:
@@ -84,17 +87,17 @@ class Graph:
 
     def add(self, node: Node) -> int:
         """Return the number of the node; arithmetic on constants becomes a constant."""
-        operands = [self.nodes[a] for a in node.operands]
-        if node.op in ARITHMETIC and all(o.op == "const" for o in operands):
+        if node.op in ARITHMETIC and all(self.nodes[a].op == "const" for a in node.args):
+            operands = [self.nodes[a] for a in node.args]
             width = max(o.width for o in operands)
             lanes = [[o.value[k if o.width > 1 else 0] for o in operands] for k in range(width)]
             return self.constant(*[_COMPUTE[node.op](*numbers) for numbers in lanes])
         if node.op in _COMMUTE:
             node = Node(node.op, tuple(sorted(node.args)), node.width)
-        if node not in self._known:
-            self._known[node] = len(self.nodes)
+        number = self._known.setdefault(node, len(self.nodes))
+        if number == len(self.nodes):
             self.nodes.append(node)
-        return self._known[node]
+        return number
 
     def constant(self, *value: float) -> int:
         """Return the node of a number or of a vector; a vector of equal numbers is the number."""
@@ -150,13 +153,10 @@ def _operation(graph: Graph, operation: int, operands: list[int]) -> int:
         return a
     if operation == ca.OP_DIV:
         return graph.add(Node("*", (a, graph.add(Node("inv", (b,))))))
-    arithmetic = {
-        ca.OP_ADD: Node("+", (a, b)), ca.OP_SUB: Node("-", (a, b)), ca.OP_MUL: Node("*", (a, b)),
-        ca.OP_NEG: Node("neg", (a,)), ca.OP_INV: Node("inv", (a,)),
-        ca.OP_SQ: Node("*", (a, a)), ca.OP_TWICE: Node("+", (a, a)),
-    }  # fmt: skip
-    if operation in arithmetic:
-        return graph.add(arithmetic[operation])
+    if operation in _PAIRS:
+        return graph.add(Node(_PAIRS[operation], (a, b)))
+    if operation in _SINGLE:
+        return graph.add(Node(_SINGLE[operation], (a,)))
     if operation in CALLS:
         text = CALLS[operation]
         return graph.add(Node(text, (a, b) if "{1}" in text else (a,)))

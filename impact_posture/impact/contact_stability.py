@@ -177,6 +177,8 @@ class FrictionCones:
     def least_pull(self, particular: Vector, basis: Vector) -> Vector:
         """Return the impulses whose largest pull is least."""
         up, count = self._lifts(), basis.shape[1]
+        if not count:
+            return particular
         # min t: -f_z ≤ t, t ≥ 0.
         cost = np.concatenate([np.zeros(count), [1.0]])
         A = np.hstack([up @ basis, -np.ones((len(up), 1))])

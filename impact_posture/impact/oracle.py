@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric, hold_locked
@@ -102,7 +101,6 @@ class ImpactOracle:
         self.M, self.J, self.Js = hold_locked(num.locked, num.mass_matrix(), num.jacobian(self.point)[:3], Js)
         rows, nv = self.Js.shape
         self._kkt = np.block([[self.M, -self.Js.T], [self.Js, self.compliance * np.eye(rows)]])
-        self._lu = scipy.linalg.lu_factor(self._kkt)
         self.n = self._normals(None)[1]
         self._nv = nv
         return self
@@ -112,7 +110,7 @@ class ImpactOracle:
         shape = (len(self.Js), *tau.shape[1:])
         moving = (tau.T * ~self.numeric.locked).T
         rhs = np.concatenate([moving, np.zeros(shape) if slip is None else slip])
-        found = np.asarray(scipy.linalg.lu_solve(self._lu, rhs))
+        found = np.linalg.solve(self._kkt, rhs)
         return Answer(found[: self._nv], found[self._nv :])
 
     def solve(self, tau: Vector) -> Vector:
@@ -278,7 +276,7 @@ class _HeldPoint:
     of ∇S would be a small difference of large numbers, with an error of the square of that matrix's condition.
     """
 
-    lu: tuple[Vector, Vector]
+    system: Vector
     axes: Vector
     outside: Vector
     mobile: NDArray[np.bool_]
@@ -297,7 +295,7 @@ class _HeldPoint:
         system[:size, :size] = kkt
         system[size:, :nv] = axes.T @ J
         system[:nv, size:] = -system[size:, :nv].T
-        return _HeldPoint(scipy.linalg.lu_factor(system), axes, vectors[:, ~kept], mobile)
+        return _HeldPoint(system, axes, vectors[:, ~kept], mobile)
 
     def can_move(self, n: Vector) -> bool:
         """Return whether the point can move along ``n``."""
@@ -305,13 +303,13 @@ class _HeldPoint:
 
     def answer(self, *, tau: Vector | None = None, velocity: Vector | None = None) -> tuple[Answer, Vector]:
         """Return the jump under ``τ`` with the point moving at ``v``, and the impulse ``s`` of the point."""
-        right = np.zeros(len(self.lu[1]))
+        right = np.zeros(len(self.system))
         size = len(right) - self.axes.shape[1]
         if tau is not None:
             right[: self.nv] = tau * self.mobile
         if velocity is not None:
             right[size:] = self.axes.T @ velocity
-        found = np.asarray(scipy.linalg.lu_solve(self.lu, right))
+        found = np.asarray(np.linalg.solve(self.system, right), dtype=np.float64)
         return Answer(found[: self.nv], found[self.nv : size]), np.asarray(self.axes @ found[size:])
 
 

@@ -28,14 +28,13 @@ from impact_posture.plot.run_figures import (
 from impact_posture.plot.run_view import RunView, Span
 from impact_posture.plot.snapshots import draw_snapshots, snapshots_figure
 from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save
-from impact_posture.plot.view import PathData, ResultView, TradeOffData, sample_path
+from impact_posture.plot.view import ResultView, TradeOffData
 
 __all__ = [
     "FIGURES",
     "FORMATS",
     "Bar",
     "FigureNotFound",
-    "PathData",
     "ResultView",
     "RunView",
     "Span",
@@ -53,7 +52,6 @@ __all__ = [
     "joints_figure",
     "metric_figure",
     "postures_figure",
-    "sample_path",
     "save",
     "snapshots_figure",
 ]

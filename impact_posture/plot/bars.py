@@ -20,7 +20,6 @@ from impact_posture.plot.style import (
     DEFAULT_FORMATS,
     INK,
     VERMILLION,
-    check_formats,
     framed,
     save,
     shared_legend,
@@ -61,7 +60,7 @@ def draw_bars(rows: Sequence[Bar], out_dir: Path, formats: Iterable[str] = DEFAU
         InputError: No rows, or an unknown format.
         OutputError: The folder or a file cannot be written.
     """
-    return save(bars_figure(rows), out_dir, "bars", check_formats(formats))
+    return save(bars_figure(rows), out_dir, "bars", formats)
 
 
 def bars_figure(rows: Sequence[Bar]) -> Figure:

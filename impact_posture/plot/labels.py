@@ -9,13 +9,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 from mpl_toolkits.mplot3d import proj3d
+from numpy.typing import NDArray
 
 from impact_posture.plot.shapes import Plane, Vector
 
-# Distances from the point (points) and directions to try; least distance of a letter from lines, pixels.
+# Distances from the point and directions to try; least distance of a letter from lines. All in points.
 _GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0, 36.0)
 _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
-_CLEAR = 2.0
+_CLEAR = 1.4
 # Grids are lighter than ink, 0 (black) to 255. Thin lines between two pixels are gray.
 _INK = 205
 
@@ -23,7 +24,7 @@ _INK = 205
 class Label(Annotation):
     """Letter at a point of an axes, in data coordinates, shape (2,) or (3,).
 
-    :func:`place_labels` finds its place.  ``toward`` is the preferred direction in the figure.
+    :func:`draw_with_labels` finds its place.  ``toward`` is the preferred direction in the figure.
     """
 
     def __init__(
@@ -54,47 +55,43 @@ def draw_end_on(axes: Any, name: str, plane: Plane, n: Vector, at: Vector, color
     axes.add_artist(Label(name, at, (1.0, 1.0), color))
 
 
-def place_labels(figure: Figure) -> None:
-    """Move the letters of a figure to places where nothing else is. The figure has been laid out."""
+def draw_with_labels(figure: Figure) -> FigureCanvasAgg:
+    """Draw a figure that has been laid out, and its letters at places where nothing else is; return the image."""
     labels = [(axes, text) for axes in figure.axes for text in axes.texts if isinstance(text, Label)]
     for _, label in labels:
         label.set_visible(False)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     # Rows of the image count from the top. Grids and faint fills are lighter than ink.
-    image = np.asarray(canvas.buffer_rgba())[::-1, :, :3].min(axis=2)
-    ink: Vector = np.argwhere(image < _INK)[:, ::-1].astype(np.float64) + 0.5
+    ink = np.asarray(canvas.buffer_rgba())[::-1, :, :3].min(axis=2) < _INK if labels else np.zeros((0, 0), bool)
     for axes, label in labels:
         label.set_visible(True)
-        ink = np.vstack([ink, _place(axes, label, ink)])
+        _place(axes, label, ink)
+        label.draw(canvas.get_renderer())
+    return canvas
 
 
-def _place(axes: Any, label: Label, ink: Vector) -> Vector:
-    """Move a letter; return points of the place that it takes."""
+def _place(axes: Any, label: Label, ink: NDArray[np.bool_]) -> None:
+    """Move a letter to the best place, and mark the place in ``ink``, shape (height, width), lowest row first."""
     point = label.point
     if len(point) == 3:
         point = np.array(proj3d.proj_transform(*point, axes.get_proj())[:2])
     label.xy = tuple(point)
     anchor = np.asarray(axes.transData.transform(point))
-    box = label.get_window_extent()
-    half = np.array([box.width, box.height]) / 2 + _CLEAR
-    scale = axes.figure.dpi / 72
-    near = ink[np.abs(ink - anchor).max(axis=1) < 2 * half.max() + _GAPS[-1] * scale]
-    best, place = np.inf, anchor
+    box, scale = label.get_window_extent(), axes.figure.dpi / 72
+    half = np.array([box.width, box.height]) / 2 + _CLEAR * scale
+    best, taken, place = np.inf, ink[:0], anchor
     for gap in _GAPS:
         for angle in _ANGLES:
             direction = np.array([np.cos(angle), np.sin(angle)])
             center = anchor + direction * (gap * scale + float(np.abs(direction) @ half))
-            hits = int((np.abs(near - center) < half).all(axis=1).sum())
-            outside = (center - half < axes.bbox.min).any() or (center + half > axes.bbox.max).any()
-            cost = 100.0 * hits + 1e6 * outside + gap - 6.0 * float(direction @ np.array(label.toward))
+            low, high = center - half, center + half
+            if (low < axes.bbox.min).any() or (high > axes.bbox.max).any():
+                continue
+            (left, bottom), (right, top) = np.rint(low).astype(int), np.rint(high).astype(int)
+            covered = ink[bottom:top, left:right]
+            cost = 25.0 * covered.sum() + gap - 6.0 * float(direction @ np.array(label.toward))
             if cost < best:
-                best, place = cost, center
+                best, taken, place = cost, covered, center
     label.xyann = tuple((place - anchor) / scale)
-    return _filled(place - half, place + half)
-
-
-def _filled(low: Vector, high: Vector) -> Vector:
-    """Return points two pixels apart in a rectangle."""
-    x, y = (np.linspace(a, b, 2 + int((b - a) / 2)) for a, b in zip(low, high, strict=True))
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    taken[:] = True

@@ -5,7 +5,7 @@ The trade-off is computed by :mod:`impact_posture.posture.pareto`.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,7 +15,10 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from impact_posture.errors import InputError
 from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import BLUE, GRAY, GREEN, INK, PURPLE, VERMILLION, framed
-from impact_posture.plot.view import PathData, ResultView, TradeOffData, header_lines, number, objective_unit
+from impact_posture.plot.view import ResultView, TradeOffData, header_lines, number, objective_unit
+
+if TYPE_CHECKING:
+    from impact_posture.posture.null_space_path import NullSpacePath
 
 NOTES = {
     "distance": "Each point is the best posture found that moves at most so far from the initial one (joint angles, "
@@ -58,7 +61,7 @@ def path_figure(view: ResultView) -> Figure:
     return figure
 
 
-def draw_shares(axes: Any, x: Vector, data: PathData | TradeOffData) -> bool:
+def draw_shares(axes: Any, x: Vector, data: NullSpacePath | TradeOffData) -> bool:
     """Draw H, G, V and S over ``x``, each divided by its value at the start; return whether any was drawn."""
     curves = {name: normalized(data, name) for name in QUANTITIES}
     drawn = {name: curve for name, curve in curves.items() if curve is not None}
@@ -92,12 +95,12 @@ def log_axis(axes: Any) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def undrawn(data: PathData | TradeOffData) -> list[str]:
+def undrawn(data: NullSpacePath | TradeOffData) -> list[str]:
     """Return the quantities without a curve, because they are undefined or zero at the start."""
     return [name for name in QUANTITIES if normalized(data, name) is None]
 
 
-def normalized(path: PathData | TradeOffData, name: str) -> Vector | None:
+def normalized(path: NullSpacePath | TradeOffData, name: str) -> Vector | None:
     """Divide a quantity by its value at the start, or by its nearest value; ``None`` where that is 0."""
     values = np.asarray(getattr(path, name), dtype=float)
     first = _first(path, name)
@@ -106,16 +109,13 @@ def normalized(path: PathData | TradeOffData, name: str) -> Vector | None:
     return np.asarray(values / values[first])
 
 
-def _first(path: PathData | TradeOffData, name: str) -> int | None:
+def _first(path: NullSpacePath | TradeOffData, name: str) -> int | None:
     values = np.asarray(getattr(path, name), dtype=float)
-    start = range(len(values))[path.start]
-    if np.isfinite(values[start]):
-        return start
     finite = np.flatnonzero(np.isfinite(values))
-    return int(finite[np.argmin(np.abs(finite - start))]) if finite.size else None
+    return int(finite[0]) if finite.size else None
 
 
-def _checked(path: PathData | None) -> PathData:
+def _checked(path: NullSpacePath | None) -> NullSpacePath:
     if path is None:
         raise InputError("there is no path to draw", where="figure nullspace", hint="give ResultView.path")
     sizes = {name: np.shape(getattr(path, name)) for name in ("s", *QUANTITIES)}
@@ -129,19 +129,14 @@ def _checked(path: PathData | None) -> PathData:
     return path
 
 
-def _mark(axes: Any, path: PathData) -> None:
+def _mark(axes: Any, path: NullSpacePath) -> None:
     """Draw upright lines at the start and the optimum, named above the axes."""
-    for word, index, align in (("start", path.start, "left"), ("optimum", path.optimum, "right")):
+    for word, index, align in (("start", 0, "left"), ("optimum", -1, "right")):
         axes.axvline(path.s[index], **_MARK)
         axes.annotate(
             word, (path.s[index], 1.0), (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points",
-            ha="center" if 0.05 < _share(path, index) < 0.95 else align, fontsize=7.5,
+            ha=align, fontsize=7.5,
         )  # fmt: skip
-
-
-def _share(path: PathData, index: int) -> float:
-    length = float(path.s[-1] - path.s[0])
-    return float(path.s[index] - path.s[0]) / length if length > 0 else 0.0
 
 
 def share_notes(where: str, missing: list[str]) -> str:

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from impact_posture.plot.labels import Label, draw_arrow, draw_end_on
-from impact_posture.plot.shapes import COORDINATE_PLANES, XY, XZ, YZ, Plane, Vector, square, upright_plane
+from impact_posture.plot.shapes import COORDINATE_PLANES, XY, XZ, YZ, Plane, Vector, outline, square, upright_plane
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.space import Space, frame_space
 from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, VERMILLION, framed, shared_legend
@@ -212,10 +211,9 @@ def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane |
 def _body(axes: Any, corners: Vector, line: dict[str, Any], plane: Plane | None) -> None:
     """Draw a box by its corners; from the side its outline."""
     if plane is not None:
-        flat = plane.axes @ corners.T
-        edge = scipy.spatial.ConvexHull(flat.T).vertices
-        axes.fill(*flat[:, edge], facecolor=line["color"], alpha=0.12, linewidth=0, zorder=1.5)
-        axes.plot(*flat[:, [*edge, edge[0]]], **(line | {"linewidth": 1.1}))
+        around = outline(plane.axes @ corners.T)
+        axes.fill(*around, facecolor=line["color"], alpha=0.12, linewidth=0, zorder=1.5)
+        axes.plot(*around, **(line | {"linewidth": 1.1}))
         return
     low, high = [0, 1, 2, 3], [4, 5, 6, 7]
     sides = [[k, (k + 1) % 4, 4 + (k + 1) % 4, 4 + k] for k in range(4)]

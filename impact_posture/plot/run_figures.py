@@ -22,7 +22,7 @@ from impact_posture.plot.run_panels import (
     whole,
 )
 from impact_posture.plot.run_view import RunView, check_same
-from impact_posture.plot.style import DEFAULT_FORMATS, check_formats, save
+from impact_posture.plot.style import DEFAULT_FORMATS, save
 
 HINT = "Less H is better: it is the squared velocity jump of an impulse of 1 N·s along n."
 LEFT = "Left: the whole run. Right: the first impact."
@@ -41,13 +41,12 @@ def draw_run(view: RunView, out_dir: Path, formats: Iterable[str] = DEFAULT_FORM
         InputError: An unknown format.
         OutputError: The folder or a file cannot be written.
     """
-    wanted = check_formats(formats)
     figures = {"metric": metric_figure(view)}
     if control_panels([view]):
         figures["controls"] = controls_figure(view)
     if joint_panels([view]):
         figures["joints"] = joints_figure([view])
-    return _write(figures, out_dir, wanted)
+    return _write(figures, out_dir, formats)
 
 
 def draw_comparison(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
@@ -64,13 +63,12 @@ def draw_comparison(views: Sequence[RunView], out_dir: Path, formats: Iterable[s
         InputError: No view, views of different scenarios or robots, an unknown format.
         OutputError: The folder or a file cannot be written.
     """
-    wanted = check_formats(formats)
     figures = {"comparison-metric": comparison_figure(views)}
     if control_panels(views):
         figures["comparison-controls"] = controls_comparison_figure(views)
     if joint_panels(views):
         figures["comparison-joints"] = joints_figure(views)
-    return _write(figures, out_dir, wanted)
+    return _write(figures, out_dir, formats)
 
 
 def _write(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str]) -> list[Path]:

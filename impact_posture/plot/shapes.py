@@ -135,8 +135,13 @@ def cone_rim(axis: Vector, degrees: float, length: float, points: int = 73) -> V
 def cone_shadow(axis: Vector, degrees: float, length: float, axes: Vector) -> Vector:
     """Outline of the projection of the cone from the origin to :func:`cone_rim`, closed, shape (2, k)."""
     flat = np.column_stack([np.zeros(2), axes @ cone_rim(axis, degrees, length)[:, :-1]])
-    edge = scipy.spatial.ConvexHull(flat.T).vertices
-    return np.asarray(flat[:, [*edge, edge[0]]])
+    return outline(flat)
+
+
+def outline(points: Vector) -> Vector:
+    """Return the convex hull of points of shape (2, k), closed."""
+    edge = scipy.spatial.ConvexHull(points.T).vertices
+    return np.asarray(points[:, [*edge, edge[0]]])
 
 
 def square(center: Vector, n: Vector, side: float) -> Vector:

@@ -33,7 +33,6 @@ from impact_posture.plot.style import (
     INK,
     PALE,
     VERMILLION,
-    check_formats,
     framed,
     save,
     shared_legend,
@@ -53,7 +52,7 @@ def draw_snapshots(views: Sequence[RunView], out_dir: Path, formats: Iterable[st
         InputError: No view, views of different scenarios or robots, an unknown format.
         OutputError: The folder or a file cannot be written.
     """
-    return save(snapshots_figure(views), out_dir, "snapshots", check_formats(formats))
+    return save(snapshots_figure(views), out_dir, "snapshots", formats)
 
 
 def instants(view: RunView) -> list[tuple[str, float]]:

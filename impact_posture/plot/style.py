@@ -11,14 +11,17 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
+from matplotlib.image import imsave
 from matplotlib.textpath import text_to_path
+from matplotlib.transforms import Bbox
 
 from impact_posture.errors import InputError, OutputError
 from impact_posture.escape import printable
 from impact_posture.output_folder import scratch_folder
-from impact_posture.plot.labels import place_labels
+from impact_posture.plot.labels import draw_with_labels
 from impact_posture.plot.view import SEPARATOR
 
 # Okabe and Ito's palette, "Color Universal Design", 2008.
@@ -61,7 +64,7 @@ _RC: dict[str, Any] = {
     "grid.linewidth": 0.5,
     "hatch.linewidth": 0.5,
     "legend.frameon": False,
-    "savefig.dpi": 200,
+    "figure.dpi": 200,
     # TrueType in the PDF (publishers refuse Type 3), and files that do not change when nothing changed.
     "pdf.fonttype": 42,
     "svg.hashsalt": "impact-posture",
@@ -141,22 +144,45 @@ def shared_legend(body: Any, handles: Sequence[Any], place: str, **look: Any) ->
     body.legend(handles=list(handles), loc=f"outside {place} center", **look)
 
 
-def lay_out(figure: Figure) -> None:
-    """Lay out a figure once, so that every format shows the same figure in half the time."""
-    # Panels with equal axes change their size in the first round and are placed in the others.
+def lay_out(figure: Figure) -> FigureCanvasAgg:
+    """Lay out a figure once, so that every format shows the same figure; return its image."""
     engine: Any = figure.get_layout_engine()
-    if engine is None:
-        return
-    for _ in range(3):
-        engine.execute(figure)
-    figure.set_layout_engine("none")
-    # Rounded, because the solver of the layout differs in the last digits from run to run.
-    for part in figure.subfigs:
-        box = part.bbox_relative
-        box.p0, box.p1 = np.round(box.p0, 6), np.round(box.p1, 6)
-    for axes in figure.axes:
-        axes.set_position(np.round(axes.get_position(original=True).bounds, 6))
-    place_labels(figure)
+    if engine is not None:
+        # Panels with equal axes change their size in the first round and are placed in the others.
+        equal = [axes for axes in figure.axes if axes.name == "3d" or axes.get_aspect() != "auto"]
+        for axes in equal:
+            _measure_once(axes)
+        for _ in range(3 if equal else 1):
+            engine.execute(figure)
+        for axes in equal:
+            del axes.get_tightbbox
+        figure.set_layout_engine("none")
+        # Rounded, because the solver of the layout differs in the last digits from run to run.
+        for part in figure.subfigs:
+            box = part.bbox_relative
+            box.p0, box.p1 = np.round(box.p0, 6), np.round(box.p1, 6)
+        for axes in figure.axes:
+            axes.set_position(np.round(axes.get_position(original=True).bounds, 6))
+    return draw_with_labels(figure)
+
+
+def _measure_once(axes: Any) -> None:
+    """Let the layout measure the texts around a panel in its first round only, because that is what takes long.
+
+    The space around a flat panel depends on its ticks, which stay as they are after the first round.
+    """
+    measure = axes.get_tightbbox
+    around: list[Any] = []
+
+    def get_tightbbox(renderer: Any = None, **more: Any) -> Any:
+        if axes.name != "3d" and len(around) == 2:
+            axes.apply_aspect()
+            return Bbox.from_extents(*(axes.bbox.extents + around[-1]))
+        found = measure(renderer, **more)
+        around.append(found.extents - axes.bbox.extents)
+        return found
+
+    axes.get_tightbbox = get_tightbbox
 
 
 def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
@@ -184,15 +210,20 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
     paths = []
     wanted = check_formats(formats)
     with style():
-        lay_out(figure)
+        canvas = lay_out(figure)
     for extension in wanted:
         path = Path(out_dir) / f"{name}.{extension}"
-        # Without a date, so that the same result gives the same file.
-        metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(extension, {})
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with scratch_folder(path.parent) as beside, style():
-                figure.savefig(beside / path.name, metadata=metadata)
+                if extension == "png":
+                    # It is drawn already, and `savefig` would draw it twice.  A higher level takes long for 3 %.
+                    quick = {"compress_level": 3}
+                    imsave(beside / path.name, canvas.buffer_rgba(), format="png", dpi=figure.dpi, pil_kwargs=quick)
+                else:
+                    # Without a date, so that the same result gives the same file.
+                    metadata = {"Date" if extension == "svg" else "CreationDate": None}
+                    figure.savefig(beside / path.name, metadata=metadata)
                 os.replace(beside / path.name, path)
         except OSError as error:
             raise OutputError(

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import PointOnLink
@@ -23,34 +21,15 @@ from impact_posture.impact.worst_case import SingleImpact
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import Against
 
+# Imported for its name alone, because the figures need no solver.
+if TYPE_CHECKING:
+    from impact_posture.posture.null_space_path import NullSpacePath
+
 Vector = NDArray[np.float64]
 
 # Separator of the facts in a header line.
 SEPARATOR = "  ·  "
 _UNITS = {"H": "‖Δν‖²/(N·s)²", "G": "1/kg", "V": "‖Δν‖²/(m/s)²", "S": "‖Δν‖²/(m/s)²", "E": "kg"}
-
-
-@dataclass(frozen=True, eq=False)
-class PathData:
-    """Impact quantities along a path of postures.
-
-    Attributes:
-        s: Path length in the tangent norm, ``∫‖dν‖`` (rad mixed with m), increasing, shape (k,).
-        H: ``nᵀΛ_c n``, shape (k,).
-        G: ``1/m_eff`` along the normal, 1/kg, shape (k,).
-        V: ``H/G²``, shape (k,).
-        S: The sticking counterpart of V, shape (k,); NaN where it does not exist.
-        start: Index of the posture that the others are compared with.
-        optimum: Index of the optimal posture.
-    """
-
-    s: Vector
-    H: Vector
-    G: Vector
-    V: Vector
-    S: Vector
-    start: int = 0
-    optimum: int = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +60,6 @@ class TradeOffData:
     knee: int | None = None
     against: Against = "distance"
 
-    @property
-    def start(self) -> int:
-        """Index of the posture that the others are compared with."""
-        return 0
-
 
 @dataclass(frozen=True, eq=False)
 class ResultView:
@@ -109,7 +83,7 @@ class ResultView:
     q_optimal: Vector
     speed: float = 1.0
     restitution: float = 0.0
-    path: PathData | None = None
+    path: NullSpacePath | None = None
     tradeoff: TradeOffData | None = None
     title: str = ""
 
@@ -153,21 +127,6 @@ class ResultView:
     def jacobian(self, q: Vector) -> Vector:
         """Return ``J(q)``, shape (3, nv), of the world velocity of the contact point without supports."""
         return np.array(self.objective.oracle.numeric.at(q).jacobian(self.contact_point)[:3])
-
-
-def sample_path(
-    objective: ImpactObjective, configurations: Sequence[Vector], start: int = 0, optimum: int = -1
-) -> PathData:
-    """Evaluate the quantities along ``configurations``, each of shape (nq,), in the order of the path.
-
-    ``s`` adds up ``‖q_{k+1} ⊖ q_k‖`` on the tangent space.
-    """
-    model = objective.robot.model
-    steps = [float(np.linalg.norm(pin.difference(model, q, p))) for q, p in pairwise(configurations)]
-    found = [objective.oracle.quantities(q) for q in configurations]
-    # A missing S becomes NaN.
-    curves = {name: np.array([getattr(f, name) for f in found], dtype=float) for name in "HGVS"}
-    return PathData(np.concatenate([[0.0], np.cumsum(steps)]), **curves, start=start, optimum=optimum)
 
 
 def jump_unit(view: ResultView) -> str:

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-import scipy
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.posture_distance import distance_gradient
-from impact_posture.posture.problem import RANK_TOLERANCE, PostureProblem, equality_jacobian
+from impact_posture.posture.problem import PostureProblem, equality_jacobian, null_space
 from impact_posture.tables import json_block
 
 Vector = NDArray[np.float64]
@@ -185,20 +184,46 @@ def _multipliers(gradients: Vector, equalities: Vector, inequalities: Vector) ->
         Weights, multipliers and residual.
     """
     count = len(gradients)
-    if len(equalities):
-        free = scipy.linalg.null_space(equalities, rcond=RANK_TOLERANCE)
-    else:
-        free = np.eye(gradients.shape[1])
+    free = null_space(equalities)
     reduced = gradients @ free
     if not free.shape[1] or (count == 1 and not len(inequalities)):
         return np.eye(count)[0], np.zeros(len(inequalities)), free @ reduced[0]
     bounds = inequalities @ free if len(inequalities) else np.zeros((0, free.shape[1]))
     if count == 1:
-        multipliers, _ = scipy.optimize.nnls(bounds.T, -reduced[0])
+        multipliers = nonnegative_least_squares(bounds.T, -reduced[0])
         return np.ones(1), multipliers, free @ (reduced[0] + bounds.T @ multipliers)
     # A row with the sum 1 scales the solution, and does not turn the least residual.
     system = np.hstack([np.vstack([reduced.T, np.ones(count)]), np.vstack([bounds.T, np.zeros(len(bounds))])])
-    found, _ = scipy.optimize.nnls(system, np.eye(len(system))[-1])
+    found = nonnegative_least_squares(system, np.eye(len(system))[-1])
     found = found / found[:count].sum()
     weights, multipliers = found[:count], found[count:]
     return weights, multipliers, free @ (reduced.T @ weights + bounds.T @ multipliers)
+
+
+def nonnegative_least_squares(matrix: Vector, right: Vector) -> Vector:
+    """Return the ``x ≥ 0`` with the least ``‖A x − b‖`` (Lawson and Hanson 1974, algorithm NNLS).
+
+    SciPy has the same function, but takes longer to import than many problems take to solve.
+    """
+    x, passive = np.zeros(matrix.shape[1]), np.zeros(matrix.shape[1], dtype=bool)
+    least = 10 * max(matrix.shape) * np.finfo(float).eps * float(np.abs(matrix).sum(axis=0).max(initial=0.0))
+    # A cycle of rounding errors would not end, and three turns an unknown are plenty.
+    for _ in range(3 * len(x)):
+        slope = np.where(passive, -np.inf, matrix.T @ (right - matrix @ x))
+        if passive.all() or slope.max() <= least:
+            break
+        passive[slope.argmax()] = True
+        while (trial := _unbounded(matrix, right, passive))[passive].min(initial=np.inf) <= 0:
+            # Go towards the trial until the first entry is zero, which then stays there.
+            falling = passive & (trial <= 0)
+            step = (x[falling] / np.maximum(x[falling] - trial[falling], np.finfo(float).tiny)).min()
+            x += step * (trial - x)
+            passive &= x > least
+        x = trial
+    return x
+
+
+def _unbounded(matrix: Vector, right: Vector, passive: NDArray[np.bool_]) -> Vector:
+    x = np.zeros(len(passive))
+    x[passive] = np.linalg.lstsq(matrix[:, passive], right, rcond=None)[0]
+    return x

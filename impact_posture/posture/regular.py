@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-import scipy.linalg
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
@@ -19,6 +18,7 @@ from impact_posture.posture.problem import (
     Requirements,
     equality_jacobian,
     held_rows,
+    null_space,
     rank,
 )
 from impact_posture.posture.starts import Projector, feasible_start
@@ -54,7 +54,8 @@ def pin_undetermined(
     turns = [motion[3:] for motion in blind if motion[3:].any()]
     if objective.contacts and requirements.contact_pose == "free" and not objective.supports:
         blind = np.vstack([blind, np.eye(6)[5]])
-    motions = move @ scipy.linalg.orth(blind.T)
+    basis, values, _ = np.linalg.svd(blind.T, full_matrices=False)
+    motions = move @ basis[:, values > 6 * np.finfo(float).eps * values[0]]
     added: list[Constraint] = []
     notes: list[str] = []
 
@@ -63,7 +64,7 @@ def pin_undetermined(
         rows = [c.evaluate(numeric)[1] @ motions for c in (*constraints, *added)]
         if not rows:
             return np.asarray(numeric.jacobian(base) @ motions)
-        allowed = scipy.linalg.null_space(np.vstack(rows), rcond=RANK_TOLERANCE)
+        allowed = null_space(np.vstack(rows))
         return np.asarray(numeric.jacobian(base) @ motions @ allowed)
 
     # A turn about another point moves the base as well, so turns are fixed before positions.
@@ -117,7 +118,7 @@ def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTu
     """Whether the linearized equalities at ``q`` allow a turn that the equalities themselves undo."""
     model = problem.robot.model
     jacobian = equality_jacobian(problem, numeric.at(q))
-    free = scipy.linalg.null_space(jacobian, rcond=RANK_TOLERANCE)
+    free = null_space(jacobian)
     along = free @ (free.T @ turn.evaluate(numeric)[1][0])
     size = float(turn.evaluate(numeric)[1][0] @ along)
     if size < 1e-3:
@@ -144,7 +145,10 @@ def _independent_rows(problem: PostureProblem, numeric: Numeric) -> tuple[tuple[
     labels = [(index, row) for index, c in equalities for row in range(c.rows)]
     stacked = np.vstack([c.evaluate(numeric)[1] for _, c in equalities])
     stacked[:, held] = 0.0
-    _, triangle, order = scipy.linalg.qr(stacked.T, mode="economic", pivoting=True)
+    # SciPy takes long to import, and few problems come here.
+    from scipy.linalg import qr
+
+    _, triangle, order = qr(stacked.T, mode="economic", pivoting=True)
     count = int((np.abs(np.diag(triangle)) > RANK_TOLERANCE).sum())
     chosen = {labels[k] for k in order[:count]}
     return tuple(

@@ -233,8 +233,6 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
 
 def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
     """Return the thrusts with ``A f = w`` farthest from their limits; without any, the nearest within the limits."""
-    from scipy.optimize import lsq_linear
-
     count = matrix.shape[1]
     if count == 6 and np.linalg.matrix_rank(matrix) == 6:
         return np.asarray(np.linalg.solve(matrix, wrench))
@@ -247,7 +245,11 @@ def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> A
         np.r_[np.full(count, -low), np.full(count, high)],
         [(None, None)] * (count + 1),
     )
-    return np.asarray(lsq_linear(matrix, wrench, bounds=(low, high)).x) if found is None else found[:-1]
+    if found is not None:
+        return found[:-1]
+    from scipy.optimize import lsq_linear
+
+    return np.asarray(lsq_linear(matrix, wrench, bounds=(low, high)).x)
 
 
 def _maximize_last(

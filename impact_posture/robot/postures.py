@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from impact_posture.errors import JointNotFound, PostureError, PostureNotFound, nearest
 from impact_posture.robot.model_joints import q_slice, scalar_entries
@@ -72,6 +71,9 @@ def posture_path(text: str) -> Path | None:
 
 
 def _load(path: Path) -> Mapping[str, object]:
+    # Imported here, because few postures come from files.
+    import yaml
+
     kind = "JSON" if path.suffix == ".json" else "YAML"
     try:
         text = path.read_text(encoding="utf-8")

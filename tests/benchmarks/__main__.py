@@ -31,6 +31,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the impacts and robustness studies")
     parser.add_argument("--number", type=int, help="robustness: print this configuration alone, run anew")
     parser.add_argument("--jobs", type=int, default=2, help="processes of robustness and reproduction")
+    parser.add_argument("--against", default="", metavar="PROGRAM", help="answer: another impact-posture")
     parser.add_argument("--write", action="store_true", help="also write the page in docs/generated")
     asked = parser.parse_args()
     wanted = [STUDIES[name] for name in asked.names]
@@ -42,7 +43,9 @@ def main() -> int:
 
 
 def _run(study: Study, asked: argparse.Namespace) -> int:
-    request = Request(asked.only, asked.count or study.count, asked.seed, asked.number, asked.jobs, asked.write)
+    request = Request(
+        asked.only, asked.count or study.count, asked.seed, asked.number, asked.jobs, asked.write, asked.against
+    )
     lines = [study.head, ""]
     try:
         for line in study.lines(request):

@@ -57,6 +57,9 @@ STUDIES = {
     for study in (
         Study("solve", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
         Study("optima", "solve:optima", "whether 16 starts find what many starts find", 500, page=False),
+        Study(
+            "answer", "answer", "optimize until its answer and until its end, beside another program", 5, page=False
+        ),
         Study("formulations", "formulations", "the linear solve inside the program or its objective", 12, page=False),
         Study("kernel", "kernel.times", "H and ∇H beside Pinocchio C++, ADAM and CasADi; passes", 101),
         Study("loader", "exported:loader", "a call of exported code from Python; passes", 100, page=False),
@@ -81,6 +84,7 @@ class Request:
     number: int | None = None
     jobs: int = 1
     write: bool = False
+    against: str = ""
     missed: list[str] = field(default_factory=list)
 
 

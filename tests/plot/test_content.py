@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from impact_posture.errors import InputError
 from impact_posture.impact.velocity_jump import tangent_units
-from impact_posture.plot import FIGURES, PathData, ResultView, postures_figure
+from impact_posture.plot import FIGURES, ResultView, postures_figure
 from impact_posture.plot.classical_figure import classical_figure, kinds_of
 from impact_posture.plot.ellipsoid_figure import ellipsoid_figure
 from impact_posture.plot.jump_figure import groups_of, jump_figure
@@ -25,6 +25,7 @@ from impact_posture.plot.shapes import (
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.style import WIDTH, style, wrap
 from impact_posture.plot.view import SEPARATOR, contact_letters, header_lines, number
+from impact_posture.posture.null_space_path import NullSpacePath
 from tests.plot.views import PENDULUM, make_view, text_of
 
 
@@ -336,13 +337,13 @@ def test_path_curves(tilthex: ResultView) -> None:
     curve = normalized(path, "H")
     assert curve is not None
     np.testing.assert_allclose(curve, path.H / tilthex.before.H)
-    assert path.H[path.optimum] == pytest.approx(tilthex.after.H)
+    assert path.H[-1] == pytest.approx(tilthex.after.H)
 
 
-def wide_path(factor: float) -> PathData:
+def wide_path(factor: float) -> NullSpacePath:
     s = np.linspace(0, 1, 9)
     S = np.where(s < 0.3, np.nan, 2.0)
-    return PathData(s, H=np.geomspace(3, 3 * factor, 9), G=1 + s, V=2 - s, S=S, optimum=6)
+    return NullSpacePath(s, s, H=np.geomspace(3, 3 * factor, 9), G=1 + s, V=2 - s, S=S, objective=s)
 
 
 @pytest.mark.parametrize(("factor", "scale"), [(0.1, "linear"), (0.01, "log")])
@@ -359,7 +360,7 @@ def test_path_axis_is_log_where_values_spread(factor: float, scale: str, panda: 
 
 
 def test_path_of_wrong_shape(panda: ResultView) -> None:
-    path = PathData(np.arange(3.0), np.ones(3), np.ones(2), np.ones(3), np.ones(3))
+    path = NullSpacePath(np.ones(3), np.arange(3.0), np.ones(3), np.ones(2), *np.ones((3, 3)))
     view = ResultView(panda.robot, panda.objective, panda.q_initial, panda.q_optimal, path=path)
     with pytest.raises(InputError, match="G \\(2,\\)"):
         path_figure(view)

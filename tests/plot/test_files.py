@@ -93,7 +93,7 @@ def test_pages_have_no_defects(name: str, figure: object, request: pytest.Fixtur
 
 
 def test_defects_are_found(monkeypatch: pytest.MonkeyPatch, turned: ResultView) -> None:
-    monkeypatch.setattr("impact_posture.plot.style.place_labels", lambda figure: None)
+    monkeypatch.setattr("impact_posture.plot.style.draw_with_labels", lambda figure: None)
     page = postures_figure(turned)
     _, flat = page.axes
     flat.set_xlabel("x")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import matplotlib
 import matplotlib.image
 import numpy as np
@@ -14,11 +16,21 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.plot import (
     ResultView,
     TradeOffData,
-    sample_path,
 )
+from impact_posture.posture.null_space_path import NullSpacePath
 from impact_posture.robot.robot_loader import load_robot
 
 PENDULUM = "example-robot-data:double_pendulum_description/urdf/double_pendulum.urdf"
+
+
+def sample_path(objective: ImpactObjective, way: list[np.ndarray]) -> NullSpacePath:
+    model = objective.robot.model
+    steps = [np.linalg.norm(pin.difference(model, q, p)) for q, p in pairwise(way)]
+    found = [objective.oracle.quantities(q) for q in way]
+    # A missing S becomes NaN.
+    curves = {name: np.array([getattr(f, name) for f in found], dtype=float) for name in "HGVS"}
+    values = np.array([objective.value(q) for q in way])
+    return NullSpacePath(np.array(way), np.concatenate([[0.0], np.cumsum(steps)]), **curves, objective=values)
 
 
 def make_view(
@@ -57,8 +69,7 @@ def trade_of(objective: ImpactObjective, way: list[np.ndarray], knee: int | None
     """A curve to draw, better or worse as it may be; its last but one point is not certified."""
     path = sample_path(objective, way)
     certified = np.arange(len(way)) != len(way) - 2
-    values = np.array([objective.value(q) for q in way])
-    return TradeOffData(path.s, path.s, values, path.H, path.G, path.V, path.S, certified, knee)
+    return TradeOffData(path.s, path.s, path.objective, path.H, path.G, path.V, path.S, certified, knee)
 
 
 def spin(seed: int = 0) -> np.ndarray:

@@ -1,0 +1,48 @@
+"""Load what writes a result in another process while this one solves the problem."""
+
+from __future__ import annotations
+
+import multiprocessing
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from impact_posture.errors import OutputError
+from impact_posture.output_folder import scratch_folder
+from impact_posture.processes import fork_server
+
+# This module is imported before all that takes long to import.
+if TYPE_CHECKING:
+    from impact_posture.result_folder import Finish
+    from impact_posture.settings import ProblemSettings
+
+
+@contextmanager
+def early_writer(settings: ProblemSettings, jobs: int) -> Iterator[Finish | None]:
+    """Yield :func:`~impact_posture.result_folder.finish_result` of a problem, in a process that prepares for it.
+
+    Yield ``None`` for a single job, or where the system has no place for a process or its temporary files.
+    """
+    with ExitStack() as stack:
+        finish = None
+        if jobs > 1 and "fork" in multiprocessing.get_all_start_methods():
+            try:
+                folder = stack.enter_context(scratch_folder())
+                finish = stack.enter_context(fork_server(partial(_load, settings, folder)))
+            except (OSError, OutputError):
+                finish = None
+        yield finish
+
+
+def _load(settings: ProblemSettings, folder: Path) -> Finish:
+    # The process may be killed.  Then nobody else removes its temporary files, of which matplotlib makes some.
+    tempfile.tempdir = str(folder)
+    import impact_posture.codegen.export
+    import impact_posture.plot  # noqa: F401 (the import is what takes long)
+    from impact_posture.posture.problem_settings import prepare
+    from impact_posture.result_folder import finish_result
+
+    return partial(finish_result, prepare(settings))
