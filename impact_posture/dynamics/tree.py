@@ -18,15 +18,25 @@ from impact_posture.dynamics.spatial import (
     constant,
     cross,
     force_to_parent,
-    ldl_solve,
-    motion_cross_force,
+    inertia_to_parent,
     motion_to_child,
-    rotate_inertia,
-    shift_inertia,
-    symmetric,
+    spin_power,
+)
+from impact_posture.dynamics.tree_steps import (
+    drive_step,
+    gradient_row,
+    motion_step,
+    pivot_of,
+    project,
+    reduce,
+    response_step,
 )
 
 __all__ = ["ByJoint", "PointOnLink", "Response", "Tree", "Wrench"]
+
+
+# No motion and no force.
+_ZERO = ca.SX(6, 1)
 
 
 @dataclass(frozen=True)
@@ -53,8 +63,8 @@ class Response:
     Attributes:
         a: ``M⁻¹(τ + Σ Jᵀ w)``, shape (nv,).
         velocities: Spatial velocity of every link under ``a``, in link coordinates.
-        before: The same without the motion of the link's own joint, for joints with a parent joint.
-        forces: Spatial force through every joint with a parent joint, on its link.
+        before: The same without the motion of the link's own joint.
+        forces: Spatial force through every joint, on its link.
         passed: The part of that force that does not depend on the motion of the parent.
         wrenches: The wrenches.
     """
@@ -65,16 +75,6 @@ class Response:
     forces: ByJoint
     passed: ByJoint
     wrenches: tuple[Wrench, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class _Factor:
-    """Per joint: ``U = I^A S``, ``D = SᵀU + armature``, ``D⁻¹Uᵀ`` and ``I^a = I^A − U D⁻¹ Uᵀ``."""
-
-    U: ByJoint
-    D: ByJoint
-    gain: ByJoint
-    reduced: ByJoint
 
 
 class Tree(Kinematics):
@@ -88,11 +88,8 @@ class Tree(Kinematics):
     def velocities(self, v: ca.SX) -> ByJoint:
         """Return the spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
         found: ByJoint = {}
-        for slot in self.chart.slots:
-            i, parent = slot.index, self._parents[slot.index]
-            own = self._S[i] @ v[slot.v]
-            moved = motion_to_child(self._R[i], self._p[i], found[parent]) if parent else ca.SX(6, 1)
-            found[i] = moved + own
+        for slot, i, parent in self._joints:
+            found[i] = motion_step(self._R[i], self._p[i], found.get(parent, _ZERO), self._S[i], v[slot.v])
         return found
 
     def _accumulate(self, forces: ByJoint) -> ByJoint:
@@ -117,29 +114,7 @@ class Tree(Kinematics):
         return self._project(momenta) + self._armature * v
 
     def _project(self, forces: ByJoint) -> ca.SX:
-        rows = [self._S[slot.index].T @ forces[slot.index] for slot in self.chart.slots]
-        return ca.densify(ca.vertcat(*rows))
-
-    def mass_matrix(self) -> ca.SX:
-        """Return ``M(q)`` by composite rigid bodies (Featherstone 2008, §6.2), shape (nv, nv), armature included."""
-        composite = dict(self._inertia)
-        M = ca.SX.zeros(self.nv, self.nv)
-        for slot in reversed(self.chart.slots):
-            i, parent = slot.index, self._parents[slot.index]
-            force = composite[i] @ self._S[i]
-            M[slot.v, slot.v] = self._S[i].T @ force
-            j, carried = i, force
-            while self._parents[j]:
-                carried = ca.horzcat(
-                    *[force_to_parent(self._R[j], self._p[j], carried[:, c]) for c in range(carried.shape[1])]
-                )
-                j = self._parents[j]
-                other = self.chart.slots[j - 1]
-                M[other.v, slot.v] = self._S[j].T @ carried
-                M[slot.v, other.v] = M[other.v, slot.v].T
-            if parent:
-                composite[parent] = composite[parent] + self._inertia_to_parent(i, composite[i])
-        return M + ca.diag(self._armature)
+        return ca.densify(ca.vertcat(*[project(S, forces[i]) for i, S in self._S.items()]))
 
     def link_force(self, wrench: Wrench) -> ca.SX:
         """Return a wrench as a spatial force in link coordinates about the origin of its link, shape (6,)."""
@@ -153,7 +128,7 @@ class Tree(Kinematics):
 
     def generalized_force(self, wrenches: Sequence[Wrench]) -> ca.SX:
         """Return ``Σ Jᵀ [force; moment]`` of the wrenches, shape (nv,)."""
-        forces: ByJoint = {i: ca.SX(6, 1) for i in self._R}
+        forces: ByJoint = dict.fromkeys(self._R, _ZERO)
         for wrench in wrenches:
             forces[wrench.point.joint] = forces[wrench.point.joint] + self.link_force(wrench)
         return self._project(self._accumulate(forces))
@@ -170,25 +145,26 @@ class Tree(Kinematics):
     def _inertia_to_parent(self, i: int, inertia: ca.SX) -> ca.SX:
         """Return the symmetric 6×6 (articulated) inertia of link i in the coordinates of its parent."""
         spin = self._spin[i]
-        turned = rotate_inertia(inertia, self._R[i] if spin is None else self._rest[i], spin)
-        return shift_inertia(turned, self._p[i])
+        if spin is None:
+            return inertia_to_parent(inertia, self._R[i], self._p[i])
+        return inertia_to_parent(inertia, self._rest[i], self._p[i], spin.cosine, spin.sine, axis=spin.axis)
 
     @cached_property
-    def _factor(self) -> _Factor:
+    def _factor(self) -> dict[int, tuple[ca.SX, ...]]:
+        """``(pivot, D⁻¹Uᵀ, I^a = I^A − U D⁻¹ Uᵀ)`` of every joint, with ``U = I^A S`` and ``D = SᵀU + armature``.
+
+        The pivot is ``D``, and ``1/D`` for a joint with one axis.
+        """
         articulated = dict(self._inertia)
-        U: ByJoint = {}
-        D: ByJoint = {}
-        gain: ByJoint = {}
-        reduced: ByJoint = {}
-        for slot in reversed(self.chart.slots):
-            i, parent = slot.index, self._parents[slot.index]
-            U[i] = ca.densify(articulated[i] @ self._S[i])
-            D[i] = symmetric(self._S[i].T @ U[i] + ca.diag(ca.SX(self._armature[slot.v])))
+        found: dict[int, tuple[ca.SX, ...]] = {}
+        for slot, i, parent in reversed(self._joints):
+            D = pivot_of(articulated[i], self._S[i], self._armature[slot.v])
+            # Not in a template, so that a constant becomes a factor and not a divisor.
+            pivot = 1 / D if slot.kind.nv == 1 else D
+            found[i] = pivot, *reduce(articulated[i], self._S[i], pivot)
             if parent:
-                gain[i] = U[i].T * (1 / D[i]) if slot.kind.nv == 1 else ldl_solve(D[i], U[i].T)
-                reduced[i] = symmetric(articulated[i] - U[i] @ gain[i])
-                articulated[parent] = articulated[parent] + self._inertia_to_parent(i, reduced[i])
-        return _Factor(U, D, gain, reduced)
+                articulated[parent] = articulated[parent] + self._inertia_to_parent(i, found[i][2])
+        return found
 
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
         """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization, in O(n) and without forming ``M``.
@@ -196,35 +172,26 @@ class Tree(Kinematics):
         The force through joint i is ``f_i = I^a_i v_i⁻ + p^a_i``.  The factorization knows the momentum of the whole
         subtree, so no sweep has to gather it.
         """
-        factor = self._factor
-        bias: ByJoint = {i: ca.SX(6, 1) for i in self._R}
+        bias: ByJoint = dict.fromkeys(self._R, _ZERO)
         for wrench in wrenches:
             bias[wrench.point.joint] = bias[wrench.point.joint] - self.link_force(wrench)
         drive: ByJoint = {}
         passed: ByJoint = {}
-        for slot in reversed(self.chart.slots):
-            i, parent = slot.index, self._parents[slot.index]
+        for slot, i, parent in reversed(self._joints):
             own = tau[slot.v] if tau is not None else ca.SX(slot.kind.nv, 1)
-            drive[i] = own - self._S[i].T @ bias[i]
+            drive[i], passed[i] = drive_step(self._S[i], own, bias[i], self._factor[i][1])
             if parent:
-                passed[i] = bias[i] + factor.gain[i].T @ drive[i]
                 bias[parent] = bias[parent] + force_to_parent(self._R[i], self._p[i], passed[i])
         velocities: ByJoint = {}
         before: ByJoint = {}
         forces: ByJoint = {}
-        parts = []
-        for slot in self.chart.slots:
-            i, parent = slot.index, self._parents[slot.index]
-            rate = drive[i] * (1 / factor.D[i]) if slot.kind.nv == 1 else ldl_solve(factor.D[i], drive[i])
-            if parent:
-                before[i] = motion_to_child(self._R[i], self._p[i], velocities[parent])
-                rate = rate - factor.gain[i] @ before[i]
-                velocities[i] = before[i] + self._S[i] @ rate
-                forces[i] = factor.reduced[i] @ before[i] + passed[i]
-            else:
-                velocities[i] = ca.densify(self._S[i] @ rate)
-            parts.append(rate)
-        return Response(ca.densify(ca.vertcat(*parts)), velocities, before, forces, passed, tuple(wrenches))
+        rates: ByJoint = {}
+        for _, i, parent in self._joints:
+            before[i] = motion_to_child(self._R[i], self._p[i], velocities.get(parent, _ZERO))
+            rates[i], velocities[i], forces[i] = response_step(
+                before[i], self._S[i], drive[i], passed[i], *self._factor[i]
+            )
+        return Response(ca.densify(ca.vertcat(*rates.values())), velocities, before, forces, passed, tuple(wrenches))
 
     def pair_gradient(self, x: Response, y: Response) -> ca.SX:
         """Return the tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` with all four letters held fixed, shape (nv,).
@@ -242,8 +209,8 @@ class Tree(Kinematics):
         for i in x.forces:
             spin = self._spin[i]
             if spin is not None:
-                rate = spin.rate(self._factor.reduced[i])
-                rows[i] = ca.dot(y.before[i], rate @ x.before[i])
+                inertia = self._factor[i][2]
+                rows[i] = spin_power(inertia, x.before[i], y.before[i], axis=spin.axis, sense=spin.sense)
                 forces[0][i], forces[1][i] = x.passed[i], y.passed[i]
         return self._gather([(y.before, forces[0]), (x.before, forces[1])], turning, rows)
 
@@ -265,11 +232,9 @@ class Tree(Kinematics):
         A joint with one axis keeps that motion, because ``Sᵀ(S ×* F)`` is zero.
         """
         return {
-            slot.index: velocities[slot.index]
-            if slot.kind.nv == 1
-            else motion_to_child(self._R[slot.index], self._p[slot.index], velocities[self._parents[slot.index]])
-            for slot in self.chart.slots
-            if self._parents[slot.index]
+            i: velocities[i] if slot.kind.nv == 1 else motion_to_child(self._R[i], self._p[i], velocities[parent])
+            for slot, i, parent in self._joints
+            if parent
         }
 
     def _turn(self, turning: ByJoint, wrench: Wrench, velocities: ByJoint) -> None:
@@ -291,16 +256,13 @@ class Tree(Kinematics):
         """Return ``Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning`` for pairs ``(v⁻, F)``, plus the ``known`` rows of joints."""
         turning = {i: turning.get(i, ca.SX(3, 1)) for i in self._R}
         rows: ByJoint = {}
-        for slot in reversed(self.chart.slots):
-            i, parent = slot.index, self._parents[slot.index]
-            row = -(self._S[i][3:, :].T @ turning[i])
+        for slot, i, parent in reversed(self._joints):
             if parent:
                 turning[parent] = turning[parent] + self._R[i] @ turning[i]
-                row = row + (known or {}).get(i, ca.SX(1, 1))
-                for before, force in pairs:
-                    row = row + self._S[i].T @ motion_cross_force(before[i], force[i])
-            rows[i] = row
-        return ca.densify(ca.vertcat(*[rows[slot.index] for slot in self.chart.slots]))
+            inner = [x[i] for pair in pairs for x in pair] if parent else []
+            row = (known or {}).get(i, ca.SX(slot.kind.nv, 1))
+            rows[i] = gradient_row(self._S[i], turning[i], row, *inner)
+        return ca.densify(ca.vertcat(*[rows[i] for i in self._R]))
 
     def turning_gradient(self, point: PointOnLink, direction: ca.SX, covector: ca.SX) -> ca.SX:
         """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), of a world direction that turns with the link."""
