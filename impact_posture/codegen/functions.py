@@ -34,7 +34,7 @@ def casadi_reference(objective: ImpactObjective) -> Reference:
     outputs = {} if objective.others else {"H": k.H, "grad": k.grad_H}
     outputs |= {"objective": value, "objective_grad": gradient}
     outputs |= {} if objective.others else {"jump": k.jump.a, "G": k.G, "V": k.V, "ellipsoid": k.ellipsoid}
-    function = ca.Function("reference", [k.q, k.n], [*outputs.values()], ["q", "n"], [*outputs], {"cse": True})
+    function = ca.Function("reference", [k.q, k.n], [*outputs.values()], ["q", "n"], [*outputs])
 
     def evaluate(q: Vector, n: Vector) -> dict[str, Vector]:
         return {name: np.array(x, dtype=float).ravel() for name, x in zip(outputs, function(q, n), strict=True)}

@@ -118,6 +118,10 @@ _COMPUTE: dict[str, Callable[..., float]] = {
 }
 
 
+# A square and a double have one operand, which is both.
+_BINARY = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_SQ: "*", ca.OP_TWICE: "+"}
+
+
 def graph_of(function: ca.Function) -> Graph:
     """Return the operations of an SX function.  Sparse outputs become dense.
 
@@ -150,13 +154,10 @@ def _operation(graph: Graph, operation: int, operands: list[int]) -> int:
         return a
     if operation == ca.OP_DIV:
         return graph.add(Node("*", (a, graph.add(Node("inv", (b,))))))
-    arithmetic = {
-        ca.OP_ADD: Node("+", (a, b)), ca.OP_SUB: Node("-", (a, b)), ca.OP_MUL: Node("*", (a, b)),
-        ca.OP_NEG: Node("neg", (a,)), ca.OP_INV: Node("inv", (a,)),
-        ca.OP_SQ: Node("*", (a, a)), ca.OP_TWICE: Node("+", (a, a)),
-    }  # fmt: skip
-    if operation in arithmetic:
-        return graph.add(arithmetic[operation])
+    if operation in _BINARY:
+        return graph.add(Node(_BINARY[operation], (a, b)))
+    if operation in (ca.OP_NEG, ca.OP_INV):
+        return graph.add(Node("neg" if operation == ca.OP_NEG else "inv", (a,)))
     if operation in CALLS:
         text = CALLS[operation]
         return graph.add(Node(text, (a, b) if "{1}" in text else (a,)))
