@@ -74,15 +74,13 @@ def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
         return axis_rotation(ca.cos(q[0]), ca.sin(q[0]), axis=axis), zero
     if kind.family == "continuous":
         return axis_rotation(q[0], q[1], axis=axis), zero
-    if kind.family == "prismatic":
-        return ca.SX.eye(3), constant(kind.axis) * q[0]
     if kind.family == "free-flyer":
         return quaternion_matrix(q[3:7]), q[:3]
     if kind.family == "planar":
         return axis_rotation(q[2], q[3], axis=axis), ca.sparsify(ca.vertcat(q[0], q[1], 0))
     if kind.family == "spherical":
         return quaternion_matrix(q), zero
-    return ca.SX.eye(3), q[:3]
+    return ca.SX.eye(3), constant(kind.subspace[:3]) @ q
 
 
 def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:

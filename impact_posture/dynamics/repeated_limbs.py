@@ -77,8 +77,7 @@ class RepeatedLimbs:
         place = self.places.get(joint)
         if place is None:
             return constant(of(joint))
-        lanes = [rounded(of(other)) for other in self.counterparts(joint)]
-        dense = [lane.reshape(len(lane), -1) for lane in lanes]
+        dense = [(lane := rounded(of(other))).reshape(len(lane), -1) for other in self.counterparts(joint)]
         own = dense[place.lane]
         symmetric = own.shape[0] == own.shape[1] and all(np.array_equal(d, d.T) for d in dense)
         found = ca.SX(*own.shape)

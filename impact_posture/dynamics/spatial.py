@@ -69,9 +69,9 @@ def cross(a: ca.SX, b: ca.SX) -> ca.SX:
 
 
 @template
-def rotate_back(R: ca.SX, direction: ca.SX) -> ca.SX:
-    """Return ``Rᵀ d`` of a 3-vector."""
-    return R.T @ direction
+def transposed_times(A: ca.SX, b: ca.SX) -> ca.SX:
+    """Return ``Aᵀ b``."""
+    return A.T @ b
 
 
 @template
@@ -130,17 +130,9 @@ def spin_power(inertia: ca.SX, x: ca.SX, y: ca.SX, *, axis: int, sense: float) -
 
     ``S`` turns about the coordinate ``axis``, or the other way if ``sense`` is −1.
     """
-    i, j, k = (axis + 1) % 3, (axis + 2) % 3, axis
-    out = ca.SX(6, 6)
-    for rows, columns in ((0, 0), (0, 3), (3, 3)):
-        M = inertia[rows : rows + 3, columns : columns + 3]
-        sum_, difference = M[i, j] + M[j, i], M[j, j] - M[i, i]
-        K = ca.SX(3, 3)
-        K[i, i], K[j, j] = sum_, -sum_
-        K[i, j], K[j, i] = difference, difference
-        K[i, k], K[j, k], K[k, i], K[k, j] = M[j, k], -M[i, k], M[k, j], -M[k, i]
-        out[rows : rows + 3, columns : columns + 3] = sense * K
-    return ca.dot(y, symmetric(ca.sparsify(out)) @ x)
+    turn = skew(constant(sense * np.eye(3)[axis]))
+    S = ca.diagcat(turn, turn)
+    return ca.dot(y, symmetric(S.T @ inertia + inertia @ S) @ x)
 
 
 @template

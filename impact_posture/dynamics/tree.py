@@ -13,6 +13,7 @@ from functools import cached_property
 
 import casadi as ca
 
+from impact_posture.dynamics import tree_steps as step
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
 from impact_posture.dynamics.spatial import (
     constant,
@@ -21,21 +22,11 @@ from impact_posture.dynamics.spatial import (
     inertia_to_parent,
     motion_to_child,
     spin_power,
-)
-from impact_posture.dynamics.tree_steps import (
-    drive_step,
-    gradient_row,
-    motion_step,
-    pivot_of,
-    project,
-    reduce,
-    response_step,
+    transposed_times,
 )
 
 __all__ = ["ByJoint", "PointOnLink", "Response", "Tree", "Wrench"]
 
-
-# No motion and no force.
 _ZERO = ca.SX(6, 1)
 
 
@@ -89,7 +80,8 @@ class Tree(Kinematics):
         """Return the spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
         found: ByJoint = {}
         for slot, i, parent in self._joints:
-            found[i] = motion_step(self._R[i], self._p[i], found.get(parent, _ZERO), self._S[i], v[slot.v])
+            moved = motion_to_child(self._R[i], self._p[i], found.get(parent, _ZERO))
+            found[i] = moved + self._S[i] @ v[slot.v]
         return found
 
     def _accumulate(self, forces: ByJoint) -> ByJoint:
@@ -114,7 +106,7 @@ class Tree(Kinematics):
         return self._project(momenta) + self._armature * v
 
     def _project(self, forces: ByJoint) -> ca.SX:
-        return ca.densify(ca.vertcat(*[project(S, forces[i]) for i, S in self._S.items()]))
+        return ca.densify(ca.vertcat(*[transposed_times(S, forces[i]) for i, S in self._S.items()]))
 
     def link_force(self, wrench: Wrench) -> ca.SX:
         """Return a wrench as a spatial force in link coordinates about the origin of its link, shape (6,)."""
@@ -158,10 +150,10 @@ class Tree(Kinematics):
         articulated = dict(self._inertia)
         found: dict[int, tuple[ca.SX, ...]] = {}
         for slot, i, parent in reversed(self._joints):
-            D = pivot_of(articulated[i], self._S[i], self._armature[slot.v])
+            D = step.pivot(articulated[i], self._S[i], self._armature[slot.v])
             # Not in a template, so that a constant becomes a factor and not a divisor.
             pivot = 1 / D if slot.kind.nv == 1 else D
-            found[i] = pivot, *reduce(articulated[i], self._S[i], pivot)
+            found[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)
             if parent:
                 articulated[parent] = articulated[parent] + self._inertia_to_parent(i, found[i][2])
         return found
@@ -179,7 +171,7 @@ class Tree(Kinematics):
         passed: ByJoint = {}
         for slot, i, parent in reversed(self._joints):
             own = tau[slot.v] if tau is not None else ca.SX(slot.kind.nv, 1)
-            drive[i], passed[i] = drive_step(self._S[i], own, bias[i], self._factor[i][1])
+            drive[i], passed[i] = step.drive(self._S[i], own, bias[i], self._factor[i][1])
             if parent:
                 bias[parent] = bias[parent] + force_to_parent(self._R[i], self._p[i], passed[i])
         velocities: ByJoint = {}
@@ -188,7 +180,7 @@ class Tree(Kinematics):
         rates: ByJoint = {}
         for _, i, parent in self._joints:
             before[i] = motion_to_child(self._R[i], self._p[i], velocities.get(parent, _ZERO))
-            rates[i], velocities[i], forces[i] = response_step(
+            rates[i], velocities[i], forces[i] = step.respond(
                 before[i], self._S[i], drive[i], passed[i], *self._factor[i]
             )
         return Response(ca.densify(ca.vertcat(*rates.values())), velocities, before, forces, passed, tuple(wrenches))
@@ -224,18 +216,13 @@ class Tree(Kinematics):
         without the motion of joint j.
         """
         forces = {i: -2 * (self._own_inertia[i] @ velocity) for i, velocity in velocities.items()}
-        return self._gather([(self._before(velocities), self._accumulate(forces))], {})
-
-    def _before(self, velocities: ByJoint) -> ByJoint:
-        """Return the velocity of every link without the motion of its own joint.
-
-        A joint with one axis keeps that motion, because ``Sᵀ(S ×* F)`` is zero.
-        """
-        return {
+        # A joint with one axis keeps its motion, because Sᵀ(S ×* F) is zero.
+        before = {
             i: velocities[i] if slot.kind.nv == 1 else motion_to_child(self._R[i], self._p[i], velocities[parent])
             for slot, i, parent in self._joints
             if parent
         }
+        return self._gather([(before, self._accumulate(forces))], {})
 
     def _turn(self, turning: ByJoint, wrench: Wrench, velocities: ByJoint) -> None:
         """Add ``f × u + m × ω`` of a wrench that stays in the world while its link moves with ``(u, ω)``.
@@ -261,7 +248,7 @@ class Tree(Kinematics):
                 turning[parent] = turning[parent] + self._R[i] @ turning[i]
             inner = [x[i] for pair in pairs for x in pair] if parent else []
             row = (known or {}).get(i, ca.SX(slot.kind.nv, 1))
-            rows[i] = gradient_row(self._S[i], turning[i], row, *inner)
+            rows[i] = step.gradient(self._S[i], turning[i], row, *inner)
         return ca.densify(ca.vertcat(*[rows[i] for i in self._R]))
 
     def turning_gradient(self, point: PointOnLink, direction: ca.SX, covector: ca.SX) -> ca.SX:

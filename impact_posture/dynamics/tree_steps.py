@@ -8,23 +8,11 @@ from __future__ import annotations
 
 import casadi as ca
 
-from impact_posture.dynamics.spatial import motion_cross_force, motion_to_child, symmetric, template
+from impact_posture.dynamics.spatial import motion_cross_force, symmetric, template
 
 
 @template
-def project(S: ca.SX, force: ca.SX) -> ca.SX:
-    """Return the generalized force ``Sᵀf`` of a joint, shape (nv,)."""
-    return S.T @ force
-
-
-@template
-def motion_step(R: ca.SX, p: ca.SX, parent: ca.SX, S: ca.SX, v: ca.SX) -> ca.SX:
-    """Return the velocity of a link from that of its parent and the rates ``v`` of its joint, shape (6,)."""
-    return motion_to_child(R, p, parent) + S @ v
-
-
-@template
-def pivot_of(inertia: ca.SX, S: ca.SX, armature: ca.SX) -> ca.SX:
+def pivot(inertia: ca.SX, S: ca.SX, armature: ca.SX) -> ca.SX:
     """Return ``D = SᵀIS + armature``, shape (nv, nv)."""
     return symmetric(S.T @ (inertia @ S) + ca.diag(armature))
 
@@ -38,19 +26,19 @@ def reduce(inertia: ca.SX, S: ca.SX, pivot: ca.SX) -> tuple[ca.SX, ...]:
 
 
 @template
-def drive_step(S: ca.SX, tau: ca.SX, bias: ca.SX, gain: ca.SX) -> tuple[ca.SX, ...]:
+def drive(S: ca.SX, tau: ca.SX, bias: ca.SX, gain: ca.SX) -> tuple[ca.SX, ...]:
     """Return what drives a joint, ``τ − Sᵀp``, shape (nv,), and the bias force that the parent feels, shape (6,)."""
-    drive = tau - S.T @ bias
-    return drive, bias + gain.T @ drive
+    driving = tau - S.T @ bias
+    return driving, bias + gain.T @ driving
 
 
 @template
-def response_step(
+def respond(
     before: ca.SX, S: ca.SX, drive: ca.SX, passed: ca.SX, pivot: ca.SX, gain: ca.SX, reduced: ca.SX
 ) -> tuple[ca.SX, ...]:
     """Return the rates of a joint, the velocity of its link and the force through it.
 
-    ``before`` is the velocity of the link without the motion of the joint.  The rest is as :func:`drive_step` and
+    ``before`` is the velocity of the link without the motion of the joint.  The rest is as :func:`drive` and
     :func:`reduce` return it.
     """
     rates = _solve(pivot, drive) - gain @ before
@@ -58,7 +46,7 @@ def response_step(
 
 
 @template
-def gradient_row(S: ca.SX, turning: ca.SX, known: ca.SX, *pairs: ca.SX) -> ca.SX:
+def gradient(S: ca.SX, turning: ca.SX, known: ca.SX, *pairs: ca.SX) -> ca.SX:
     """Return ``known − S_ωᵀ turning + Σ Sᵀ(v ×* F)`` for ``pairs`` of ``v`` and ``F`` in turn, shape (nv,)."""
     row = known - S[3:, :].T @ turning
     for velocity, force in zip(pairs[::2], pairs[1::2], strict=True):
