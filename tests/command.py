@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib.metadata import entry_points
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -54,6 +54,9 @@ PARSER = typer.main.get_command(app)
 for name in COMMANDS:
     load(name)
 
+# The figures of a result.
+ALL_PICTURES = tuple(impact_posture.plot.FIGURES)
+
 # The program that the installation puts on the path.
 (MAIN,) = (entry.load() for entry in entry_points(group="console_scripts", name="impact-posture"))
 
@@ -64,11 +67,11 @@ def run(
     env: Mapping[str, str] | None = None,
     prepare: Callable[[], None] | None = None,
     timeout: float = 600,
-    pictures: bool = False,
+    pictures: Collection[str] = (),
 ) -> subprocess.CompletedProcess[str]:
     """Run ``impact-posture`` with arguments, as its entry point does; ``env`` is added to the environment.
 
-    Without ``pictures`` the figures are blank: to draw them takes most of the time of a small robot's answer.
+    Figures but the named ``pictures`` are blank: to draw them takes most of the time of a small robot's answer.
     The timeout ends what hangs; it is no bound on how long a command takes.
     """
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
@@ -123,7 +126,7 @@ def start(
     cwd: Path | None = None,
     env: Mapping[str, str] | None = None,
     prepare: Callable[[], None] | None = None,
-    pictures: bool = False,
+    pictures: Collection[str] = (),
 ) -> BaseProcess:
     """Start what :func:`run` waits for, its standard output and error on these descriptors."""
     words = [str(argument) for argument in arguments]
@@ -140,7 +143,7 @@ def _command(
     prepare: Callable[[], None] | None,
     out: int,
     errors: int,
-    pictures: bool,
+    pictures: Collection[str],
 ) -> None:
     """Become what a shell would have started: streams, folder, signals and warnings are those of a new program."""
     # The test's objects are left alone: a page that is looked at is a page that is copied.
@@ -155,17 +158,17 @@ def _command(
     warnings.resetwarnings()
     for category in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
         warnings.simplefilter("ignore", category)
+    impact_posture.plot.FIGURES.update(dict.fromkeys(set(ALL_PICTURES) - set(pictures), blank))
     if not pictures:
-        impact_posture.plot.FIGURES.update(dict.fromkeys(impact_posture.plot.FIGURES, _blank))
         # Of a run the snapshots stay, as blank.
         figures = impact_posture.experiment.figures
         figures.draw_run = figures.draw_comparison = lambda *arguments: []
-        impact_posture.plot.snapshots.snapshots_figure = _blank
+        impact_posture.plot.snapshots.snapshots_figure = blank
     if prepare is not None:
         prepare()
     sys.argv = ["impact-posture", *words]
     MAIN()
 
 
-def _blank(views: object) -> Figure:
+def blank(views: object) -> Figure:
     return Figure(figsize=(1, 1))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import casadi as ca
 
 from impact_posture.dynamics.chart import Chart
-from impact_posture.dynamics.spatial import quaternion_matrix
+from impact_posture.dynamics.spatial import force_to_parent, quaternion_matrix
+from impact_posture.dynamics.tree import Tree
 
 
 def tangent_map(chart: Chart, q: ca.SX) -> ca.SX:
@@ -34,3 +35,23 @@ def _quaternion_rate(quaternion: ca.SX) -> ca.SX:
     """Return ``½ quaternion ⊗ [w; 0]`` as a (4, 3) matrix on the body angular velocity ``w``."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     return 0.5 * ca.blockcat([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]])
+
+
+def composite_mass_matrix(tree: Tree) -> ca.SX:
+    """``M(q)`` by composite rigid bodies (Featherstone 2008, §6.2), shape (nv, nv), armature included."""
+    composite = dict(tree._inertia)
+    M = ca.SX.zeros(tree.nv, tree.nv)
+    for slot, i, parent in reversed(tree._joints):
+        carried = composite[i] @ tree._S[i]
+        M[slot.v, slot.v] = tree._S[i].T @ carried
+        j = i
+        while tree._parents[j]:
+            columns = ca.horzsplit(carried)
+            carried = ca.horzcat(*[force_to_parent(tree._R[j], tree._p[j], column) for column in columns])
+            j = tree._parents[j]
+            other = tree.chart.slots[j - 1]
+            M[other.v, slot.v] = tree._S[j].T @ carried
+            M[slot.v, other.v] = M[other.v, slot.v].T
+        if parent:
+            composite[parent] = composite[parent] + tree._inertia_to_parent(i, composite[i])
+    return M + ca.diag(tree._armature)

@@ -17,7 +17,7 @@ import pytest
 from impact_posture import plot
 from impact_posture.plot.view import header_lines
 from impact_posture.result_folder import load_view
-from tests.command import on_terminal, read_terminal, refused, run, start
+from tests.command import ALL_PICTURES, on_terminal, read_terminal, refused, run, start
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
@@ -27,7 +27,7 @@ FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One result of the main job, pictures and C code included."""
     folder = tmp_path_factory.mktemp("main-job")
-    done = run("optimize", "tilthex_arm", "--frame", "ee", "--normal", 0, 0, 1, cwd=folder, pictures=True)
+    done = run("optimize", "tilthex_arm", "--frame", "ee", "--normal", 0, 0, 1, cwd=folder, pictures=ALL_PICTURES)
     assert done.returncode == 0, done.stderr
     return folder / "tilthex_arm-ee"
 
@@ -97,7 +97,7 @@ def test_plot_draws_again(result: Path, tmp_path: Path) -> None:
         "--figure",
         "ellipsoid",
         cwd=tmp_path,
-        pictures=True,
+        pictures=("ellipsoid",),
     )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "pictures" / "ellipsoid.svg").is_file()

@@ -164,7 +164,7 @@ def test_file_size_limit_leaves_nothing(tmp_path: Path) -> None:
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 
-    refused(run(*BASE, "--out", "out", cwd=tmp_path, prepare=limit, pictures=True), 1, "out")
+    refused(run(*BASE, "--out", "out", cwd=tmp_path, prepare=limit, pictures=("ellipsoid",)), 1, "out")
     untouched(tmp_path)
 
 

@@ -45,7 +45,8 @@ def assert_coulomb(B: Vector, n: Vector, friction: float, impulse: Vector, toler
     assert normal > 0 and size <= friction * normal + tolerance * (1 + normal + size)
     if slip > tolerance * scale:
         assert abs(size - friction * normal) <= tolerance * (1 + normal + size)
-        assert np.linalg.norm(tangential * slip + after * friction * normal) <= tolerance * scale * (1 + normal + size)
+        opposed = np.linalg.norm(tangential * slip + after * friction * normal)
+        assert opposed <= tolerance * scale * (1 + normal + size)
     # The change of energy: impulse times mean velocity of the point.
     assert impulse @ (after - n) / 2 <= tolerance * scale
 

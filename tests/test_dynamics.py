@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.joints import joint_kind
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.spatial import template
 from impact_posture.dynamics.tree import PointOnLink, Tree, Wrench
 from impact_posture.errors import UnsupportedJoint
 from impact_posture.robot.urdf import build_model
@@ -32,6 +33,7 @@ from tests.helpers import (
     rng,
     robot,
 )
+from tests.tangent import composite_mass_matrix
 
 TOLERANCE = 1e-10
 OFFSET = np.array([0.03, -0.05, 0.08])
@@ -64,7 +66,7 @@ def build(model: pin.Model, frame: int) -> Symbolic:
     solved, other = tree.respond(tau=tau, wrenches=[world]), tree.respond(tau=u, wrenches=[local])
     rates = solved.velocities
     outputs = {
-        "M": tree.mass_matrix(),
+        "M": composite_mass_matrix(tree),
         "M v": tree.mass_times(v),
         "M v of known velocities": tree.mass_times(v, at_v, extra=False),
         "solve": tree.respond(tau=tau).a,
@@ -355,3 +357,23 @@ def test_urdf_joints(tmp_path: Path, joints: list[tuple[str, str]], types: list[
     symbolic = build(model, model.getFrameId(f"l{len(joints)}"))
     for k, q in enumerate(random_configurations(model, 2, types, floating)):
         compare(symbolic, q, rng(types, k))
+
+
+def test_a_template_inserts_its_arguments_as_if_written_out() -> None:
+    times = []
+
+    @template
+    def turned(R: ca.SX, v: ca.SX, *, factor: float) -> ca.SX:
+        times.append(factor)
+        return factor * (R @ v)
+
+    v, angle = ca.SX.sym("v", 3), ca.SX.sym("angle")
+    R = ca.blockcat([[1, 0, 0], [0, ca.cos(angle), -ca.sin(angle)], [0, ca.sin(angle), ca.cos(angle)]])
+    written, found = 2 * (R @ v), turned(R, v, factor=2.0)
+    assert str(found) == str(written)
+    assert str(turned(ca.SX.eye(3), v, factor=2.0)) == str(2 * v)
+    assert turned(ca.SX(3, 3), v, factor=2.0).is_zero()
+    assert times == [2.0], "made again for the same sizes and options"
+    assert turned(R, ca.SX.sym("two", 3, 2), factor=2.0).shape == (3, 2)
+    assert turned(R, v, factor=3.0).shape == (3, 1)
+    assert times == [2.0, 2.0, 3.0]

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 import impact_posture as ip
+from impact_posture import plot
 from impact_posture.errors import ContactError, InputError, MetricError, PostureError, SpecError
 from impact_posture.impact.evaluation import Evaluation
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.toolchain import find_compiler
-from tests.command import run
+from tests.command import ALL_PICTURES, blank, run
 from tests.settings import make_settings
 from tests.test_extension import JointDistance
 
@@ -120,10 +121,15 @@ def test_evaluation_has_its_numbers() -> None:
     assert found.V is not None and found.S is not None and found.speed == 2.0
 
 
-def test_a_result_saves_what_the_command_line_writes(result: ip.PostureResult, tmp_path: Path) -> None:
+def test_a_result_saves_what_the_command_line_writes(
+    result: ip.PostureResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The same files, and on them nothing, as the command has them here.
+    for name in ALL_PICTURES:
+        monkeypatch.setitem(plot.FIGURES, name, blank)
     written = result.save(tmp_path / "python", codegen=False, jobs=1)
     options = ("--normal", 0, 0, 2, "--base", "level", "--starts", 2, "--jobs", 1, "--no-codegen", "--out", "cli")
-    done = run("optimize", "tilthex_arm", "--frame", "ee", *options, cwd=tmp_path, pictures=True)
+    done = run("optimize", "tilthex_arm", "--frame", "ee", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     theirs = tmp_path / "cli"
     assert {p.name for p in written.out.iterdir()} == {p.name for p in theirs.iterdir()}

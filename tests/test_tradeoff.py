@@ -297,7 +297,7 @@ BASE = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--starts", 2, "--jobs",
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("tradeoff")
-    done = run(*BASE, "--format", "png", "--tradeoff", 6, cwd=folder, pictures=True)
+    done = run(*BASE, "--format", "png", "--tradeoff", 6, cwd=folder, pictures=("tradeoff",))
     assert done.returncode == 0, done.stderr
     return folder / "tilthex_arm-ee", done.stdout
 
@@ -326,7 +326,7 @@ def test_the_folder_holds_the_curve(written: tuple[Path, str]) -> None:
 def test_the_curve_is_drawn_again_and_only_where_there_is_one(written: tuple[Path, str], tmp_path: Path) -> None:
     folder, _ = written
     arguments = ("--figure", "tradeoff", "--format", "png", "--out", tmp_path)
-    done = run("plot", folder, *arguments, cwd=tmp_path, pictures=True)
+    done = run("plot", folder, *arguments, cwd=tmp_path, pictures=("tradeoff",))
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "tradeoff.png").read_bytes() == (folder / "tradeoff.png").read_bytes()
     plain = tmp_path / "plain"
@@ -334,7 +334,7 @@ def test_the_curve_is_drawn_again_and_only_where_there_is_one(written: tuple[Pat
     document = json.loads((plain / "result.json").read_text())
     del document["tradeoff"]
     (plain / "result.json").write_text(json.dumps(document))
-    refused = run("plot", plain, *arguments, cwd=tmp_path, pictures=True)
+    refused = run("plot", plain, *arguments, cwd=tmp_path, pictures=("tradeoff",))
     assert refused.returncode == 1 and "--tradeoff" in refused.stderr and "Traceback" not in refused.stderr
     negative = run(*BASE, "--tradeoff", -1, cwd=tmp_path)
     assert negative.returncode == 2 and "--tradeoff" in negative.stderr

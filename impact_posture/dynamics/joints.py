@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, skew
+from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, skew, template
 from impact_posture.errors import UnsupportedJoint
 
 # Short name of a joint model without "JointModel" → its family.
@@ -69,20 +69,18 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
 
 def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return rotation (3, 3) and translation (3,) of the moved frame in the rest frame of the joint."""
-    zero = ca.SX(3, 1)
+    zero, axis = ca.SX(3, 1), tuple(kind.axis.tolist())
     if kind.family == "revolute":
-        return axis_rotation(kind.axis, ca.cos(q[0]), ca.sin(q[0])), zero
+        return axis_rotation(ca.cos(q[0]), ca.sin(q[0]), axis=axis), zero
     if kind.family == "continuous":
-        return axis_rotation(kind.axis, q[0], q[1]), zero
-    if kind.family == "prismatic":
-        return ca.SX.eye(3), constant(kind.axis) * q[0]
+        return axis_rotation(q[0], q[1], axis=axis), zero
     if kind.family == "free-flyer":
         return quaternion_matrix(q[3:7]), q[:3]
     if kind.family == "planar":
-        return axis_rotation(kind.axis, q[2], q[3]), ca.sparsify(ca.vertcat(q[0], q[1], 0))
+        return axis_rotation(q[2], q[3], axis=axis), ca.sparsify(ca.vertcat(q[0], q[1], 0))
     if kind.family == "spherical":
         return quaternion_matrix(q), zero
-    return ca.SX.eye(3), q[:3]
+    return ca.SX.eye(3), constant(kind.subspace[:3]) @ q
 
 
 def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
@@ -95,7 +93,8 @@ def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
     return Spin(axis, cosine, sense * sine, sense)
 
 
-def axis_rotation(axis: NDArray[np.float64], cosine: ca.SX, sine: ca.SX) -> ca.SX:
+@template
+def axis_rotation(cosine: ca.SX, sine: ca.SX, *, axis: tuple[float, ...]) -> ca.SX:
     """Return the rotation ``aaᵀ + cos (I − aaᵀ) + sin [a]×`` (Rodrigues)."""
     outer = np.outer(axis, axis)
     return ca.sparsify(constant(outer) + cosine * constant(np.eye(3) - outer) + sine * skew(constant(axis)))

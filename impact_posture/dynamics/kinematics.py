@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.joints import joint_quaternion, joint_spin, joint_transform
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
-from impact_posture.dynamics.spatial import Spin, constant, quaternion_product
+from impact_posture.dynamics.spatial import constant, quaternion_product, transposed_times
 from impact_posture.robot.model_joints import finite_armature
 
 # Spatial inertias, forces or motions by joint index.
@@ -72,20 +72,16 @@ class Kinematics:
         self._R: ByJoint = {}
         self._p: ByJoint = {}
         self._rest: ByJoint = {}
-        self._spin: dict[int, Spin | None] = {}
-        self._S: ByJoint = {}
         self._inertia: ByJoint = {}
         self.limbs = limbs
-        for slot in self.chart.slots:
-            i = slot.index
+        self._joints = [(slot, slot.index, self._parents[slot.index]) for slot in self.chart.slots]
+        self._spin = {i: joint_spin(slot.kind, q[slot.q]) for slot, i, _ in self._joints}
+        self._S = {i: constant(slot.kind.subspace) for slot, i, _ in self._joints}
+        for slot, i, _ in self._joints:
             R, p = joint_transform(slot.kind, q[slot.q])
-            place_R = self._constant(i, "rotation", lambda j: model.jointPlacements[j].rotation)
+            self._rest[i] = self._constant(i, "rotation", lambda j: model.jointPlacements[j].rotation)
             place_p = self._constant(i, "translation", lambda j: model.jointPlacements[j].translation)
-            self._R[i] = place_R @ R
-            self._rest[i] = place_R
-            self._spin[i] = joint_spin(slot.kind, q[slot.q])
-            self._p[i] = ca.densify(place_p) + place_R @ p
-            self._S[i] = constant(slot.kind.subspace)
+            self._R[i], self._p[i] = self._rest[i] @ R, ca.densify(place_p) + self._rest[i] @ p
             self._inertia[i] = self._constant(
                 i, "inertia", lambda j: model.inertias[j].matrix() + self._extra.get(j, 0.0)
             )
@@ -126,11 +122,10 @@ class Kinematics:
         if self._x is None:
             raise ValueError("quaternions need chart_x")
         found: ByJoint = {0: ca.SX([0, 0, 0, 1])}
-        for slot in self.chart.slots:
-            i = slot.index
+        for slot, i, parent in self._joints:
             rest = constant_quaternion(self.model.jointPlacements[i].rotation)
             turned = quaternion_product(rest, joint_quaternion(slot.kind, self._x[slot.x]))
-            found[i] = quaternion_product(found[self._parents[i]], turned)
+            found[i] = quaternion_product(found[parent], turned)
         return found
 
     def position(self, point: PointOnLink) -> ca.SX:
@@ -160,7 +155,7 @@ class Kinematics:
         while self._parents[chain[-1]] > 0:
             chain.append(self._parents[chain[-1]])
         for i in reversed(chain):
-            direction = self._R[i].T @ direction
+            direction = transposed_times(self._R[i], direction)
         return direction
 
 

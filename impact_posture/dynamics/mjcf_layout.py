@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -22,19 +21,6 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart, JointSlot
 
 Vector = NDArray[np.float64]
-
-# How many numbers of qpos a joint has.  It has as many velocities as in Pinocchio.
-_WIDTH = {
-    "revolute": 1,
-    "continuous": 1,
-    "prismatic": 1,
-    "planar": 3,
-    "spherical": 4,
-    "translation": 3,
-    "free-flyer": 7,
-}
-# Families with the same single number in Pinocchio and MuJoCo.
-_PLAIN = ("revolute", "prismatic")
 
 
 @dataclass(frozen=True)
@@ -45,21 +31,16 @@ class MjcfSlot:
         joint: Type of the joint, and its place in the Pinocchio vectors.
         qpos: Its entries of ``qpos``.
         qvel: Its entries of ``qvel``.
-        free: Whether it is a MuJoCo free joint, whose pose and linear velocity are in world axes.  Any other
-            free-flyer is three slides and a ball in the rest frame of the joint.
         placement: Rest frame of the joint in its parent.
+        moved: Whether it is a MuJoCo free joint, whose pose and linear velocity are in world axes, and its rest frame
+            is not that of the world.  Any other free-flyer is three slides and a ball in the rest frame of the joint.
     """
 
     joint: JointSlot
     qpos: slice
     qvel: slice
-    free: bool
     placement: pin.SE3
-
-    @cached_property
-    def moved(self) -> bool:
-        """Whether the rest frame differs from the parent frame."""
-        return not self.placement.isIdentity(0.0)
+    moved: bool
 
 
 class MjcfLayout:
@@ -79,63 +60,56 @@ class MjcfLayout:
         q = v = 0
         for i in order:
             joint = by_index[i]
-            width, rates = _WIDTH[joint.kind.family], joint.kind.nv
+            # One number for an angle and four for a quaternion, as in the chart.
+            width, rates = joint.x.stop - joint.x.start, joint.kind.nv
             place = pin.SE3(model.jointPlacements[i])
-            self.slots.append(MjcfSlot(joint, slice(q, q + width), slice(v, v + rates), i in free, place))
+            moved = i in free and not place.isIdentity(0.0)
+            self.slots.append(MjcfSlot(joint, slice(q, q + width), slice(v, v + rates), place, moved))
             q, v = q + width, v + rates
         self.nqpos, self.nv, self.nq = q, v, int(model.nq)
-        # A simulation converts in every tick.  Joints with one number on both sides are copied by index, all at once.
-        plain = [slot for slot in self.slots if slot.joint.kind.family in _PLAIN]
-        self._plain_q = np.array([slot.joint.q.start for slot in plain], dtype=int)
-        self._plain_qpos = np.array([slot.qpos.start for slot in plain], dtype=int)
-        self._others = [slot for slot in self.slots if slot.joint.kind.family not in _PLAIN]
-        self._turning = [slot for slot in self.slots if slot.joint.kind.family in ("free-flyer", "planar")]
+        # A simulation converts in every tick, so all joints are converted at once: numbers that both sides have are
+        # copied by index, then come the angles.  Left are quaternions to normalize and poses from another frame.
+        copied: list[tuple[int, int]] = []
+        angles: list[tuple[int, int]] = []
+        self._quaternions: list[tuple[slice, slice]] = []
         # The velocity map before the linear parts are rotated.
         self._permutation = np.zeros((self.nv, self.nv))
         for slot in self.slots:
             self._permutation[slot.qvel, slot.joint.v] = np.eye(slot.joint.kind.nv)
+            family, order = slot.joint.kind.family, list(range(slot.joint.q.start, slot.joint.q.stop))
+            if family in ("continuous", "planar"):
+                angles.append((order[-2], slot.qpos.stop - 1))
+                order = order[:-2]
+            elif family in ("spherical", "free-flyer"):
+                theirs = slice(slot.qpos.stop - 4, slot.qpos.stop)
+                self._quaternions.append((slice(order[-4], order[-1] + 1), theirs))
+                order = [*order[:-4], order[-1], *order[-4:-1]]
+            copied += zip(order, range(slot.qpos.start, slot.qpos.stop), strict=False)
+        self._q, self._qpos = np.array(copied, dtype=int).reshape(-1, 2).T
+        self._cosine, self._angle = np.array(angles, dtype=int).reshape(-1, 2).T
+        self._moved = [slot for slot in self.slots if slot.moved]
+        self._turning = [slot for slot in self.slots if slot.joint.kind.family in ("free-flyer", "planar")]
 
     def qpos(self, q: Vector) -> Vector:
         """Return ``qpos``, shape (nqpos,), of a configuration, shape (nq,)."""
+        for slot in self._moved:
+            q = q.copy()
+            q[slot.joint.q] = pin.SE3ToXYZQUAT(slot.placement * pin.XYZQUATToSE3(q[slot.joint.q]))
         found = np.zeros(self.nqpos)
-        found[self._plain_qpos] = q[self._plain_q]
-        for slot in self._others:
-            piece, family = q[slot.joint.q], slot.joint.kind.family
-            if family == "continuous":
-                value: Vector = np.array([np.arctan2(piece[1], piece[0])])
-            elif family == "planar":
-                value = np.array([piece[0], piece[1], np.arctan2(piece[3], piece[2])])
-            elif family == "spherical":
-                value = _scalar_first(piece)
-            elif family == "free-flyer":
-                if slot.free and slot.moved:
-                    piece = pin.SE3ToXYZQUAT(slot.placement * pin.XYZQUATToSE3(piece))
-                value = np.concatenate([piece[:3], _scalar_first(piece[3:])])
-            else:
-                value = piece
-            found[slot.qpos] = value
+        found[self._qpos] = q[self._q]
+        found[self._angle] = np.arctan2(q[self._cosine + 1], q[self._cosine])
         return found
 
     def q(self, qpos: Vector) -> Vector:
         """Return the configuration, shape (nq,), of a ``qpos``, shape (nqpos,), with quaternions normalized."""
         found = np.zeros(self.nq)
-        found[self._plain_q] = qpos[self._plain_qpos]
-        for slot in self._others:
-            piece, family = qpos[slot.qpos], slot.joint.kind.family
-            if family == "continuous":
-                value: Vector = np.array([np.cos(piece[0]), np.sin(piece[0])])
-            elif family == "planar":
-                value = np.array([piece[0], piece[1], np.cos(piece[2]), np.sin(piece[2])])
-            elif family == "spherical":
-                value = _scalar_last(piece)
-            elif family == "free-flyer":
-                value = np.concatenate([piece[:3], _scalar_last(piece[3:])])
-                if slot.free and slot.moved:
-                    pose = slot.placement.actInv(pin.XYZQUATToSE3(value))
-                    value = pin.SE3ToXYZQUAT(pose)
-            else:
-                value = piece
-            found[slot.joint.q] = value
+        found[self._q] = qpos[self._qpos]
+        found[self._cosine], found[self._cosine + 1] = np.cos(qpos[self._angle]), np.sin(qpos[self._angle])
+        for ours, theirs in self._quaternions:
+            found[ours] /= np.linalg.norm(qpos[theirs])
+        for slot in self._moved:
+            pose = slot.placement.actInv(pin.XYZQUATToSE3(found[slot.joint.q]))
+            found[slot.joint.q] = pin.SE3ToXYZQUAT(pose)
         return found
 
     def velocity_map(self, q: Vector) -> Vector:
@@ -165,12 +139,4 @@ def _turn(slot: MjcfSlot, piece: Vector) -> Vector:
     if slot.joint.kind.family == "planar":
         return np.array([[piece[2], -piece[3]], [piece[3], piece[2]]])
     R = pin.Quaternion(np.array(piece[3:])).matrix()
-    return np.asarray(slot.placement.rotation @ R if slot.free and slot.moved else R)
-
-
-def _scalar_first(xyzw: Vector) -> Vector:
-    return np.asarray(xyzw[[3, 0, 1, 2]])
-
-
-def _scalar_last(wxyz: Vector) -> Vector:
-    return np.asarray(wxyz[[1, 2, 3, 0]] / np.linalg.norm(wxyz))
+    return np.asarray(slot.placement.rotation @ R if slot.moved else R)

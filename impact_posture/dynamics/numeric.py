@@ -72,9 +72,8 @@ class Numeric:
         follow by rotation, because its LOCAL_WORLD_ALIGNED derivatives leave the rotation of the frame out.
         """
         pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
-        dv_dq = np.asarray(pin.getJointVelocityDerivatives(self.model, self.data, point.joint, pin.LOCAL)[0]).reshape(
-            6, -1
-        )
+        dv_dq = pin.getJointVelocityDerivatives(self.model, self.data, point.joint, pin.LOCAL)[0]
+        dv_dq = np.asarray(dv_dq).reshape(6, -1)
         motion = self.data.v[point.joint]
         R = np.array(self.data.oMi[point.joint].rotation)
         shift = -pin.skew(point.position)

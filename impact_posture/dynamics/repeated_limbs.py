@@ -15,7 +15,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.dynamics.joints import joint_kind
-from impact_posture.dynamics.spatial import constant
+from impact_posture.dynamics.spatial import constant, rounded
 from impact_posture.robot.model_joints import finite_armature
 
 # A limb computes with zeros where another limb has other constants.  So much more work is worth it.
@@ -75,11 +75,10 @@ class RepeatedLimbs:
             tag: A name for the kind of constant.
             of: The numbers of a joint: a vector, or a matrix (a symmetric one stays symmetric).
         """
-        lanes = [constant(of(other)) for other in self.counterparts(joint)]
         place = self.places.get(joint)
         if place is None:
-            return lanes[0]
-        dense = [np.array(ca.DM(ca.densify(lane))) for lane in lanes]
+            return constant(of(joint))
+        dense = [(lane := rounded(of(other))).reshape(len(lane), -1) for other in self.counterparts(joint)]
         own = dense[place.lane]
         symmetric = own.shape[0] == own.shape[1] and all(np.array_equal(d, d.T) for d in dense)
         found = ca.SX(*own.shape)
@@ -158,4 +157,4 @@ def _alike(model: pin.Model, one: tuple[int, ...], other: tuple[int, ...]) -> bo
 def _numbers(model: pin.Model, joint: int) -> NDArray[np.float64]:
     placement = model.jointPlacements[joint]
     arrays = (placement.rotation, placement.translation, model.inertias[joint].matrix())
-    return np.concatenate([np.array(ca.DM(ca.densify(constant(a)))).ravel() for a in arrays])
+    return np.concatenate([rounded(a).ravel() for a in arrays])

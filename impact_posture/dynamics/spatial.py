@@ -6,20 +6,55 @@ parent by ``x_parent = R x_child + p``.  Structural zeros stay, so that CasADi n
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+
+P = ParamSpec("P")
+Result = TypeVar("Result", ca.SX, tuple[ca.SX, ...])
+
+
+def template(operation: Callable[P, Result]) -> Callable[P, Result]:
+    """Make the expressions of an operation once for each size of its arguments, which are inserted from then on.
+
+    A tree applies the same few operations to joint after joint, and most of the time goes to calls from Python.
+    CasADi inserts arguments as if the operation were written out with them, so that their zeros and ones vanish.
+
+    Args:
+        operation: Function of ``SX`` matrices that returns one matrix or a tuple.  Keyword arguments are options.
+    """
+    functions: dict[tuple[object, ...], ca.Function] = {}
+
+    @wraps(operation)
+    def insert(*arguments: Any, **options: Any) -> Any:
+        key = (*[argument.size() for argument in arguments], *options.items())
+        if key not in functions:
+            symbols = [ca.SX.sym("argument", *argument.size()) for argument in arguments]
+            results = operation(*symbols, **options)
+            functions[key] = ca.Function("template", symbols, results if isinstance(results, tuple) else [results])
+        found = functions[key].call(arguments)
+        return found[0] if len(found) == 1 else tuple(found)
+
+    return insert
+
+
+def rounded(value: ArrayLike) -> NDArray[np.float64]:
+    """Return numbers without rounding dust: what is nearly −1, 0 or 1 becomes exactly that."""
+    array = np.array(value, dtype=float)
+    nice = np.rint(array)
+    near = (np.abs(array - nice) < 1e-15) & (np.abs(nice) <= 1)
+    array[near] = nice[near] + 0.0
+    return array
 
 
 def constant(value: ArrayLike) -> ca.SX:
-    """Turn numbers into ``SX`` with exact zeros as structural zeros and rounding dust removed."""
-    array = np.array(value, dtype=float)
-    for nice in (-1.0, 0.0, 1.0):
-        array[np.abs(array - nice) < 1e-15] = nice
-    return ca.sparsify(ca.SX(array))
+    """Turn :func:`rounded` numbers into ``SX`` with exact zeros as structural zeros."""
+    return ca.sparsify(ca.SX(rounded(value)))
 
 
 def skew(p: ca.SX) -> ca.SX:
@@ -27,23 +62,33 @@ def skew(p: ca.SX) -> ca.SX:
     return ca.sparsify(ca.skew(ca.densify(p)))
 
 
+@template
 def cross(a: ca.SX, b: ca.SX) -> ca.SX:
     """Return ``a × b`` of two 3-vectors."""
     return ca.cross(ca.densify(a), ca.densify(b))
 
 
+@template
+def transposed_times(A: ca.SX, b: ca.SX) -> ca.SX:
+    """Return ``Aᵀ b``."""
+    return A.T @ b
+
+
+@template
 def motion_to_child(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
     """Express a parent-frame motion in the child frame: ``w = Rᵀw, v = Rᵀ(v + w × p)``."""
     linear, angular = motion[:3], motion[3:]
     return ca.vertcat(R.T @ (linear + cross(angular, p)), R.T @ angular)
 
 
+@template
 def force_to_parent(R: ca.SX, p: ca.SX, force: ca.SX) -> ca.SX:
     """Express a child-frame force in the parent frame: ``f = R f, m = R m + p × R f``."""
     linear = R @ force[:3]
     return ca.vertcat(linear, R @ force[3:] + cross(p, linear))
 
 
+@template
 def motion_cross_force(motion: ca.SX, force: ca.SX) -> ca.SX:
     """Return ``motion ×* force = [w × f; w × m + v × f]`` (Featherstone 2008, eq. 2.32)."""
     linear, angular = motion[:3], motion[3:]
@@ -62,60 +107,52 @@ class Spin:
     sine: ca.SX
     sense: float = 1.0
 
-    @cached_property
-    def double(self) -> tuple[ca.SX, ca.SX]:
-        """Cosine and sine of twice the angle, by which a symmetric matrix turns."""
-        return (self.cosine - self.sine) * (self.cosine + self.sine), 2 * self.sine * self.cosine
 
-    def matrix(self, M: ca.SX) -> ca.SX:
-        """Return ``R M Rᵀ`` of a 3×3 matrix by plane rotations, with 16 products, or 12 if ``M`` is symmetric."""
-        i, j, k = (self.axis + 1) % 3, (self.axis + 2) % 3, self.axis
-        c2, s2 = self.double
-        mean, half = (M[i, i] + M[j, j]) / 2, (M[i, i] - M[j, j]) / 2
-        even, odd = (M[i, j] + M[j, i]) / 2, (M[i, j] - M[j, i]) / 2
-        turned, mixed = half * c2 - even * s2, half * s2 + even * c2
-        out = ca.SX(3, 3)
-        out[i, i], out[j, j], out[i, j], out[j, i] = mean + turned, mean - turned, mixed + odd, mixed - odd
-        out[i, k], out[j, k] = self._plane(M[i, k], M[j, k])
-        out[k, i], out[k, j] = self._plane(M[k, i], M[k, j])
-        out[k, k] = M[k, k]
-        return ca.sparsify(out)
-
-    def rate(self, inertia: ca.SX) -> ca.SX:
-        """Return the symmetric ``K = (S×)ᵀ I + I (S×)`` of a 6×6 inertia ``I`` and the motion ``S`` of the axis."""
-        i, j, k = (self.axis + 1) % 3, (self.axis + 2) % 3, self.axis
-        out = ca.SX(6, 6)
-        for rows, columns in ((0, 0), (0, 3), (3, 3)):
-            M = inertia[rows : rows + 3, columns : columns + 3]
-            sum_, difference = M[i, j] + M[j, i], M[j, j] - M[i, i]
-            K = ca.SX(3, 3)
-            K[i, i], K[j, j] = sum_, -sum_
-            K[i, j], K[j, i] = difference, difference
-            K[i, k], K[j, k], K[k, i], K[k, j] = M[j, k], -M[i, k], M[k, j], -M[k, i]
-            out[rows : rows + 3, columns : columns + 3] = self.sense * K
-        return symmetric(ca.sparsify(out))
-
-    def _plane(self, x: ca.SX, y: ca.SX) -> tuple[ca.SX, ca.SX]:
-        return self.cosine * x - self.sine * y, self.sine * x + self.cosine * y
+def _turned(M: ca.SX, k: int, cosine: ca.SX, sine: ca.SX) -> ca.SX:
+    """Return ``R M Rᵀ`` of a 3×3 matrix by plane rotations, with 16 products, or 12 if ``M`` is symmetric."""
+    i, j = (k + 1) % 3, (k + 2) % 3
+    # A symmetric matrix turns by twice the angle.
+    c2, s2 = (cosine - sine) * (cosine + sine), 2 * sine * cosine
+    mean, half = (M[i, i] + M[j, j]) / 2, (M[i, i] - M[j, j]) / 2
+    even, odd = (M[i, j] + M[j, i]) / 2, (M[i, j] - M[j, i]) / 2
+    turned, mixed = half * c2 - even * s2, half * s2 + even * c2
+    out = ca.SX(3, 3)
+    out[i, i], out[j, j], out[i, j], out[j, i] = mean + turned, mean - turned, mixed + odd, mixed - odd
+    out[i, k], out[j, k] = cosine * M[i, k] - sine * M[j, k], sine * M[i, k] + cosine * M[j, k]
+    out[k, i], out[k, j] = cosine * M[k, i] - sine * M[k, j], sine * M[k, i] + cosine * M[k, j]
+    out[k, k] = M[k, k]
+    return out
 
 
-def rotate_inertia(inertia: ca.SX, R: ca.SX, spin: Spin | None) -> ca.SX:
-    """Rotate a symmetric 6×6 inertia by ``spin`` and then by ``R``; by ``R`` alone without a spin."""
+@template
+def spin_power(inertia: ca.SX, x: ca.SX, y: ca.SX, *, axis: int, sense: float) -> ca.SX:
+    """Return ``yᵀ K x`` with the symmetric ``K = (S×)ᵀ I + I (S×)`` of a 6×6 inertia ``I`` and a motion ``S``.
+
+    ``S`` turns about the coordinate ``axis``, or the other way if ``sense`` is −1.
+    """
+    turn = skew(constant(sense * np.eye(3)[axis]))
+    S = ca.diagcat(turn, turn)
+    return ca.dot(y, symmetric(S.T @ inertia + inertia @ S) @ x)
+
+
+@template
+def inertia_to_parent(inertia: ca.SX, R: ca.SX, p: ca.SX, *spin: ca.SX, axis: int | None = None) -> ca.SX:
+    """Return a symmetric 6×6 inertia of a child in the coordinates of its parent.
+
+    Args:
+        inertia: Inertia in child coordinates.
+        R: Rotation of the child, or of its rest position where it spins.
+        p: Origin of the child, shape (3, 1).
+        spin: Cosine and sine of the rotation about ``axis`` that comes before ``R``; none without an axis.
+        axis: Coordinate axis of the spin, 0, 1 or 2.
+    """
     blocks = [symmetric(inertia[:3, :3]), inertia[:3, 3:], symmetric(inertia[3:, 3:])]
-    if spin is not None:
-        blocks = [spin.matrix(block) for block in blocks]
-    if not (R.is_constant() and np.array_equal(np.array(ca.DM(R)), np.eye(3))):
-        blocks = [R @ block @ R.T for block in blocks]
-    A, B, D = blocks
-    return symmetric(ca.blockcat([[A, B], [B.T, D]]))
-
-
-def shift_inertia(inertia: ca.SX, p: ca.SX) -> ca.SX:
-    """Move a symmetric 6×6 inertia to the origin at ``−p`` by ``B' = B − A[p]×, D' = D + [p]×B + B'ᵀ[p]×ᵀ``."""
-    P = skew(p)
-    A, B, D = inertia[:3, :3], inertia[:3, 3:], inertia[3:, 3:]
+    if axis is not None:
+        blocks = [_turned(block, axis, *spin) for block in blocks]
+    A, B, D = (R @ block @ R.T for block in blocks)
+    A, D, P = symmetric(A), symmetric(D), skew(p)
+    # At the origin of the parent, B' = B − A[p]× and D' = D + [p]×B + B'ᵀ[p]×ᵀ, where ([p]× B')ᵀ = B'ᵀ [p]×ᵀ.
     shifted = B - A @ P
-    # ([p]× B')ᵀ = B'ᵀ [p]×ᵀ
     return symmetric(ca.blockcat([[A, shifted], [shifted.T, D + P @ B + (P @ shifted).T]]))
 
 
@@ -124,13 +161,7 @@ def symmetric(matrix: ca.SX) -> ca.SX:
     return ca.triu2symm(ca.triu(matrix))
 
 
-def ldl_solve(matrix: ca.SX, rhs: ca.SX) -> ca.SX:
-    """Solve ``matrix x = rhs`` for a small symmetric positive definite matrix by ``LDLᵀ``, without pivots."""
-    D, LT, order = ca.ldl(ca.densify(matrix), False)
-    found: ca.SX = ca.ldl_solve(ca.densify(rhs), D, LT, order)
-    return found
-
-
+@template
 def quaternion_product(a: ca.SX, b: ca.SX) -> ca.SX:
     """Return the Hamilton product of two quaternions in ``x y z w`` order."""
     va, wa, vb, wb = a[:3], a[3], b[:3], b[3]

@@ -13,21 +13,21 @@ from functools import cached_property
 
 import casadi as ca
 
-from impact_posture.dynamics.chart import JointSlot
+from impact_posture.dynamics import tree_steps as step
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
 from impact_posture.dynamics.spatial import (
     constant,
     cross,
     force_to_parent,
-    ldl_solve,
-    motion_cross_force,
+    inertia_to_parent,
     motion_to_child,
-    rotate_inertia,
-    shift_inertia,
-    symmetric,
+    spin_power,
+    transposed_times,
 )
 
 __all__ = ["ByJoint", "PointOnLink", "Response", "Tree", "Wrench"]
+
+_ZERO = ca.SX(6, 1)
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class Response:
     Attributes:
         a: ``M⁻¹(τ + Σ Jᵀ w)``, shape (nv,).
         velocities: Spatial velocity of every link under ``a``, in link coordinates.
-        before: The same without the motion of the link's own joint, for joints with a parent joint.
-        forces: Spatial force through every joint with a parent joint, on its link.
+        before: The same without the motion of the link's own joint.
+        forces: Spatial force through every joint, on its link.
         passed: The part of that force that does not depend on the motion of the parent.
         wrenches: The wrenches.
     """
@@ -66,19 +66,6 @@ class Response:
     forces: ByJoint
     passed: ByJoint
     wrenches: tuple[Wrench, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class _Factor:
-    """Per joint: ``U = I^A S``, ``D = SᵀU + armature``, ``D⁻¹Uᵀ`` and ``I^a = I^A − U D⁻¹ Uᵀ``.
-
-    A locked joint has ``D⁻¹ = 0``.
-    """
-
-    U: ByJoint
-    D: ByJoint
-    gain: ByJoint
-    reduced: ByJoint
 
 
 class Tree(Kinematics):
@@ -92,11 +79,9 @@ class Tree(Kinematics):
     def velocities(self, v: ca.SX) -> ByJoint:
         """Return the spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
         found: ByJoint = {}
-        for slot in self.chart.slots:
-            i, parent = slot.index, self._parents[slot.index]
-            own = self._S[i] @ v[slot.v]
-            moved = motion_to_child(self._R[i], self._p[i], found[parent]) if parent else ca.SX(6, 1)
-            found[i] = moved + own
+        for slot, i, parent in self._joints:
+            moved = motion_to_child(self._R[i], self._p[i], found.get(parent, _ZERO))
+            found[i] = moved + self._S[i] @ v[slot.v]
         return found
 
     def _accumulate(self, forces: ByJoint) -> ByJoint:
@@ -121,29 +106,7 @@ class Tree(Kinematics):
         return self._project(momenta) + self._armature * v
 
     def _project(self, forces: ByJoint) -> ca.SX:
-        rows = [self._S[slot.index].T @ forces[slot.index] for slot in self.chart.slots]
-        return ca.densify(ca.vertcat(*rows))
-
-    def mass_matrix(self) -> ca.SX:
-        """Return ``M(q)`` by composite rigid bodies (Featherstone 2008, §6.2), shape (nv, nv), armature included."""
-        composite = dict(self._inertia)
-        M = ca.SX.zeros(self.nv, self.nv)
-        for slot in reversed(self.chart.slots):
-            i, parent = slot.index, self._parents[slot.index]
-            force = composite[i] @ self._S[i]
-            M[slot.v, slot.v] = self._S[i].T @ force
-            j, carried = i, force
-            while self._parents[j]:
-                carried = ca.horzcat(
-                    *[force_to_parent(self._R[j], self._p[j], carried[:, c]) for c in range(carried.shape[1])]
-                )
-                j = self._parents[j]
-                other = self.chart.slots[j - 1]
-                M[other.v, slot.v] = self._S[j].T @ carried
-                M[slot.v, other.v] = M[other.v, slot.v].T
-            if parent:
-                composite[parent] = composite[parent] + self._inertia_to_parent(i, composite[i])
-        return M + ca.diag(self._armature)
+        return ca.densify(ca.vertcat(*[transposed_times(S, forces[i]) for i, S in self._S.items()]))
 
     def link_force(self, wrench: Wrench) -> ca.SX:
         """Return a wrench as a spatial force in link coordinates about the origin of its link, shape (6,)."""
@@ -157,7 +120,7 @@ class Tree(Kinematics):
 
     def generalized_force(self, wrenches: Sequence[Wrench]) -> ca.SX:
         """Return ``Σ Jᵀ [force; moment]`` of the wrenches, shape (nv,)."""
-        forces: ByJoint = {i: ca.SX(6, 1) for i in self._R}
+        forces: ByJoint = dict.fromkeys(self._R, _ZERO)
         for wrench in wrenches:
             forces[wrench.point.joint] = forces[wrench.point.joint] + self.link_force(wrench)
         return self._project(self._accumulate(forces))
@@ -174,29 +137,29 @@ class Tree(Kinematics):
     def _inertia_to_parent(self, i: int, inertia: ca.SX) -> ca.SX:
         """Return the symmetric 6×6 (articulated) inertia of link i in the coordinates of its parent."""
         spin = self._spin[i]
-        turned = rotate_inertia(inertia, self._R[i] if spin is None else self._rest[i], spin)
-        return shift_inertia(turned, self._p[i])
+        if spin is None:
+            return inertia_to_parent(inertia, self._R[i], self._p[i])
+        return inertia_to_parent(inertia, self._rest[i], self._p[i], spin.cosine, spin.sine, axis=spin.axis)
 
     @cached_property
-    def _factor(self) -> _Factor:
+    def _factor(self) -> dict[int, tuple[ca.SX, ...]]:
+        """``(pivot, D⁻¹Uᵀ, I^a = I^A − U D⁻¹ Uᵀ)`` of every joint, with ``U = I^A S`` and ``D = SᵀU + armature``.
+
+        The pivot is ``D``, and ``1/D`` for a joint with one axis.  A locked joint has ``D⁻¹ = 0``.
+        """
         articulated = dict(self._inertia)
-        U: ByJoint = {}
-        D: ByJoint = {}
-        gain: ByJoint = {}
-        reduced: ByJoint = {}
-        for slot in reversed(self.chart.slots):
-            i, parent = slot.index, self._parents[slot.index]
-            U[i] = ca.densify(articulated[i] @ self._S[i])
-            D[i] = symmetric(self._S[i].T @ U[i] + ca.diag(ca.SX(self._armature[slot.v])))
+        found: dict[int, tuple[ca.SX, ...]] = {}
+        for slot, i, parent in reversed(self._joints):
             if slot.v.start in self.locked:
-                gain[i], reduced[i] = ca.SX(slot.kind.nv, 6), articulated[i]
-                if parent:
-                    articulated[parent] = articulated[parent] + self._inertia_to_parent(i, reduced[i])
-            elif parent:
-                gain[i] = U[i].T * (1 / D[i]) if slot.kind.nv == 1 else ldl_solve(D[i], U[i].T)
-                reduced[i] = symmetric(articulated[i] - U[i] @ gain[i])
-                articulated[parent] = articulated[parent] + self._inertia_to_parent(i, reduced[i])
-        return _Factor(U, D, gain, reduced)
+                found[i] = ca.SX(slot.kind.nv, slot.kind.nv), ca.SX(slot.kind.nv, 6), articulated[i]
+            else:
+                D = step.pivot(articulated[i], self._S[i], self._armature[slot.v])
+                # Not in a template, so that a constant becomes a factor and not a divisor.
+                pivot = 1 / D if slot.kind.nv == 1 else D
+                found[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)
+            if parent:
+                articulated[parent] = articulated[parent] + self._inertia_to_parent(i, found[i][2])
+        return found
 
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
         """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization, in O(n) and without forming ``M``.
@@ -204,41 +167,30 @@ class Tree(Kinematics):
         The force through joint i is ``f_i = I^a_i v_i⁻ + p^a_i``.  The factorization knows the momentum of the whole
         subtree, so no sweep has to gather it.
         """
-        factor = self._factor
-        bias: ByJoint = {i: ca.SX(6, 1) for i in self._R}
+        bias: ByJoint = dict.fromkeys(self._R, _ZERO)
         for wrench in wrenches:
             bias[wrench.point.joint] = bias[wrench.point.joint] - self.link_force(wrench)
         drive: ByJoint = {}
         passed: ByJoint = {}
-        for slot in reversed(self.chart.slots):
-            i, parent = slot.index, self._parents[slot.index]
+        for slot, i, parent in reversed(self._joints):
             own = tau[slot.v] if tau is not None else ca.SX(slot.kind.nv, 1)
-            drive[i] = own - self._S[i].T @ bias[i]
+            drive[i], passed[i] = step.drive(self._S[i], own, bias[i], self._factor[i][1])
             if parent:
-                passed[i] = bias[i] + factor.gain[i].T @ drive[i]
                 bias[parent] = bias[parent] + force_to_parent(self._R[i], self._p[i], passed[i])
         velocities: ByJoint = {}
         before: ByJoint = {}
         forces: ByJoint = {}
-        parts = []
-        for slot in self.chart.slots:
-            i, parent = slot.index, self._parents[slot.index]
-            rate = self._solve_joint(slot, factor.D[i], drive[i])
-            if parent:
-                before[i] = motion_to_child(self._R[i], self._p[i], velocities[parent])
-                rate = rate - factor.gain[i] @ before[i]
-                velocities[i] = before[i] + self._S[i] @ rate
-                forces[i] = factor.reduced[i] @ before[i] + passed[i]
-            else:
-                velocities[i] = ca.densify(self._S[i] @ rate)
-            parts.append(rate)
-        return Response(ca.densify(ca.vertcat(*parts)), velocities, before, forces, passed, tuple(wrenches))
-
-    def _solve_joint(self, slot: JointSlot, D: ca.SX, drive: ca.SX) -> ca.SX:
-        """Return ``D⁻¹u`` of a joint, zero if it is locked."""
-        if slot.v.start in self.locked:
-            return ca.SX(slot.kind.nv, 1)
-        return drive * (1 / D) if slot.kind.nv == 1 else ldl_solve(D, drive)
+        rates: ByJoint = {}
+        for slot, i, parent in self._joints:
+            before[i] = motion_to_child(self._R[i], self._p[i], velocities.get(parent, _ZERO))
+            if slot.v.start in self.locked:
+                rates[i], velocities[i] = ca.SX(slot.kind.nv, 1), before[i]
+                forces[i] = self._factor[i][2] @ before[i] + passed[i]
+                continue
+            rates[i], velocities[i], forces[i] = step.respond(
+                before[i], self._S[i], drive[i], passed[i], *self._factor[i]
+            )
+        return Response(ca.densify(ca.vertcat(*rates.values())), velocities, before, forces, passed, tuple(wrenches))
 
     def pair_gradient(self, x: Response, y: Response) -> ca.SX:
         """Return the tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` with all four letters held fixed, shape (nv,).
@@ -256,8 +208,8 @@ class Tree(Kinematics):
         for i in x.forces:
             spin = self._spin[i]
             if spin is not None:
-                rate = spin.rate(self._factor.reduced[i])
-                rows[i] = ca.dot(y.before[i], rate @ x.before[i])
+                inertia = self._factor[i][2]
+                rows[i] = spin_power(inertia, x.before[i], y.before[i], axis=spin.axis, sense=spin.sense)
                 forces[0][i], forces[1][i] = x.passed[i], y.passed[i]
         return self._gather([(y.before, forces[0]), (x.before, forces[1])], turning, rows)
 
@@ -271,20 +223,13 @@ class Tree(Kinematics):
         without the motion of joint j.
         """
         forces = {i: -2 * (self._own_inertia[i] @ velocity) for i, velocity in velocities.items()}
-        return self._gather([(self._before(velocities), self._accumulate(forces))], {})
-
-    def _before(self, velocities: ByJoint) -> ByJoint:
-        """Return the velocity of every link without the motion of its own joint.
-
-        A joint with one axis keeps that motion, because ``Sᵀ(S ×* F)`` is zero.
-        """
-        return {
-            slot.index: velocities[slot.index]
-            if slot.kind.nv == 1
-            else motion_to_child(self._R[slot.index], self._p[slot.index], velocities[self._parents[slot.index]])
-            for slot in self.chart.slots
-            if self._parents[slot.index]
+        # A joint with one axis keeps its motion, because Sᵀ(S ×* F) is zero.
+        before = {
+            i: velocities[i] if slot.kind.nv == 1 else motion_to_child(self._R[i], self._p[i], velocities[parent])
+            for slot, i, parent in self._joints
+            if parent
         }
+        return self._gather([(before, self._accumulate(forces))], {})
 
     def _turn(self, turning: ByJoint, wrench: Wrench, velocities: ByJoint) -> None:
         """Add ``f × u + m × ω`` of a wrench that stays in the world while its link moves with ``(u, ω)``.
@@ -305,16 +250,13 @@ class Tree(Kinematics):
         """Return ``Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning`` for pairs ``(v⁻, F)``, plus the ``known`` rows of joints."""
         turning = {i: turning.get(i, ca.SX(3, 1)) for i in self._R}
         rows: ByJoint = {}
-        for slot in reversed(self.chart.slots):
-            i, parent = slot.index, self._parents[slot.index]
-            row = -(self._S[i][3:, :].T @ turning[i])
+        for slot, i, parent in reversed(self._joints):
             if parent:
                 turning[parent] = turning[parent] + self._R[i] @ turning[i]
-                row = row + (known or {}).get(i, ca.SX(1, 1))
-                for before, force in pairs:
-                    row = row + self._S[i].T @ motion_cross_force(before[i], force[i])
-            rows[i] = row
-        return ca.densify(ca.vertcat(*[rows[slot.index] for slot in self.chart.slots]))
+            inner = [x[i] for pair in pairs for x in pair] if parent else []
+            row = (known or {}).get(i, ca.SX(slot.kind.nv, 1))
+            rows[i] = step.gradient(self._S[i], turning[i], row, *inner)
+        return ca.densify(ca.vertcat(*[rows[i] for i in self._R]))
 
     def turning_gradient(self, point: PointOnLink, direction: ca.SX, covector: ca.SX) -> ca.SX:
         """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), of a world direction that turns with the link."""

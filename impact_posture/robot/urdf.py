@@ -7,6 +7,7 @@ import os
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import IO
@@ -22,6 +23,7 @@ MOST_DEGREES_OF_FREEDOM = 200
 EXAMPLE_PREFIX = "example-robot-data:"
 
 
+@cache
 def example_robot_data() -> Path:
     """Return the ``robots/`` folder of the installed example-robot-data package.
 
@@ -38,9 +40,7 @@ def example_robot_data() -> Path:
     for entry in listed:
         parts = entry.parts
         if "example-robot-data" in parts and "robots" in parts:
-            root = Path(*parts[: parts.index("robots") + 1])
-            located = Path(str(entry.locate()))
-            return located.parents[len(parts) - len(root.parts) - 1]
+            return Path(str(entry.locate())).parents[len(parts) - parts.index("robots") - 2]
     raise PackageNotFound("example-robot-data", [], hint="pip install example-robot-data")
 
 

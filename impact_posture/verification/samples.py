@@ -39,9 +39,7 @@ def random_samples(robot: Robot, count: int, seed: int, normal: Vector | None = 
     lower, upper = chart.bounds()
     reach = np.ones(chart.nx)
     for slot in chart.slots:
-        if slot.kind.family in ("revolute", "continuous"):
-            reach[slot.x] = np.pi
-        elif slot.kind.family == "planar":
+        if slot.kind.family in ("revolute", "continuous", "planar"):
             reach[slot.x.stop - 1] = np.pi
     lower = np.where(np.isfinite(lower), lower, np.minimum(start, upper) - reach)
     upper = np.where(np.isfinite(upper), upper, np.maximum(start, lower) + reach)

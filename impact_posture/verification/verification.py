@@ -87,14 +87,13 @@ def verify(
     values = dict.fromkeys(("H", "G", "Λ_c", "∇H"), allowed.values)
     of_mujoco = {"M": allowed.model, "J": allowed.model} | values | {"∇H": allowed.differences}
     with ExitStack() as stack:
-        candidates: list[_Candidate] = [_Candidate(CASADI, values, casadi_source(objective))]
-        if find_compiler() is None:
-            candidates.append(_Candidate(COMPILED, values, note=NO_COMPILER))
-        else:
-            candidates.append(_Candidate(COMPILED, values, stack.enter_context(compiled_source(objective))))
-        differences = partial(pinocchio_differences, objective)
-        candidates.append(_Candidate(DIFFERENCES, {"∇H": allowed.differences}, differences))
-        candidates.append(_mujoco(objective, of_mujoco))
+        compiled = None if find_compiler() is None else stack.enter_context(compiled_source(objective))
+        candidates = (
+            _Candidate(CASADI, values, casadi_source(objective)),
+            _Candidate(COMPILED, values, compiled, NO_COMPILER),
+            _Candidate(DIFFERENCES, {"∇H": allowed.differences}, partial(pinocchio_differences, objective)),
+            _mujoco(objective, of_mujoco),
+        )
         compared, total = 0, sum(own.source is not None for own in candidates) * len(drawn)
         rows: list[Row] = []
         for own in candidates:
@@ -116,7 +115,7 @@ def verify(
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """A source to compare, with the tolerance of each quantity; without a source, the reason."""
+    """A source to compare, with the tolerance of each quantity, or the reason why there is no source."""
 
     name: str
     tolerances: Mapping[str, float]

@@ -56,7 +56,7 @@ def defects(figure: Figure) -> list[str]:
     figure.set_dpi(100)
     canvas = FigureCanvasAgg(figure)
     lay_out(figure)
-    canvas.draw()
+    figure.draw_without_rendering()
     texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and _shown(t, figure)]
     words = [Words.of(text) for text in texts]
     found = [
@@ -66,14 +66,13 @@ def defects(figure: Figure) -> list[str]:
         and other.holds(one.points).any()
     ]
     for text in texts:
-        text.set_alpha(0.0)
-        # A plate behind a letter would only hide the line that it stands on.
-        text.set_bbox(None)
+        # With the plate behind it, which would only hide the line that it stands on.
+        text.set_visible(False)
     canvas.draw()
     image = np.asarray(canvas.buffer_rgba())[::-1, :, :3].min(axis=2) / 255
     dark = np.argwhere(image < _INK)[:, ::-1] + 0.5
     for text in texts:
-        text.set_alpha(None)
+        text.set_visible(True)
     height, width = image.shape
     for one in words:
         if one.holds(dark).any():

@@ -25,7 +25,7 @@ from tests.benchmarks.build import CONTRACT, Built, build, flag_sets
 from tests.benchmarks.core import say
 from tests.benchmarks.kernel.counts import of_export, of_function
 from tests.benchmarks.kernel.harness import Absent, Kernel, Samples, c_compiler
-from tests.tangent import tangent_map
+from tests.tangent import composite_mass_matrix, tangent_map
 
 _WRAPPER = """
 int kernel_eval(const double *q, const double *n, double *H, double *grad)
@@ -98,7 +98,7 @@ def dense(samples: Samples) -> list[Kernel]:
         direction = rest - ca.cross(step[3:6], rest)
     tree = Tree(robot.model, at)
     impact = Wrench(point_on(robot, samples.frame), direction, ca.SX.zeros(3))
-    H = solved(tree.mass_matrix(), tree.generalized_force([impact]))
+    H = solved(composite_mass_matrix(tree), tree.generalized_force([impact]))
     return _by_reverse_mode("CasADi", "casadi", q, n, step, H)
 
 

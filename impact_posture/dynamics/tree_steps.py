@@ -1,0 +1,63 @@
+"""What a sweep over the tree does at one joint, as templates.
+
+Letters are those of Featherstone (2008).  ``S`` is the motion subspace, shape (6, nv), ``I`` the articulated inertia
+of the link, and ``pivot`` is ``D = SᵀIS + armature``, or ``1/D`` for a joint with one axis.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from impact_posture.dynamics.spatial import motion_cross_force, symmetric, template
+
+
+@template
+def pivot(inertia: ca.SX, S: ca.SX, armature: ca.SX) -> ca.SX:
+    """Return ``D = SᵀIS + armature``, shape (nv, nv)."""
+    return symmetric(S.T @ (inertia @ S) + ca.diag(armature))
+
+
+@template
+def reduce(inertia: ca.SX, S: ca.SX, pivot: ca.SX) -> tuple[ca.SX, ...]:
+    """Return the gain ``D⁻¹SᵀI``, shape (nv, 6), and the inertia that the parent feels, ``I − I S D⁻¹SᵀI``."""
+    U = inertia @ S
+    gain = _solve(pivot, U.T)
+    return gain, symmetric(inertia - U @ gain)
+
+
+@template
+def drive(S: ca.SX, tau: ca.SX, bias: ca.SX, gain: ca.SX) -> tuple[ca.SX, ...]:
+    """Return what drives a joint, ``τ − Sᵀp``, shape (nv,), and the bias force that the parent feels, shape (6,)."""
+    driving = tau - S.T @ bias
+    return driving, bias + gain.T @ driving
+
+
+@template
+def respond(
+    before: ca.SX, S: ca.SX, drive: ca.SX, passed: ca.SX, pivot: ca.SX, gain: ca.SX, reduced: ca.SX
+) -> tuple[ca.SX, ...]:
+    """Return the rates of a joint, the velocity of its link and the force through it.
+
+    ``before`` is the velocity of the link without the motion of the joint.  The rest is as :func:`drive` and
+    :func:`reduce` return it.
+    """
+    rates = _solve(pivot, drive) - gain @ before
+    return rates, before + S @ rates, reduced @ before + passed
+
+
+@template
+def gradient(S: ca.SX, turning: ca.SX, known: ca.SX, *pairs: ca.SX) -> ca.SX:
+    """Return ``known − S_ωᵀ turning + Σ Sᵀ(v ×* F)`` for ``pairs`` of ``v`` and ``F`` in turn, shape (nv,)."""
+    row = known - S[3:, :].T @ turning
+    for velocity, force in zip(pairs[::2], pairs[1::2], strict=True):
+        row = row + S.T @ motion_cross_force(velocity, force)
+    return row
+
+
+def _solve(pivot: ca.SX, rhs: ca.SX) -> ca.SX:
+    """Return ``D⁻¹ rhs``, for several axes by ``LDLᵀ`` without pivoting."""
+    if pivot.is_scalar():
+        return pivot * rhs
+    D, LT, order = ca.ldl(pivot, False)
+    found: ca.SX = ca.ldl_solve(rhs, D, LT, order)
+    return found
