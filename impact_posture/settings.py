@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from impact_posture.errors import ImpactPostureError
+from impact_posture.errors import ImpactPostureError, not_one_of
 from impact_posture.parsing import parse_armature, parse_contact, parse_payloads, parse_stiffness
 from impact_posture.tables import STRICT
 
@@ -115,7 +115,10 @@ def tilt_of(pose: str) -> float | None:
 
 
 def _pose(value: str) -> bool:
-    return value in get_args(ContactPose) or 0 < (tilt_of(value) or 0.0) < 90
+    """Tell whether a text is a contact pose; a misspelt one gets a suggestion."""
+    if value in get_args(ContactPose) or value.startswith("aligned:"):
+        return value in get_args(ContactPose) or 0 < (tilt_of(value) or 0.0) < 90
+    raise ValueError("; ".join(not_one_of(value, (*get_args(ContactPose), "aligned:DEG"))))
 
 
 def _share(value: float) -> bool:
@@ -351,7 +354,7 @@ class ProblemSettings(ImpactSettings):
             "Constraint on the contact frame: full, position, aligned (spin free), aligned:DEG (and tilted by up to "
             "DEG), free or box.",
             TASK, "KIND", "robot.toml's, else full", holds=_pose,
-            demand=f"give {', '.join(get_args(ContactPose))}, or aligned:DEG with degrees above 0 and below 90",
+            demand="give aligned:DEG with degrees above 0 and below 90",
         ),
     ] = None  # fmt: skip
     box: Annotated[Vector3, Setting("Half extents of --contact-pose box, m.", TASK, "X Y Z", **_LENGTHS)] = (

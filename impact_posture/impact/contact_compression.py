@@ -163,7 +163,7 @@ class Compression:
         elif self.fitting == "reflected":
             meaning = "the rotors move with the links: joint model 'reflected'"
         else:
-            meaning = "neither 'link' nor 'reflected' is right (errors up to 45 %)"
+            meaning = "neither 'link' nor 'reflected' is right; evaluate with `joint_model='elastic'`"
         return f"x = {self.x:.2g}: {meaning}"
 
     def to_dict(self) -> dict[str, object]:

@@ -1,8 +1,8 @@
 """Velocity jumps with Coulomb friction, at one contact and at several contacts at once.
 
 Several contacts obey ``0 ≤ p_n ⊥ u_n ≥ 0``, ``‖p_t‖ ≤ μ p_n``, ``u_t = −κ p_t``, ``0 ≤ κ ⊥ μ p_n − ‖p_t‖ ≥ 0`` each,
-with impulses ``p_i`` and the velocities ``u = u⁻ + Bp`` after the impact.  Block Gauss–Seidel iterates their fixed point
-``p_i = P(p_i − ρ(u_i + μ‖u_t‖n_i))``, with ``P`` the projection onto the friction cone.
+with impulses ``p_i`` and the velocities ``u = u⁻ + Bp`` after the impact.  Block Gauss–Seidel iterates their fixed
+point ``p_i = P(p_i − ρ(u_i + μ‖u_t‖n_i))``, with ``P`` the projection onto the friction cone.
 """
 
 from __future__ import annotations
