@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.impact import objective as core
 from impact_posture.impact.contact import ImpactContact, Support
@@ -50,8 +51,6 @@ from impact_posture.tables import validate
 # The C export and the pictures are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
-
-Vector = NDArray[np.float64]
 
 
 class ImpactObjective(core.ImpactObjective):
@@ -229,12 +228,12 @@ class PostureResult:
         self.robustness, self.tradeoff = robustness, tradeoff
 
     @property
-    def q(self) -> Vector:
+    def q(self) -> Array:
         """The best certified posture, shape (nq,)."""
         return self.solution.q
 
     @property
-    def initial(self) -> Vector:
+    def initial(self) -> Array:
         """The start, moved to the constraints if it did not satisfy them, shape (nq,)."""
         return self.solution.initial
 

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from impact_posture.arrays import Array
 from impact_posture.codegen.emitter import REALS, Real
-from impact_posture.codegen.functions import Reference, Vector, casadi_reference, named_objectives, oracle_reference
+from impact_posture.codegen.functions import Reference, casadi_reference, named_objectives, oracle_reference
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.reader import read_manifest
@@ -179,7 +180,7 @@ class Deviation:
     index: tuple[int, ...]
 
 
-def deviation(found: Vector, expected: Vector, scale: float = 0.0) -> Deviation:
+def deviation(found: Array, expected: Array, scale: float = 0.0) -> Deviation:
     """Return the largest deviation over the largest expected entry, or over ``scale`` if that is larger."""
     with np.errstate(invalid="ignore"):
         difference = np.abs(found - expected)

@@ -8,8 +8,9 @@ from functools import lru_cache
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.codegen.graph import Graph, graph_of
 from impact_posture.codegen.naming import stems
 from impact_posture.codegen.simd_lanes import Seed, packed
@@ -19,8 +20,7 @@ from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 
-Vector = NDArray[np.float64]
-Reference = Callable[[Vector, Vector], dict[str, Vector]]
+Reference = Callable[[Array, Array], dict[str, Array]]
 """Quantities at a configuration ``q`` (nq,) and a normal ``n`` (3,), by name, each a flat array."""
 
 
@@ -39,7 +39,7 @@ def casadi_reference(objective: ImpactObjective) -> Reference:
     outputs |= {} if objective.others else {"jump": k.jump.a, "G": k.G, "V": k.V, "ellipsoid": k.ellipsoid}
     function = ca.Function("reference", [k.q, k.n], [*outputs.values()], ["q", "n"], [*outputs])
 
-    def evaluate(q: Vector, n: Vector) -> dict[str, Vector]:
+    def evaluate(q: Array, n: Array) -> dict[str, Array]:
         return {name: np.array(x, dtype=float).ravel() for name, x in zip(outputs, function(q, n), strict=True)}
 
     return evaluate
@@ -48,7 +48,7 @@ def casadi_reference(objective: ImpactObjective) -> Reference:
 def oracle_reference(objective: ImpactObjective) -> Reference:
     """Return the same quantities from the numbers of Pinocchio."""
 
-    def evaluate(q: Vector, n: Vector) -> dict[str, Vector]:
+    def evaluate(q: Array, n: Array) -> dict[str, Array]:
         found: dict[str, ArrayLike] = {"objective": objective.value(q), "objective_grad": objective.gradient(q)}
         if not objective.others:
             oracle = oracle_along(objective, n)
@@ -60,7 +60,7 @@ def oracle_reference(objective: ImpactObjective) -> Reference:
     return evaluate
 
 
-def oracle_along(objective: ImpactObjective, normal: Vector) -> ImpactOracle:
+def oracle_along(objective: ImpactObjective, normal: Array) -> ImpactOracle:
     """Return the oracle of the leading contact along another normal, shape (3,), in the axes of its own."""
     x, y, z = (float(v) for v in normal)
     return ImpactOracle(replace(objective.case, contact=replace(objective.contact, normal=(x, y, z))))

@@ -9,8 +9,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.codegen.emitter import DOUBLE, Real
 from impact_posture.codegen.functions import casadi_reference, named_objectives
 from impact_posture.codegen.naming import FUNCTIONS
@@ -21,8 +21,6 @@ from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.version import __version__
-
-Vector = NDArray[np.float64]
 
 # A unit vector along no axis, so that no entry of a gradient vanishes.  It is exact enough in binary.
 _NORMAL = (0.48, -0.6, 0.64)
@@ -53,7 +51,7 @@ def unit_slices(robot: Robot) -> list[slice]:
     return found
 
 
-def sample_postures(robot: Robot, count: int, seed: int) -> list[Vector]:
+def sample_postures(robot: Robot, count: int, seed: int) -> list[Array]:
     """Return random configurations around the default posture, each of shape (nq,)."""
     rng = np.random.default_rng(seed)
     start = robot.posture()
@@ -83,7 +81,7 @@ def self_test(objective: ImpactObjective, real: Real = DOUBLE) -> dict[str, Any]
 def build_manifest(
     objectives: Sequence[ImpactObjective],
     prefix: str,
-    posture: Vector | None,
+    posture: Array | None,
     real: Real = DOUBLE,
     stack_bytes: int = 0,
 ) -> dict[str, Any]:

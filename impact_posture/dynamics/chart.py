@@ -9,11 +9,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.joints import JointKind, joint_kind
-
-Vector = NDArray[np.float64]
 
 # Joints whose last coordinate is an angle; their q has its cosine and sine.
 _ANGLES = ("continuous", "planar")
@@ -76,7 +74,7 @@ class Chart:
         """Return ``|quaternion|² − 1`` for each quaternion in ``x``."""
         return ca.vertcat(ca.SX(0, 1), *[ca.sumsqr(x[s]) - 1 for s in self.quaternion_slices()])
 
-    def to_x(self, q: Vector) -> Vector:
+    def to_x(self, q: Array) -> Array:
         """Return the chart coordinates of a configuration, shape (nx,)."""
         parts: list[Any] = []
         for slot in self.slots:
@@ -85,11 +83,11 @@ class Chart:
             parts += [piece[:-2], np.arctan2(piece[-1], piece[-2])] if angle else [piece]
         return np.hstack([np.zeros(0), *parts])
 
-    def to_q(self, x: Vector) -> Vector:
+    def to_q(self, x: Array) -> Array:
         """Return the configuration of chart coordinates, shape (nq,), with normalized quaternions."""
         return np.asarray(pin.normalize(self._model, np.hstack([np.zeros(0), *self._parts(x, np.cos, np.sin)])))
 
-    def bounds(self) -> tuple[Vector, Vector]:
+    def bounds(self) -> tuple[Array, Array]:
         """Return the position limits in chart coordinates, infinite where there are none."""
         lower, upper = np.full(self.nx, -np.inf), np.full(self.nx, np.inf)
         for slot in self.slots:

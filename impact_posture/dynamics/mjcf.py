@@ -12,14 +12,13 @@ from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart, JointSlot
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.errors import InputError, UnsupportedJoint
 from impact_posture.escape import xml_name
 
-Vector = NDArray[np.float64]
 Geom = Literal["sphere", "box", "plane"]
 
 # Joint index that stands for the world.
@@ -60,7 +59,7 @@ class Mjcf:
     bodies: dict[int, str]
     joints: dict[int, tuple[str, ...]]
     sites: dict[int, str]
-    moments: dict[str, Vector]
+    moments: dict[str, Array]
 
     def body(self, joint: int) -> Any:
         """Return the ``MjsBody`` that a Pinocchio joint moves, or the world for :data:`WORLD`."""
@@ -82,7 +81,7 @@ class Mjcf:
             name=name, type=type_, size=size, mass=0.0, contype=0, conaffinity=0, **pose(placement)
         )
 
-    def add_plane(self, name: str, point: Vector, normal: Vector) -> None:
+    def add_plane(self, name: str, point: Array, normal: Array) -> None:
         """Add an endless plane through a point to the world, with a unit normal, each world, shape (3,)."""
         upright = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(normal)).matrix()
         self.add_geom(WORLD, name, "plane", (1.0, 1.0, 1.0), pin.SE3(upright, np.array(point)))
@@ -120,7 +119,7 @@ def import_mujoco() -> Any:
     return mujoco
 
 
-def pose(placement: pin.SE3) -> dict[str, Vector]:
+def pose(placement: pin.SE3) -> dict[str, Array]:
     """Return ``pos`` (m) and ``quat`` (w x y z, unit) of a placement."""
     quaternion = pin.Quaternion(np.array(placement.rotation)).normalized()
     return {"pos": np.array(placement.translation), "quat": np.array(quaternion.coeffs()[[3, 0, 1, 2]])}
@@ -207,7 +206,7 @@ def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken:
     family, armature, types = slot.kind.family, np.asarray(model.armature)[slot.v], import_mujoco().mjtJoint
     names = []
 
-    def add(kind: str, suffix: str, value: float, axis: Vector | None = None, limit: int | None = None) -> None:
+    def add(kind: str, suffix: str, value: float, axis: Array | None = None, limit: int | None = None) -> None:
         names.append(_unique(slot.name + suffix, taken))
         joint = body.add_joint(name=names[-1], type=getattr(types, f"mjJNT_{kind}"), armature=value)
         if axis is not None:
@@ -217,7 +216,7 @@ def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken:
             if low < high and max(-low, high) < _ENDLESS:
                 joint.range = (low, high)
 
-    def add_slides(count: int, values: Vector, limited: bool = False) -> None:
+    def add_slides(count: int, values: Array, limited: bool = False) -> None:
         for k, (letter, axis) in enumerate(zip("xyz"[:count], np.eye(3), strict=False)):
             add("SLIDE", f".{letter}", values[k], axis, slot.q.start + k if limited else None)
 
@@ -243,7 +242,7 @@ def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken:
     return tuple(names)
 
 
-def _alike(armature: Vector, slot: JointSlot) -> Vector:
+def _alike(armature: Array, slot: JointSlot) -> Array:
     """Return the armature of a ball, or of axes that turn against each other, which must all be equal."""
     if np.ptp(armature) > 0:
         raise InputError(
@@ -255,7 +254,7 @@ def _alike(armature: Vector, slot: JointSlot) -> Vector:
 # ---- inertias and sites -----------------------------------------------------------------------------------------
 
 
-def _inertia(inertia: pin.Inertia) -> tuple[dict[str, Any], Vector | None]:
+def _inertia(inertia: pin.Inertia) -> tuple[dict[str, Any], Array | None]:
     """Return the arguments of ``add_body`` for an inertia, and its exact moments where MuJoCo refuses them."""
     moments, axes = np.linalg.eigh(np.array(inertia.inertia))
     if np.linalg.det(axes) < 0:

@@ -16,11 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart, JointSlot
-
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ class MjcfLayout:
         self._moved = [slot for slot in self.slots if slot.moved]
         self._turning = [slot for slot in self.slots if slot.joint.kind.family in ("free-flyer", "planar")]
 
-    def qpos(self, q: Vector) -> Vector:
+    def qpos(self, q: Array) -> Array:
         """Return ``qpos``, shape (nqpos,), of a configuration, shape (nq,)."""
         for slot in self._moved:
             q = q.copy()
@@ -100,7 +98,7 @@ class MjcfLayout:
         found[self._angle] = np.arctan2(q[self._cosine + 1], q[self._cosine])
         return found
 
-    def q(self, qpos: Vector) -> Vector:
+    def q(self, qpos: Array) -> Array:
         """Return the configuration, shape (nq,), of a ``qpos``, shape (nqpos,), with quaternions normalized."""
         found = np.zeros(self.nq)
         found[self._q] = qpos[self._qpos]
@@ -112,7 +110,7 @@ class MjcfLayout:
             found[slot.joint.q] = pin.SE3ToXYZQUAT(pose)
         return found
 
-    def velocity_map(self, q: Vector) -> Vector:
+    def velocity_map(self, q: Array) -> Array:
         """Return ``T(q)`` of ``qvel = T v``, orthogonal, shape (nv, nv).
 
         It follows that ``M = Tᵀ M_mj T``, ``J = J_mj T`` and ``τ = Tᵀ τ_mj``.
@@ -124,17 +122,17 @@ class MjcfLayout:
             found[row : row + size, column : column + size] = turn
         return found
 
-    def qvel(self, q: Vector, v: Vector) -> Vector:
+    def qvel(self, q: Array, v: Array) -> Array:
         """Return ``qvel`` of a velocity, shape (nv,)."""
         return np.asarray(self.velocity_map(q) @ v)
 
-    def state(self, qpos: Vector, qvel: Vector) -> tuple[Vector, Vector]:
+    def state(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
         """Return the Pinocchio configuration, shape (nq,), and velocity, shape (nv,)."""
         q = self.q(qpos)
         return q, np.asarray(self.velocity_map(q).T @ qvel)
 
 
-def _turn(slot: MjcfSlot, piece: Vector) -> Vector:
+def _turn(slot: MjcfSlot, piece: Array) -> Array:
     """Return the rotation of the linear velocity of a free-flyer or planar joint."""
     if slot.joint.kind.family == "planar":
         return np.array([[piece[2], -piece[3]], [piece[3], piece[2]]])

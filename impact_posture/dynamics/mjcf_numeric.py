@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco
-
-Vector = NDArray[np.float64]
 
 
 class MujocoNumeric:
@@ -28,24 +27,24 @@ class MujocoNumeric:
         self.data = self._mujoco.MjData(self.model)
         self._map = np.eye(model.nv)
 
-    def at(self, q: Vector) -> MujocoNumeric:
+    def at(self, q: Array) -> MujocoNumeric:
         """Move to ``q``, shape (nq,)."""
         self.data.qpos[:] = self.mjcf.layout.qpos(q)
         self._mujoco.mj_fwdPosition(self.model, self.data)
         self._map = self.mjcf.layout.velocity_map(q)
         return self
 
-    def mass_matrix(self) -> Vector:
+    def mass_matrix(self) -> Array:
         """Return ``M(q)``, shape (nv, nv), including armature."""
         found = np.zeros((self.model.nv, self.model.nv))
         self._mujoco.mj_fullM(self.model, self.data, found)
         return np.asarray(self._map.T @ found @ self._map)
 
-    def rotation(self, site: str) -> Vector:
+    def rotation(self, site: str) -> Array:
         """Return the rotation of a frame in the world, shape (3, 3)."""
         return np.array(self.data.site(site).xmat).reshape(3, 3)
 
-    def jacobian(self, site: str, offset: ArrayLike = (0.0, 0.0, 0.0)) -> Vector:
+    def jacobian(self, site: str, offset: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         """Return ``J``, shape (6, nv), of the linear and angular velocity of a point in world axes.
 
         Args:

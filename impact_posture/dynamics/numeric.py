@@ -6,10 +6,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.robot.model_joints import finite_armature
-
-Vector = NDArray[np.float64]
 
 
 class Numeric:
@@ -30,13 +29,13 @@ class Numeric:
         self.q = pin.neutral(model)
         self._zero = np.zeros(model.nv)
 
-    def at(self, q: Vector) -> Numeric:
+    def at(self, q: Array) -> Numeric:
         """Move to ``q``, shape (nq,)."""
         self.q = np.array(q, dtype=float)
         pin.computeJointJacobians(self.model, self.data, self.q)
         return self
 
-    def mass_matrix(self) -> Vector:
+    def mass_matrix(self) -> Array:
         """Return ``M(q)``, shape (nv, nv), armature included, as if no joint were locked."""
         upper = np.triu(pin.crba(self.model, self.data, self.q))
         return np.asarray(upper + np.triu(upper, 1).T)
@@ -45,7 +44,7 @@ class Numeric:
         """Return the world placement of the frame of a point."""
         return self.data.oMi[point.joint] * pin.SE3(point.rotation, point.position)
 
-    def jacobian(self, point: PointOnLink) -> Vector:
+    def jacobian(self, point: PointOnLink) -> Array:
         """Return ``J``, shape (6, nv), of the world linear and angular velocity (LOCAL_WORLD_ALIGNED)."""
         local = pin.getJointJacobian(self.model, self.data, point.joint, pin.LOCAL)
         local = np.asarray(local).reshape(6, -1)
@@ -53,19 +52,19 @@ class Numeric:
         linear = local[:3] - pin.skew(point.position) @ local[3:]
         return np.vstack([R @ linear, R @ local[3:]])
 
-    def center_of_mass(self) -> tuple[Vector, Vector]:
+    def center_of_mass(self) -> tuple[Array, Array]:
         """Return the world center of mass, shape (3,), and its Jacobian, shape (3, nv)."""
         J = np.array(pin.jacobianCenterOfMass(self.model, self.data, self.q)).reshape(3, -1)
         return np.array(self.data.com[0]), J
 
-    def inertial_gradient(self, left: Vector, right: Vector) -> Vector:
+    def inertial_gradient(self, left: Array, right: Array) -> Array:
         """Return the tangent gradient of ``leftᵀ M(q) right``, shape (nv,), by the RNEA derivatives of Pinocchio."""
         dtau_dq = pin.computeRNEADerivatives(self.model, self.data, self.q, self._zero, right)[0]
         gradient = np.asarray(dtau_dq).reshape(self.model.nv, -1).T @ left
         self.at(self.q)  # the sweep of the derivatives has changed data
         return np.asarray(gradient)
 
-    def coupling_gradient(self, point: PointOnLink, wrench: Vector, v: Vector, *, in_frame: bool = False) -> Vector:
+    def coupling_gradient(self, point: PointOnLink, wrench: Array, v: Array, *, in_frame: bool = False) -> Array:
         """Return the tangent gradient of ``wᵀ J(q) v``, shape (nv,), with ``w`` constant in the world or the frame.
 
         The LOCAL velocity derivatives of Pinocchio are true derivatives of the local velocity.  Those in the world
@@ -89,12 +88,12 @@ class Numeric:
             gradient = gradient + angular.T @ (_cross(linear, force) + _cross(motion.angular, moment))
         return np.asarray(gradient)
 
-    def turning_gradient(self, point: PointOnLink, direction: Vector, covector: Vector) -> Vector:
+    def turning_gradient(self, point: PointOnLink, direction: Array, covector: Array) -> Array:
         """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), of a world direction that turns with the link."""
         return np.asarray(self.jacobian(point)[3:].T @ _cross(direction, covector))
 
 
-def hold_locked(locked: NDArray[np.bool_], M: Vector, *jacobians: Vector) -> tuple[Vector, ...]:
+def hold_locked(locked: NDArray[np.bool_], M: Array, *jacobians: Array) -> tuple[Array, ...]:
     """Return ``M`` and Jacobians of a robot whose locked entries do not move: their rows and columns are zero.
 
     The diagonal of ``M`` is one there, so that systems with ``M`` stay regular.
@@ -103,6 +102,6 @@ def hold_locked(locked: NDArray[np.bool_], M: Vector, *jacobians: Vector) -> tup
     return np.where(np.outer(mobile, mobile), M, np.diag(locked.astype(float))), *(J * mobile for J in jacobians)
 
 
-def _cross(a: Vector, b: Vector) -> Vector:
+def _cross(a: Array, b: Array) -> Array:
     """Return ``a × b``; ``numpy.cross`` takes twenty times as long on three numbers."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

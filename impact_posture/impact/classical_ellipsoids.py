@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.impact.objective import ImpactObjective
-
-Vector = NDArray[np.float64]
 
 # An eigenvalue below this share of the largest one is zero: no motion along it, and no bound on the force.
 _RANK = 1e-12
@@ -24,8 +22,8 @@ class Ellipsoid:
         radii: Semi-axes, descending, shape (3,); infinite along an axis without a bound.
     """
 
-    axes: Vector
-    radii: Vector
+    axes: Array
+    radii: Array
 
     @property
     def finite_radii(self) -> list[float | None]:
@@ -37,7 +35,7 @@ class Ellipsoid:
         return {"axes": self.axes.tolist(), "radii": self.finite_radii}
 
 
-def ellipsoid_of(matrix: Vector) -> Ellipsoid:
+def ellipsoid_of(matrix: Array) -> Ellipsoid:
     """Return the ellipsoid ``{A^{1/2} u : |u| ≤ 1}`` of a symmetric PSD ``A``, shape (3, 3).
 
     Its radii are ``√eigenvalues``.
@@ -46,7 +44,7 @@ def ellipsoid_of(matrix: Vector) -> Ellipsoid:
     return Ellipsoid(_oriented(vectors[:, ::-1]), np.sqrt(np.clip(values[::-1], 0.0, None)))
 
 
-def velocity_ellipsoid(J: Vector) -> Ellipsoid:
+def velocity_ellipsoid(J: Array) -> Ellipsoid:
     """Return the ellipsoid of ``JJᵀ``: contact velocities for joint velocities ``|ν| ≤ 1`` (Yoshikawa 1985).
 
     Args:
@@ -55,7 +53,7 @@ def velocity_ellipsoid(J: Vector) -> Ellipsoid:
     return ellipsoid_of(J @ J.T)
 
 
-def force_ellipsoid(J: Vector) -> Ellipsoid:
+def force_ellipsoid(J: Array) -> Ellipsoid:
     """Return the ellipsoid of ``(JJᵀ)⁻¹``: contact forces for joint torques ``|Jᵀf| ≤ 1``.
 
     It is infinite along directions in which J loses rank.
@@ -69,7 +67,7 @@ def force_ellipsoid(J: Vector) -> Ellipsoid:
     return Ellipsoid(_oriented(vectors), radii)
 
 
-def classical_ellipsoids(objective: ImpactObjective, q: Vector) -> dict[str, Ellipsoid]:
+def classical_ellipsoids(objective: ImpactObjective, q: Array) -> dict[str, Ellipsoid]:
     """Return ``{"velocity", "force"}`` of the contact at ``q``.
 
     Both ignore inertia and supports, and mix m/s with rad/s as ``|ν|`` does.
@@ -78,7 +76,7 @@ def classical_ellipsoids(objective: ImpactObjective, q: Vector) -> dict[str, Ell
     return {"velocity": velocity_ellipsoid(J), "force": force_ellipsoid(J)}
 
 
-def _oriented(vectors: Vector) -> Vector:
+def _oriented(vectors: Array) -> Array:
     """Fix the signs of eigenvectors: the largest entry is positive, and the axes are right-handed."""
     axes = np.array(vectors, dtype=float)
     for k in range(2):

@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
+from impact_posture.arrays import Array
 
 # Values that differ by less, relative to the size of A times sin α (their possible range), are tied.
 TIED = 1e-6
@@ -39,8 +38,8 @@ class WorstNormal:
     """
 
     value: float
-    normal: Vector
-    normals: Vector
+    normal: Array
+    normals: Array
     angle_deg: float
     multiplier: float
     bound: float
@@ -50,7 +49,7 @@ class WorstNormal:
         """Whether another normal has the same value; the value then has a kink here and no gradient."""
         return len(self.normals) > 1
 
-    def turned(self, R: Vector) -> WorstNormal:
+    def turned(self, R: Array) -> WorstNormal:
         """Return the same maximum with its normals in other axes."""
         return replace(self, normal=R @ self.normal, normals=self.normals @ R.T)
 
@@ -64,7 +63,7 @@ class WorstNormal:
         }
 
 
-def cone_axes(n: Vector) -> Vector:
+def cone_axes(n: Array) -> Array:
     """Return orthonormal axes with ``n`` as first column, shape (3, 3); accurate for every ``n``."""
     x, y, z = (float(v) for v in n)
     side = 1.0 if z >= 0 else -1.0
@@ -74,7 +73,7 @@ def cone_axes(n: Vector) -> Vector:
     return np.array([[x, 1 + side * x * x * a, b], [y, side * b, side + y * y * a], [z, -side * x, -y]])
 
 
-def worst_normal(A: Vector, axis: Vector, cone_deg: float) -> WorstNormal:
+def worst_normal(A: Array, axis: Array, cone_deg: float) -> WorstNormal:
     """Maximize ``nᵀAn`` over the unit vectors within ``cone_deg`` of ``axis``.
 
     Args:
@@ -93,7 +92,7 @@ def worst_normal(A: Vector, axis: Vector, cone_deg: float) -> WorstNormal:
     # The leading normal must not depend on rounding, so its coordinates decide a tie.
     near = [k for k in range(len(found)) if values[k] >= best - TIED * s * size]
     near.sort(key=lambda k: (round((best - values[k]) / (_EQUAL * size)), *(-found[k])))
-    apart: list[Vector] = []
+    apart: list[Array] = []
     for k in near:
         if all(np.linalg.norm(found[k] - other) > _APART * s for other in apart):
             apart.append(found[k])
@@ -110,7 +109,7 @@ def worst_normal(A: Vector, axis: Vector, cone_deg: float) -> WorstNormal:
     )
 
 
-def tied_normals(A: Vector, axis: Vector, cone_deg: float, worst: WorstNormal, tolerance: float) -> Vector:
+def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tolerance: float) -> Array:
     """Return the normals whose value is within ``tolerance · |A|`` of the worst normal, it first, shape (k, 3).
 
     An arc, a circle or a cap of tied normals gives a sample that is dense enough for its convex hull.
@@ -131,7 +130,7 @@ def tied_normals(A: Vector, axis: Vector, cone_deg: float, worst: WorstNormal, t
     return np.vstack([worst.normals, more[heights >= worst.value - tolerance * size]])
 
 
-def _multiplier(P: Vector, n: Vector, c: float, s: float) -> float:
+def _multiplier(P: Array, n: Array, c: float, s: float) -> float:
     """``μ`` of ``(P + μ diag(s², −c², −c²)) n = t n``, from its first row, in a form without cancellation."""
     if n[0] > c * (1 + 1e-12):
         return 0.0
@@ -139,7 +138,7 @@ def _multiplier(P: Vector, n: Vector, c: float, s: float) -> float:
     return max(0.0, float((2 * c * c - 1) / (c * s) * (P[0, 1:] @ w) + w @ P[1:, 1:] @ w - P[0, 0]))
 
 
-def _inside(P: Vector, c: float, size: float) -> Vector:
+def _inside(P: Array, c: float, size: float) -> Array:
     """Top eigenvectors within the cap, in its axes; for a multiple eigenvalue also the nearest to the axis."""
     values, vectors = np.linalg.eigh(P)
     top = vectors[:, values >= values[-1] - TIED * size]
@@ -151,18 +150,18 @@ def _inside(P: Vector, c: float, size: float) -> Vector:
     return turned[turned[:, 0] >= c]
 
 
-def _on_edge(P: Vector, c: float, s: float, size: float) -> Vector:
+def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
     """Maxima on the edge of the cap ``n = (c, s cos φ, s sin φ)``; three of its points if the value is constant."""
     b1, b2 = float(P[0, 1]), float(P[0, 2])
     h, k = float(P[1, 1] - P[2, 2]) / 2, float(P[1, 2])
 
-    def slope(x: Vector) -> Vector:
+    def slope(x: Array) -> Array:
         return np.asarray(c * (b2 * np.cos(x) - b1 * np.sin(x)) + s * (k * np.cos(2 * x) - h * np.sin(2 * x)))
 
-    def bend(x: Vector) -> Vector:
+    def bend(x: Array) -> Array:
         return np.asarray(-c * (b2 * np.sin(x) + b1 * np.cos(x)) - 2 * s * (k * np.sin(2 * x) + h * np.cos(2 * x)))
 
-    def height(x: Vector) -> Vector:
+    def height(x: Array) -> Array:
         return np.asarray(2 * c * (b1 * np.cos(x) + b2 * np.sin(x)) + s * (h * np.cos(2 * x) + k * np.sin(2 * x)))
 
     # The zeros of the slope are roots z = exp(iφ).  The angles of all roots are candidates.

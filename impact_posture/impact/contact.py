@@ -6,15 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import SupportSpec
 from impact_posture.settings import FRICTION, NormalFrame, SupportKind, Vector3
-
-Vector = NDArray[np.float64]
 
 # A normal shorter than this is zero up to rounding.
 _DUST = 1e-9
@@ -158,9 +156,9 @@ def heavy_feet_rounding(robot: Robot, compliance: float) -> float:
     return max(1.0, default_compliance(robot) / compliance)
 
 
-def support_inertia(robot: Robot, supports: tuple[Support, ...], compliance: float) -> dict[int, Vector]:
+def support_inertia(robot: Robot, supports: tuple[Support, ...], compliance: float) -> dict[int, Array]:
     """Return ``J_sᵀJ_s/ε`` by link, as 6×6 inertias: point masses ``1/ε``, and moments ``1/ε`` for a surface."""
-    extra: dict[int, Vector] = {}
+    extra: dict[int, Array] = {}
     for support in supports:
         point = point_on(robot, support.frame, support.offset)
         jacobian = np.eye(6)

@@ -18,16 +18,14 @@ from dataclasses import dataclass, replace
 from math import gamma, pi, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.robot.joint_model import transmissions, with_joint_model
 from impact_posture.settings import MATERIALS, JointModel
-
-Vector = NDArray[np.float64]
 
 # ∫₀¹ dz/√(1 − z^{5/2}), the time to greatest compression in units of δ/v for the force κδ^{3/2}.
 HERTZ_TIME = sqrt(pi) * gamma(7 / 5) / gamma(9 / 10)
@@ -180,7 +178,7 @@ class Compression:
 
 
 def compression(
-    objective: ImpactObjective, q: Vector, speed: float, contact: ContactStiffness | None
+    objective: ImpactObjective, q: Array, speed: float, contact: ContactStiffness | None
 ) -> Compression | None:
     """Return T, peak force and x of the impact at the leading contact; ``None`` if none of them is known.
 
@@ -210,7 +208,7 @@ def compression(
     return Compression(contact, time, force, x, by_material, objective.robot.joint_model)
 
 
-def springs_along(case: ImpactCase, q: Vector) -> tuple[float, float] | None:
+def springs_along(case: ImpactCase, q: Array) -> tuple[float, float] | None:
     """Return ``G = jM⁻¹jᵀ`` of the links alone, 1/kg, and ``C = jK⁻¹jᵀ`` of the joint springs, m/N.
 
     Returns:

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.impact.contact import Support
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.tables import json_block
-
-Vector = NDArray[np.float64]
 
 # A singular value of J_s below this share of the largest one is rounding.
 _RANK = 1e-9
@@ -41,8 +39,8 @@ class FootImpulse:
     """
 
     frame: str
-    impulse: Vector
-    moment: Vector
+    impulse: Array
+    moment: Array
     lifts: bool
 
     def to_dict(self) -> dict[str, object]:
@@ -89,7 +87,7 @@ class ContactStability:
         }
 
 
-def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Vector) -> ContactStability:
+def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Array) -> ContactStability:
     """Find impulses within the friction cones, or impulses with the least pull.
 
     The ground is level, so the axis of the cones is world z.  A sole with a ``size`` bears moments up to its edges.
@@ -105,7 +103,7 @@ def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Ve
     cones = FrictionCones(supports, [oracle.numeric.placement(p).rotation for p, _ in oracle.feet])
     none = _NONE * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
 
-    def verdict(friction: float | None, impulse: Vector) -> ContactStability:
+    def verdict(friction: float | None, impulse: Array) -> ContactStability:
         return ContactStability(friction, cones.feet(impulse, none), basis.shape[1])
 
     lifting = cones.least_pull(particular, basis)
@@ -132,12 +130,12 @@ class FrictionCones:
         axes: World axes of the frame of each foot, along which its sole has a size, shape (3, 3).
     """
 
-    def __init__(self, supports: tuple[Support, ...], axes: Sequence[Vector]) -> None:
+    def __init__(self, supports: tuple[Support, ...], axes: Sequence[Array]) -> None:
         starts = np.cumsum([0, *[s.rows for s in supports]])
         self._size = int(starts[-1])
         self._feet = [(int(k), s, np.asarray(R)) for k, s, R in zip(starts, supports, axes, strict=False)]
 
-    def matrix(self, friction: float) -> tuple[Vector, list[str]]:
+    def matrix(self, friction: float) -> tuple[Array, list[str]]:
         """Return ``A``, shape (rows, impulses), for a friction coefficient, and the name of each row.
 
         The rows are ``−f_z ≤ 0``, for soles ``|τ_x| ≤ Y f_z`` and ``|τ_y| ≤ X f_z`` in the axes of the foot, then
@@ -145,7 +143,7 @@ class FrictionCones:
         """
         names, rows = [f"{s.frame} lifts" for _, s, _ in self._feet], [*self._lifts()]
 
-        def add(name: str, start: int, entries: Vector) -> None:
+        def add(name: str, start: int, entries: Array) -> None:
             names.append(name)
             rows.append(np.zeros(self._size))
             rows[-1][start : start + len(entries)] = entries
@@ -164,17 +162,17 @@ class FrictionCones:
                     add(f"{support.frame} turns", start, np.array([0.0, 0.0, -twist, 0.0, 0.0, sign]))
         return np.array(rows), names
 
-    def _lifts(self) -> Vector:
+    def _lifts(self) -> Array:
         rows = np.zeros((len(self._feet), self._size))
         for row, (start, _, _) in zip(rows, self._feet, strict=True):
             row[start + 2] = -1.0
         return rows
 
-    def pull(self, impulse: Vector) -> float:
+    def pull(self, impulse: Array) -> float:
         """Return the largest pull of the ground on a foot; zero if it pushes all feet."""
         return float(np.max(self._lifts() @ impulse, initial=0.0))
 
-    def least_pull(self, particular: Vector, basis: Vector) -> Vector:
+    def least_pull(self, particular: Array, basis: Array) -> Array:
         """Return the impulses whose largest pull is least."""
         up, count = self._lifts(), basis.shape[1]
         if not count:
@@ -186,7 +184,7 @@ class FrictionCones:
         found = scipy.optimize.linprog(cost, A_ub=A, b_ub=-up @ particular, bounds=bounds)
         return particular if found.status != 0 else particular + basis @ found.x[:-1]
 
-    def within(self, particular: Vector, basis: Vector, friction: float) -> Vector | None:
+    def within(self, particular: Array, basis: Array, friction: float) -> Array | None:
         """Return the impulses within the cones whose largest entry is least, or ``None``."""
         A, _ = self.matrix(friction)
         slack = 1e-9 * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
@@ -200,7 +198,7 @@ class FrictionCones:
         found = scipy.optimize.linprog(cost, A_ub=rows, b_ub=right, bounds=[(None, None)] * (size + 1))
         return particular + basis @ found.x[:-1] if found.status == 0 else None
 
-    def feet(self, impulse: Vector, none: float) -> tuple[FootImpulse, ...]:
+    def feet(self, impulse: Array, none: float) -> tuple[FootImpulse, ...]:
         """Return the impulse on each foot; a pull above ``none`` lifts it."""
         found = []
         for start, support, _ in self._feet:

@@ -14,12 +14,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.spatial import cross
 from impact_posture.impact.oracle import ImpactOracle, no_sticking
-
-Vector = NDArray[np.float64]
 
 # An eigenvalue of B_tt below this share of the trace of B is zero.
 _RANK = 1e-9
@@ -42,13 +40,13 @@ class CoulombImpact:
     """
 
     sticks: bool
-    jump: Vector
-    impulse: Vector
-    slip: Vector
+    jump: Array
+    impulse: Array
+    slip: Array
     sigma: float
 
 
-def coulomb_impact(oracle: ImpactOracle, q: Vector, *, other: bool = False) -> CoulombImpact:
+def coulomb_impact(oracle: ImpactOracle, q: Array, *, other: bool = False) -> CoulombImpact:
     """Compute the impact with the friction of the contact at ``q``, from Pinocchio's numbers.
 
     With ``other``, compute the branch beyond the switch instead: sticking where it slides, sliding with ``σ < 0``.
@@ -83,7 +81,7 @@ def coulomb_impact(oracle: ImpactOracle, q: Vector, *, other: bool = False) -> C
     return CoulombImpact(False, oracle.solve(oracle.J.T @ impulse), impulse, B @ impulse - n, sigma)
 
 
-def coulomb_gradient(oracle: ImpactOracle, q: Vector, impact: CoulombImpact) -> Vector:
+def coulomb_gradient(oracle: ImpactOracle, q: Array, impact: CoulombImpact) -> Array:
     """Return the tangent gradient of ``C = ‖Δν‖²_W`` at unit approach speed, shape (nv,), of an impact at ``q``.
 
     With the impulse ``p`` and ``∂w = K ∂B (n − w)`` it is ``∂_q pᵀΛ_c p + 2 ∂_q rᵀBp`` for fixed ``p`` and

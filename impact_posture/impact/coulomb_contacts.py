@@ -10,14 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import MetricError
 from impact_posture.impact.coulomb import coulomb_impact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.velocity_jump import Jump, weighed_jump
-
-Vector = NDArray[np.float64]
 
 # Sweeps over the contacts, steps at one contact in a sweep, and the error of an impulse that ends them, relative.
 _SWEEPS, _STEPS, _TOLERANCE = 5000, 20, 1e-11
@@ -37,10 +35,10 @@ class CoulombJump(Jump):
 
     friction: float
     sticks: bool
-    slip_direction: Vector | None
+    slip_direction: Array | None
 
     @staticmethod
-    def of(jump: Jump, impulse: Vector, friction: float, slip: Vector) -> CoulombJump:
+    def of(jump: Jump, impulse: Array, friction: float, slip: Array) -> CoulombJump:
         """Return a jump with the impulse of a contact and its slip per approach speed, both of shape (3,)."""
         size = float(np.linalg.norm(slip))
         direction = None if size <= _SLIP else slip / size
@@ -49,7 +47,7 @@ class CoulombJump(Jump):
         )
 
 
-def coulomb_jump(objective: ImpactObjective, q: Vector, rebound: float) -> CoulombJump | None:
+def coulomb_jump(objective: ImpactObjective, q: Array, rebound: float) -> CoulombJump | None:
     """Return the jump of the leading contact with friction for ``rebound = (1 + e) v_n``, m/s; ``None`` for none."""
     try:
         found = coulomb_impact(objective.oracle, q)
@@ -60,7 +58,7 @@ def coulomb_jump(objective: ImpactObjective, q: Vector, rebound: float) -> Coulo
     return CoulombJump.of(jump, impulse, objective.contact.friction, found.slip)
 
 
-def coulomb_jumps(objective: ImpactObjective, q: Vector, speed: float) -> tuple[CoulombJump, ...] | None:
+def coulomb_jumps(objective: ImpactObjective, q: Array, speed: float) -> tuple[CoulombJump, ...] | None:
     """Return the jump of the plastic impact of several contacts at once, each with its own impulse and slip.
 
     Every contact point approaches along its own normal at ``speed``, m/s.  The jump and its norm are those of all
@@ -83,7 +81,7 @@ def coulomb_jumps(objective: ImpactObjective, q: Vector, speed: float) -> tuple[
     return tuple(CoulombJump.of(found, impulse, float(mu), slip) for impulse, mu, slip in each)
 
 
-def contact_impulses(B: Vector, normals: Vector, friction: Vector) -> Vector | None:
+def contact_impulses(B: Array, normals: Array, friction: Array) -> Array | None:
     """Return the impulses per unit approach speed, world, shape (m, 3); ``None`` if they do not converge.
 
     ``B`` has shape (3m, 3m), the world unit ``normals`` have shape (m, 3), and the coefficients shape (m,).
@@ -104,7 +102,7 @@ def contact_impulses(B: Vector, normals: Vector, friction: Vector) -> Vector | N
     return None
 
 
-def _on_cone(p: Vector, n: Vector, mu: float) -> Vector:
+def _on_cone(p: Array, n: Array, mu: float) -> Array:
     """Return the nearest impulse with ``‖p_t‖ ≤ μ p_n``."""
     along = float(n @ p)
     across = p - along * n

@@ -6,8 +6,8 @@ from contextlib import suppress
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import MetricError
 from impact_posture.impact.coulomb import NO_FRICTION, coulomb_direction, coulomb_gradient, coulomb_impact
@@ -16,8 +16,6 @@ from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
-
-Vector = NDArray[np.float64]
 
 # Slip times distance from the edge of the cone is zero, and at most this in the program, which needs an inside.
 _CORNER = 1e-10
@@ -35,16 +33,16 @@ class CoulombKind(ImpactKind):
     kink = "where the contact point begins to slip, grad is that of sticking"
     no_cone = "coulomb is no quadratic form of the normal: the exact worst case over a cone is not known for it"
 
-    def value(self, oracle: ImpactOracle, q: Vector) -> float:
+    def value(self, oracle: ImpactOracle, q: Array) -> float:
         """Return the value from Pinocchio's numbers; see the base for errors."""
         jump = coulomb_impact(oracle, q).jump
         return float(jump @ oracle.weigh(jump))
 
-    def gradient(self, oracle: ImpactOracle, q: Vector) -> Vector:
+    def gradient(self, oracle: ImpactOracle, q: Array) -> Array:
         """Return the tangent gradient from Pinocchio's numbers, shape (nv,); at the kink, that of sticking."""
         return coulomb_gradient(oracle, q, coulomb_impact(oracle, q))
 
-    def subgradients(self, oracle: ImpactOracle, q: Vector, within: float) -> tuple[Vector, Vector]:
+    def subgradients(self, oracle: ImpactOracle, q: Array, within: float) -> tuple[Array, Array]:
         """Return the gradient, and that of the other branch where both nearly tie and the value is the larger.
 
         Where the value is the smaller of both, no optimum lies at the kink.
@@ -90,11 +88,11 @@ class CoulombKind(ImpactKind):
         slip, inside = jump.variables[-2], jump.variables[-1]
         return Lifted(jump.variables, jump.residual, self.lifted_value(case, jump), slip * inside - _CORNER)
 
-    def jump(self, found: ImpactQuantities) -> tuple[Vector, Vector]:
+    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
         """Return the frictionless jump, which :meth:`guess` replaces."""
         return found.jump / found.G, np.array([1 / found.G, 0, 0, 0, 0, 1])
 
-    def guess(self, oracle: ImpactOracle, q: Vector) -> Guess:
+    def guess(self, oracle: ImpactOracle, q: Array) -> Guess:
         """Return the unknowns of :meth:`lift` that solve its equations at ``q``; ``κ`` and ``o`` are ≥ 0."""
         found, friction = coulomb_impact(oracle, q), oracle.contact.friction
         n, p = oracle.n, found.impulse

@@ -25,17 +25,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
+from impact_posture.arrays import Array
 from impact_posture.errors import ContactError, InputError
 from impact_posture.impact.contact import LARGEST
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.oracle import Answer, ImpactOracle
 from impact_posture.robot.joint_model import transmissions, with_joint_model
 from impact_posture.tables import json_block
-
-Vector = NDArray[np.float64]
 
 # Contact stiffness, N/m: from below foam to above steel on steel.
 _SOFTEST, _STIFFEST = 1.0, 1e12
@@ -76,13 +74,13 @@ class ElasticResponse:
     compliance_ratio: float
     force: float
     impulse: float
-    jump: Vector
+    jump: Array
     jump_norm: float
     value: float
     peak_jump_norm: float
-    rotor_jump: Vector
-    torque: Vector
-    peak_torque: Vector
+    rotor_jump: Array
+    torque: Array
+    peak_torque: Array
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content; ``None`` for a compliance ratio without a bound."""
@@ -90,7 +88,7 @@ class ElasticResponse:
         return json_block(self) | {"compliance_ratio": ratio}
 
 
-def elastic_response(case: ImpactCase, q: Vector, stiffness: float, speed: float = 1.0) -> ElasticResponse:
+def elastic_response(case: ImpactCase, q: Array, stiffness: float, speed: float = 1.0) -> ElasticResponse:
     """Return the response of a robot with elastic joints to one contact; see :class:`ElasticImpact`."""
     return ElasticImpact(case).response(q, stiffness, speed)
 
@@ -116,7 +114,7 @@ class ElasticImpact:
         self.kappa, self.d = found.stiffness[self.joints], found.damping[self.joints]
         self.oracle = ImpactOracle(replace(case, robot=robot))
 
-    def response(self, q: Vector, stiffness: float, speed: float = 1.0) -> ElasticResponse:
+    def response(self, q: Array, stiffness: float, speed: float = 1.0) -> ElasticResponse:
         """Return the response at ``q``, shape (nq,), to a contact of ``stiffness`` in N/m at ``speed`` in m/s.
 
         Raises:
@@ -149,13 +147,13 @@ class ElasticImpact:
             peak_torque=peak * speed,
         )
 
-    def value(self, q: Vector, stiffness: float) -> float:
+    def value(self, q: Array, stiffness: float) -> float:
         """Return ``‖ẋ(T)‖²_W/v²``."""
         c = self._compression(q, stiffness)
         x = c.columns.a @ c.impulse(c.state)
         return float(x @ self.oracle.weigh(x))
 
-    def gradient(self, q: Vector, stiffness: float) -> Vector:
+    def gradient(self, q: Array, stiffness: float) -> Array:
         """Return the tangent gradient of :meth:`value`, shape (nv,).
 
         ``T`` moves with ``q`` so that ``δ̇(T) = 0``.  The gradient does not exist where ``δ̇`` touches zero without
@@ -176,7 +174,7 @@ class ElasticImpact:
             gradient = gradient - weight * oracle.inertial(mode, mode)
         return np.asarray(gradient + oracle.metric_gradient(x.a))
 
-    def _compression(self, q: Vector, stiffness: float) -> _Compression:
+    def _compression(self, q: Array, stiffness: float) -> _Compression:
         """Check the stiffness, and solve for a unit approach speed."""
         if not _SOFTEST <= stiffness <= _STIFFEST:
             hint = f"give {_SOFTEST:g} to {_STIFFEST:g} N/m"
@@ -212,7 +210,7 @@ class _Compression:
         oracle: Weighs velocities.
     """
 
-    def __init__(self, mobility: Vector, columns: Answer, kappa: Vector, d: Vector, oracle: ImpactOracle) -> None:
+    def __init__(self, mobility: Array, columns: Answer, kappa: Array, d: Array, oracle: ImpactOracle) -> None:
         self.mobility, self.columns, self.kappa, self.d, self._oracle = mobility, columns, kappa, d, oracle
         try:
             self._L = np.linalg.cholesky(mobility)
@@ -227,17 +225,17 @@ class _Compression:
         self._start[-1] = 1 / self._L[-1, -1]
         self.duration, self.state = self._greatest_compression()
 
-    def impulse(self, states: Vector) -> Vector:
+    def impulse(self, states: Array) -> Array:
         """Return ``I`` of one state or of columns, springs first, shape (m+1, …)."""
         moved = (self._start - states.T).T[len(self.kappa) :]
         return np.asarray(scipy.linalg.solve_triangular(self._L, moved, trans=1, lower=True))
 
-    def force(self, states: Vector) -> Vector:
+    def force(self, states: Array) -> Array:
         """Return ``κc + dċ`` of one state or of columns, springs first."""
         r = len(self.kappa)
         return np.asarray((np.sqrt(self.kappa) * states[:r].T + self.d * (self._L @ states[r:]).T).T)
 
-    def _greatest_compression(self) -> tuple[float, Vector]:
+    def _greatest_compression(self) -> tuple[float, Array]:
         """Return the first root ``T`` of ``p = δ̇/v``, and the state there.
 
         ``|p̈| ≤ kG``, because the energy of the second derivative of ``c`` starts at ``k²v²G/2`` and never grows.  So
@@ -258,7 +256,7 @@ class _Compression:
             state = scipy.linalg.expm(step * self._generator) @ state
         return t, state
 
-    def peaks(self) -> tuple[float, Vector]:
+    def peaks(self) -> tuple[float, Array]:
         """Return the largest ``‖ẋ‖²_W`` and the largest ``|τ|`` of each spring, by cubics between exact samples."""
         count = int(np.clip(self.duration * self._fastest / _SAMPLE, _FEWEST, _MOST))
         step, states = scipy.linalg.expm(self.duration / count * self._generator), [self._start]
@@ -271,7 +269,7 @@ class _Compression:
         largest = [_peak(times, *curve) for curve in zip(torques[:-1], rates[:-1], strict=True)]
         return _peak(times, np.sum(x * weighed, axis=0), slope), np.array(largest)
 
-    def adjoint(self, g: Vector) -> Vector:
+    def adjoint(self, g: Array) -> Array:
         """Return the symmetric ``X`` with ``⟨X, dA⟩ = gᵀdI(T)``, shape (m+1, m+1), where ``T`` moves with ``A``."""
         r, L, T = len(self.kappa), self._L, self.duration
         weighed, rate = scipy.linalg.cho_solve((L, True), g), self._generator @ self.state
@@ -284,7 +282,7 @@ class _Compression:
         return np.asarray(-(X + X.T) / 2)
 
 
-def _peak(times: Vector, values: Vector, slopes: Vector) -> float:
+def _peak(times: Array, values: Array, slopes: Array) -> float:
     """Return the largest size of the piecewise cubic through values and slopes."""
     cubic = CubicHermiteSpline(times, values, slopes)
     return float(np.nanmax(np.abs([*values, *cubic(cubic.derivative().roots(extrapolate=False))])))

@@ -6,16 +6,14 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.impact.frictionless_kind import FrictionlessKind
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_kind import QuadraticKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import UnknownJump
 from impact_posture.impact.oracle import ImpactOracle
-
-Vector = NDArray[np.float64]
 
 
 class EnergyKind(FrictionlessKind, QuadraticKind):
@@ -31,11 +29,11 @@ class EnergyKind(FrictionlessKind, QuadraticKind):
         """Return ``λ/2``."""
         return jump.variables[-1] / 2
 
-    def form(self, oracle: ImpactOracle, mobility: Vector, world: Vector, jumps: Vector) -> Vector:
+    def form(self, oracle: ImpactOracle, mobility: Array, world: Array, jumps: Array) -> Array:
         """Return ``−JM⁻¹Jᵀ`` along the directions."""
         return np.asarray(-world.T @ mobility @ world)
 
-    def form_gradient(self, oracle: ImpactOracle, q: Vector, n: Vector) -> Vector:
+    def form_gradient(self, oracle: ImpactOracle, q: Array, n: Array) -> Array:
         """Return ``−∇G`` along ``n``."""
         return -oracle.gradient_G(q, n)
 
@@ -43,11 +41,11 @@ class EnergyKind(FrictionlessKind, QuadraticKind):
         """Return ``−JM⁻¹Jᵀ``."""
         return -k.mobility
 
-    def of_form(self, case: ImpactCase, form: Vector) -> Vector:
+    def of_form(self, case: ImpactCase, form: Array) -> Array:
         """Return ``−1/(2K)``; infinite where the contact cannot move."""
         return np.asarray(np.where(form < 0, -1 / (2 * np.where(form < 0, form, -1.0)), np.inf))
 
-    def of_form_slope(self, case: ImpactCase, form: Vector) -> Vector:
+    def of_form_slope(self, case: ImpactCase, form: Array) -> Array:
         """Return ``1/(2K²)``."""
         return np.asarray(1 / (2 * form**2))
 

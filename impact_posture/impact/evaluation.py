@@ -7,8 +7,8 @@ from operator import attrgetter
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.classical_ellipsoids import Ellipsoid, ellipsoid_of
 from impact_posture.impact.cone import WorstNormal
@@ -29,8 +29,6 @@ from impact_posture.impact.scalars import (
     worst_variant,
 )
 from impact_posture.impact.velocity_jump import Dominance, Jump, find_dominance, weighed_jump
-
-Vector = NDArray[np.float64]
 
 # A relative change of H above this share, with supports ten times as stiff, gets a warning.
 _SOFT = 0.01
@@ -71,13 +69,13 @@ class Evaluation:
         warnings: Limits of these numbers, one line each.
     """
 
-    q: Vector
+    q: Array
     scalars: Scalars
     objective: float | None
-    gradient: Vector
-    objective_gradient: Vector | None
-    normal: Vector
-    worst_normal: Vector
+    gradient: Array
+    objective_gradient: Array | None
+    normal: Array
+    worst_normal: Array
     cone: WorstNormal | None
     ellipsoid: Ellipsoid
     pose: pin.SE3
@@ -155,7 +153,7 @@ _OWN = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pos
 
 def evaluate(
     objective: ImpactObjective,
-    q: Vector,
+    q: Array,
     speed: float = 1.0,
     restitution: float = 0.0,
     contact_stiffness: ContactStiffness | None = None,
@@ -228,7 +226,7 @@ def evaluate(
     )  # fmt: skip
 
 
-def _worst(objective: ImpactObjective, q: Vector) -> WorstNormal | None:
+def _worst(objective: ImpactObjective, q: Array) -> WorstNormal | None:
     if objective.normal_cone is None:
         return None
     try:
@@ -237,7 +235,7 @@ def _worst(objective: ImpactObjective, q: Vector) -> WorstNormal | None:
         return None
 
 
-def _without_supports(objective: ImpactObjective, q: Vector, H: float) -> tuple[Scalars | None, float | None]:
+def _without_supports(objective: ImpactObjective, q: Array, H: float) -> tuple[Scalars | None, float | None]:
     if not objective.supports:
         return None, None
     case = objective.case
@@ -247,7 +245,7 @@ def _without_supports(objective: ImpactObjective, q: Vector, H: float) -> tuple[
 
 
 def _elastic(
-    objective: ImpactObjective, q: Vector, speed: float, contact: ContactStiffness | None
+    objective: ImpactObjective, q: Array, speed: float, contact: ContactStiffness | None
 ) -> ElasticResponse | None:
     """Return the response of elastic joints to the stated contact, if the joint model asks for it."""
     if objective.robot.joint_model != "elastic":
@@ -262,7 +260,7 @@ def _elastic(
     return elastic_response(objective.case, q, contact.linear_stiffness(G, speed), speed)
 
 
-def _joint_model_warning(objective: ImpactObjective, q: Vector, found: Compression | None) -> tuple[str, ...]:
+def _joint_model_warning(objective: ImpactObjective, q: Array, found: Compression | None) -> tuple[str, ...]:
     """Warn where the joint model does not fit x, with the answers of both models."""
     if found is None or found.x is None or objective.robot.joint_model in (found.fitting, "locked", "elastic"):
         return ()

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.lifted import UnknownJump, impact_at, in_world, unknown_jump
 from impact_posture.impact.oracle import ImpactQuantities
-
-Vector = NDArray[np.float64]
 
 
 class FrictionlessKind(ImpactKind):
@@ -24,6 +22,6 @@ class FrictionlessKind(ImpactKind):
         jump = unknown_jump(case, tree, impact_at(case, n * impulse), label)
         return jump.with_impulse(impulse, ca.dot(in_world(case, tree, n), jump.contact_velocity) - 1)
 
-    def jump(self, found: ImpactQuantities) -> tuple[Vector, Vector]:
+    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
         """Return ``a/G`` and ``λ = 1/G``."""
         return found.jump / found.G, np.array([1 / found.G])

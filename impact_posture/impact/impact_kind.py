@@ -7,15 +7,13 @@ from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import Guess, Lifted, UnknownJump, impact_at, unknown_jump, weighed
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities, no_sticking
-
-Vector = NDArray[np.float64]
 
 
 class ImpactKind(ABC):
@@ -44,7 +42,7 @@ class ImpactKind(ABC):
         """Return the value divided by the scalar that :attr:`symbol` names."""
         return 1.0
 
-    def value(self, oracle: ImpactOracle, q: Vector) -> float:
+    def value(self, oracle: ImpactOracle, q: Array) -> float:
         """Return the value from Pinocchio's numbers.
 
         Raises:
@@ -55,11 +53,11 @@ class ImpactKind(ABC):
             raise no_sticking()
         return self.factor(oracle.case) * float(found)
 
-    def gradient(self, oracle: ImpactOracle, q: Vector) -> Vector:
+    def gradient(self, oracle: ImpactOracle, q: Array) -> Array:
         """Return the tangent gradient from Pinocchio's numbers, shape (nv,)."""
         return np.asarray(self.factor(oracle.case) * getattr(oracle, f"gradient_{self.symbol}")(q))
 
-    def subgradients(self, oracle: ImpactOracle, q: Vector, within: float) -> tuple[Vector, Vector]:
+    def subgradients(self, oracle: ImpactOracle, q: Array, within: float) -> tuple[Array, Array]:
         """Return gradients, shape (k, nv), and gaps of their values, shape (k,): one where the value is smooth."""
         return self.gradient(oracle, q)[None, :], np.zeros(1)
 
@@ -73,7 +71,7 @@ class ImpactKind(ABC):
         """Return the unknown jump at ``tree.q`` along the normal ``n``, with the equations that fix it."""
 
     @abstractmethod
-    def jump(self, found: ImpactQuantities) -> tuple[Vector, Vector]:
+    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
         """Return the jump (nv,) and the unknown impulse that solve the equations of :meth:`unknowns`."""
 
     def lifted_value(self, case: ImpactCase, jump: UnknownJump) -> ca.SX:
@@ -85,7 +83,7 @@ class ImpactKind(ABC):
         jump = self.unknowns(case, tree, n)
         return Lifted(jump.variables, jump.residual, self.lifted_value(case, jump))
 
-    def guess(self, oracle: ImpactOracle, q: Vector) -> Guess:
+    def guess(self, oracle: ImpactOracle, q: Array) -> Guess:
         """Return the unknowns of :meth:`lift` that solve its equations at ``q``."""
         a, impulse = self.jump(oracle.quantities(q))
         return Guess.unbounded(np.concatenate([oracle.with_support_impulses(a), impulse]))
@@ -97,7 +95,7 @@ class QuadraticKind(ImpactKind):
     A quadratic form has an exact worst case over a cone of normals.  The defaults are those of ``K = Λ_c``.
     """
 
-    def directions(self, mobility: Vector, world: Vector) -> Vector:
+    def directions(self, mobility: Array, world: Array) -> Array:
         """Return impulses whose jumps make up the form along world directions (columns), shape (3, 3).
 
         Raises:
@@ -105,23 +103,23 @@ class QuadraticKind(ImpactKind):
         """
         return world
 
-    def form(self, oracle: ImpactOracle, mobility: Vector, world: Vector, jumps: Vector) -> Vector:
+    def form(self, oracle: ImpactOracle, mobility: Array, world: Array, jumps: Array) -> Array:
         """Return ``K`` along world directions (columns) whose impulses cause ``jumps`` (columns), shape (3, 3)."""
         return np.asarray(jumps.T @ oracle.weigh(jumps))
 
     @abstractmethod
-    def form_gradient(self, oracle: ImpactOracle, q: Vector, n: Vector) -> Vector:
+    def form_gradient(self, oracle: ImpactOracle, q: Array, n: Array) -> Array:
         """Return the tangent gradient of ``nᵀK(q)n``, shape (nv,), for a fixed ``n`` of any length."""
 
     @abstractmethod
     def form_expression(self, k: ImpactKernel) -> ca.SX:
         """Return ``K`` in world axes, shape (3, 3)."""
 
-    def of_form(self, case: ImpactCase, form: Vector) -> Vector:
+    def of_form(self, case: ImpactCase, form: Array) -> Array:
         """Return the values of the objective for values of the form."""
         return self.factor(case) * form
 
-    def of_form_slope(self, case: ImpactCase, form: Vector) -> Vector:
+    def of_form_slope(self, case: ImpactCase, form: Array) -> Array:
         """Return the derivative of :meth:`of_form`."""
         return np.full_like(form, self.factor(case))
 
@@ -140,7 +138,7 @@ class QuadraticKind(ImpactKind):
         """
         return unknown_jump(case, tree, impact_at(case, n), label)
 
-    def guess_direction(self, jump: Vector, support_impulse: Vector, impulse: Vector) -> list[Vector]:
+    def guess_direction(self, jump: Array, support_impulse: Array, impulse: Array) -> list[Array]:
         """Return the unknowns of :meth:`lift_direction`, given the jump and the impulses of the direction."""
         return [jump, support_impulse]
 

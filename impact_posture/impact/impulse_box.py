@@ -14,8 +14,8 @@ from itertools import product
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.errors import ContactError, MetricError
 from impact_posture.impact.contact import ImpactContact
@@ -34,8 +34,6 @@ from impact_posture.impact.lifted import (
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.impact.worst_case import Subgradients, finite_maximum, first_of_largest
 
-Vector = NDArray[np.float64]
-
 # Six contacts have 63 corners.  Each additional contact doubles the rows of the program.
 MOST_CONTACTS = 6
 
@@ -52,9 +50,9 @@ class WorstImpulses:
     """
 
     value: float
-    impulses: Vector
-    tied: Vector
-    jump: Vector
+    impulses: Array
+    tied: Array
+    jump: Array
 
     def to_dict(self) -> dict[str, object]:
         """Return the ``worst_impulses`` block of an evaluation."""
@@ -100,7 +98,7 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: ImpactKind, *, bilat
         )
 
 
-def corners(count: int, bilateral: bool) -> Vector:
+def corners(count: int, bilateral: bool) -> Array:
     """Return the corners of the unit box as rows, shape (k, count).
 
     The entries are 0 and 1, without the origin.  They are ±1 (up to sign) if the contacts are bilateral.
@@ -132,38 +130,38 @@ class ImpulseBox:
         return self.oracles[0]
 
     @cached_property
-    def corners(self) -> Vector:
+    def corners(self) -> Array:
         """Impulses at the corners, N·s, shape (k, m)."""
         bounds = np.array([oracle.contact.impulse for oracle in self.oracles])
         return np.asarray(corners(len(bounds), self.bilateral) * bounds)
 
-    def worst(self, q: Vector) -> WorstImpulses:
+    def worst(self, q: Array) -> WorstImpulses:
         """Return the worst corner at ``q``, from Pinocchio's numbers."""
         jumps, values = self._jumps_and_values(q)
         leading, tied, _ = finite_maximum(values)
         impulses = self.corners[leading]
         return WorstImpulses(float(values[leading]), impulses, self.corners[tied], jumps @ impulses)
 
-    def value(self, q: Vector) -> float:
+    def value(self, q: Array) -> float:
         """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
         return float(self._jumps_and_values(q)[1].max())
 
-    def gradient(self, q: Vector) -> Vector:
+    def gradient(self, q: Array) -> Array:
         """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
         return self._gradient(q, self.worst(q).impulses)
 
-    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """See :class:`~impact_posture.impact.worst_case.Minimized`; all corners that tie contribute."""
         _, tied, gaps = finite_maximum(self._jumps_and_values(q)[1], within)
         return Subgradients(np.array([self._gradient(q, self.corners[k]) for k in tied]), gaps)
 
-    def _jumps_and_values(self, q: Vector) -> tuple[Vector, Vector]:
+    def _jumps_and_values(self, q: Array) -> tuple[Array, Array]:
         """``a_i`` as columns, shape (nv, m), and ``λᵀKλ`` at every corner, shape (k,)."""
         jumps = np.stack([oracle.quantities(q).jump for oracle in self.oracles], axis=1)
         K = jumps.T @ self.oracle.at(q).weigh(jumps)
         return jumps, np.asarray(np.einsum("ki,ij,kj->k", self.corners, K, self.corners))
 
-    def _gradient(self, q: Vector, impulses: Vector) -> Vector:
+    def _gradient(self, q: Array, impulses: Array) -> Array:
         """``∂_q‖Σ λ_i a_i‖²_W = 2 ∂_q[Σ λ_i n_iᵀJ_i b − bᵀMa]``, shape (nv,)."""
         oracles = [oracle.at(q) for oracle in self.oracles]
         first = oracles[0]
@@ -196,7 +194,7 @@ class ImpulseBox:
         parts = [Lifted(jump.variables, jump.residual, ca.SX(0)) for jump in jumps]
         return worst_of(parts, [_form(K, ca.DM(corner)) for corner in self.corners], scale)
 
-    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
         found = [oracle.quantities(q) for oracle in self.oracles]
         parts = [Guess.unbounded(np.concatenate([one.jump, one.support_impulse])) for one in found]

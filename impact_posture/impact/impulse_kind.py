@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_kind import QuadraticKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import UnknownJump, impact_at, unknown_jump
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
-
-Vector = NDArray[np.float64]
 
 
 class ImpulseKind(QuadraticKind):
@@ -31,11 +29,11 @@ class ImpulseKind(QuadraticKind):
         """Return ``M a − J_sᵀf − Jᵀn = 0``, ``J_s a + εf = 0``."""
         return unknown_jump(case, tree, impact_at(case, n), label)
 
-    def jump(self, found: ImpactQuantities) -> tuple[Vector, Vector]:
+    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
         """Return ``a = M⁻¹Jᵀn``; no impulse is unknown."""
         return found.jump, np.zeros(0)
 
-    def form_gradient(self, oracle: ImpactOracle, q: Vector, n: Vector) -> Vector:
+    def form_gradient(self, oracle: ImpactOracle, q: Array, n: Array) -> Array:
         """Return ``∇H`` along ``n``."""
         return oracle.gradient_H(q, n)
 

@@ -7,14 +7,12 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.metric import Metric
-
-Vector = NDArray[np.float64]
 
 # Start of t above its bounds by attempt, in units of the scale.  A barrier is finite inside only.
 ABOVE = (0.01, 1.0, 0.1)
@@ -46,11 +44,11 @@ class Guess:
         lower: Lower bounds, shape (k,); minus infinity where there is none.
     """
 
-    values: Vector
-    lower: Vector
+    values: Array
+    lower: Array
 
     @staticmethod
-    def unbounded(values: Vector) -> Guess:
+    def unbounded(values: Array) -> Guess:
         """Return a guess without lower bounds."""
         return Guess(values, np.full(values.size, -np.inf))
 

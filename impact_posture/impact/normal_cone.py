@@ -20,8 +20,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.cone import WorstNormal, cone_axes, tied_normals, worst_normal
@@ -31,8 +31,6 @@ from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import Guess, Lifted, in_world
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.impact.worst_case import Subgradients
-
-Vector = NDArray[np.float64]
 
 # Normals whose value is within this share of the largest value are worst normals in a subdifferential.
 _ACTIVE = 1e-7
@@ -76,11 +74,11 @@ class NormalCone:
     attempts: int = len(_INSIDE)
 
     @property
-    def axis(self) -> Vector:
+    def axis(self) -> Array:
         """The contact's own normal, shape (3,)."""
         return np.array(self.oracle.contact.normal)
 
-    def worst(self, q: Vector) -> WorstNormal:
+    def worst(self, q: Array) -> WorstNormal:
         """Return the worst normal at ``q``, in the axes of the contact's normal.
 
         Its ``value`` is that of the form ``nᵀKn``.  :meth:`value` is that of the objective.
@@ -90,22 +88,22 @@ class NormalCone:
         """
         return worst_normal(self._form(q)[0], self.axis, self.degrees)
 
-    def worst_in_world(self, q: Vector) -> WorstNormal:
+    def worst_in_world(self, q: Array) -> WorstNormal:
         """Return :meth:`worst` with its normals in world axes."""
         found = self.worst(q)
         return found.turned(self._axes_in_world(q))
 
-    def value(self, q: Vector) -> float:
+    def value(self, q: Array) -> float:
         """See :class:`~impact_posture.impact.worst_case.Minimized`."""
         return float(self.kind.of_form(self.oracle.case, np.array(self.worst(q).value)))
 
-    def gradient(self, q: Vector) -> Vector:
+    def gradient(self, q: Array) -> Array:
         """Return the tangent gradient at the worst normal, held fixed (Danskin); at a tie, a subgradient."""
         found = self.worst(q)
         slope = float(self.kind.of_form_slope(self.oracle.case, np.array(found.value)))
         return slope * self.kind.form_gradient(self.oracle, q, found.normal)
 
-    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return the gradients at all worst normals, the leading normal first.
 
         An arc or a circle of worst normals gives a dense sample.  A normal counts if its objective is at most
@@ -161,12 +159,12 @@ class NormalCone:
             value=kind.of_form_expression(case, unit * t),
         )
 
-    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """Return the auxiliaries of :meth:`lift` at ``q``, with ``Z`` inside the cone that it must stay in."""
         oracle = self.oracle
         form, jumps, impulses = self._form(q, cone_axes(self.axis))
         form = form / self.kind.form_unit(oracle.case, scale)
-        parts: list[Vector] = []
+        parts: list[Array] = []
         for k in range(3):
             feet = -oracle.Js @ jumps[:, k] / oracle.compliance
             parts += self.kind.guess_direction(jumps[:, k], feet, impulses[:, k])
@@ -189,14 +187,14 @@ class NormalCone:
         alpha = np.deg2rad(self.degrees)
         return float(np.cos(alpha)), float(np.sin(alpha))
 
-    def _axes_in_world(self, q: Vector) -> Vector:
+    def _axes_in_world(self, q: Array) -> Array:
         """World axes of the contact's normal at ``q``, as columns."""
         oracle = self.oracle.at(q)
         return (
             np.array(oracle.numeric.placement(oracle.point).rotation) if oracle.case.in_contact_frame else np.eye(3)
         )
 
-    def _form(self, q: Vector, directions: Vector | None = None) -> tuple[Vector, Vector, Vector]:
+    def _form(self, q: Array, directions: Array | None = None) -> tuple[Array, Array, Array]:
         """``K`` along three directions (columns in the axes of the normal, those axes by default), shape (3, 3).
 
         Returns:
@@ -216,7 +214,7 @@ class NormalCone:
         K = self.kind.form(self.oracle, mobility, world, jumps)
         return (K + K.T) / 2, jumps, impulses
 
-    def _form_tensor(self, q: Vector) -> Vector:
+    def _form_tensor(self, q: Array) -> Array:
         """``∂K``, shape (3, 3, nv), from the gradients along six directions."""
         axes = np.eye(3)
         tensor = np.zeros((3, 3, self.oracle.robot.nv))

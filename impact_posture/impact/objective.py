@@ -14,8 +14,8 @@ from typing import Protocol
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.contact import ImpactContact, Support, default_compliance
@@ -32,8 +32,6 @@ from impact_posture.impact.worst_case import Minimized, ModelSet, SingleImpact, 
 from impact_posture.robot.model_variant import ModelVariant
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import ObjectiveKind
-
-Vector = NDArray[np.float64]
 
 
 class Objective(Minimized, Protocol):
@@ -65,15 +63,15 @@ class Objective(Minimized, Protocol):
         ...
 
     @property
-    def parameters(self) -> Vector:
+    def parameters(self) -> Array:
         """Numbers of the lifted form that may change without rebuilding the program, shape (k,)."""
         ...
 
-    def movable(self, q: Vector) -> bool:
+    def movable(self, q: Array) -> bool:
         """Return whether the value at ``q`` is more than rounding."""
         ...
 
-    def blind_motions(self) -> Vector:
+    def blind_motions(self) -> Array:
         """Return base twists that do not change the value, world axes, linear first, shape (k, 6)."""
         ...
 
@@ -147,7 +145,7 @@ class ImpactObjective:
         )
 
     @property
-    def parameters(self) -> Vector:
+    def parameters(self) -> Array:
         """Normal of the leading contact, shape (3,)."""
         return np.array(self.contact.normal)
 
@@ -254,7 +252,7 @@ class ImpactObjective:
         """Number of guesses: one where the equations are linear in the auxiliaries."""
         return self.worst_case.attempts
 
-    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """Return the auxiliaries of :meth:`lift` that solve its equations at ``q``."""
         return self.worst_case.guess(q, scale, attempt)
 
@@ -265,7 +263,7 @@ class ImpactObjective:
         """Pinocchio's numbers for the leading contact, on the robot as modeled."""
         return ImpactOracle(self.case)
 
-    def value(self, q: Vector) -> float:
+    def value(self, q: Array) -> float:
         """Return the objective at ``q`` from Pinocchio's numbers.
 
         Raises:
@@ -273,21 +271,21 @@ class ImpactObjective:
         """
         return self.worst_case.value(q)
 
-    def gradient(self, q: Vector) -> Vector:
+    def gradient(self, q: Array) -> Array:
         """Return the tangent gradient at ``q`` from Pinocchio's numbers, shape (nv,); a subgradient at a tie."""
         return self.worst_case.gradient(q)
 
-    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return the gradients of all members of the maximum that tie or lie at most ``within`` below."""
         return self.worst_case.subgradients(q, within)
 
-    def movable(self, q: Vector) -> bool:
+    def movable(self, q: Array) -> bool:
         """Return whether a contact can move along its normal at ``q``, or along another normal of its cone."""
         if self.normal_cone_deg:
             return True
         return not all(single.oracle.quantities(q).blocked for single in self.singles)
 
-    def blind_motions(self) -> Vector:
+    def blind_motions(self) -> Array:
         """Return the translations, and the turn about the normal, because the base enters through ``R_bᵀn`` alone.
 
         All turns are blind if the normal turns with the robot.  No turn is blind if contacts have different normals.

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric, hold_locked
 from impact_posture.errors import MetricError
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.impact_case import ImpactCase
-
-Vector = NDArray[np.float64]
 
 # Relative size of a singular value of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
 _RANK = 1e-9
@@ -48,13 +47,13 @@ class ImpactQuantities:
     V: float
     S: float | None
     E: float
-    jump: Vector
-    sticking_jump: Vector | None
-    sticking_impulse: Vector | None
-    ellipsoid: Vector
-    mobility: Vector
-    normal: Vector
-    support_impulse: Vector
+    jump: Array
+    sticking_jump: Array | None
+    sticking_impulse: Array | None
+    ellipsoid: Array
+    mobility: Array
+    normal: Array
+    support_impulse: Array
 
     @property
     def blocked(self) -> bool:
@@ -71,8 +70,8 @@ class Answer:
         f: Support impulses ``−J_s a/ε``, shape (rows,) or (rows, k).
     """
 
-    a: Vector
-    f: Vector
+    a: Array
+    f: Array
 
 
 class ImpactOracle:
@@ -88,9 +87,9 @@ class ImpactOracle:
         self.point = case.point
         self.feet = [(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
         self.compliance = case.compliance
-        self._q: Vector | None = None
+        self._q: Array | None = None
 
-    def at(self, q: Vector) -> ImpactOracle:
+    def at(self, q: Array) -> ImpactOracle:
         """Move to ``q`` and factorize there."""
         if self._q is not None and np.array_equal(q, self._q):
             return self
@@ -105,7 +104,7 @@ class ImpactOracle:
         self._nv = nv
         return self
 
-    def answer(self, tau: Vector, slip: Vector | None = None) -> Answer:
+    def answer(self, tau: Array, slip: Array | None = None) -> Answer:
         """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for vectors or columns; the slip is zero by default."""
         shape = (len(self.Js), *tau.shape[1:])
         moving = (tau.T * ~self.numeric.locked).T
@@ -113,17 +112,17 @@ class ImpactOracle:
         found = np.linalg.solve(self._kkt, rhs)
         return Answer(found[: self._nv], found[self._nv :])
 
-    def solve(self, tau: Vector) -> Vector:
+    def solve(self, tau: Array) -> Array:
         """Return ``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector or columns."""
         return self.answer(tau).a
 
-    def weigh(self, a: Vector) -> Vector:
+    def weigh(self, a: Array) -> Array:
         """Return ``W a``."""
         if self.metric.kind == "kinetic":
             return np.asarray(self.M @ a)
         return np.asarray((self.metric.diagonal(self._nv) * a.T).T)
 
-    def quantities(self, q: Vector) -> ImpactQuantities:
+    def quantities(self, q: Array) -> ImpactQuantities:
         """Return all quantities at ``q``."""
         self.at(q)
         answers = self.answer(self.J.T)
@@ -153,13 +152,13 @@ class ImpactOracle:
             support_impulse=np.asarray(answers.f @ self.n),
         )
 
-    def with_support_impulses(self, a: Vector) -> Vector:
+    def with_support_impulses(self, a: Array) -> Array:
         """Return ``a`` and its support impulses ``−J_s a/ε`` at the last posture, as one vector."""
         return np.concatenate([a, -self.Js @ a / self.compliance])
 
     # ---- gradients --------------------------------------------------------------------------------------------
 
-    def gradient_H(self, q: Vector, normal: Vector | None = None) -> Vector:
+    def gradient_H(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of H, shape (nv,).
 
         Args:
@@ -173,14 +172,14 @@ class ImpactOracle:
         gradient = 2 * (self.coupling(own, y.a, self.case.in_contact_frame) - self.inertial(y, x))
         return gradient + self.metric_gradient(x.a)
 
-    def gradient_G(self, q: Vector, normal: Vector | None = None) -> Vector:
+    def gradient_G(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of G, shape (nv,), with ``normal`` as in :meth:`gradient_H`."""
         self.at(q)
         own, n = self._normals(normal)
         x = self.answer(self.J.T @ n)
         return 2 * self.coupling(own, x.a, self.case.in_contact_frame) - self.inertial(x, x)
 
-    def gradient_S(self, q: Vector, normal: Vector | None = None) -> Vector:
+    def gradient_S(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of S, shape (nv,), with ``normal`` as in :meth:`gradient_H`.
 
         Where ``JM⁻¹Jᵀ`` is singular, the point is held in its range.  That is right if the directions in which the
@@ -201,21 +200,21 @@ class ImpactOracle:
             gradient = gradient - 2 * self.numeric.turning_gradient(self.point, n, r)
         return gradient + self.metric_gradient(x.a)
 
-    def gradient_V(self, q: Vector) -> Vector:
+    def gradient_V(self, q: Array) -> Array:
         """Return the tangent gradient of V, ``∇H/G² − 2H/G³ ∇G``, shape (nv,)."""
         found = self.quantities(q)
         return self.gradient_H(q) / found.G**2 - 2 * found.H / found.G**3 * self.gradient_G(q)
 
-    def gradient_E(self, q: Vector) -> Vector:
+    def gradient_E(self, q: Array) -> Array:
         """Return the tangent gradient of E, ``−∇G/(2G²)``, shape (nv,)."""
         return -self.gradient_G(q) / (2 * self.quantities(q).G ** 2)
 
-    def _normals(self, given: Vector | None) -> tuple[Vector, Vector]:
+    def _normals(self, given: Array | None) -> tuple[Array, Array]:
         """A normal (by default that of the contact) in the axes of the contact's normal, and in world axes."""
         own = np.array(self.contact.normal) if given is None else given
         return own, self.numeric.placement(self.point).rotation @ own if self.case.in_contact_frame else own
 
-    def support_gradient(self, q: Vector) -> Vector:
+    def support_gradient(self, q: Array) -> Array:
         """Return the tangent Jacobian of the support impulses ``f``, shape (rows, nv).
 
         Row k uses the adjoint ``M p − J_sᵀr = 0, J_s p + εr = −e_k``: ``∂f_k = pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)``.
@@ -231,7 +230,7 @@ class ImpactOracle:
         ]
         return np.array(found).reshape(rows, self._nv)
 
-    def jump_gradient(self, q: Vector) -> Vector:
+    def jump_gradient(self, q: Array) -> Array:
         """Return the tangent Jacobian of ``a = M⁻¹Jᵀn``, shape (nv, nv).
 
         Row k is ``∂a_k = p_kᵀ∂(Jᵀn − M a)`` with ``M p_k = e_k``.
@@ -246,12 +245,12 @@ class ImpactOracle:
         ]
         return np.array(rows)
 
-    def coupling(self, direction: Vector, v: Vector, in_frame: bool) -> Vector:
+    def coupling(self, direction: Array, v: Array, in_frame: bool) -> Array:
         """Return ``∂_q directionᵀJ v``, shape (nv,), for a direction in world axes or fixed in the frame."""
         wrench = np.concatenate([direction, np.zeros(3)])
         return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)
 
-    def inertial(self, left: Answer, right: Answer) -> Vector:
+    def inertial(self, left: Answer, right: Answer) -> Array:
         """Return ``∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]`` with all four letters held: ``∂_q lᵀ(M + J_sᵀJ_s/ε)r``."""
         gradient = self.numeric.inertial_gradient(left.a, right.a)
         first = 0
@@ -263,7 +262,7 @@ class ImpactOracle:
             first += rows
         return gradient
 
-    def metric_gradient(self, a: Vector) -> Vector:
+    def metric_gradient(self, a: Array) -> Array:
         """Return ``∂_q aᵀWa`` with ``a`` held fixed, shape (nv,); zero unless W = M."""
         return self.numeric.inertial_gradient(a, a) if self.metric.kind == "kinetic" else np.zeros(self._nv)
 
@@ -276,9 +275,9 @@ class _HeldPoint:
     of ∇S would be a small difference of large numbers, with an error of the square of that matrix's condition.
     """
 
-    system: Vector
-    axes: Vector
-    outside: Vector
+    system: Array
+    axes: Array
+    outside: Array
     mobile: NDArray[np.bool_]
 
     @property
@@ -286,7 +285,7 @@ class _HeldPoint:
         return len(self.mobile)
 
     @staticmethod
-    def of(kkt: Vector, J: Vector, mobility: Vector, mobile: NDArray[np.bool_]) -> _HeldPoint:
+    def of(kkt: Array, J: Array, mobility: Array, mobile: NDArray[np.bool_]) -> _HeldPoint:
         values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
         kept = values > _RANK * max(float(values[-1]), 1e-300)
         axes = np.eye(3) if kept.all() else vectors[:, kept]
@@ -297,11 +296,11 @@ class _HeldPoint:
         system[:nv, size:] = -system[size:, :nv].T
         return _HeldPoint(system, axes, vectors[:, ~kept], mobile)
 
-    def can_move(self, n: Vector) -> bool:
+    def can_move(self, n: Array) -> bool:
         """Return whether the point can move along ``n``."""
         return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(_RANK))
 
-    def answer(self, *, tau: Vector | None = None, velocity: Vector | None = None) -> tuple[Answer, Vector]:
+    def answer(self, *, tau: Array | None = None, velocity: Array | None = None) -> tuple[Answer, Array]:
         """Return the jump under ``τ`` with the point moving at ``v``, and the impulse ``s`` of the point."""
         right = np.zeros(len(self.system))
         size = len(right) - self.axes.shape[1]

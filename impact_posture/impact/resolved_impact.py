@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.contact import ImpactContact, Support, least_compliance, point_on
 from impact_posture.impact.contact_compression import ContactStiffness
@@ -26,8 +26,6 @@ from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import ImpactSettings, ObjectiveKind, Vector3
-
-Vector = NDArray[np.float64]
 
 FLOATS = "because its data name neither feet nor rotors"
 
@@ -140,7 +138,7 @@ class ResolvedImpact:
     """
 
     objective: ImpactObjective
-    q: Vector
+    q: Array
     posture: str
     speed: float
     restitution: float
@@ -168,7 +166,7 @@ class ResolvedImpact:
         """Weight of the jump."""
         return self.objective.metric
 
-    def evaluate(self, q: Vector | None = None) -> Evaluation:
+    def evaluate(self, q: Array | None = None) -> Evaluation:
         """Evaluate the impact at ``q``, by default at the given posture."""
         return evaluate(
             self.objective, self.q if q is None else q, self.speed, self.restitution, self.contact_stiffness
@@ -182,7 +180,7 @@ class ResolvedImpact:
             return found
         return (*found, f"{self.robot.name} is taken as floating freely, {FLOATS}; {self.missing_support}")
 
-    def to_dict(self, q: Vector | None = None) -> dict[str, object]:
+    def to_dict(self, q: Array | None = None) -> dict[str, object]:
         """Return the blocks of ``result.json`` that state the impact: robot, contacts, supports, metric.
 
         Args:
@@ -208,7 +206,7 @@ class ResolvedImpact:
         }
 
 
-def _contact_block(single: ImpactObjective, q: Vector) -> dict[str, object]:
+def _contact_block(single: ImpactObjective, q: Array) -> dict[str, object]:
     """The block of a contact, with its normal in world axes at ``q``."""
     contact = single.contact
     return {

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import MetricError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.impact.worst_case import SingleImpact
-
-Vector = NDArray[np.float64]
 
 # JM⁻¹Jᵀ is singular if an eigenvalue is below this share of the largest one.
 _SINGULAR = 1e-9
@@ -72,7 +70,7 @@ class VariantValue:
         return {"name": self.name, "objective": self.objective, **self.scalars.to_dict()}
 
 
-def variant_values(objective: ImpactObjective, q: Vector) -> tuple[VariantValue, ...]:
+def variant_values(objective: ImpactObjective, q: Array) -> tuple[VariantValue, ...]:
     """Return the objective and its parts on each model variant; empty if there is none."""
     pairs = zip(objective.model_variants, objective.by_variant, strict=True) if objective.model_variants else ()
     return tuple(
@@ -86,7 +84,7 @@ def worst_variant(variants: tuple[VariantValue, ...]) -> int:
     return int(np.argmax([np.inf if variant.objective is None else variant.objective for variant in variants]))
 
 
-def objective_value(objective: ImpactObjective, q: Vector) -> float | None:
+def objective_value(objective: ImpactObjective, q: Array) -> float | None:
     """Return the objective; ``None`` if it does not exist for a model variant or a normal of the cone."""
     if objective.model_variants:
         values = [objective_value(member, q) for member in objective.by_variant]
@@ -102,7 +100,7 @@ def objective_value(objective: ImpactObjective, q: Vector) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def objective_gradient(objective: ImpactObjective, q: Vector, value: float | None) -> Vector | None:
+def objective_gradient(objective: ImpactObjective, q: Array, value: float | None) -> Array | None:
     """Return the tangent gradient where the objective has ``value``, shape (nv,); a subgradient at a tie.
 
     It is ``None`` where it does not exist.

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from impact_posture.impact.frictionless_kind import FrictionlessKind
-
-Vector = NDArray[np.float64]
 
 
 class SpeedKind(FrictionlessKind):

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_kind import QuadraticKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import UnknownJump, in_world, unknown_jump
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities, no_sticking
-
-Vector = NDArray[np.float64]
-
 
 # An eigenvalue of JM⁻¹Jᵀ below this share of the largest one is zero.
 _SINGULAR = 1e-9
@@ -35,20 +32,20 @@ class StickingKind(QuadraticKind):
         jump = unknown_jump(case, tree, Wrench(case.point, impulse, ca.SX.zeros(3)), label)
         return jump.with_impulse(impulse, jump.contact_velocity - in_world(case, tree, n))
 
-    def jump(self, found: ImpactQuantities) -> tuple[Vector, Vector]:
+    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
         """Return jump and impulse ``s``; without friction where ``S`` does not exist."""
         if found.sticking_jump is None or found.sticking_impulse is None:
             return found.jump / found.G, found.normal / found.G
         return found.sticking_jump, found.sticking_impulse
 
-    def directions(self, mobility: Vector, world: Vector) -> Vector:
+    def directions(self, mobility: Array, world: Array) -> Array:
         """Return ``B⁻¹`` times the directions."""
         sizes = np.linalg.eigvalsh((mobility + mobility.T) / 2)
         if sizes[0] <= _SINGULAR * sizes[-1]:
             raise no_sticking()
         return np.asarray(np.linalg.solve(mobility, world))
 
-    def form_gradient(self, oracle: ImpactOracle, q: Vector, n: Vector) -> Vector:
+    def form_gradient(self, oracle: ImpactOracle, q: Array, n: Array) -> Array:
         """Return ``∇S`` along ``n``."""
         return oracle.gradient_S(q, n)
 
@@ -60,6 +57,6 @@ class StickingKind(QuadraticKind):
         """Return a jump whose impulse ``s`` is unknown, with ``J a`` along the direction."""
         return self.unknowns(case, tree, n, label)
 
-    def guess_direction(self, jump: Vector, support_impulse: Vector, impulse: Vector) -> list[Vector]:
+    def guess_direction(self, jump: Array, support_impulse: Array, impulse: Array) -> list[Array]:
         """Return the jump, the support impulses and ``s``."""
         return [jump, support_impulse, impulse]

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.joints import joint_kind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.robot.robot import Robot
 from impact_posture.tables import json_block
-
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +25,9 @@ class Jump:
         largest: ``(name, value, unit)`` of the largest entries, largest first.
     """
 
-    velocity: Vector
+    velocity: Array
     norm: float
-    impulse: Vector
+    impulse: Array
     largest: tuple[tuple[str, float, str], ...]
 
     @property
@@ -78,7 +76,7 @@ def tangent_units(robot: Robot) -> tuple[str, ...]:
     return tuple(units)
 
 
-def largest_entries(robot: Robot, values: Vector, count: int = 5) -> tuple[tuple[str, float, str], ...]:
+def largest_entries(robot: Robot, values: Array, count: int = 5) -> tuple[tuple[str, float, str], ...]:
     """Return ``(name, value, unit)`` of the largest entries of a tangent vector, above 0.1 % of the first."""
     units, sizes = tangent_units(robot), np.abs(values)
     order = np.argsort(-sizes, kind="stable")[:count]
@@ -100,7 +98,7 @@ def merged_entries(
     ]
 
 
-def weighed_jump(objective: ImpactObjective, velocity: Vector, impulse: Vector) -> Jump:
+def weighed_jump(objective: ImpactObjective, velocity: Array, impulse: Array) -> Jump:
     """Measure the jump ``velocity``, shape (nv,), in the metric at the posture of the oracle."""
     norm = float(np.sqrt(max(float(velocity @ objective.oracle.weigh(velocity)), 0.0)))
     return Jump(velocity, norm, impulse, largest_entries(objective.robot, velocity))

@@ -15,13 +15,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import ABOVE, Guess, Lifted, worst_of, worst_of_guesses
 from impact_posture.impact.oracle import ImpactOracle
-
-Vector = NDArray[np.float64]
 
 # A member of a finite maximum is active if its value is within this share of the largest value.
 ACTIVE = 1e-6
@@ -36,11 +35,11 @@ class Subgradients:
         gaps: Distance of the value of each member below the objective, shape (k,).
     """
 
-    gradients: Vector
-    gaps: Vector
+    gradients: Array
+    gaps: Array
 
     @property
-    def first(self) -> Vector:
+    def first(self) -> Array:
         """The first subgradient, shape (nv,)."""
         return np.asarray(self.gradients[0])
 
@@ -53,11 +52,11 @@ class Minimized(Protocol):
         """Number of guesses from which the lifted form may be tried."""
         ...
 
-    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """Return the initial auxiliaries of the lifted form at ``q``, and their bounds."""
         ...
 
-    def value(self, q: Vector) -> float:
+    def value(self, q: Array) -> float:
         """Return the value from Pinocchio's numbers, > 0.
 
         Raises:
@@ -65,7 +64,7 @@ class Minimized(Protocol):
         """
         ...
 
-    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return vectors that span the subdifferential at ``q``, from Pinocchio's numbers.
 
         There is one gradient where the value is smooth.  Members of a maximum count if they are at most ``within``
@@ -86,7 +85,7 @@ class WorstCase(Minimized, Protocol):
         """Pinocchio's numbers for the leading contact, on the robot as modeled."""
         ...
 
-    def gradient(self, q: Vector) -> Vector:
+    def gradient(self, q: Array) -> Array:
         """Return the tangent gradient, shape (nv,); at a tie, the gradient of one member."""
         ...
 
@@ -109,15 +108,15 @@ class SingleImpact:
     kind: ImpactKind
     attempts: int = 1
 
-    def value(self, q: Vector) -> float:
+    def value(self, q: Array) -> float:
         """See :class:`Minimized`."""
         return self.kind.value(self.oracle, q)
 
-    def gradient(self, q: Vector) -> Vector:
+    def gradient(self, q: Array) -> Array:
         """See :class:`WorstCase`."""
         return self.kind.gradient(self.oracle, q)
 
-    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """See :class:`Minimized`."""
         return Subgradients(*self.kind.subgradients(self.oracle, q, within))
 
@@ -129,7 +128,7 @@ class SingleImpact:
         """See :class:`Minimized`."""
         return self.kind.lift(self.oracle.case, tree, parameters)
 
-    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """See :class:`Minimized`."""
         return self.kind.guess(self.oracle, q)
 
@@ -157,23 +156,23 @@ class ModelSet:
         """See :class:`Minimized`."""
         return max(len(ABOVE), *[member.attempts for member in self.members])
 
-    def values(self, q: Vector) -> Vector:
+    def values(self, q: Array) -> Array:
         """Return the value on each model, from Pinocchio's numbers, shape (k,)."""
         return np.array([member.value(q) for member in self.members])
 
-    def worst(self, q: Vector) -> int:
+    def worst(self, q: Array) -> int:
         """Return the index of the worst model."""
         return finite_maximum(self.values(q))[0]
 
-    def value(self, q: Vector) -> float:
+    def value(self, q: Array) -> float:
         """See :class:`Minimized`."""
         return float(self.values(q).max())
 
-    def gradient(self, q: Vector) -> Vector:
+    def gradient(self, q: Array) -> Array:
         """See :class:`WorstCase`."""
         return self.members[self.worst(q)].gradient(q)
 
-    def subgradients(self, q: Vector, within: float = 0.0) -> Subgradients:
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """See :class:`Minimized`; all models that tie contribute."""
         _, tied, gaps = finite_maximum(self.values(q), within)
         # The gap of a model below the worst model uses up that much of ``within``.
@@ -200,13 +199,13 @@ class ModelSet:
             parts.append(member.lift(tree if model is tree.model else Tree(model, tree.q), parameters, scale))
         return worst_of(parts, [part.value for part in parts], scale)
 
-    def guess(self, q: Vector, scale: float, attempt: int = 0) -> Guess:
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """See :class:`Minimized`."""
         parts = [member.guess(q, scale, min(attempt, member.attempts - 1)) for member in self.members]
         return worst_of_guesses(parts, self.value(q) / scale, attempt)
 
 
-def finite_maximum(values: Vector, within: float = 0.0) -> tuple[int, NDArray[np.int_], Vector]:
+def finite_maximum(values: Array, within: float = 0.0) -> tuple[int, NDArray[np.int_], Array]:
     """Return the first index of the largest values, the indices that tie with it (it first), and their gaps.
 
     A value ties if it is at most a share :data:`ACTIVE`, or ``within``, below the largest value.

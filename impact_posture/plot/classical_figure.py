@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from impact_posture.arrays import Array
 from impact_posture.plot.ellipsoid_figure import draw_normals, normal_label, normals, square_panel
-from impact_posture.plot.shapes import COORDINATE_PLANES, Plane, Vector, polar, shadow
+from impact_posture.plot.shapes import COORDINATE_PLANES, Plane, polar, shadow
 from impact_posture.plot.style import BLUE, GREEN, INK, VERMILLION, framed, shared_legend
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
@@ -49,9 +50,9 @@ class Kind:
     formula: str
     unit: str
     scale: float
-    matrices: Sequence[Vector]
-    finite: Sequence[Vector]
-    endless: Sequence[Vector]
+    matrices: Sequence[Array]
+    finite: Sequence[Array]
+    endless: Sequence[Array]
 
     @property
     def label(self) -> str:
@@ -106,7 +107,7 @@ def classical_figure(view: ResultView) -> Figure:
     return figure
 
 
-def _longest(matrix: Vector) -> float:
+def _longest(matrix: Array) -> float:
     return float(np.sqrt(max(float(np.linalg.eigvalsh(matrix)[-1]), 0.0)))
 
 

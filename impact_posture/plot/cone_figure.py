@@ -8,9 +8,10 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from impact_posture.arrays import Array
 from impact_posture.impact.cone import WorstNormal
 from impact_posture.plot.labels import draw_arrow
-from impact_posture.plot.shapes import Plane, Vector, cone_rim, cone_shadow, half_width
+from impact_posture.plot.shapes import Plane, cone_rim, cone_shadow, half_width
 from impact_posture.plot.style import GRAY, PALE, WORST_AFTER, WORST_BEFORE
 from impact_posture.plot.view import ResultView, number
 
@@ -66,13 +67,13 @@ def uncertainty_handles(view: ResultView) -> list[Any]:
     return handles
 
 
-def _axes_of_cones(view: ResultView) -> list[Vector]:
+def _axes_of_cones(view: ResultView) -> list[Array]:
     """Return the world axis of the cone, or both axes where it turned with the contact frame."""
     before, after = view.before.normal, view.after.normal
     return [after] if abs(before - after).max() < 1e-3 else [before, after]
 
 
-def _worst(view: ResultView) -> list[tuple[str, WorstNormal, Vector, dict[str, Any]]]:
+def _worst(view: ResultView) -> list[tuple[str, WorstNormal, Array, dict[str, Any]]]:
     """Return name, worst normals, ellipsoid and line of each posture that has worst normals."""
     found = [
         ("before", view.worst[0], view.before.ellipsoid, WORST_BEFORE),

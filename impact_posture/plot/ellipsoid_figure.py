@@ -9,13 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from impact_posture.arrays import Array
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.plot.cone_figure import draw_uncertainty, draw_uncertainty_3d, has_cone, uncertainty_handles
 from impact_posture.plot.labels import Label, draw_arrow, draw_end_on
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
     Plane,
-    Vector,
     half_width,
     principal_sections,
     shadow,
@@ -78,7 +78,7 @@ def ellipsoid_figure(view: ResultView) -> Figure:
     return figure
 
 
-def common_limit(matrices: list[Vector]) -> float:
+def common_limit(matrices: list[Array]) -> float:
     """Return half the side of a cube that holds all ellipsoids with a margin; 1 if all are points."""
     widest = max(float(np.linalg.eigvalsh(matrix)[-1]) for matrix in matrices)
     return 1.18 * float(np.sqrt(widest)) if widest > 0 else 1.0
@@ -97,7 +97,7 @@ def square_panel(axes: Any, plane: Plane, limit: float, unit: str) -> None:
     axes.set_title(f"shadow on {plane.name}")
 
 
-def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Vector]], limit: float) -> None:
+def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Array]], limit: float) -> None:
     """Draw the projection of each normal as an arrow, or as a dot (towards the reader) or cross (away)."""
     for name, n in named:
         flat = plane.axes @ n
@@ -128,14 +128,14 @@ def _tangents(axes: Any, plane: Plane, state: ImpactQuantities, line: dict[str, 
         axes.plot(ends[:, 0], ends[:, 1], color=line["color"], linestyle=line["linestyle"], linewidth=0.7, zorder=2)
 
 
-def normals(before: ImpactQuantities, after: ImpactQuantities) -> list[tuple[str, Vector]]:
+def normals(before: ImpactQuantities, after: ImpactQuantities) -> list[tuple[str, Array]]:
     """Return name and direction of n, or of both normals where n turned with the contact frame."""
     if np.linalg.norm(before.normal - after.normal) < 1e-3:
         return [("n", after.normal)]
     return [("n₀", before.normal), ("n₁", after.normal)]
 
 
-def normal_label(named: list[tuple[str, Vector]]) -> str:
+def normal_label(named: list[tuple[str, Array]]) -> str:
     """Return the legend entry of :func:`normals`."""
     return "n, out of the surface" if len(named) == 1 else "n₀ before, n₁ after"
 

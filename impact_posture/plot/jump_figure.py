@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from impact_posture.arrays import Array
 from impact_posture.escape import plot_label
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.impact.velocity_jump import tangent_units
-from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, BLUE, INK, VERMILLION, framed, shared_legend
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
@@ -29,7 +29,7 @@ def jump_figure(view: ResultView) -> Figure:
     gain = (1 + view.restitution) * view.speed
     states = (view.before, view.after)
     stuck = [None if state.sticking_jump is None else gain * state.sticking_jump for state in states]
-    columns: list[tuple[str, str, list[Vector], list[Vector | None], str]] = [
+    columns: list[tuple[str, str, list[Array], list[Array | None], str]] = [
         ("per impulse of 1 N·s", "/(N·s)", [state.jump for state in states], [None, None], _norms(view, "H", 1.0)),
         (
             f"for an approach at {view.speed:g} m/s, e = {view.restitution:g}",
@@ -67,7 +67,7 @@ def groups_of(view: ResultView) -> list[tuple[str, list[int], str]]:
     return [group for group in groups if group[1]]
 
 
-def _bars(axes: Any, jumps: list[Vector], points: list[Vector | None]) -> None:
+def _bars(axes: Any, jumps: list[Array], points: list[Array | None]) -> None:
     rows = np.arange(len(jumps[0]))
     for shift, jump, point, bar in zip((-0.2, 0.2), jumps, points, (BEFORE_BAR, AFTER_BAR), strict=True):
         axes.barh(rows + shift, jump, height=0.36, **bar)
@@ -94,7 +94,7 @@ def _norms(view: ResultView, name: str, gain: float) -> str:
     return f"‖Δν‖ = {factor}√{name} = {norm(view.before)} → {norm(view.after)} {unit}"
 
 
-def _notes(view: ResultView, stuck: list[Vector | None]) -> list[str]:
+def _notes(view: ResultView, stuck: list[Array | None]) -> list[str]:
     notes = "Bars: no friction. A posture can lower one column and raise the other: the impulse grows as G falls."
     still = [word for word, state in (("before", view.before), ("after", view.after)) if not state.G > 0]
     if still:
@@ -104,7 +104,7 @@ def _notes(view: ResultView, stuck: list[Vector | None]) -> list[str]:
     return [notes + " Diamonds: the contact point sticks (no slip), as S counts it."]
 
 
-def _handles(stuck: list[Vector | None]) -> list[Any]:
+def _handles(stuck: list[Array | None]) -> list[Any]:
     handles: list[Any] = [Patch(label="before", **BEFORE_BAR), Patch(label="after", **AFTER_BAR)]
     for word, color, point in zip(("before", "after"), (VERMILLION, BLUE), stuck, strict=True):
         if point is not None:

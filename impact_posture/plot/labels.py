@@ -11,7 +11,8 @@ from matplotlib.text import Annotation
 from mpl_toolkits.mplot3d import proj3d
 from numpy.typing import NDArray
 
-from impact_posture.plot.shapes import Plane, Vector
+from impact_posture.arrays import Array
+from impact_posture.plot.shapes import Plane
 
 # Distances from the point and directions to try; least distance of a letter from lines. All in points.
 _GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0, 36.0)
@@ -28,7 +29,7 @@ class Label(Annotation):
     """
 
     def __init__(
-        self, text: str, point: Vector, toward: tuple[float, float] = (0.0, 1.0), color: str = "black"
+        self, text: str, point: Array, toward: tuple[float, float] = (0.0, 1.0), color: str = "black"
     ) -> None:
         super().__init__(
             text, (0.0, 0.0), (0.0, 0.0), textcoords="offset points", fontstyle="italic", ha="center", va="center",
@@ -40,13 +41,13 @@ class Label(Annotation):
         self.set_in_layout(False)
 
 
-def draw_arrow(axes: Any, tail: Vector, tip: Vector, zorder: float, **look: Any) -> None:
+def draw_arrow(axes: Any, tail: Array, tip: Array, zorder: float, **look: Any) -> None:
     """Draw an arrow between two points of a panel, each of shape (2,)."""
     look = {"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0} | look
     axes.annotate("", tuple(tip), tuple(tail), arrowprops=look, zorder=zorder)
 
 
-def draw_end_on(axes: Any, name: str, plane: Plane, n: Vector, at: Vector, color: str = "black") -> None:
+def draw_end_on(axes: Any, name: str, plane: Plane, n: Array, at: Array, color: str = "black") -> None:
     """Draw a normal across the plane of the figure as a dot (towards the reader) or a cross (away) in a ring."""
     toward = float(np.cross(plane.axes[0], plane.axes[1]) @ n)
     look = {"linestyle": "", "markeredgecolor": color, "zorder": 6.5}

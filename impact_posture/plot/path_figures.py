@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
-from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import BLUE, GRAY, GREEN, INK, PURPLE, VERMILLION, framed
 from impact_posture.plot.view import ResultView, TradeOffData, header_lines, number, objective_unit
 
@@ -61,7 +61,7 @@ def path_figure(view: ResultView) -> Figure:
     return figure
 
 
-def draw_shares(axes: Any, x: Vector, data: NullSpacePath | TradeOffData) -> bool:
+def draw_shares(axes: Any, x: Array, data: NullSpacePath | TradeOffData) -> bool:
     """Draw H, G, V and S over ``x``, each divided by its value at the start; return whether any was drawn."""
     curves = {name: normalized(data, name) for name in QUANTITIES}
     drawn = {name: curve for name, curve in curves.items() if curve is not None}
@@ -82,7 +82,7 @@ def draw_shares(axes: Any, x: Vector, data: NullSpacePath | TradeOffData) -> boo
     return bool(drawn)
 
 
-def spreads(values: Vector, ratio: float = _SPREAD) -> bool:
+def spreads(values: Array, ratio: float = _SPREAD) -> bool:
     """Return whether positive values spread by more than ``ratio``, so that they need a log axis."""
     positive = values[values > 0]
     return bool(positive.size) and float(positive.max() / positive.min()) > ratio
@@ -100,7 +100,7 @@ def undrawn(data: NullSpacePath | TradeOffData) -> list[str]:
     return [name for name in QUANTITIES if normalized(data, name) is None]
 
 
-def normalized(path: NullSpacePath | TradeOffData, name: str) -> Vector | None:
+def normalized(path: NullSpacePath | TradeOffData, name: str) -> Array | None:
     """Divide a quantity by its value at the start, or by its nearest value; ``None`` where that is 0."""
     values = np.asarray(getattr(path, name), dtype=float)
     first = _first(path, name)

@@ -11,8 +11,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from impact_posture.arrays import Array
 from impact_posture.plot.labels import Label, draw_arrow, draw_end_on
-from impact_posture.plot.shapes import COORDINATE_PLANES, XY, XZ, YZ, Plane, Vector, outline, square, upright_plane
+from impact_posture.plot.shapes import COORDINATE_PLANES, XY, XZ, YZ, Plane, outline, square, upright_plane
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.space import Space, frame_space
 from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, VERMILLION, framed, shared_legend
@@ -39,20 +40,20 @@ class Surface:
         color: Color of its posture; gray for a plane of both postures.
     """
 
-    point: Vector
-    normal: Vector
+    point: Array
+    normal: Array
     side: float
-    contact: Vector
+    contact: Array
     reach: float
     name: str
     color: str
 
     @property
-    def tip(self) -> Vector:
+    def tip(self) -> Array:
         """Tip of n, shape (3,)."""
         return np.asarray(self.contact + self.reach * self.normal)
 
-    def outline(self, plane: Plane) -> Vector:
+    def outline(self, plane: Plane) -> Array:
         """Return the corners of the strip of matter below the plane as seen from the side, shape (4, 2)."""
         middle, n = plane.axes @ self.point, plane.axes @ self.normal
         along, deep = np.array([-n[1], n[0]]) * self.side / 2, -0.22 * self.side * n
@@ -134,7 +135,7 @@ def surfaces_of(first: Skeleton, second: Skeleton, letters: list[str], side: flo
     return found
 
 
-def _box(axes: Any, points: Vector) -> None:
+def _box(axes: Any, points: Array) -> None:
     """Give 3-D axes equal scales around the points."""
     low, high = points.min(axis=0), points.max(axis=0)
     # The box of a planar robot keeps some depth.
@@ -143,7 +144,7 @@ def _box(axes: Any, points: Vector) -> None:
     frame_space(axes, middle - half, middle + half, "m", 5, azimuth=-60)
 
 
-def _window(states: list[Skeleton], plane: Plane, surfaces: list[Surface]) -> tuple[Vector, Vector]:
+def _window(states: list[Skeleton], plane: Plane, surfaces: list[Surface]) -> tuple[Array, Array]:
     """Return the lower left and upper right corner of the side view, with a margin around all that is drawn."""
     drawn = [plane.axes @ state.points.T for state in states]
     for s in surfaces:
@@ -152,14 +153,14 @@ def _window(states: list[Skeleton], plane: Plane, surfaces: list[Surface]) -> tu
     return padded(low, high)
 
 
-def padded(low: Vector, high: Vector) -> tuple[Vector, Vector]:
+def padded(low: Array, high: Array) -> tuple[Array, Array]:
     """Return the corners of a picture with a margin, whose shorter side is at least 0.6 of the longer."""
     longest = float((high - low).max()) or 1.0
     middle, half = (low + high) / 2, np.maximum(high - low, 0.6 * longest) / 2 + 0.05 * longest
     return middle - half, middle + half
 
 
-def frame_flat(axes: Any, low: Vector, high: Vector, bins: int) -> None:
+def frame_flat(axes: Any, low: Array, high: Array, bins: int) -> None:
     """Give a panel the corners ``low`` and ``high``, shape (2,), equal axes and few ticks."""
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect("equal", adjustable="box")
@@ -173,12 +174,12 @@ def depth_of(plane: Plane) -> str:
     return "the horizontal across n"
 
 
-def _draw(axes: Any, points: Vector, plane: Plane | None, **look: Any) -> None:
+def _draw(axes: Any, points: Array, plane: Plane | None, **look: Any) -> None:
     """Plot points of shape (3, k), projected where there is a plane."""
     axes.plot(*(points if plane is None else plane.axes @ points), **look)
 
 
-def _fill(axes: Any, faces: list[Vector], plane: Plane | None, color: str, zorder: float) -> None:
+def _fill(axes: Any, faces: list[Array], plane: Plane | None, color: str, zorder: float) -> None:
     """Fill polygons of shape (3, k) faintly, projected where there is a plane."""
     if plane is None:
         axes.add_collection3d(Poly3DCollection([face.T for face in faces], facecolor=color, alpha=0.1, linewidth=0))
@@ -208,7 +209,7 @@ def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane |
     _draw(axes, state.contacts.T, plane, marker="o", markersize=5.5, markeredgewidth=0.8, zorder=6, **look)
 
 
-def _body(axes: Any, corners: Vector, line: dict[str, Any], plane: Plane | None) -> None:
+def _body(axes: Any, corners: Array, line: dict[str, Any], plane: Plane | None) -> None:
     """Draw a box by its corners; from the side its outline."""
     if plane is not None:
         around = outline(plane.axes @ corners.T)

@@ -12,11 +12,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator
 
+from impact_posture.arrays import Array
 from impact_posture.escape import plot_label
 from impact_posture.plot.path_figures import log_axis, spreads
 from impact_posture.plot.run_panels import LINES, RUNS, Clip, Panel
 from impact_posture.plot.run_view import RunView, run_header
-from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import GRAY, INK, framed, shared_legend
 
 # Pink and light gray differ in a gray print as well.
@@ -148,7 +148,7 @@ def _shade(axes: Any, view: RunView, clip: Clip) -> None:
                 axes.axvspan(clip.x(span.begin), clip.x(span.end), **look)
 
 
-def _curve(axes: Any, view: RunView, values: Vector, clip: Clip, **look: Any) -> None:
+def _curve(axes: Any, view: RunView, values: Array, clip: Clip, **look: Any) -> None:
     """Draw a curve within a clip, straight across gaps (NaN)."""
     inside = (view.t >= clip.begin) & (view.t <= clip.end) & np.isfinite(values)
     axes.plot(clip.x(view.t[inside]), values[inside], **look)
@@ -164,7 +164,7 @@ def _saturation(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) 
         axes.plot(clip.x(seen), np.full(len(seen), limit), **AT_LIMIT)
 
 
-def _band(axes: Any, view: RunView, bounds: Vector, clip: Clip) -> None:
+def _band(axes: Any, view: RunView, bounds: Array, clip: Clip) -> None:
     """Fill between the lowest lower bound and the highest upper bound of each bin of ticks."""
     inside = (view.t >= clip.begin) & (view.t <= clip.end)
     t, bounds = view.t[inside], bounds[inside]
@@ -173,7 +173,7 @@ def _band(axes: Any, view: RunView, bounds: Vector, clip: Clip) -> None:
     axes.fill_between(clip.x(t[starts]), low, high, **BAND)
 
 
-def _scale_metric(axes: Any, values: Sequence[Vector]) -> None:
+def _scale_metric(axes: Any, values: Sequence[Array]) -> None:
     """Make the axis of H logarithmic where H spans more than a decade; else let it begin at zero."""
     every = np.concatenate([value[np.isfinite(value)] for value in values])
     if every.size and (every > 0).all() and spreads(every, 10.0):

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from impact_posture.arrays import Array
 from impact_posture.plot.run_view import Flags, RunView
-from impact_posture.plot.shapes import Vector
 from impact_posture.plot.style import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILLION
 from impact_posture.plot.view import mixed_unit, number
 
@@ -103,9 +103,9 @@ class Panel:
 
     label: str
     names: Sequence[str]
-    values: Sequence[Vector]
+    values: Sequence[Array]
     limits: tuple[float, float] | tuple[()] = ()
-    ranges: Sequence[Vector] | None = None
+    ranges: Sequence[Array] | None = None
     stopped: Sequence[Flags] | None = None
     note: str = ""
     noisy: bool = False
@@ -237,6 +237,6 @@ def joint_panels(views: Sequence[RunView]) -> list[Panel]:
     return panels
 
 
-def _largest(size: Vector) -> Any:
+def _largest(size: Array) -> Any:
     """Return the indices of the :data:`SHOWN` largest entries, in the order of the robot."""
     return np.sort(np.argsort(-size, kind="stable")[:SHOWN])

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.velocity_jump import tangent_units
-from impact_posture.plot.shapes import Vector
 from impact_posture.plot.view import number
 from impact_posture.robot.robot import Robot
 
@@ -73,19 +73,19 @@ class RunView:
     controller: str
     robot: Robot
     contact: ImpactContact
-    t: Vector
-    q: Vector
-    v: Vector
-    torque: Vector
-    rotor_command: Vector
-    rotor_speed: Vector
-    force: Vector
-    peak: Vector
-    objective: Vector
-    level: Vector
+    t: Array
+    q: Array
+    v: Array
+    torque: Array
+    rotor_command: Array
+    rotor_speed: Array
+    force: Array
+    peak: Array
+    objective: Array
+    level: Array
     at_stop: Flags
     windows: tuple[Span, ...] = ()
-    surface: Vector | None = None
+    surface: Array | None = None
     supports: tuple[Support, ...] = ()
     label: str = ""
     title: str = ""
@@ -134,7 +134,7 @@ class RunView:
         return self.surface is None
 
     @cached_property
-    def speed(self) -> Vector:
+    def speed(self) -> Array:
         """``‖ν‖``, shape (n,)."""
         return np.asarray(np.linalg.norm(self.v, axis=1))
 
@@ -149,7 +149,7 @@ class RunView:
         return tuple(unit.removesuffix("/s") for unit in tangent_units(self.robot)[self.first_joint :])
 
     @cached_property
-    def positions(self) -> Vector:
+    def positions(self) -> Array:
         """Position of each joint, shape (n, joints): rad (of endless joints unwrapped) or m.
 
         NaN for the entries of joints of several degrees of freedom, which have no angle of their own.
@@ -165,7 +165,7 @@ class RunView:
         return found[:, self.first_joint :]
 
     @property
-    def torque_limits(self) -> Vector:
+    def torque_limits(self) -> Array:
         """Torque limit of each joint, N·m (N), shape (joints,); infinite without a limit."""
         effort = np.array(self.robot.model.effortLimit, dtype=float)[self.first_joint :]
         return np.where(effort > 0, effort, np.inf)

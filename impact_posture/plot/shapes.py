@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
+from impact_posture.arrays import Array
 
 # A direction within 1° of a plane counts as in it: its half-width differs there by less than 2e-4 of itself.
 IN_PLANE = float(np.cos(np.radians(1.0)))
@@ -26,7 +25,7 @@ class Plane:
         up: Name of the second.
     """
 
-    axes: Vector
+    axes: Array
     right: str
     up: str
 
@@ -35,7 +34,7 @@ class Plane:
         """``xy`` and the like."""
         return f"{self.right}{self.up}" if len(self.right + self.up) == 2 else "plane of n and z"
 
-    def contains(self, direction: Vector) -> bool:
+    def contains(self, direction: Array) -> bool:
         """Return whether a unit direction lies in the plane, up to a degree."""
         return bool(np.linalg.norm(self.axes @ direction) >= IN_PLANE)
 
@@ -47,25 +46,25 @@ YZ = Plane(np.array([_Y, _Z]), "y", "z")
 COORDINATE_PLANES = (XY, XZ, YZ)
 
 
-def upright_plane(n: Vector) -> Plane:
+def upright_plane(n: Array) -> Plane:
     """Return the plane of the vertical and a unit vector that is not vertical."""
     across = np.array([n[0], n[1], 0.0]) / np.hypot(n[0], n[1])
     name = f"along ({across[0]:.2f}, {across[1]:.2f}, 0)".replace("-", "−")
     return Plane(np.array([across, _Z]), name, "z")
 
 
-def root(matrix: Vector) -> Vector:
+def root(matrix: Array) -> Array:
     """Return the symmetric square root of a positive semidefinite matrix, with negative eigenvalues set to zero."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
-def half_width(matrix: Vector, direction: Vector) -> float:
+def half_width(matrix: Array, direction: Array) -> float:
     """Half-width ``√(dᵀΛd)`` of ``{x: xᵀΛ⁻¹x ≤ 1}`` along a unit ``d``, the distance of its tangent planes."""
     return float(np.sqrt(max(float(direction @ matrix @ direction), 0.0)))
 
 
-def shadow(matrix: Vector, axes: Vector, points: int = 181) -> Vector:
+def shadow(matrix: Array, axes: Array, points: int = 181) -> Array:
     """Edge of the projection of ``{x: xᵀΛ⁻¹x ≤ 1}`` on the plane of ``axes`` (rows, orthonormal), shape (2, points).
 
     The projection is the ellipse of ``P Λ Pᵀ``; a degenerate one is a segment from end to end, or a point.
@@ -73,14 +72,14 @@ def shadow(matrix: Vector, axes: Vector, points: int = 181) -> Vector:
     return _ring(_semi_axes(axes @ matrix @ axes.T), points)
 
 
-def surface(matrix: Vector, rings: int = 25) -> Vector:
+def surface(matrix: Array, rings: int = 25) -> Array:
     """Return points of the surface of the ellipsoid on a grid, shape (3, rings, 2·rings)."""
     across, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
     sphere = np.array([np.sin(across) * np.cos(around), np.sin(across) * np.sin(around), np.cos(across)])
     return np.asarray(np.einsum("ij,jkl->ikl", root(matrix), sphere))
 
 
-def principal_sections(matrix: Vector, points: int = 121) -> list[Vector]:
+def principal_sections(matrix: Array, points: int = 121) -> list[Array]:
     """Return the ellipses through two principal axes each, shape (3, points), without those that are a point."""
     axes = _semi_axes(matrix)
     flat = _NEGLIGIBLE * np.linalg.norm(axes[:, 2])
@@ -90,13 +89,13 @@ def principal_sections(matrix: Vector, points: int = 121) -> list[Vector]:
     return [_ring(axes[:, pair], points) for pair in pairs]
 
 
-def _semi_axes(matrix: Vector) -> Vector:
+def _semi_axes(matrix: Array) -> Array:
     """Semi-axes as columns, the longest last."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _ring(axes: Vector, points: int) -> Vector:
+def _ring(axes: Array, points: int) -> Array:
     """The ellipse with two semi-axes (columns, the longer last); a segment if the shorter is negligible.
 
     There and back would put the gaps of a dashed line under its dashes.
@@ -108,7 +107,7 @@ def _ring(axes: Vector, points: int) -> Vector:
     return np.asarray(axes[:, ::-1] @ np.array([np.cos(angle), np.sin(angle)]))
 
 
-def polar(matrix: Vector, infinite: float) -> tuple[Vector, Vector]:
+def polar(matrix: Array, infinite: float) -> tuple[Array, Array]:
     """The matrix of the polar dual ``{f: fᵀAf ≤ 1}`` of ``{x: xᵀA⁻¹x ≤ 1}``, and where it has no end.
 
     Args:
@@ -124,7 +123,7 @@ def polar(matrix: Vector, infinite: float) -> tuple[Vector, Vector]:
     return np.asarray((vectors * inverse) @ vectors.T), np.asarray(vectors[:, ~bounded])
 
 
-def cone_rim(axis: Vector, degrees: float, length: float, points: int = 73) -> Vector:
+def cone_rim(axis: Array, degrees: float, length: float, points: int = 73) -> Array:
     """Ends of the lines of ``length`` at ``degrees`` from a unit ``axis``, a closed circle, shape (3, points)."""
     across = np.linalg.svd(axis[None])[2][1:]
     angle, tilt = np.linspace(0.0, 2 * np.pi, points), np.radians(degrees)
@@ -132,19 +131,19 @@ def cone_rim(axis: Vector, degrees: float, length: float, points: int = 73) -> V
     return np.asarray(length * (np.cos(tilt) * axis[:, None] + np.sin(tilt) * around))
 
 
-def cone_shadow(axis: Vector, degrees: float, length: float, axes: Vector) -> Vector:
+def cone_shadow(axis: Array, degrees: float, length: float, axes: Array) -> Array:
     """Outline of the projection of the cone from the origin to :func:`cone_rim`, closed, shape (2, k)."""
     flat = np.column_stack([np.zeros(2), axes @ cone_rim(axis, degrees, length)[:, :-1]])
     return outline(flat)
 
 
-def outline(points: Vector) -> Vector:
+def outline(points: Array) -> Array:
     """Return the convex hull of points of shape (2, k), closed."""
     edge = scipy.spatial.ConvexHull(points.T).vertices
     return np.asarray(points[:, [*edge, edge[0]]])
 
 
-def square(center: Vector, n: Vector, side: float) -> Vector:
+def square(center: Array, n: Array, side: float) -> Array:
     """Corners of a square perpendicular to the unit vector ``n``, closed, shape (3, 5)."""
     # The edges follow the world axis that n is farthest from.
     first = np.eye(3)[int(np.argmin(np.abs(n)))]

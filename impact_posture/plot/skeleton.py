@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.impact.contact import ImpactContact, Support, point_on
-from impact_posture.plot.shapes import Vector
 from impact_posture.robot.robot import Robot
 
 # Least height of a body, as a part of its shorter side.
@@ -33,33 +33,33 @@ class Skeleton:
         rotors: Circles of the propellers, shape (r, 3, points).
     """
 
-    bones: Vector
-    joints: Vector
+    bones: Array
+    joints: Array
     base: pin.SE3
-    body: Vector
-    contacts: Vector
-    normals: Vector
-    feet: Vector
-    rotors: Vector
+    body: Array
+    contacts: Array
+    normals: Array
+    feet: Array
+    rotors: Array
 
     @property
-    def contact(self) -> Vector:
+    def contact(self) -> Array:
         """The first contact point, shape (3,)."""
         return np.asarray(self.contacts[0])
 
     @property
-    def normal(self) -> Vector:
+    def normal(self) -> Array:
         """Normal of the first contact, shape (3,)."""
         return np.asarray(self.normals[0])
 
     @property
-    def arms(self) -> Vector:
+    def arms(self) -> Array:
         """Lines from the base to the centers of the rotors, shape (r, 2, 3)."""
         centers = self.rotors.mean(axis=2)
         return np.stack([np.broadcast_to(np.asarray(self.base.translation), centers.shape), centers], axis=1)
 
     @property
-    def points(self) -> Vector:
+    def points(self) -> Array:
         """All points that the figure has to show, shape (m, 3)."""
         circles = self.rotors.transpose(0, 2, 1).reshape(-1, 3)
         origin = np.asarray(self.base.translation)[None]
@@ -67,7 +67,7 @@ class Skeleton:
 
 
 def build_skeleton(
-    robot: Robot, q: Vector, contacts: Sequence[ImpactContact], supports: Sequence[Support] = ()
+    robot: Robot, q: Array, contacts: Sequence[ImpactContact], supports: Sequence[Support] = ()
 ) -> Skeleton:
     """Place the sticks at ``q``, shape (nq,).
 
@@ -119,7 +119,7 @@ def build_skeleton(
     )
 
 
-def _body(model: pin.Model, base: pin.SE3) -> Vector:
+def _body(model: pin.Model, base: pin.SE3) -> Array:
     """Return the corners of the box between the joints on the base; none for fewer than four joints."""
     hips = np.array([model.jointPlacements[i].translation for i in range(2, model.njoints) if model.parents[i] == 1])
     if len(hips) < 4:
@@ -137,14 +137,14 @@ def _placed(places: Sequence[pin.SE3], point: PointOnLink) -> pin.SE3:
     return places[point.joint] * pin.SE3(point.rotation, point.position)
 
 
-def _tip(model: pin.Model, joint: int) -> Vector:
+def _tip(model: pin.Model, joint: int) -> Array:
     """Return the frame of a link that is farthest from its joint, in joint axes; else the center of mass."""
     places = [np.array(f.placement.translation) for f in model.frames if f.parentJoint == joint]
     tip = max(places, key=lambda place: float(np.linalg.norm(place)), default=np.zeros(3))
     return tip if np.linalg.norm(tip) > 1e-3 else np.array(model.inertias[joint].lever)
 
 
-def _rotors(robot: Robot, places: list[pin.SE3]) -> Vector:
+def _rotors(robot: Robot, places: list[pin.SE3]) -> Array:
     """Return circles across the thrust directions, as large as the spacing of the rotors allows."""
     propulsion = robot.spec.propulsion
     if propulsion is None:

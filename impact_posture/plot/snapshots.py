@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from impact_posture.arrays import Array
 from impact_posture.escape import plot_label
 from impact_posture.plot.labels import draw_arrow
 from impact_posture.plot.robot_drawing import (
@@ -24,7 +25,7 @@ from impact_posture.plot.robot_drawing import (
     stick_notes,
 )
 from impact_posture.plot.run_view import RunView, check_same, run_header
-from impact_posture.plot.shapes import Plane, Vector
+from impact_posture.plot.shapes import Plane
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.style import (
     BLUE,
@@ -122,7 +123,7 @@ def _skeleton(view: RunView, tick: int) -> Skeleton:
     return build_skeleton(view.robot, view.q[tick], [view.contact], view.supports)
 
 
-def _window(low: Vector, high: Vector, view: RunView, plane: Plane) -> tuple[Vector, Vector]:
+def _window(low: Array, high: Array, view: RunView, plane: Plane) -> tuple[Array, Array]:
     """Return the corners of a panel, which shows all sticks, and the surface where it is seen from its edge."""
     if view.surface is not None:
         touched = plane.axes @ view.surface
@@ -135,7 +136,7 @@ def _window(low: Vector, high: Vector, view: RunView, plane: Plane) -> tuple[Vec
     return padded(low, high)
 
 
-def _surface(axes: Any, view: RunView, plane: Plane, low: Vector, high: Vector) -> None:
+def _surface(axes: Any, view: RunView, plane: Plane, low: Array, high: Array) -> None:
     """Draw the surface as seen from its edge, hatched behind it."""
     if view.surface is None:
         return
@@ -152,7 +153,7 @@ def _surface(axes: Any, view: RunView, plane: Plane, low: Vector, high: Vector) 
     axes.plot(*corners[:2].T, color=INK, linewidth=1.0, zorder=1)
 
 
-def _arrow(view: RunView, state: Skeleton, plane: Plane, reach: float) -> Vector | None:
+def _arrow(view: RunView, state: Skeleton, plane: Plane, reach: float) -> Array | None:
     """Return the push from tail to tip in the figure; ``None`` without a push."""
     largest = view.force[int(np.argmax(np.linalg.norm(view.force, axis=1)))]
     size = float(np.linalg.norm(largest))
@@ -161,7 +162,7 @@ def _arrow(view: RunView, state: Skeleton, plane: Plane, reach: float) -> Vector
     return np.asarray(plane.axes @ largest / size * reach)
 
 
-def _push(axes: Any, contact: Vector, arrow: Vector, *, acting: bool) -> None:
+def _push(axes: Any, contact: Array, arrow: Array, *, acting: bool) -> None:
     look = {"linewidth": 1.8} if acting else {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}
     draw_arrow(axes, contact - arrow, contact, 7, color=VERMILLION, shrinkB=3, **look)
 

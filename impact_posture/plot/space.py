@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from impact_posture.plot.shapes import Vector
+from impact_posture.arrays import Array
 from impact_posture.plot.style import text_width
 
 _TICKS = 6.5
@@ -24,7 +24,7 @@ class Space(Axes3D):  # type: ignore[misc]
         return super().get_tightbbox(renderer, **(more | {"for_layout_only": False}))
 
 
-def frame_space(axes: Any, low: Vector, high: Vector, unit: str, bins: int, *, azimuth: float) -> None:
+def frame_space(axes: Any, low: Array, high: Array, unit: str, bins: int, *, azimuth: float) -> None:
     """Give 3-D axes the limits ``low`` to ``high``, one scale, few ticks, and names with the unit."""
     size = high - low
     axes.set_box_aspect(tuple(size))

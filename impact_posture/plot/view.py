@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import MetricError
 from impact_posture.impact.cone import WorstNormal
@@ -24,8 +25,6 @@ from impact_posture.settings import Against
 # Imported for its name alone, because the figures need no solver.
 if TYPE_CHECKING:
     from impact_posture.posture.null_space_path import NullSpacePath
-
-Vector = NDArray[np.float64]
 
 # Separator of the facts in a header line.
 SEPARATOR = "  ·  "
@@ -49,13 +48,13 @@ class TradeOffData:
         against: What the points bound.
     """
 
-    within: Vector
-    distance: Vector
-    objective: Vector
-    H: Vector
-    G: Vector
-    V: Vector
-    S: Vector
+    within: Array
+    distance: Array
+    objective: Array
+    H: Array
+    G: Array
+    V: Array
+    S: Array
     certified: NDArray[np.bool_]
     knee: int | None = None
     against: Against = "distance"
@@ -79,8 +78,8 @@ class ResultView:
 
     robot: Robot
     objective: ImpactObjective
-    q_initial: Vector
-    q_optimal: Vector
+    q_initial: Array
+    q_optimal: Array
     speed: float = 1.0
     restitution: float = 0.0
     path: NullSpacePath | None = None
@@ -110,7 +109,7 @@ class ResultView:
         """World worst normals of the cone before and after; ``None`` without a cone or where none exists."""
         return self._worst(self.q_initial), self._worst(self.q_optimal)
 
-    def _worst(self, q: Vector) -> WorstNormal | None:
+    def _worst(self, q: Array) -> WorstNormal | None:
         cone = self.objective.normal_cone
         if cone is None:
             return None
@@ -124,7 +123,7 @@ class ResultView:
         """Contact point on its link."""
         return point_on(self.robot, self.objective.contact.frame, self.objective.contact.offset)
 
-    def jacobian(self, q: Vector) -> Vector:
+    def jacobian(self, q: Array) -> Array:
         """Return ``J(q)``, shape (3, nv), of the world velocity of the contact point without supports."""
         return np.array(self.objective.oracle.numeric.at(q).jacobian(self.contact_point)[:3])
 

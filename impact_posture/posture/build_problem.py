@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 import scipy
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
@@ -31,10 +31,8 @@ from impact_posture.posture.regular import pin_undetermined, regularize
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import tilt_of
 
-Vector = NDArray[np.float64]
 
-
-def build_problem(robot: Robot, objective: Objective, given: Vector, requirements: Requirements) -> PostureProblem:
+def build_problem(robot: Robot, objective: Objective, given: Array, requirements: Requirements) -> PostureProblem:
     """Turn requirements into constraints; nothing is solved yet.
 
     Raises:
@@ -242,7 +240,7 @@ def _com_constraint(
     return CenterOfMassOverFeet(unique[:, :2], -unique[:, 2], margin)
 
 
-def _bounds(robot: Robot, chart: Chart, given: Vector, requirements: Requirements) -> tuple[Vector, Vector]:
+def _bounds(robot: Robot, chart: Chart, given: Array, requirements: Requirements) -> tuple[Array, Array]:
     lower, upper = chart.bounds()
     x = chart.to_x(given)
     margin = requirements.limit_margin

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.problem_settings import Prepared
 from impact_posture.robot.actuation import hover
-
-Vector = NDArray[np.float64]
 
 # A contact counts as locked if its 1/mass falls below this share of the initial value.
 _LOCKED = 0.05
@@ -28,7 +24,7 @@ def percent(share: float) -> str:
     return f"{text.removeprefix('-') if float(text) == 0 else text}%"
 
 
-def notes_on_impacts(objective: Objective, initial: Vector, q: Vector) -> list[str]:
+def notes_on_impacts(objective: Objective, initial: Array, q: Array) -> list[str]:
     """Return notes on contacts that lock."""
     notes: list[str] = []
     if not isinstance(objective, ImpactObjective):
@@ -45,12 +41,12 @@ def notes_on_impacts(objective: Objective, initial: Vector, q: Vector) -> list[s
     return notes
 
 
-def caveats(prepared: Prepared, initial: Vector, q: Vector) -> list[str]:
+def caveats(prepared: Prepared, initial: Array, q: Array) -> list[str]:
     """Return warnings about hovering, the surface and the ground, for the initial and the optimal posture."""
     return [*_hover_warnings(prepared, q), *_surface_warnings(prepared, initial, q), *_ground_warnings(prepared, q)]
 
 
-def _hover_warnings(prepared: Prepared, q: Vector) -> list[str]:
+def _hover_warnings(prepared: Prepared, q: Array) -> list[str]:
     """Reasons why an aerial robot cannot hover in the optimal posture."""
     robot = prepared.impact.robot
     if robot.spec.propulsion is None or not robot.floating:
@@ -59,7 +55,7 @@ def _hover_warnings(prepared: Prepared, q: Vector) -> list[str]:
     return [f"the robot cannot hover in the optimal posture: {violation}" for violation in violations]
 
 
-def _surface_warnings(prepared: Prepared, initial: Vector, q: Vector) -> list[str]:
+def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]:
     """Links whose origin lies behind the plane of the contact; no constraint keeps them on the side of the normal.
 
     A push (a free contact pose) has no surface.
@@ -82,7 +78,7 @@ def _surface_warnings(prepared: Prepared, initial: Vector, q: Vector) -> list[st
     return lines
 
 
-def _joints_behind(prepared: Prepared, q: Vector) -> list[str]:
+def _joints_behind(prepared: Prepared, q: Array) -> list[str]:
     """Joints whose origin lies behind the plane of the contact, except the joint of the link that touches."""
     oracle = prepared.impact.objective.oracle.at(q)
     contact = oracle.numeric.placement(oracle.point).translation
@@ -94,7 +90,7 @@ def _joints_behind(prepared: Prepared, q: Vector) -> list[str]:
     ]
 
 
-def _ground_warnings(prepared: Prepared, q: Vector) -> list[str]:
+def _ground_warnings(prepared: Prepared, q: Array) -> list[str]:
     """Joints below the lowest foot, where level ground would be; no constraint keeps them above it."""
     robot, supports = prepared.impact.robot, prepared.impact.supports
     if not supports:
@@ -110,7 +106,7 @@ def _ground_warnings(prepared: Prepared, q: Vector) -> list[str]:
     ]
 
 
-def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Vector]]:
+def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array]]:
     """Index, name and world origin of every joint at the posture of ``numeric``."""
     model = prepared.impact.robot.model
     return [

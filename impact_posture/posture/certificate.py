@@ -8,13 +8,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.posture_distance import distance_gradient
 from impact_posture.posture.problem import PostureProblem, equality_jacobian, null_space
 from impact_posture.tables import json_block
-
-Vector = NDArray[np.float64]
 
 # An inequality closer than this (m, rad) may have a multiplier.  The product of both is the complementarity.
 _ACTIVE = 1e-3
@@ -86,7 +85,7 @@ class Certificate:
         return {key: value for key, value in json_block(self).items() if key != "active"}
 
 
-def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
+def certify(problem: PostureProblem, q: Array, scale: float) -> Certificate:
     """Certify ``q``; ``scale`` is the initial objective f₀."""
     numeric = Numeric(problem.robot.model)
     gradients, gaps = objective_gradients(problem, q, scale)
@@ -114,7 +113,7 @@ def certify(problem: PostureProblem, q: Vector, scale: float) -> Certificate:
     )
 
 
-def objective_gradients(problem: PostureProblem, q: Vector, scale: float) -> tuple[Vector, Vector]:
+def objective_gradients(problem: PostureProblem, q: Array, scale: float) -> tuple[Array, Array]:
     """Return vectors that span the subdifferential of objective/scale plus the regularization.
 
     Returns:
@@ -134,11 +133,11 @@ class _Near:
 
     name: str
     side: str
-    outward: Vector
+    outward: Array
     slack: float
 
 
-def _near_bounds(name: str, value: float, low: float, high: float, gradient: Vector) -> list[_Near]:
+def _near_bounds(name: str, value: float, low: float, high: float, gradient: Array) -> list[_Near]:
     """The bounds of a scalar that are near, given its tangent gradient."""
     sides = _Near(name, "lower", -gradient, float(value - low)), _Near(name, "upper", gradient, float(high - value))
     return [side for side in sides if side.slack < _ACTIVE]
@@ -157,7 +156,7 @@ def _inequalities(problem: PostureProblem, numeric: Numeric) -> tuple[list[_Near
     return near, violation
 
 
-def _limits(problem: PostureProblem, q: Vector) -> tuple[list[_Near], float]:
+def _limits(problem: PostureProblem, q: Array) -> tuple[list[_Near], float]:
     """Joint limits that are near, and the largest violation of all limits."""
     chart = Chart(problem.robot.model)
     x, unit = chart.to_x(q), np.eye(problem.robot.nv)
@@ -175,7 +174,7 @@ def _limits(problem: PostureProblem, q: Vector) -> tuple[list[_Near], float]:
     return near, float(worst)
 
 
-def _multipliers(gradients: Vector, equalities: Vector, inequalities: Vector) -> tuple[Vector, Vector, Vector]:
+def _multipliers(gradients: Array, equalities: Array, inequalities: Array) -> tuple[Array, Array, Array]:
     """Weights of the gradients (≥ 0, sum 1) and multipliers of the inequalities (≥ 0) with the least residual.
 
     Multipliers of equalities have any sign, so all gradients are projected onto the null space of the equalities.
@@ -200,7 +199,7 @@ def _multipliers(gradients: Vector, equalities: Vector, inequalities: Vector) ->
     return weights, multipliers, free @ (reduced.T @ weights + bounds.T @ multipliers)
 
 
-def nonnegative_least_squares(matrix: Vector, right: Vector) -> Vector:
+def nonnegative_least_squares(matrix: Array, right: Array) -> Array:
     """Return the ``x ≥ 0`` with the least ``‖A x − b‖`` (Lawson and Hanson 1974, algorithm NNLS).
 
     SciPy has the same function, but takes longer to import than many problems take to solve.
@@ -223,7 +222,7 @@ def nonnegative_least_squares(matrix: Vector, right: Vector) -> Vector:
     return x
 
 
-def _unbounded(matrix: Vector, right: Vector, passive: NDArray[np.bool_]) -> Vector:
+def _unbounded(matrix: Array, right: Array, passive: NDArray[np.bool_]) -> Array:
     x = np.zeros(len(passive))
     x[passive] = np.linalg.lstsq(matrix[:, passive], right, rcond=None)[0]
     return x

@@ -12,13 +12,11 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.spatial import quaternion_product
 from impact_posture.dynamics.tree import PointOnLink, Tree
-
-Vector = NDArray[np.float64]
 
 
 class Constraint(ABC):
@@ -32,9 +30,9 @@ class Constraint(ABC):
     """
 
     name: str
-    parameters: Vector
-    lower: Vector
-    upper: Vector
+    parameters: Array
+    lower: Array
+    upper: Array
 
     @property
     def rows(self) -> int:
@@ -56,10 +54,10 @@ class Constraint(ABC):
         """Return ``c(q)`` as an expression, shape (rows, 1), of a ``tree`` that was built with ``chart_x``."""
 
     @abstractmethod
-    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """Return ``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``model.q``."""
 
-    def excess(self, value: Vector) -> Vector:
+    def excess(self, value: Array) -> Array:
         """Return how far ``c(q)`` lies outside its bounds, signed, shape (rows,)."""
         return value - np.clip(value, self.lower, self.upper)
 
@@ -79,7 +77,7 @@ class Constraint(ABC):
 class HeldPosition(Constraint):
     """The point stays at ``p*``: ``p(q) − p* = 0``, world axes, meters."""
 
-    def __init__(self, name: str, point: PointOnLink, target: Vector) -> None:
+    def __init__(self, name: str, point: PointOnLink, target: Array) -> None:
         self.name, self.point = name, point
         self.parameters = np.array(target, dtype=float)
         self.lower = self.upper = np.zeros(3)
@@ -88,7 +86,7 @@ class HeldPosition(Constraint):
         """See :class:`Constraint`."""
         return tree.position(self.point) - parameters
 
-    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
         return model.placement(self.point).translation - self.parameters, model.jacobian(self.point)[:3]
 
@@ -100,7 +98,7 @@ class HeldPosition(Constraint):
 class PositionBox(HeldPosition):
     """The point stays within a box around ``p*``: ``|p(q) − p*| ≤ half``, world axes, meters."""
 
-    def __init__(self, name: str, point: PointOnLink, target: Vector, half: Sequence[float]) -> None:
+    def __init__(self, name: str, point: PointOnLink, target: Array, half: Sequence[float]) -> None:
         super().__init__(name, point, target)
         self.upper = np.array(half, dtype=float)
         self.lower = -self.upper
@@ -133,7 +131,7 @@ class HeldOrientation(Constraint):
         axis: Axis in the frame whose direction is held and about which it may turn; ``None`` holds all three.
     """
 
-    def __init__(self, name: str, point: PointOnLink, target: Vector, axis: Vector | None = None) -> None:
+    def __init__(self, name: str, point: PointOnLink, target: Array, axis: Array | None = None) -> None:
         self.name, self.point, self.target = name, point, np.array(target, dtype=float)
         self.axis = axis
         width = 3 if axis is None else 2
@@ -151,7 +149,7 @@ class HeldOrientation(Constraint):
         error = quaternion_product(quaternion_product(parameters[:4], tree.quaternion(self.point)), parameters[4:8])
         return 2 * error[: self.rows]
 
-    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
         right = pin.Quaternion(self.parameters[4:8])
         placement = model.placement(self.point)
@@ -175,7 +173,7 @@ class HeldOrientation(Constraint):
 class HeldPose(Constraint):
     """The frame keeps position and orientation: six rows, or five with a free spin."""
 
-    def __init__(self, name: str, point: PointOnLink, target: pin.SE3, axis: Vector | None = None) -> None:
+    def __init__(self, name: str, point: PointOnLink, target: pin.SE3, axis: Array | None = None) -> None:
         self.name = name
         self._parts: tuple[Constraint, ...] = (
             HeldPosition(name, point, target.translation),
@@ -193,7 +191,7 @@ class HeldPose(Constraint):
         position, orientation = self._parts
         return ca.vertcat(position.symbolic(tree, parameters[:3]), orientation.symbolic(tree, parameters[3:]))
 
-    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
         values, jacobians = zip(*(p.evaluate(model) for p in self._parts), strict=True)
         return np.concatenate(values), np.vstack(jacobians)
@@ -215,7 +213,7 @@ class AxisInCone(Constraint):
         degrees: Half angle α of the cone, degrees.
     """
 
-    def __init__(self, name: str, point: PointOnLink, axis: Vector, direction: Vector, degrees: float) -> None:
+    def __init__(self, name: str, point: PointOnLink, axis: Array, direction: Array, degrees: float) -> None:
         self.name, self.point, self._degrees = name, point, degrees
         self.parameters = np.concatenate([axis, direction])
         self.lower, self.upper = np.array([np.cos(np.deg2rad(degrees))]), np.array([np.inf])
@@ -228,7 +226,7 @@ class AxisInCone(Constraint):
         """See :class:`Constraint`."""
         return ca.dot(tree.rotation(self.point) @ parameters[:3], parameters[3:])
 
-    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
         axis, direction = self.parameters[:3], self.parameters[3:]
         now = model.placement(self.point).rotation @ axis
@@ -245,7 +243,7 @@ class HeldTurn(Constraint):
         name: Name of the constraint.
     """
 
-    def __init__(self, point: PointOnLink, target: Vector, axis: Vector, name: str) -> None:
+    def __init__(self, point: PointOnLink, target: Array, axis: Array, name: str) -> None:
         self.name = name
         self._whole = HeldOrientation(name, point, target)
         self._axis = np.array(axis, dtype=float)
@@ -256,7 +254,7 @@ class HeldTurn(Constraint):
         """See :class:`Constraint`."""
         return ca.dot(parameters[8:], self._whole.symbolic(tree, parameters[:8]))
 
-    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
         value, jacobian = self._whole.evaluate(model)
         return np.array([self._axis @ value]), (self._axis @ jacobian)[None, :]
@@ -273,7 +271,7 @@ class CenterOfMassOverFeet(Constraint):
     """
 
     def __init__(
-        self, normals: Vector, offsets: Vector, margin: float, loaded: tuple[pin.Model, str] | None = None
+        self, normals: Array, offsets: Array, margin: float, loaded: tuple[pin.Model, str] | None = None
     ) -> None:
         self.name = "center of mass over the feet" + (f" with {loaded[1]}" if loaded else "")
         self.normals, self.offsets, self.margin = normals, offsets, margin
@@ -293,7 +291,7 @@ class CenterOfMassOverFeet(Constraint):
         center = own.center_of_mass()
         return parameters[:k] * center[0] + parameters[k : 2 * k] * center[1] - parameters[2 * k :]
 
-    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
         k = self._k
         normals = self.parameters[: 2 * k].reshape(2, k).T
@@ -311,10 +309,10 @@ def base_point() -> PointOnLink:
     return PointOnLink(1, np.zeros(3), np.eye(3))
 
 
-def _coefficients(rotation: Vector) -> Vector:
+def _coefficients(rotation: Array) -> Array:
     return np.array(pin.Quaternion(np.asarray(rotation)).coeffs())
 
 
-def _rotation_to(axis: Vector) -> Vector:
+def _rotation_to(axis: Array) -> Array:
     """A rotation that takes e_z to ``axis``."""
     return np.array(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(axis, dtype=float)).matrix())

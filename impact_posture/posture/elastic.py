@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
@@ -15,8 +15,6 @@ from impact_posture.posture.nlp import IPOPT_OPTIONS, run_solver
 from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import random_posture
-
-Vector = NDArray[np.float64]
 
 # A constraint with a violation below this (m, rad) is satisfied.
 _KEPT = 1e-6
@@ -32,7 +30,7 @@ class ElasticAnswer:
         at_limits: Joints on a limit at ``q``.
     """
 
-    q: Vector
+    q: Array
     conflicts: dict[str, float]
     at_limits: tuple[str, ...]
 
@@ -82,7 +80,7 @@ def _build(problem: PostureProblem, chart: Chart) -> tuple[ca.Function, int]:
     return ca.nlpsol("elastic", "ipopt", program, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8}), k
 
 
-def _judge(problem: PostureProblem, chart: Chart, q: Vector) -> ElasticAnswer:
+def _judge(problem: PostureProblem, chart: Chart, q: Array) -> ElasticAnswer:
     numeric = Numeric(problem.robot.model).at(q)
     conflicts: dict[str, float] = {}
     for constraint, excess in zip(problem.constraints, problem.violations(numeric), strict=True):

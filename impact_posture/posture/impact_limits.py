@@ -12,16 +12,14 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.contact import support_inertia
 from impact_posture.impact.lifted import impact_at
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.constraint import Constraint
-
-Vector = NDArray[np.float64]
 
 
 class ImpactLimits(Constraint):
@@ -73,7 +71,7 @@ class ImpactLimits(Constraint):
         rows = [G] if self._least > 0 else []
         return ca.densify(ca.vertcat(*rows, *[found.a[int(k)] / G for k in self._joints]))
 
-    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
         oracle = self._objective.oracle
         found, slope = oracle.quantities(model.q), oracle.gradient_G(model.q)

@@ -7,16 +7,14 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.contact import point_on, support_inertia
 from impact_posture.impact.contact_stability import FrictionCones
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.constraint import Constraint
-
-Vector = NDArray[np.float64]
 
 
 class KeptFeet(Constraint):
@@ -68,7 +66,7 @@ class KeptFeet(Constraint):
         parts = [-heavy.point_velocity(foot, found.velocities)[:rows] / compliance for foot, rows in self._feet]
         return ca.densify(ca.SX(self._matrix) @ ca.vertcat(*parts))
 
-    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
         oracle = self._objective.oracle
         impulse = oracle.quantities(model.q).support_impulse

@@ -29,15 +29,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import threadpoolctl
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.compiled import CompileMode, compiled_solver
 from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
-
-Vector = NDArray[np.float64]
 
 IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.print_level": 0,
@@ -75,7 +73,7 @@ class SolveRecord:
         cpu_s: Processor time of the call, all threads together.
     """
 
-    q: Vector
+    q: Array
     status: str
     iterations: int
     time_s: float
@@ -111,7 +109,7 @@ class PostureNLP:
     compiled: bool
     compiler_fault: str = ""
 
-    def solve(self, start: Vector, *, scale: float | None = None, attempt: int = 0) -> SolveRecord:
+    def solve(self, start: Array, *, scale: float | None = None, attempt: int = 0) -> SolveRecord:
         """Solve from ``start``.
 
         Args:
@@ -158,7 +156,7 @@ def _libraries() -> threadpoolctl.ThreadpoolController:
     return threadpoolctl.ThreadpoolController()
 
 
-def run_solver(solver: ca.Function, **arguments: Vector) -> dict[str, ca.DM]:
+def run_solver(solver: ca.Function, **arguments: Array) -> dict[str, ca.DM]:
     """Call an ``nlpsol``, and raise the Ctrl-C that IPOPT may catch."""
     with _noticing_interrupts():
         answer: dict[str, ca.DM] = solver(**arguments)
@@ -221,7 +219,7 @@ def program(problem: PostureProblem, chart: Chart) -> tuple[dict[str, ca.SX], in
     return symbols, int(lifted.inequalities.numel())
 
 
-def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Vector:
+def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Array:
     """Return the values of the parameters of the program."""
     return np.concatenate(
         [
@@ -233,7 +231,7 @@ def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Vector:
     )
 
 
-def _row_bounds(problem: PostureProblem, nlp: PostureNLP) -> dict[str, Vector]:
+def _row_bounds(problem: PostureProblem, nlp: PostureNLP) -> dict[str, Array]:
     norms = np.zeros(len(nlp.chart.quaternion_slices()))
     lower, upper = (np.concatenate([norms, bounds]) for bounds in problem.row_bounds)
     # The other rows belong to the objective: first equations, then inequalities that bound it from below.

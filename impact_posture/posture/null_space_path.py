@@ -7,12 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import Projector
-
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -29,16 +27,16 @@ class NullSpacePath:
         objective: The objective, shape (N,).
     """
 
-    q: Vector
-    s: Vector
-    H: Vector
-    G: Vector
-    V: Vector
-    S: Vector
-    objective: Vector
+    q: Array
+    s: Array
+    H: Array
+    G: Array
+    V: Array
+    S: Array
+    objective: Array
 
 
-def null_space_path(problem: PostureProblem, start: Vector, end: Vector, points: int = 61) -> NullSpacePath:
+def null_space_path(problem: PostureProblem, start: Array, end: Array, points: int = 61) -> NullSpacePath:
     """Interpolate from ``start`` to ``end`` on the manifold and pull every point onto the constraints."""
     projector, model = Projector(problem), problem.robot.model
     postures = [start]

@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.contact_compression import ContactStiffness
 from impact_posture.posture.certificate import Certificate, certify
@@ -32,8 +32,6 @@ from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.rulers import DistanceRuler, ForceRuler, Ruler
 from impact_posture.posture.solve import PostureSolution, Progress, run_start, solve
 from impact_posture.posture.tradeoff import TradeOff, TradePoint, find_knee
-
-Vector = NDArray[np.float64]
 
 # A move below this (rad, m) is zero.
 _STILL = 1e-6
@@ -179,7 +177,7 @@ class _Curve:
                 better |= self._best[k] is not own
         return better
 
-    def _solve(self, k: int, path: str, start: Vector) -> Vector:
+    def _solve(self, k: int, path: str, start: Array) -> Array:
         """Solve within level ``k``, from ``start`` or from a posture nearby that is within it."""
         level = self._levels[k]
         key = (k, start.tobytes())
@@ -201,7 +199,7 @@ class _Curve:
         bound = self._ruler.bound(level)
         return replace(self._problem, constraints=(*self._problem.constraints[:-1], bound))
 
-    def _take(self, k: int, path: str, q: Vector, certificate: Certificate | None = None) -> None:
+    def _take(self, k: int, path: str, q: Array, certificate: Certificate | None = None) -> None:
         """Keep a posture if it satisfies the constraints and is the best within level ``k``."""
         found = _Found(path, self._point(k, q, certificate))
         feasible = replace(found.point.certificate, stationarity=0.0, complementarity=0.0).holds()
@@ -210,7 +208,7 @@ class _Curve:
         if feasible and (own is None or (found.rank[0], found.rank[1] + margin) < own.rank):
             self._best[k] = found
 
-    def _point(self, k: int, q: Vector, certificate: Certificate | None = None) -> TradePoint:
+    def _point(self, k: int, q: Array, certificate: Certificate | None = None) -> TradePoint:
         problem = self._at(self._levels[k])
         found = problem.impact.oracle.quantities(q)
         return TradePoint(

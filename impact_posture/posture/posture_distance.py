@@ -7,14 +7,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.constraint import Constraint
-
-Vector = NDArray[np.float64]
 
 
 def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
@@ -34,12 +32,12 @@ def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
     return ca.sum1(ca.vertcat(*parts))
 
 
-def distance(chart: Chart, q: Vector, reference: Vector) -> float:
+def distance(chart: Chart, q: Array, reference: Array) -> float:
     """Return the root of :func:`distance_squared` of two configurations, shape (nq,)."""
     return float(np.sqrt(max(float(distance_squared(chart, ca.DM(q), ca.DM(reference))), 0.0)))
 
 
-def distance_gradient(chart: Chart, q: Vector, reference: Vector) -> Vector:
+def distance_gradient(chart: Chart, q: Array, reference: Array) -> Array:
     """Return the tangent gradient of :func:`distance_squared` at ``q``, shape (nv,)."""
     gradient = np.zeros(chart.nv)
     for slot in chart.slots:
@@ -73,7 +71,7 @@ class WithinDistance(Constraint):
         radius: Radius, about ``‖q ⊖ reference‖``, > 0.
     """
 
-    def __init__(self, chart: Chart, reference: Vector, radius: float) -> None:
+    def __init__(self, chart: Chart, reference: Array, radius: float) -> None:
         self.name = "distance from the initial posture"
         self._chart = chart
         self.parameters = np.array(reference, dtype=float)
@@ -84,7 +82,7 @@ class WithinDistance(Constraint):
         value: ca.SX = distance_squared(self._chart, tree.q, parameters)
         return value
 
-    def evaluate(self, model: Numeric) -> tuple[Vector, Vector]:
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
         value = distance(self._chart, model.q, self.parameters) ** 2
         return np.array([value]), distance_gradient(self._chart, model.q, self.parameters)[None, :]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
@@ -16,8 +16,6 @@ from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.constraint import Constraint
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import BaseMode, Vector3
-
-Vector = NDArray[np.float64]
 
 # A direction of the tangent space is held if a unit step along it moves a constraint by more than this.
 RANK_TOLERANCE = 1e-7
@@ -87,10 +85,10 @@ class PostureProblem:
     robot: Robot
     objective: Objective
     requirements: Requirements
-    given: Vector
+    given: Array
     constraints: tuple[Constraint, ...]
-    lower: Vector
-    upper: Vector
+    lower: Array
+    upper: Array
     rows: tuple[tuple[int, ...], ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -114,7 +112,7 @@ class PostureProblem:
         return list(self.rows[index]) if self.rows else list(range(self.constraints[index].rows))
 
     @property
-    def row_bounds(self) -> tuple[Vector, Vector]:
+    def row_bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of all rows that the program carries."""
         carried = [(c, self.carried(i)) for i, c in enumerate(self.constraints)]
         empty = np.zeros(0)
@@ -129,7 +127,7 @@ class PostureProblem:
         pairs = enumerate(zip(self.constraints, symbols, strict=True))
         return [c.symbolic(tree, p)[self.carried(index)] for index, (c, p) in pairs], symbols
 
-    def violations(self, numeric: Numeric) -> list[Vector]:
+    def violations(self, numeric: Numeric) -> list[Array]:
         """Return the signed violation of each constraint at ``numeric.q``, shape (rows,) each; zero if satisfied."""
         return [constraint.excess(constraint.evaluate(numeric)[0]) for constraint in self.constraints]
 
@@ -142,12 +140,12 @@ class PostureProblem:
         return lines
 
 
-def rank(jacobian: Vector) -> int:
+def rank(jacobian: Array) -> int:
     """Return the rank of a constraint Jacobian at the tolerance of all counts of redundancy."""
     return int(np.linalg.matrix_rank(jacobian, tol=RANK_TOLERANCE)) if jacobian.size else 0
 
 
-def null_space(jacobian: Vector) -> Vector:
+def null_space(jacobian: Array) -> Array:
     """Return an orthonormal basis of the motions that a Jacobian does not see, as columns; tolerance as in rank.
 
     SciPy has the same function, but takes longer to import than many problems take to solve.
@@ -157,14 +155,14 @@ def null_space(jacobian: Vector) -> Vector:
     return np.asarray(rows[int((values > RANK_TOLERANCE * values.max(initial=0.0)).sum()) :].T)
 
 
-def equality_jacobian(problem: PostureProblem, numeric: Numeric) -> Vector:
+def equality_jacobian(problem: PostureProblem, numeric: Numeric) -> Array:
     """Return the tangent Jacobian of all equalities and held joints at ``numeric.q``, shape (rows, nv)."""
     blocks = [held_rows(problem.robot, problem.requirements.hold)]
     blocks += [c.evaluate(numeric)[1] for c in problem.constraints if c.equality]
     return np.vstack(blocks)
 
 
-def held_rows(robot: Robot, hold: Sequence[str]) -> Vector:
+def held_rows(robot: Robot, hold: Sequence[str]) -> Array:
     """Return the unit rows of the tangent entries of held joints, shape (k, nv)."""
     rows: list[int] = []
     for joint in hold:

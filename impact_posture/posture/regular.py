@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.objective import Objective
 from impact_posture.posture.constraint import Constraint, HeldPosition, HeldTurn, base_point
@@ -23,8 +23,6 @@ from impact_posture.posture.problem import (
 )
 from impact_posture.posture.starts import Projector, feasible_start
 from impact_posture.robot.robot import Robot
-
-Vector = NDArray[np.float64]
 
 # Size of the trial turn (rad), and the share of it that must survive for the turn to be possible.
 _TRIAL, _SURVIVES = 0.05, 0.1
@@ -59,7 +57,7 @@ def pin_undetermined(
     added: list[Constraint] = []
     notes: list[str] = []
 
-    def free() -> Vector:
+    def free() -> Array:
         """Base twists that are still allowed, world axes, shape (6, k)."""
         rows = [c.evaluate(numeric)[1] @ motions for c in (*constraints, *added)]
         if not rows:
@@ -114,7 +112,7 @@ def regularize(problem: PostureProblem) -> PostureProblem:
     return replace(problem, rows=_independent_rows(problem, numeric.at(generic)))
 
 
-def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTurn, q: Vector) -> bool:
+def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTurn, q: Array) -> bool:
     """Whether the linearized equalities at ``q`` allow a turn that the equalities themselves undo."""
     model = problem.robot.model
     jacobian = equality_jacobian(problem, numeric.at(q))

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
@@ -19,8 +19,6 @@ from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.solve import SAME_POSTURE, PostureSolution, Progress, solve, wrapped_difference
 from impact_posture.robot.model_variant import between
 from impact_posture.tables import json_block
-
-Vector = NDArray[np.float64]
 
 # Number of models drawn between the variants, to check whether one is worse than all variants.
 _BETWEEN = 60
@@ -43,7 +41,7 @@ class VariantOptimum:
     name: str
     at_robust: float
     own: float | None
-    q: Vector | None
+    q: Array | None
     moved: float | None
 
     def to_dict(self) -> dict[str, object]:
@@ -158,7 +156,7 @@ def solve_robustly(
     ]
     total = starts * (len(alone) + 1)
 
-    def run(one: PostureProblem, guesses: Sequence[Vector], number: int) -> PostureSolution:
+    def run(one: PostureProblem, guesses: Sequence[Array], number: int) -> PostureSolution:
         def advance(done: int, _: int) -> None:
             if progress is not None:
                 progress(min(number * starts + done, total), total)
@@ -177,7 +175,7 @@ def solve_robustly(
     return RobustSolution(solution, compare_variants(solution, optima, seed))
 
 
-def compare_variants(solution: PostureSolution, optima: Sequence[Vector | None], seed: int = 0) -> Robustness:
+def compare_variants(solution: PostureSolution, optima: Sequence[Array | None], seed: int = 0) -> Robustness:
     """Compare the robust optimum with the optima of the variants, and with models drawn between the variants."""
     problem, objective = solution.problem, solution.problem.impact
     found: list[VariantOptimum] = []
@@ -200,23 +198,23 @@ def compare_variants(solution: PostureSolution, optima: Sequence[Vector | None],
     )
 
 
-def _apart(problem: PostureProblem, postures: Sequence[Vector]) -> list[Vector]:
+def _apart(problem: PostureProblem, postures: Sequence[Array]) -> list[Array]:
     """The postures without those that are nearly equal to an earlier posture."""
-    found: list[Vector] = []
+    found: list[Array] = []
     for q in postures:
         if all(np.linalg.norm(wrapped_difference(problem, one, q)) > SAME_POSTURE for one in found):
             found.append(q)
     return found
 
 
-def _broken(problem: PostureProblem, q: Vector) -> list[str]:
+def _broken(problem: PostureProblem, q: Array) -> list[str]:
     """Names of the constraints that a posture does not satisfy."""
     violations = problem.violations(Numeric(problem.robot.model).at(q))
     pairs = zip(problem.constraints, violations, strict=True)
     return [constraint.name for constraint, excess in pairs if np.abs(excess).max(initial=0.0) > _NOISE]
 
 
-def _optimum(run: Callable[[], PostureSolution]) -> Vector | None:
+def _optimum(run: Callable[[], PostureSolution]) -> Array | None:
     try:
         return run().q
     except (Infeasible, SolverFailed):

@@ -7,8 +7,8 @@ from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.impact.contact_compression import ContactStiffness
 from impact_posture.impact.objective import ImpactObjective
@@ -16,8 +16,6 @@ from impact_posture.posture.constraint import Constraint
 from impact_posture.posture.impact_limits import ImpactLimits
 from impact_posture.posture.posture_distance import WithinDistance, distance
 from impact_posture.settings import Against
-
-Vector = NDArray[np.float64]
 
 
 class Ruler(Protocol):
@@ -35,7 +33,7 @@ class Ruler(Protocol):
         ...
 
     @property
-    def nearest(self) -> Vector:
+    def nearest(self) -> Array:
         """See the attributes."""
         ...
 
@@ -44,7 +42,7 @@ class Ruler(Protocol):
         """See the attributes."""
         ...
 
-    def measure(self, q: Vector) -> float:
+    def measure(self, q: Array) -> float:
         """Return the price of ``q``."""
         ...
 
@@ -52,7 +50,7 @@ class Ruler(Protocol):
         """Return the constraint that the price is at most ``level``; one program serves all levels."""
         ...
 
-    def within(self, q: Vector, level: float) -> Vector:
+    def within(self, q: Array, level: float) -> Array:
         """Return a start for the program with this bound, from a posture that may exceed it."""
         ...
 
@@ -62,11 +60,11 @@ class DistanceRuler:
     """The distance from the initial posture, rad mixed with m."""
 
     model: pin.Model
-    nearest: Vector
+    nearest: Array
     against: Against = "distance"
     nothing: str = "the optimum is the initial posture"
 
-    def measure(self, q: Vector) -> float:
+    def measure(self, q: Array) -> float:
         """See :class:`Ruler`."""
         return distance(Chart(self.model), q, self.nearest)
 
@@ -74,7 +72,7 @@ class DistanceRuler:
         """See :class:`Ruler`."""
         return WithinDistance(Chart(self.model), self.nearest, level)
 
-    def within(self, q: Vector, level: float) -> Vector:
+    def within(self, q: Array, level: float) -> Array:
         """See :class:`Ruler`."""
         away = self.measure(q)
         return q if away <= level else np.array(pin.interpolate(self.model, self.nearest, q, level / away))
@@ -87,11 +85,11 @@ class ForceRuler:
     objective: ImpactObjective
     contact: ContactStiffness
     speed: float
-    nearest: Vector
+    nearest: Array
     against: Against = "force"
     nothing: str = "the optimum has the least force"
 
-    def measure(self, q: Vector) -> float:
+    def measure(self, q: Array) -> float:
         """See :class:`Ruler`."""
         return self.contact.peak_force(self.objective.oracle.quantities(q).G, self.speed)
 
@@ -99,6 +97,6 @@ class ForceRuler:
         """See :class:`Ruler`."""
         return ImpactLimits(self.objective, self.contact.least_mobility(level, self.speed), float("inf"))
 
-    def within(self, q: Vector, level: float) -> Vector:
+    def within(self, q: Array, level: float) -> Array:
         """See :class:`Ruler`."""
         return q

@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ContactError, Infeasible, MetricError, SolverFailed
@@ -24,7 +24,6 @@ from impact_posture.posture.problem import PostureProblem, equality_jacobian, ra
 from impact_posture.posture.starts import Projector, feasible_start
 from impact_posture.processes import fork_map
 
-Vector = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 # Optima closer than this in posture (tangent norm) and in objective (relative) are the same optimum.
@@ -43,7 +42,7 @@ class Optimum:
         hits: Number of starts that ended there.
     """
 
-    q: Vector
+    q: Array
     objective: float
     hits: int
 
@@ -73,9 +72,9 @@ class PostureSolution:
     """
 
     problem: PostureProblem
-    initial: Vector
+    initial: Array
     moved: float
-    q: Vector
+    q: Array
     certificate: Certificate
     redundancy: int
     optima: tuple[Optimum, ...]
@@ -99,7 +98,7 @@ class PostureSolution:
 
 @dataclass(frozen=True)
 class _Run:
-    start: Vector | None
+    start: Array | None
     record: SolveRecord | None
     objective: float
     minimized: float
@@ -115,7 +114,7 @@ def solve(
     jobs: int = 2,
     compile: CompileMode = "auto",
     progress: Progress | None = None,
-    guesses: Sequence[Vector] = (),
+    guesses: Sequence[Array] = (),
 ) -> PostureSolution:
     """Solve from the given posture, from feasible ``guesses`` and from random feasible ones: ``starts`` in all.
 
@@ -172,7 +171,7 @@ def solve(
     )
 
 
-def _initial(problem: PostureProblem, seed: int) -> Vector:
+def _initial(problem: PostureProblem, seed: int) -> Array:
     """The given posture pulled onto the constraints, or the first other start that reaches them."""
     for index in range(5):
         start = feasible_start(problem, index, seed)
@@ -194,7 +193,7 @@ def _initial(problem: PostureProblem, seed: int) -> Vector:
     return found.q
 
 
-def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
+def _initial_objective(problem: PostureProblem, initial: Array) -> float:
     """The objective at the start, which scales the program and so must exist.
 
     Raises:
@@ -214,7 +213,7 @@ def _initial_objective(problem: PostureProblem, initial: Vector) -> float:
 
 
 @one_blas_thread()
-def run_start(nlp: PostureNLP, start: Vector, scale: float) -> tuple[SolveRecord, Certificate]:
+def run_start(nlp: PostureNLP, start: Array, scale: float) -> tuple[SolveRecord, Certificate]:
     """Solve from a feasible start and certify the end; try the other guesses of the objective if it fails."""
     record = nlp.solve(start, scale=scale)
     certificate = certify(nlp.problem, record.q, scale)
@@ -237,7 +236,7 @@ class _Job:
     """Data of all starts: the program, the first starts, the scale, and the seed of the other starts."""
 
     nlp: PostureNLP
-    known: tuple[Vector, ...]
+    known: tuple[Array, ...]
     scale: float
     seed: int
 
@@ -271,7 +270,7 @@ def _run_all(job: _Job, starts: int, jobs: int, progress: Progress | None) -> li
     return [runs[index] for index in range(starts)]
 
 
-def distinct(problem: PostureProblem, ends: list[tuple[Vector, float]]) -> tuple[Optimum, ...]:
+def distinct(problem: PostureProblem, ends: list[tuple[Array, float]]) -> tuple[Optimum, ...]:
     """Group ends at the same posture, best objective first."""
     found: list[Optimum] = []
     for q, objective in sorted(ends, key=lambda end: end[1]):
@@ -285,7 +284,7 @@ def distinct(problem: PostureProblem, ends: list[tuple[Vector, float]]) -> tuple
     return tuple(found)
 
 
-def wrapped_difference(problem: PostureProblem, one: Vector, other: Vector) -> Vector:
+def wrapped_difference(problem: PostureProblem, one: Array, other: Array) -> Array:
     """Return ``other ⊖ one`` without full turns of revolute joints."""
     step = np.array(pin.difference(problem.robot.model, one, other))
     for slot in Chart(problem.robot.model).slots:

@@ -8,11 +8,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.problem import PostureProblem, held_rows
-
-Vector = NDArray[np.float64]
 
 _ATTEMPTS = 20
 _STEPS = 80
@@ -29,7 +28,7 @@ class Projection:
         violation: Largest violation (m, rad, or the unit of the constraint).
     """
 
-    q: Vector
+    q: Array
     violation: float
 
 
@@ -47,12 +46,12 @@ class Projector:
         self._held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
         self._to_v = _bounded_entries(self.chart)
 
-    def clip(self, q: Vector) -> Vector:
+    def clip(self, q: Array) -> Array:
         """Clamp ``q`` to the bounds."""
         x = np.clip(self.chart.to_x(q), self.problem.lower, self.problem.upper)
         return self.chart.to_q(x)
 
-    def residual(self, q: Vector) -> tuple[Vector, Vector]:
+    def residual(self, q: Array) -> tuple[Array, Array]:
         """Return the violations of all rows at ``q``, zero where an inequality holds, and their Jacobian."""
         self.numeric.at(q)
         values, jacobians = [np.zeros(0)], [np.zeros((0, self.problem.robot.nv))]
@@ -65,7 +64,7 @@ class Projector:
             jacobians.append(jacobian)
         return np.concatenate(values), np.vstack(jacobians)
 
-    def project(self, q: Vector, tolerance: float = 1e-9) -> Projection:
+    def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
         """Pull ``q`` onto the constraints.  The result may still violate them."""
         q = self.clip(q)
         value, jacobian = self.residual(q)
@@ -89,7 +88,7 @@ class Projector:
                 damping = max(damping * 10, 1e-6)
         return Projection(q, float(np.abs(value).max(initial=0.0)))
 
-    def _blocked(self, q: Vector, direction: Vector) -> NDArray[np.bool_]:
+    def _blocked(self, q: Array, direction: Array) -> NDArray[np.bool_]:
         """Joints on a limit that the descent direction would violate."""
         x = self.chart.to_x(q)
         blocked = np.zeros(self.problem.robot.nv, dtype=bool)
@@ -100,7 +99,7 @@ class Projector:
         return blocked
 
 
-def feasible_start(problem: PostureProblem, index: int, seed: int, tolerance: float = 1e-8) -> Vector | None:
+def feasible_start(problem: PostureProblem, index: int, seed: int, tolerance: float = 1e-8) -> Array | None:
     """Return the ``index``-th feasible start of a seed; ``None`` if no attempt reached the constraints.
 
     Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near it, even starts anywhere within
@@ -119,7 +118,7 @@ def feasible_start(problem: PostureProblem, index: int, seed: int, tolerance: fl
     return None
 
 
-def random_posture(problem: PostureProblem, chart: Chart, rng: np.random.Generator, *, near: bool) -> Vector:
+def random_posture(problem: PostureProblem, chart: Chart, rng: np.random.Generator, *, near: bool) -> Array:
     """Return a random posture within the bounds, not yet on the constraints."""
     model = problem.robot.model
     base = 6 if problem.robot.floating else 0

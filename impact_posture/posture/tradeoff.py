@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.posture.certificate import Certificate
 from impact_posture.settings import Against
 from impact_posture.tables import json_block
-
-Vector = NDArray[np.float64]
 
 # Least excess of the share of the gain over the share of the distance at a knee.  A parabola, the shape around every
 # smooth optimum, reaches 1/4.
@@ -37,7 +35,7 @@ class TradePoint:
 
     within: float
     distance: float
-    q: Vector
+    q: Array
     objective: float
     H: float
     G: float
@@ -85,14 +83,14 @@ class TradeOff:
         """Return the ``tradeoff`` block of ``result.json``."""
         return [{**point.to_dict(), "knee": k == self.knee} for k, point in enumerate(self.points)]
 
-    def arrays(self) -> dict[str, Vector]:
+    def arrays(self) -> dict[str, Array]:
         """Return entries of ``result.npz``: ``tradeoff_q`` (k, nq) and arrays (k,), with NaN for a missing S."""
         names = ("within", "distance", "objective", "H", "G", "V", "q", "certified")
         found = {f"tradeoff_{name}": np.array([getattr(p, name) for p in self.points]) for name in names}
         return found | {"tradeoff_S": np.array([np.nan if p.S is None else p.S for p in self.points])}
 
 
-def find_knee(distances: Vector, objectives: Vector) -> int | None:
+def find_knee(distances: Array, objectives: Array) -> int | None:
     """Return the point whose share of the gain exceeds its share of the distance most.
 
     It is ``None`` if the excess is below :data:`KNEE`, or if there is no gain.

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 from math import sqrt
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from impact_posture.impact.contact_compression import both_models
 from impact_posture.impact.coulomb_contacts import CoulombJump, coulomb_jump
 from impact_posture.impact.evaluation import Evaluation
@@ -17,7 +14,6 @@ from impact_posture.impact.resolved_impact import ResolvedImpact
 from impact_posture.impact.velocity_jump import Jump
 from impact_posture.tables import json_block
 
-Vector = NDArray[np.float64]
 Outcome = Literal["better", "better at the price of force", "no better", "worse", "unknown"]
 
 # A change below this share is none.

@@ -10,13 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.robot.guess import joints_to, upright_frames
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import SupportSpec
-
-Vector = NDArray[np.float64]
 
 # Points of a foot within this distance (m) of its lowest one touch the ground with it.
 _PATCH = 2e-3
@@ -77,11 +75,11 @@ def support_depth(robot: Robot, feet: Sequence[SupportSpec]) -> float:
     return -float(np.max(hull.equations[:, :2] @ center + hull.equations[:, 2]))
 
 
-def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Vector:
+def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Array:
     """Return the lowest points (world) of the primitive collision shapes that move with a frame, without meshes."""
     model = robot.model
     joint = model.frames[index].parentJoint
-    found: list[Vector] = []
+    found: list[Array] = []
     for link in ET.parse(urdf).getroot().iter("link"):
         name = link.get("name", "")
         if not model.existFrame(name, pin.FrameType.BODY):
@@ -101,12 +99,12 @@ def _origin(tag: ET.Element | None) -> pin.SE3:
     return pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)
 
 
-def _numbers(tag: ET.Element | None, key: str) -> Vector:
+def _numbers(tag: ET.Element | None, key: str) -> Array:
     words = (tag.get(key) or "").split() if tag is not None else []
     return np.array([float(w) for w in words]) if len(words) == 3 else np.zeros(3)
 
 
-def _bottom(shape: ET.Element, at: pin.SE3) -> Sequence[Vector]:
+def _bottom(shape: ET.Element, at: pin.SE3) -> Sequence[Array]:
     """Return points of a shape that include its lowest ones; none for a mesh."""
     if shape.tag == "sphere":
         return [np.array(at.translation) - [0, 0, float(shape.get("radius", 0))]]

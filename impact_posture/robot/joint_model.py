@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.robot.inertia_checks import check_mass_matrix
 from impact_posture.robot.model_joints import joint_index, v_slice
@@ -21,7 +22,6 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import JointTransmissionSpec
 from impact_posture.settings import JointModel
 
-Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
@@ -41,8 +41,8 @@ class Transmissions:
     stated: Mask
     rigid: Mask
     locked: Mask
-    stiffness: Vector
-    damping: Vector
+    stiffness: Array
+    damping: Array
 
     @property
     def elastic(self) -> Mask:

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.arrays import Array
 from impact_posture.errors import SpecError, UrdfError
 from impact_posture.robot.model_joints import joint_index, joint_range, q_slice, scalar_entries
-from impact_posture.robot.robot import Vector
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.settings import Root
 
 
 def named_postures(
     model: pin.Model, srdf: Path | None, spec: RobotSpec, root: Root, name: str
-) -> tuple[dict[str, Vector], str]:
+) -> tuple[dict[str, Array], str]:
     """Return all named postures, shape (nq,) each, and the name of the default one.
 
     Args:
@@ -63,7 +63,7 @@ def ignored_bases(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str
     )
 
 
-def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict[str, Vector]:
+def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict[str, Array]:
     if srdf is None:
         return {}
     try:
@@ -74,7 +74,7 @@ def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict
     return {name: pin.normalize(model, q) for name, q in states.items() if name not in spec.postures}
 
 
-def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> dict[str, Vector]:
+def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> dict[str, Array]:
     result = {}
     for key, posture in spec.postures.items():
         where = f"{name} posture '{key}'"
@@ -108,7 +108,7 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
     return result
 
 
-def _neutral(model: pin.Model) -> Vector:
+def _neutral(model: pin.Model) -> Array:
     """Return the neutral configuration, clipped to the limits of the joints that zero violates."""
     q = np.array(pin.neutral(model), dtype=float)
     for i in joint_range(model):

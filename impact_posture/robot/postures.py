@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from impact_posture.arrays import Array
 from impact_posture.errors import JointNotFound, PostureError, PostureNotFound, nearest
 from impact_posture.robot.model_joints import q_slice, scalar_entries
-from impact_posture.robot.robot import Robot, Vector
+from impact_posture.robot.robot import Robot
 
 SCHEMA = "impact-posture/posture/1"
 
@@ -23,7 +24,7 @@ _FIXED = ", but the root is fixed, with the root link at the world's origin alon
 _NO_BASE = "remove the base and give `normal` in those axes, or use `root='free-flyer'`"
 
 
-def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Vector:
+def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Array:
     """Return the configuration that ``text`` names, shape (nq,), with its length, quaternion and limits checked.
 
     Args:
@@ -48,7 +49,7 @@ def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Vect
     return robot.check_posture(_configuration(robot, data, str(path)), where=str(path))
 
 
-def write_posture(robot: Robot, q: Vector) -> dict[str, object]:
+def write_posture(robot: Robot, q: Array) -> dict[str, object]:
     """Return the content of ``posture.json`` for ``q``, shape (nq,); :func:`read_posture` reads it back.
 
     Raises:
@@ -90,7 +91,7 @@ def _load(path: Path) -> Mapping[str, object]:
     return {str(key): value for key, value in data.items()}
 
 
-def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Vector:
+def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Array:
     """Read one of the three shapes, which differ in their keys."""
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
@@ -116,7 +117,7 @@ def _only(data: Mapping[str, object], known: Sequence[str], where: str) -> None:
             raise PostureError(f"unknown key '{key}'", where=where, hint=f"did you mean {close}?")
 
 
-def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Vector:
+def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Array:
     if "joint_names" in data:
         names = _names(data["joint_names"], "joint_names", where)
         for name in names:
@@ -134,7 +135,7 @@ def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Vector:
     return np.array(q)
 
 
-def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: str) -> Vector:
+def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: str) -> Array:
     q = robot.posture()
     if base is not None:
         if not robot.floating:
@@ -146,7 +147,7 @@ def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: st
     return set_joints(robot, q, joints, where)
 
 
-def set_joints(robot: Robot, q: Vector, joints: Mapping[str, object], where: str) -> Vector:
+def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str) -> Array:
     """Return a configuration with the given joints at other values, otherwise unchecked.
 
     Args:

@@ -10,14 +10,12 @@ from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import FrameNotFound, JointNotFound, NotWithinLimits, PostureError, PostureNotFound
 from impact_posture.robot.model_joints import joint_range, q_slice
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.settings import ContactPose, JointModel, RobotSettings, Root
-
-Vector = NDArray[np.float64]
 
 CONVENTION = (
     "q = [x, y, z, qx, qy, qz, qw, joints]; v = [base linear, base angular, joint rates], base twist in the base "
@@ -54,14 +52,14 @@ class Robot:
     source: str
     model: pin.Model
     root: Root
-    postures: Mapping[str, Vector]
+    postures: Mapping[str, Array]
     default_posture: str
     spec: RobotSpec
     locked: tuple[str, ...] = ()
     armature_source: str = "none"
     warnings: tuple[str, ...] = ()
     joint_model: JointModel = "reflected"
-    stated_armature: Vector | None = None
+    stated_armature: Array | None = None
     settings: RobotSettings | None = None
 
     @property
@@ -99,7 +97,7 @@ class Robot:
         return tuple(names)
 
     @cached_property
-    def armature(self) -> Vector:
+    def armature(self) -> Array:
         """Armature of each velocity entry as stated, shape (nv,), kg·m² (kg for prismatic joints)."""
         return np.array(self.model.armature if self.stated_armature is None else self.stated_armature, dtype=float)
 
@@ -123,7 +121,7 @@ class Robot:
         """The same hash with the armature that the joint model leaves to an impact."""
         return self._hash(np.asarray(self.model.armature))
 
-    def _hash(self, armature: Vector) -> str:
+    def _hash(self, armature: Array) -> str:
         model = self.model
         content = [
             [
@@ -168,7 +166,7 @@ class Robot:
         balls = [foot.frame for foot in self.spec.supports if foot.kind == "point"]
         return self.spec.contact.frames.get(frame, "position" if frame in balls else self.spec.contact.pose)
 
-    def posture(self, name: str | None = None) -> Vector:
+    def posture(self, name: str | None = None) -> Array:
         """Return a copy of the named posture, or of the default one, shape (nq,).
 
         Raises:
@@ -179,7 +177,7 @@ class Robot:
             raise PostureNotFound(name, self.postures, where=self.name)
         return np.array(self.postures[name], dtype=float)
 
-    def check_posture(self, q: Vector, *, where: str = "posture", limits: bool = True) -> Vector:
+    def check_posture(self, q: Array, *, where: str = "posture", limits: bool = True) -> Array:
         """Check length, finiteness, quaternion and limits of ``q``; return it with unit quaternions.
 
         Raises:
@@ -205,7 +203,7 @@ class Robot:
             self.check_limits(q, where=where)
         return np.asarray(q)
 
-    def _check_norms(self, q: Vector, where: str) -> None:
+    def _check_norms(self, q: Array, where: str) -> None:
         """Refuse quaternions, and cosines and sines of continuous joints, without unit length."""
         for i, part in unit_parts(self.model):
             norm = float(np.linalg.norm(q[part]))
@@ -216,7 +214,7 @@ class Robot:
                 order = " x y z w" if four else ""
                 raise PostureError(f"{whose} has norm {norm:.4g}", where=where, hint=f"give a unit {what}{order}")
 
-    def _check_swapped(self, quaternion: Vector, where: str) -> None:
+    def _check_swapped(self, quaternion: Array, where: str) -> None:
         """Refuse a base quaternion that is plainly in the order w x y z."""
         rotation = pin.Quaternion(*[float(quaternion[k]) for k in (3, 0, 1, 2)]).matrix()
         swapped = pin.Quaternion(*[float(v) for v in quaternion]).matrix()
@@ -230,7 +228,7 @@ class Robot:
         what = f"the base quaternion {fault} and looks like w x y z"
         raise PostureError(what, where=where, hint="give it as x y z w (scalar last)")
 
-    def check_limits(self, q: Vector, *, where: str = "posture", tolerance: float = 1e-6) -> None:
+    def check_limits(self, q: Array, *, where: str = "posture", tolerance: float = 1e-6) -> None:
         """Raise :class:`NotWithinLimits` for the first joint of ``q`` outside its position limits."""
         for joint in self.joint_names:
             index = self.model.getJointId(joint)
@@ -243,7 +241,7 @@ class Robot:
                     raise NotWithinLimits(joint, float(q[k]), low, high, where=where)
 
 
-def _axis(joint: pin.JointModel) -> Vector:
+def _axis(joint: pin.JointModel) -> Array:
     """Return the motion subspace of a joint at the identity, which distinguishes two unaligned joints."""
     model, data = pin.Model(), joint.createData()
     model.addJoint(0, joint, pin.SE3.Identity(), "joint")

@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
 from impact_posture.robot.armature import armature_warning, set_armature
 from impact_posture.robot.inertia_checks import check_mass_matrix, check_moved_mass, massless_joints
 from impact_posture.robot.model_joints import joint_index, movable_joints, q_slice, v_slice
 from impact_posture.robot.named_postures import ignored_bases, named_postures
-from impact_posture.robot.robot import Robot, Vector
+from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RobotSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, build_model, example_models, resolve_path, robots_data
 from impact_posture.settings import LoadOptions, RobotSettings, Root, Vector3
@@ -235,8 +236,8 @@ def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, 
 
 
 def _lock(
-    model: pin.Model, locked: Sequence[str], postures: dict[str, Vector], default: str, name: str
-) -> tuple[pin.Model, dict[str, Vector]]:
+    model: pin.Model, locked: Sequence[str], postures: dict[str, Array], default: str, name: str
+) -> tuple[pin.Model, dict[str, Array]]:
     ids = [joint_index(model, joint, f"{name} lock") for joint in locked]
     reduced = pin.buildReducedModel(model, ids, postures[default])
     kept = [i for i in range(1, model.njoints) if i not in ids]

@@ -6,15 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
+from impact_posture.arrays import Array
 
 _FIRST_STEP = 0.02
 _LEVELS = 7
 
 
-def difference_gradient(value: Callable[[Vector], float], model: pin.Model, q: Vector) -> Vector:
+def difference_gradient(value: Callable[[Array], float], model: pin.Model, q: Array) -> Array:
     """Return ``d/dε value(q ⊕ ε e_i)``, shape (nv,), by Ridders' extrapolation of central differences.
 
     Each entry is the one of its tableau that differs least from its neighbors.  So the steps need no tuning, neither
@@ -27,12 +26,12 @@ def difference_gradient(value: Callable[[Vector], float], model: pin.Model, q: V
     """
     directions = np.eye(model.nv)
 
-    def central(step: float) -> Vector:
+    def central(step: float) -> Array:
         ahead, behind = ([value(pin.integrate(model, q, s * e)) for e in directions] for s in (step, -step))
         return np.asarray((np.array(ahead) - np.array(behind)) / (2 * step))
 
     best, least = np.full(model.nv, np.nan), np.full(model.nv, np.inf)
-    before: list[Vector] = []
+    before: list[Array] = []
     for level in range(_LEVELS):
         row = [central(_FIRST_STEP / 2**level)]
         for order, old in enumerate(before, start=1):

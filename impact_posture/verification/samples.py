@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.robot.robot import Robot
-
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,11 +20,11 @@ class Sample:
         normal: Unit vector, shape (3,), in the contact's normal frame.
     """
 
-    q: Vector
-    normal: Vector
+    q: Array
+    normal: Array
 
 
-def random_samples(robot: Robot, count: int, seed: int, normal: Vector | None = None) -> tuple[Sample, ...]:
+def random_samples(robot: Robot, count: int, seed: int, normal: Array | None = None) -> tuple[Sample, ...]:
     """Return random postures, each with a random normal; one seed gives one result.
 
     The first sample has ``normal``, shape (3,), if it is given.
@@ -53,7 +51,7 @@ def random_samples(robot: Robot, count: int, seed: int, normal: Vector | None = 
     return tuple(found)
 
 
-def _direction(generator: np.random.Generator, size: int) -> Vector:
+def _direction(generator: np.random.Generator, size: int) -> Array:
     """Return a unit vector, uniform on the sphere."""
     vector = generator.normal(size=size)
     return np.asarray(vector / np.linalg.norm(vector))

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.codegen.export import export
 from impact_posture.codegen.functions import casadi_reference, oracle_along
 from impact_posture.codegen.impact_gradient import ImpactGradient
@@ -21,8 +21,6 @@ from impact_posture.robot.model_joints import finite_armature
 from impact_posture.verification.differences import difference_gradient
 from impact_posture.verification.samples import Sample
 
-Vector = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
@@ -33,7 +31,7 @@ class Numbers:
         scales: Least scale of the relative error of each quantity; its largest entry replaces a smaller scale.
     """
 
-    values: dict[str, Vector]
+    values: dict[str, Array]
     scales: dict[str, float] = field(default_factory=dict)
 
 
@@ -64,7 +62,7 @@ def pinocchio_differences(objective: ImpactObjective, sample: Sample) -> Numbers
     """Return ``∇H`` as finite differences of ``H`` from Pinocchio."""
     oracle = oracle_along(objective, sample.normal)
 
-    def value(q: Vector) -> float:
+    def value(q: Array) -> float:
         oracle.at(q)
         a = oracle.solve(oracle.J.T @ oracle.n)
         return float(a @ oracle.weigh(a))
@@ -90,7 +88,7 @@ def compiled_source(objective: ImpactObjective) -> Iterator[Source]:
         compiled = ImpactGradient(load_library(build_library(folder, made.prefix)), made.manifest)
 
         def numbers(sample: Sample) -> Numbers:
-            values: dict[str, Vector] = {}
+            values: dict[str, Array] = {}
             for function, names in _RESULTS.items():
                 code, results = compiled.call(function, sample.q, sample.normal)
                 # Code 3 of jump says that V does not exist, because G is zero.  G does exist.
@@ -110,7 +108,7 @@ def _impulse(objective: ImpactObjective) -> ImpactObjective:
     return replace(objective, kind="impulse")
 
 
-def _named(values: dict[str, Vector]) -> Numbers:
+def _named(values: dict[str, Array]) -> Numbers:
     return Numbers(
         {"H": values["H"], "G": values["G"], "Λ_c": values["ellipsoid"].reshape(3, 3), "∇H": values["grad"]}
     )
@@ -128,13 +126,13 @@ class MujocoSource:
     def __call__(self, sample: Sample) -> Numbers:
         """Return the numbers at one sample; ``∇H`` by finite differences of this ``H``."""
 
-        def value(q: Vector) -> float:
+        def value(q: Array) -> float:
             return float(self._values(q, sample.normal)["H"][0])
 
         gradient = difference_gradient(value, self._objective.robot.model, sample.q)
         return Numbers({**self._values(sample.q, sample.normal), "∇H": gradient})
 
-    def _values(self, q: Vector, normal: Vector) -> dict[str, Vector]:
+    def _values(self, q: Array, normal: Array) -> dict[str, Array]:
         """``[M, −J_sᵀ; J_s, εI] [A; f] = [Jᵀ; 0]``, ``Λ_c = AᵀWA``, ``H = nᵀΛ_c n``, ``G = nᵀJA n``."""
         objective, numeric = self._objective, self._numeric.at(q)
         contact, metric = objective.contact, objective.metric
