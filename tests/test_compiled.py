@@ -154,12 +154,18 @@ def test_one_thread_within_and_as_before_after() -> None:
     assert libraries
     if list(Path(ca.__file__).parent.glob("libcasadi-tp-openblas*")):
         assert "casadi_openblas" in {library.internal_api for library in libraries}
-    for library in libraries:
-        library.set_num_threads(2)
-    with pytest.raises(KeyboardInterrupt), one_blas_thread():
-        assert [library.num_threads for library in libraries] == [1] * len(libraries)
-        raise KeyboardInterrupt
-    assert [library.num_threads for library in libraries] == [2] * len(libraries)
+    before = [library.num_threads for library in libraries]
+    try:
+        for library in libraries:
+            library.set_num_threads(2)
+        with pytest.raises(KeyboardInterrupt), one_blas_thread():
+            assert [library.num_threads for library in libraries] == [1] * len(libraries)
+            raise KeyboardInterrupt
+        assert [library.num_threads for library in libraries] == [2] * len(libraries)
+    finally:
+        # The tests after this one would share the cores with threads that wait for work.
+        for library, count in zip(libraries, before, strict=True):
+            library.set_num_threads(count)
 
 
 def test_compilers_run_beside_each_other_and_none_stays(tmp_path: Path) -> None:
