@@ -131,15 +131,17 @@ def _export(prepared: Prepared, optimal: np.ndarray, folder: Path) -> tuple[Expo
     """Write the C export; return it and the reason if it could not be built."""
     from impact_posture.codegen.export import export
     from impact_posture.codegen.naming import products
+    from impact_posture.impact.contact_compression import compression
 
     folder.mkdir()
-    failure = ""
+    failure, impact = "", prepared.impact
+    squeezed = compression(impact.objective, optimal, impact.speed, impact.contact_stiffness)
     try:
-        made = export(prepared.impact.objective, folder, posture=optimal)
+        made = export(impact.objective, folder, posture=optimal, compression=squeezed)
     except CompilerError as error:
         # The posture is kept although the compiler failed. The command line reports the error.
         failure = error.line
-        made = export(prepared.impact.objective, folder, posture=optimal, force=True, check=False)
+        made = export(impact.objective, folder, posture=optimal, compression=squeezed, force=True, check=False)
     # A record of its own lets the export be replaced alone, with the products of its Makefile.
     write_record(folder, "export", products(made.prefix))
     return made, failure

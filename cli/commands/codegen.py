@@ -36,7 +36,7 @@ def codegen(
         given.check_contact()
     from impact_posture.codegen.export import write_export
 
-    posture = None
+    posture = squeezed = None
     objectives: list[ImpactObjective]
     warnings: tuple[str, ...] = ()
     if from_result:
@@ -45,12 +45,14 @@ def codegen(
         view = load_view(Path(robot))
         objectives, posture = [view.objective], view.q_optimal
     else:
+        from impact_posture.impact.contact_compression import compression
         from impact_posture.impact.resolved_impact import resolve
 
         objectives = []
         for frame in given.values.get("frame", (None,)):
             impact = resolve(given.fill(ImpactSettings, robot=robot, frame=frame))
             objectives.append(impact.objective)
+            squeezed = squeezed or compression(impact.objective, impact.q, impact.speed, impact.contact_stiffness)
             warnings = impact.warnings
     with progress("writing and compiling" if compile else "writing", shown=not (quiet or json)):
         written = write_export(
@@ -58,6 +60,7 @@ def codegen(
             Path(out) if out else None,
             prefix=prefix,
             posture=posture,
+            compression=squeezed,
             single=float_,
             portable=portable,
             build=compile,

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.codegen.build_check import compile_and_check
 from impact_posture.codegen.code import build_code
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
@@ -20,6 +20,7 @@ from impact_posture.codegen.manifest import build_manifest
 from impact_posture.codegen.naming import c_identifier, check_prefix, products
 from impact_posture.codegen.render import render
 from impact_posture.errors import CompilerError, InputError, OutputError
+from impact_posture.impact.contact_compression import Compression
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import library_path
 from impact_posture.output_folder import whole_folder, write_whole
@@ -103,7 +104,8 @@ def export(
     out: Path,
     *,
     prefix: str | None = None,
-    posture: NDArray[np.float64] | None = None,
+    posture: Array | None = None,
+    compression: Compression | None = None,
     real: Real = DOUBLE,
     portable: bool = False,
     force: bool = False,
@@ -119,6 +121,7 @@ def export(
         out: The folder.
         prefix: Beginning of the C names, a C identifier; robot and frame by default.
         posture: A configuration that the code holds as a constant, shape (nq,).
+        compression: Compression time, peak force and x of the impact, which the manifest and the header state.
         real: The C type to compute in.
         portable: Write plain C99, for compilers without the vectors of GCC and Clang.
         force: Replace existing files.
@@ -142,7 +145,7 @@ def export(
         posture = given if np.allclose(given, posture, rtol=0, atol=1e-9) else posture
     exported = named_objectives(objectives, prefix)
     code = build_code(exported, prefix, real, portable=portable)
-    manifest = build_manifest(objectives, prefix, posture, real, code.stack_bytes)
+    manifest = build_manifest(objectives, prefix, posture, compression, real, code.stack_bytes)
     texts = render(exported, prefix, manifest, code, real)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     there = [name for name in texts if (out / name).exists()]
@@ -161,7 +164,8 @@ def write_export(
     out: Path | None = None,
     *,
     prefix: str | None = None,
-    posture: NDArray[np.float64] | None = None,
+    posture: Array | None = None,
+    compression: Compression | None = None,
     single: bool = False,
     portable: bool = False,
     build: bool = False,
@@ -174,6 +178,7 @@ def write_export(
         out: The folder; ``./<prefix>-c`` by default.
         prefix: Beginning of the C names; robot and frame by default.
         posture: A configuration that the code holds as a constant, shape (nq,).
+        compression: As :func:`export`.
         single: Compute in ``float``.
         portable: Write plain C99, for compilers without the vectors of GCC and Clang.
         build: Leave ``lib<prefix>.so`` in the folder.  A machine without a compiler gets no library and no error.
@@ -189,7 +194,10 @@ def write_export(
     real = FLOAT if single else DOUBLE
     agreement = None
     with whole_folder(out, force=force, kind="export", products=products(prefix)) as folder:
-        made = export(objectives, folder, prefix=prefix, posture=posture, real=real, portable=portable, check=False)
+        made = export(
+            objectives, folder, prefix=prefix, posture=posture, compression=compression, real=real, portable=portable,
+            check=False,
+        )  # fmt: skip
         if build and find_compiler() is not None:
             try:
                 agreement = compile_and_check(folder, prefix, objectives, keep=True)

@@ -18,6 +18,7 @@ from impact_posture.codegen.reader import SCHEMA
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import MetricError
 from impact_posture.impact.contact import ImpactContact
+from impact_posture.impact.contact_compression import Compression
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.version import __version__
@@ -82,6 +83,7 @@ def build_manifest(
     objectives: Sequence[ImpactObjective],
     prefix: str,
     posture: Array | None,
+    compression: Compression | None,
     real: Real = DOUBLE,
     stack_bytes: int = 0,
 ) -> dict[str, Any]:
@@ -136,6 +138,7 @@ def build_manifest(
         "support_compliance": first.compliance if first.supports else None,
         "armature": robot.armature.tolist(),
         "joint_model": robot.joint_model,
+        "compression": None if compression is None else compression.to_dict(),
         "posture": None if posture is None else posture.tolist(),
         **frames[0],
         "symbols": symbols,

@@ -151,6 +151,7 @@ def _context(
         "identity": identity(manifest),
         "tolerance": f"{self_test_tolerance(objective, real):g}",
         "metric": f"{metric.kind} ({weights[metric.kind]})",
+        "joint_note": f"; {found['line']}" if (found := manifest["compression"]) and found["line"] else "",
         "supports": (
             f"{supports}; M stands for M + Js'Js/c with c = {objective.compliance:.6g} 1/kg"
             if supports

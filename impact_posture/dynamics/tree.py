@@ -145,18 +145,15 @@ class Tree(Kinematics):
     def _factor(self) -> dict[int, tuple[ca.SX, ...]]:
         """``(pivot, D⁻¹Uᵀ, I^a = I^A − U D⁻¹ Uᵀ)`` of every joint, with ``U = I^A S`` and ``D = SᵀU + armature``.
 
-        The pivot is ``D``, and ``1/D`` for a joint with one axis.  A locked joint has ``D⁻¹ = 0``.
+        The pivot is ``D``, ``1/D`` for a joint with one axis, and zero for a locked joint, which has ``D⁻¹ = 0``.
         """
         articulated = dict(self._inertia)
         found: dict[int, tuple[ca.SX, ...]] = {}
         for slot, i, parent in reversed(self._joints):
-            if slot.v.start in self.locked:
-                found[i] = ca.SX(slot.kind.nv, slot.kind.nv), ca.SX(slot.kind.nv, 6), articulated[i]
-            else:
-                D = step.pivot(articulated[i], self._S[i], self._armature[slot.v])
-                # Not in a template, so that a constant becomes a factor and not a divisor.
-                pivot = 1 / D if slot.kind.nv == 1 else D
-                found[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)
+            D = step.pivot(articulated[i], self._S[i], self._armature[slot.v])
+            # Not in a template, so that a constant becomes a factor and not a divisor.
+            pivot = ca.SX(0) if slot.v.start in self.locked else 1 / D if slot.kind.nv == 1 else D
+            found[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)
             if parent:
                 articulated[parent] = articulated[parent] + self._inertia_to_parent(i, found[i][2])
         return found
@@ -181,12 +178,8 @@ class Tree(Kinematics):
         before: ByJoint = {}
         forces: ByJoint = {}
         rates: ByJoint = {}
-        for slot, i, parent in self._joints:
+        for _, i, parent in self._joints:
             before[i] = motion_to_child(self._R[i], self._p[i], velocities.get(parent, _ZERO))
-            if slot.v.start in self.locked:
-                rates[i], velocities[i] = ca.SX(slot.kind.nv, 1), before[i]
-                forces[i] = self._factor[i][2] @ before[i] + passed[i]
-                continue
             rates[i], velocities[i], forces[i] = step.respond(
                 before[i], self._S[i], drive[i], passed[i], *self._factor[i]
             )
