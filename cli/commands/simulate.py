@@ -99,7 +99,8 @@ def _rigid(prediction: dict[str, Any]) -> str:
 
     if prediction["sticking"] is None:
         return f"{number(prediction['frictionless'], missing='–')} if nobody controlled"
-    return f"{number(prediction['frictionless'])} without friction, {number(prediction['sticking'])} sticking"
+    named = {"frictionless": "without friction", "coulomb": "with the surface's", "sticking": "sticking"}
+    return ", ".join(f"{number(prediction[key], missing='–')} {words}" for key, words in named.items())
 
 
 def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> None:

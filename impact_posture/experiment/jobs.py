@@ -154,7 +154,7 @@ def _run_document(factory: ControllerFactory, one: Run, metrics: Metrics) -> dic
 def _mean_prediction(impacts: list[dict[str, Any]]) -> dict[str, Any]:
     """Return means over the impacts, and ``None`` where a value is undefined for one of them."""
     found: dict[str, Any] = {"impacts": len(impacts)}
-    for key in ("H", "G", "V", "S", "approach", "frictionless", "sticking", "measured", "ratio"):
+    for key in ("H", "G", "V", "S", "approach", "frictionless", "sticking", "coulomb", "measured", "ratio"):
         values = [impact[key] for impact in impacts]
         found[key] = None if not values or None in values else float(np.mean(values))
     return found

@@ -8,6 +8,7 @@ import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
+from impact_posture.impact.kinds import KINDS
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.simulation.metrics import before, jump
 from impact_posture.simulation.run import Run
@@ -28,6 +29,7 @@ class Prediction:
         frictionless: Jump without friction and rebound, ``v √V``.  For pushes, ``√H`` times the impulse, which is the
             velocity at the end of the push of a robot without controller.
         sticking: Jump if the contact sticks, ``v √S`` (for an approach along the normal), or ``None`` for pushes.
+        coulomb: Jump with the friction of the surface, ``v √C`` (likewise), or ``None`` for pushes.
         measured: Measured jump, as in :class:`~impact_posture.simulation.metrics.Metrics`.
         ratio: ``measured`` over ``frictionless``, or ``None`` if the latter vanishes.
     """
@@ -40,6 +42,7 @@ class Prediction:
     approach: float
     frictionless: float
     sticking: float | None
+    coulomb: float | None
     measured: float
     ratio: float | None
 
@@ -57,14 +60,14 @@ def predict(setup: Setup, objective: ImpactObjective, run: Run) -> tuple[Predict
         here = objective.oracle.quantities(q)
         if scenario.push:
             approach = float(np.linalg.norm(scenario.push.force)) * scenario.push.duration
-            smooth, sticking = approach * float(np.sqrt(here.H)), None
+            smooth, sticking, coulomb = approach * float(np.sqrt(here.H)), None, None
         else:
             approach = float(-scenario.normal @ numeric.at(q).jacobian(point)[:3] @ v)
             smooth = approach * float(np.sqrt(here.V))
             sticking = None if here.S is None else approach * float(np.sqrt(here.S))
+            coulomb = approach * float(np.sqrt(KINDS["coulomb"].value(objective.oracle, q)))
         measured = jump(setup, run.series, window)
         ratio = measured / smooth if smooth > 1e-9 else None
-        found.append(
-            Prediction(window.contact, here.H, here.G, here.V, here.S, approach, smooth, sticking, measured, ratio)
-        )
+        jumps = smooth, sticking, coulomb, measured
+        found.append(Prediction(window.contact, here.H, here.G, here.V, here.S, approach, *jumps, ratio))
     return tuple(found)

@@ -38,7 +38,8 @@ def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: b
     """
     scenario, robot = setup.scenario, setup.robot
     x, y, z = (float(value) for value in scenario.normal)
-    contact = ImpactContact(scenario.task.frame, (x, y, z), scenario.offset)
+    friction = {} if scenario.push else {"friction": scenario.surface.friction}
+    contact = ImpactContact(scenario.task.frame, (x, y, z), scenario.offset, **friction)
     supports = () if free or scenario.control.footing is None else resolve_supports(robot, None)
     return ImpactObjective(robot, contact, Metric(), kind, supports)
 

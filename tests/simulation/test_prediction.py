@@ -103,6 +103,7 @@ def test_a_drop_without_friction_jumps_as_predicted(k: int) -> None:
     # Stated band: 5 %, for the 4 ms that the contact takes (tests/test_world.py has 3 % for the impact alone).
     assert found.measured == pytest.approx((1 + e) * 0.5 * np.sqrt(found.V), rel=0.05)
     assert found.frictionless == pytest.approx(0.5 * np.sqrt(found.V))
+    assert found.coulomb == pytest.approx(found.frictionless)
     # And V is the formula's.
     M = mass_matrix(setup.robot.model, q)
     J = frame_jacobian(setup.robot.model, q, frame)[2]
@@ -116,9 +117,19 @@ def test_a_drop_that_sticks_jumps_as_predicted() -> None:
     found, run, setup = drop(law, factory("aerial-vertical").setup.q, timestep=2.5e-5)
     e = restitution(setup, run, 0.5)
     assert found.S is not None and found.sticking == pytest.approx(0.5 * np.sqrt(found.S))
+    assert found.coulomb == pytest.approx(found.sticking)
     # Stated band: 5 %; the frictionless prediction is far off.
     assert found.measured == pytest.approx((1 + e) * 0.5 * np.sqrt(found.S), rel=0.05)
     assert abs(found.measured / ((1 + e) * found.frictionless) - 1) > 0.2
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.3])
+def test_a_drop_that_slides_jumps_as_predicted(friction: float) -> None:
+    law = ContactLaw(solref=(2e-4, 1.0), solimp=(0.9999, 0.9999, 0.001), friction=friction)
+    found, run, setup = drop(law, factory("aerial-vertical").setup.q, timestep=2.5e-5)
+    e = restitution(setup, run, 0.5)
+    assert found.coulomb is not None and found.sticking is not None
+    assert found.measured == pytest.approx((1 + e) * found.coulomb, rel=0.05)
 
 
 def test_the_peak_is_the_impacts_and_nothing_else_moves_it() -> None:
