@@ -107,9 +107,7 @@ def _on_cone(p: Array, n: Array, mu: float) -> Array:
     along = float(n @ p)
     across = p - along * n
     size = float(np.linalg.norm(across))
-    if size <= mu * along:
-        return p
-    if mu * size <= -along:
-        return np.zeros(3)
-    along = (along + mu * size) / (1 + mu**2)
-    return np.asarray(along * (n + (mu / size) * across if size > 0 else n))
+    if along < 0 or size > mu * along:
+        along = max(along + mu * size, 0.0) / (1 + mu**2)
+        across = across * (mu * along / max(size, 1e-300))
+    return np.asarray(along * n + across)

@@ -65,7 +65,7 @@ class CoulombKind(ImpactKind):
         x = k.answer([impact_at(case, direction / ca.dot(B @ n, direction))])
         value = k.product(x, x)
         r = -value * n - K @ (R.T @ k.adjoint_velocity(x) - value * (B @ n))
-        return value, k.reacting_gradient(x, impact_at(case, r))
+        return value, k.size_gradient(x, impact_at(case, r))
 
     def unknowns(self, case: ImpactCase, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
         """Return the jump under ``λ(n − μd)``; the last unknowns are ``λ``, ``d``, ``κ`` (slip) and ``o = 1 − ‖d‖²``.

@@ -99,22 +99,20 @@ class ImpactKernel:
         """Return ``a₁ᵀWa₂`` of two responses."""
         return ca.dot(one.a, self._weigh(other.a, other.velocities))
 
-    def size_gradient(self, jump: Response) -> ca.SX:
-        """Return the tangent gradient of ``aᵀWa`` of a response for fixed impulses, shape (nv,)."""
-        if self.metric.kind == "kinetic" and not self._supported:
+    def size_gradient(self, jump: Response, r: Wrench | None = None) -> ca.SX:
+        """Return the tangent gradient of ``aᵀWa`` of a response, shape (nv,).
+
+        Its impulses are fixed, or there is one impulse ``p`` with ``∂pᵀJM⁻¹Wa = rᵀ∂B p``.
+        """
+        if self.metric.kind == "kinetic" and not self._supported and r is None:
             return self.tree.pair_gradient(jump, jump)
-        adjoint = self.tree.respond(tau=self._weigh(jump.a, jump.velocities))
+        adjoint = self.tree.respond(self._weigh(jump.a, jump.velocities), [] if r is None else self._alike(r))
         return 2 * self.tree.pair_gradient(jump, adjoint) + self._metric_gradient(jump.velocities)
 
     def adjoint_velocity(self, x: Response) -> ca.SX:
         """Return ``JM⁻¹Wa`` of a response, world, shape (3,)."""
         free = self.tree.respond(tau=self._weigh(x.a, x.velocities))
         return self.tree.point_velocity(self.point, free.velocities)[:3]
-
-    def reacting_gradient(self, x: Response, r: Wrench) -> ca.SX:
-        """Return the gradient of ``aᵀWa``, shape (nv,), of an impulse ``p`` with ``∂pᵀJM⁻¹Wa = rᵀ∂B p``."""
-        adjoint = self.tree.respond(tau=self._weigh(x.a, x.velocities), wrenches=self._alike(r))
-        return 2 * self.tree.pair_gradient(x, adjoint) + self._metric_gradient(x.velocities)
 
     @cached_property
     def grad_G(self) -> ca.SX:
@@ -187,7 +185,7 @@ class ImpactKernel:
         """``2 ∂_q[sᵀJb + rᵀJa − bᵀMa]`` (and ``−2rᵀn(q)`` for a normal that turns with the robot), shape (nv,)."""
         x = self._sticking
         r = -self._mobility_inverse @ self.adjoint_velocity(x)
-        gradient = self.reacting_gradient(x, self._force(r))
+        gradient = self.size_gradient(x, self._force(r))
         if self.case.in_contact_frame:
             gradient = gradient - 2 * self.tree.turning_gradient(self.point, self.world_normal, r)
         return gradient
