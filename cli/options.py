@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from impact_posture.settings import CONTACT, OUTPUT
+from impact_posture.setting import CONTACT, OUTPUT
 
 CompileMode = Literal["auto", "always", "never"]
 

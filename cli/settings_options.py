@@ -12,7 +12,8 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 import typer
 
 from impact_posture.errors import ImpactPostureError
-from impact_posture.settings import CONTACT, METRIC, OUTPUT, ROBOT, TASK, ImpactSettings, RobotSettings, Setting
+from impact_posture.setting import CONTACT, METRIC, OUTPUT, ROBOT, TASK, Setting
+from impact_posture.settings import ImpactSettings, RobotSettings
 from impact_posture.tables import validate
 from impact_posture_cli.error_boundary import UsageError
 

@@ -10,7 +10,8 @@ import pytest
 
 from impact_posture.errors import ImpactPostureError, SpecError
 from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
-from impact_posture.settings import ProblemSettings, Setting
+from impact_posture.setting import Setting
+from impact_posture.settings import ProblemSettings
 from impact_posture.tables import validate
 from impact_posture_cli.app import build
 from impact_posture_cli.option_names import as_options, option_of

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impact_posture.settings import OUTPUT, RobotSettings
+from impact_posture.setting import OUTPUT
+from impact_posture.settings import RobotSettings
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, number, print_json

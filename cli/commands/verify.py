@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impact_posture.settings import CONTACT, OUTPUT, ImpactSettings, Vector3
+from impact_posture.setting import CONTACT, OUTPUT
+from impact_posture.settings import ImpactSettings, Vector3
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, complain, print_json
 from impact_posture_cli.progress import progress

@@ -29,7 +29,7 @@ from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.regular import pin_undetermined, regularize
 from impact_posture.robot.robot import Robot
-from impact_posture.settings import tilt_of
+from impact_posture.setting import tilt_of
 
 
 def build_problem(robot: Robot, objective: Objective, given: Array, requirements: Requirements) -> PostureProblem:

@@ -1,0 +1,126 @@
+"""The annotation of a setting: its meaning, its spelling as an option, and the demand on its value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from impact_posture.errors import ImpactPostureError, not_one_of
+from impact_posture.parsing import parse_contact
+
+CONTACT, METRIC, ROBOT, TASK, OUTPUT = "Contact", "Measure", "Robot", "Task", "Output"
+_LARGEST = float("inf")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Annotation of a setting, besides its type.
+
+    Attributes:
+        help: Meaning in one line.
+        panel: Part of ``--help`` with the option.
+        takes: Placeholder of the value in ``--help``.
+        default: Default in words, if it comes from the robot.
+        demand: Demand on a value, as an error states it.
+        holds: Whether a value meets the demand.
+        option: Spelling of the option, if it differs from the field.
+        parse: Function from all words of the command line to the value.
+        repeatable: Whether the option may be given several times.
+    """
+
+    help: str
+    panel: str = TASK
+    takes: str | None = None
+    default: str | None = None
+    demand: str = ""
+    holds: Callable[[Any], bool] | None = None
+    option: str | None = None
+    parse: Callable[[Any], Any] | None = None
+    repeatable: bool = False
+
+    def check(self, value: Any) -> Any:
+        """Return the value.
+
+        Raises:
+            ValueError: The value does not meet the demand.
+        """
+        if value is not None and self.holds is not None and not self.holds(value):
+            raise ValueError(self.demand)
+        return value
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
+
+
+def _finite(value: Any) -> bool:
+    return all(-_LARGEST < v < _LARGEST for v in (value if isinstance(value, tuple) else (value,)))
+
+
+def _direction(value: tuple[float, ...]) -> bool:
+    return _finite(value) and max(abs(v) for v in value) >= 1e-9
+
+
+def _positive(value: Any) -> bool:
+    return _finite(value) and min(value if isinstance(value, tuple) else (value,)) > 0
+
+
+def _contacts(value: Any) -> bool:
+    """Tell whether each text is a contact with a direction."""
+    for text in (value,) if isinstance(value, str) else value:
+        try:
+            _, normal, impulse = parse_contact(text)
+        except ImpactPostureError as error:
+            raise ValueError(f"{error.what}; {error.hint}") from None
+        if not _direction(normal) or not _positive(1.0 if impulse is None else impulse):
+            raise ValueError(f"'{text}' needs a normal with a direction and an impulse above zero")
+    return True
+
+
+# Demands on values, as keyword arguments of a setting.
+NUMBERS = {"holds": _finite, "demand": "give finite numbers"}
+LENGTHS = {"holds": _positive, "demand": "give three numbers above zero"}
+ABOVE_ZERO = {"holds": _positive, "demand": "give a number above zero"}
+ZERO_OR_MORE = {"holds": lambda value: 0 <= value < _LARGEST, "demand": "give a number, zero or more"}
+SHARE = {"holds": lambda value: 0 <= value <= 1, "demand": "give a number from 0 to 1"}
+HALF_ANGLE = {"holds": lambda value: 0 <= value < 90, "demand": "give degrees from 0 to below 90"}
+DIRECTION = {"holds": _direction, "demand": "give three finite numbers, not all zero"}
+CONTACTS = {"holds": _contacts}
+FACTORS = {
+    "holds": lambda value: 0 < value[0] <= value[1] < _LARGEST,
+    "demand": "give two factors above zero, the lower first, such as 0.5 2",
+}
+MASSES = {
+    "holds": lambda value: all(0 < mass < _LARGEST for _, mass in value),
+    "demand": "give a frame and kg above zero each",
+}
+
+
+def number_or(names: Sequence[str], unit: str) -> dict[str, Any]:
+    """Return the demand for a number above zero or one of several names."""
+    return {
+        "holds": lambda value: value in names if isinstance(value, str) else _positive(value),
+        "demand": f"give {unit} above zero, or one of {', '.join(names)}",
+    }
+
+
+def tilt_of(pose: str) -> float | None:
+    """Return DEG of the contact pose ``aligned:DEG``, or ``None`` for any other pose."""
+    kind, colon, degrees = pose.partition(":")
+    try:
+        return float(degrees) if kind == "aligned" and colon else None
+    except ValueError:
+        return None
+
+
+def pose_of(kinds: Sequence[str]) -> dict[str, Any]:
+    """Return the demand for a contact pose of these kinds, or ``aligned:DEG``; a misspelt one gets a suggestion."""
+
+    def holds(value: str) -> bool:
+        if value in kinds or value.startswith("aligned:"):
+            return value in kinds or 0 < (tilt_of(value) or 0.0) < 90
+        raise ValueError("; ".join(not_one_of(value, (*kinds, "aligned:DEG"))))
+
+    return {"holds": holds, "demand": "give aligned:DEG with degrees above 0 and below 90"}
