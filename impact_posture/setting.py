@@ -83,6 +83,7 @@ def _contacts(value: Any) -> bool:
 NUMBERS = {"holds": _finite, "demand": "give finite numbers"}
 LENGTHS = {"holds": _positive, "demand": "give three numbers above zero"}
 ABOVE_ZERO = {"holds": _positive, "demand": "give a number above zero"}
+ONE_OR_MORE = {"holds": _positive, "demand": "give 1 or more"}
 ZERO_OR_MORE = {"holds": lambda value: 0 <= value < _LARGEST, "demand": "give a number, zero or more"}
 SHARE = {"holds": lambda value: 0 <= value <= 1, "demand": "give a number from 0 to 1"}
 HALF_ANGLE = {"holds": lambda value: 0 <= value < 90, "demand": "give degrees from 0 to below 90"}

@@ -324,5 +324,5 @@ class ProblemSettings(ImpactSettings):
             "What --tradeoff bounds: the distance from the start, or the peak force of the impact.", TASK, "WHAT"
         ),
     ] = "distance"  # fmt: skip
-    starts: Annotated[int, Setting("Number of starting points of the search.", OUTPUT, **demand.ABOVE_ZERO)] = 16
+    starts: Annotated[int, Setting("Number of starting points of the search.", OUTPUT, **demand.ONE_OR_MORE)] = 16
     seed: Annotated[int, Setting("Seed of the random starts.", OUTPUT, **demand.ZERO_OR_MORE)] = 0

@@ -47,7 +47,7 @@ WRONG: list[tuple[str, object, str]] = [
     ("box", (0.1, 0.0, 0.1), "above zero"),
     ("friction", -0.1, "zero or more"),
     ("starts", 0, "1 or more"),
-    ("seed", -1, "0 or more"),
+    ("seed", -1, "zero or more"),
     ("tradeoff", -1, "zero or more"),
 ]
 

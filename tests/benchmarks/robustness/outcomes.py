@@ -15,7 +15,7 @@ from impact_posture.errors import ImpactPostureError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import Metrics, before, measure
-from impact_posture.simulation.offline import holds
+from impact_posture.simulation.offline import SHARE, holds
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
@@ -30,7 +30,7 @@ AERIAL = (NOMINAL, "robust", "robust-speed", "posture")
 PUSHED = (NOMINAL, "robust", HELD, "posture")
 # Share of the motors' limits with which the start must be held; share of a nominal run's ticks outside the windows
 # that may be at a limit.
-SHARE, SATURATED = 0.8, 0.05
+SATURATED = 0.05
 # Draws of a configuration before it is given up.
 ATTEMPTS = 40
 # Tilt (rad) from which on a robot that flies has lost itself; share of its height below which one that stands has
@@ -122,7 +122,7 @@ def _admit(chosen: Draw, runs: _RUNS) -> tuple[ControllerFactory, Outcome]:
         setup = prepare(chosen)
     except ImpactPostureError as error:
         raise NotAdmissible(f"no start ({type(error).__name__})") from None
-    if not holds(setup, setup.q, SHARE):
+    if not holds(setup, setup.q):
         raise NotAdmissible(f"the motors do not hold the start with {100 * SHARE:.0f} % of their limits")
     factory = ControllerFactory(setup, gradient_of=interpreted)
     nominal = outcome(factory, NOMINAL, runs)

@@ -6,9 +6,10 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+from impact_posture.simulation.offline import SHARE
 from tests.benchmarks.core import table
 from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, RANGES
-from tests.benchmarks.robustness.outcomes import AERIAL, HELD, NOMINAL, SATURATED, SHARE, Record, controllers
+from tests.benchmarks.robustness.outcomes import AERIAL, HELD, NOMINAL, SATURATED, Record, controllers
 from tests.benchmarks.robustness.statistics import (
     Split,
     Summary,
