@@ -172,7 +172,7 @@ def test_random_arms_with_random_transmissions(data: st.DataObject) -> None:
 # ---- what follows from it ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["tilthex_arm", "talos"])
+@pytest.mark.parametrize("name", ["tilthex_arm", "panda"])
 def test_the_export_has_the_numbers_of_its_joint_model(name: str, tmp_path: Path) -> None:
     need_compiler()
     found = with_some_locked(robot(name))
