@@ -48,7 +48,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
         """Insert :func:`markdown` where it stands."""
 
         required_arguments = 1
-        optional_arguments = 9
+        optional_arguments = 30
 
         def run(self) -> list[nodes.Node]:
             return self.parse_text_to_nodes(markdown(self.arguments), allow_section_headings=True)
