@@ -6,16 +6,16 @@ They use the defaults of the robot, as the command line does, and check their ar
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, not_one_of
 from impact_posture.impact import objective as core
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.contact_compression import ContactStiffness
@@ -40,6 +40,7 @@ from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import (
     Against,
+    ImpactSettings,
     JointModel,
     MetricKind,
     ObjectiveKind,
@@ -96,6 +97,8 @@ class ImpactObjective(core.ImpactObjective):
         payloads: Sequence[tuple[str, float]] = (),
         joint_model: JointModel | None = None,
     ) -> None:
+        _check_choice("joint_model", joint_model or robot.joint_model, get_args(JointModel))
+        _check_choice("kind", kind, get_args(ObjectiveKind))
         robot = with_joint_model(robot, joint_model or robot.joint_model)
         given = [contact] if isinstance(contact, ImpactContact) else list(contact)
         if not given:
@@ -133,11 +136,17 @@ class ImpactObjective(core.ImpactObjective):
         return write_export([self], Path(out), build=build, **options)
 
 
+def _check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    if value not in choices:
+        what, hint = not_one_of(value, choices)
+        raise InputError(what, where=name, hint=hint)
+
+
 def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
     own = robot.spec.contact
     if contact.frame != own.frame or any(contact.offset) or not any(own.offset):
         return contact
-    return ImpactContact(contact.frame, contact.normal, own.offset, contact.normal_frame, contact.impulse)
+    return replace(contact, offset=own.offset)
 
 
 def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[Support, ...]:
@@ -145,6 +154,10 @@ def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[S
         return resolve_supports(robot, None)
     texts = tuple(support for support in supports if isinstance(support, str))
     return (*resolve_supports(robot, texts), *(support for support in supports if isinstance(support, Support)))
+
+
+# Settings that the objective and its robot hold already.
+_OF_THE_OBJECTIVE = {field.name for field in fields(ImpactSettings)} - {"contact_stiffness", "contact_duration"}
 
 
 class PostureProblem:
@@ -184,6 +197,12 @@ class PostureProblem:
         loaded = robot.settings or RobotSettings(robot=robot.source)
         given = {field.name: getattr(loaded, field.name) for field in fields(RobotSettings)}
         given |= {"speed": speed, "restitution": restitution, "joint_model": robot.joint_model}
+        if isinstance(objective, core.ImpactObjective):
+            given["friction"] = objective.contact.friction
+        for name in _OF_THE_OBJECTIVE & set(task):
+            raise InputError(
+                "belongs to the objective", where=name, hint="give it to ImpactObjective or ImpactContact"
+            )
         settings = validate(ProblemSettings, given | task, "PostureProblem")
         self.prepared: Prepared | None = None
         if isinstance(objective, core.ImpactObjective):

@@ -99,11 +99,12 @@ MASSES = {
 }
 
 
-def number_or(names: Sequence[str], unit: str) -> dict[str, Any]:
-    """Return the demand for a number above zero or one of several names."""
+def between(low: float, high: float, unit: str, names: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the demand for a number within bounds, or for one of several names."""
+    named = f", or one of {', '.join(names)}" if names else ""
     return {
-        "holds": lambda value: value in names if isinstance(value, str) else _positive(value),
-        "demand": f"give {unit} above zero, or one of {', '.join(names)}",
+        "holds": lambda value: value in names if isinstance(value, str) else low <= value <= high,
+        "demand": f"give {low:g} to {high:g} {unit}{named}",
     }
 
 

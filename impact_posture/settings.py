@@ -143,13 +143,15 @@ class ImpactSettings(RobotSettings):
         str | float | None,
         Setting(
             f"Stiffness of the contact, or what a steel tip touches: {', '.join(MATERIALS)}.",
-            CONTACT, "N/M|MATERIAL", "not known", parse=parse_stiffness, **demand.number_or(tuple(MATERIALS), "N/m"),
+            CONTACT, "N/M|MATERIAL", "not known", parse=parse_stiffness,
+            **demand.between(1.0, 1e12, "N/m", tuple(MATERIALS)),
         ),
     ] = None  # fmt: skip
     contact_duration: Annotated[
         float | None,
         Setting(
-            "Time from touch to greatest compression, s.", CONTACT, default="not known", **demand.ABOVE_ZERO,
+            "Time from touch to greatest compression, s.", CONTACT, default="not known",
+            **demand.between(1e-7, 100.0, "s"),
         ),
     ] = None  # fmt: skip
     friction: Annotated[
@@ -280,27 +282,28 @@ class ProblemSettings(ImpactSettings):
         float | None,
         Setting(
             "Largest peak force, N, without friction; needs --contact-stiffness or --contact-duration.", TASK,
-            default="no bound", **demand.ABOVE_ZERO,
+            default="no bound", **demand.between(1e-6, 1e9, "N"),
         ),
     ] = None  # fmt: skip
     max_joint_jump: Annotated[
         float | None,
         Setting(
             "Largest velocity jump of a joint without friction, rad/s or m/s.", TASK, default="no bound",
-            **demand.ABOVE_ZERO,
+            **demand.between(1e-6, 1e9, "rad/s or m/s"),
         ),
     ] = None  # fmt: skip
     max_torque: Annotated[
         float | None,
         Setting(
             "Largest torque, N·m, with which the controller answers the jump; needs --velocity-gain.", TASK,
-            default="no bound", **demand.ABOVE_ZERO,
+            default="no bound", **demand.between(1e-6, 1e9, "N·m"),
         ),
     ] = None  # fmt: skip
     velocity_gain: Annotated[
         float | None,
         Setting(
-            "Gain K_d of the controller for --max-torque, N·m·s/rad.", TASK, default="not known", **demand.ABOVE_ZERO,
+            "Gain K_d of the controller for --max-torque, N·m·s/rad.", TASK, default="not known",
+            **demand.between(1e-6, 1e9, "N·m·s/rad"),
         ),
     ] = None  # fmt: skip
     limit_margin: Annotated[

@@ -24,12 +24,13 @@ from impact_posture.impact.contact_compression import (
     hertz_stiffness,
     springs_along,
 )
+from impact_posture.impact.elastic_joints import elastic_response
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.constraint import AxisInCone
 from impact_posture.posture.impact_limits import ImpactLimits
 from impact_posture.posture.pareto import pareto_front
-from impact_posture.posture.problem_settings import prepare
+from impact_posture.posture.problem_settings import prepare, read_settings
 from impact_posture.posture.solve import solve
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot
@@ -97,8 +98,7 @@ def elastic(name: str, stiffness: float = 12000.0) -> Robot:
 )
 def test_x_from_plain_matrices(name: str, frame: str) -> None:
     found = elastic(name)
-    supports = tuple(Support.from_spec(s) for s in found.spec.supports)
-    objective = ImpactObjective(found, ImpactContact(frame, (0.3, 0.1, 1.0)), supports=supports)
+    objective = ImpactObjective(found, ImpactContact(frame, (0.3, 0.1, 1.0)))
     contact = ContactStiffness(linear=3e5)
     for q in random_configurations(found.model, 2, name, "x"):
         oracle = objective.oracle.at(q)
@@ -113,6 +113,20 @@ def test_x_from_plain_matrices(name: str, frame: str) -> None:
         assert told.peak_force == pytest.approx(0.7 * np.sqrt(3e5 / objective.oracle.quantities(q).G))
         table = compression(objective, q, 0.7, None)
         assert table is not None and table.x is None and list(table.by_material) == list(MATERIALS)
+
+
+def test_x_of_a_robot_on_its_feet_is_that_of_the_elastic_response() -> None:
+    found = elastic("talos", 2000.0)
+    supports = tuple(Support.from_spec(s) for s in found.spec.supports)
+    for frame in ("torso_2_link", "gripper_right_base_link"):
+        objective = ImpactObjective(found, ImpactContact(frame, (-1, 0, 0)), supports=supports)
+        q = found.posture()
+        G, _ = springs_along(objective.case, q) or (0.0, 0.0)
+        told = compression(objective, q, 1.0, ContactStiffness(linear=1e9))
+        response = elastic_response(objective.case, q, 1e9)
+        assert told is not None and told.x is not None and G > 0
+        # A very short contact: T is that of the links alone.
+        assert told.x == pytest.approx(response.compliance_ratio, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -232,9 +246,12 @@ def test_the_front_of_jump_and_force_is_that_of_searches_with_a_bound(name: str)
         ({"max_torque": 1.0}, InputError, "gain"),
         ({"velocity_gain": 1.0}, InputError, "gain"),
         ({"contact_stiffness": "iron"}, SpecError, "steel, wood"),
-        ({"contact_stiffness": -1.0}, SpecError, "above zero"),
+        ({"contact_stiffness": -1.0}, SpecError, "1 to 1e"),
+        ({"max_force": 1e-300, "contact_stiffness": 1e5}, SpecError, "to 1e"),
+        ({"max_force": 5.0, "contact_stiffness": 1e5, "speed": 0.0}, InputError, "approach speed"),
+        ({"tradeoff": 3, "tradeoff_against": "force", "contact_duration": 0.01, "speed": 0.0}, InputError, "speed"),
         ({"contact_stiffness": 1e5, "contact_duration": 0.1}, InputError, "one of the two"),
-        ({"contact_duration": 0.0}, SpecError, "above zero"),
+        ({"contact_duration": 0.0}, SpecError, "1e-07 to 100 s"),
         ({"contact_pose": "aligned:90"}, SpecError, "aligned:DEG"),
         ({"contact_pose": "aligned:nan"}, SpecError, "aligned:DEG"),
         ({"max_force": 1.0, "contact_stiffness": "steel"}, Infeasible, "bounds on the impact"),
@@ -243,6 +260,23 @@ def test_the_front_of_jump_and_force_is_that_of_searches_with_a_bound(name: str)
 def test_refusals(values: dict[str, object], error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         solve(prepare(make_settings({"robot": "tilthex_arm", "normal": (0.0, 0.0, 1.0), **values})).problem, starts=1)
+
+
+def test_edges_of_speed_and_of_locked_joints(tmp_path: Path) -> None:
+    """A material at rest has no T, and a robot without moving joints no jump of a joint to bound."""
+    still = ("evaluate", "panda", "--normal", 0, 0, 1, "--speed", 0, "--contact-stiffness", "steel", "--json")
+    told = json.loads(run(*still).stdout)["evaluation"]["compression"]
+    assert told["compression_time"] is None and told["peak_force"] == 0 and told["x"] is None
+    rigid = prepare(
+        make_settings({"robot": "tilthex_arm", "normal": (0, 0, 1), "joint_model": "locked", "max_joint_jump": 2.0})
+    )
+    assert not any(isinstance(c, ImpactLimits) for c in rigid.problem.constraints)
+
+
+def test_an_option_stands_for_the_other_key_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "p.toml"
+    path.write_text('robot = "panda"\nnormal = [0.0, 0.0, 1.0]\ncontact_stiffness = 1e5\n')
+    assert read_settings(path, {"contact_duration": 0.01}).contact_stiffness is None
 
 
 def test_the_commands(tmp_path: Path) -> None:

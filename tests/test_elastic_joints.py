@@ -312,7 +312,7 @@ def test_armature_is_that_stated_whatever_the_joint_model() -> None:
 @pytest.mark.parametrize("stiffness", [0.0, -1e5, float("nan"), float("inf"), 1e30, 0.5])
 def test_stiffness_out_of_range(stiffness: float) -> None:
     case, q, _ = setup("arm")
-    with pytest.raises(InputError, match=r"^contact stiffness: is .* N/m; give 1 to 1e\+12 N/m$"):
+    with pytest.raises(InputError, match=r"^contact_stiffness: is .* N/m; give 1 to 1e\+12 N/m$"):
         elastic_response(case, q, stiffness)
 
 

@@ -188,3 +188,33 @@ def test_the_shown_lines_run(page: str, tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "result.json").is_file() and "Certificate" in done.stdout
+
+
+def test_friction_is_that_of_the_contact_and_is_saved(tmp_path: Path) -> None:
+    robot = ip.load_robot("tilthex_arm")
+    objective = ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1), friction=0.3), kind="coulomb")
+    problem = ip.PostureProblem(objective, base="level")
+    ip.optimize(problem, starts=1).save(tmp_path / "out", codegen=False)
+    assert "friction = 0.3" in (tmp_path / "out" / "problem.toml").read_text()
+    assert problem.problem.requirements.friction == 0.3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "task", "words"),
+    [
+        ({"joint_model": "foo"}, {}, "joint_model.*reflected"),
+        ({"kind": "auto"}, {}, "kind.*impulse"),
+        ({}, {"friction": 0.1}, "friction.*ImpactContact"),
+        ({}, {"joint_model": "link"}, "joint_model.*ImpactObjective"),
+    ],
+)
+def test_what_the_objective_holds_is_said_there(arguments: dict[str, Any], task: dict[str, Any], words: str) -> None:
+    robot = ip.load_robot("tilthex_arm")
+    with pytest.raises(ip.ImpactPostureError, match=words):
+        ip.PostureProblem(ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1)), **arguments), **task)
+
+
+@pytest.mark.parametrize("friction", ["0.3", None, -1.0, float("nan")])
+def test_a_friction_that_is_none(friction: Any) -> None:
+    with pytest.raises(ip.ImpactPostureError, match="friction"):
+        ip.ImpactContact("ee", (0, 0, 1), friction=friction)

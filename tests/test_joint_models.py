@@ -257,6 +257,15 @@ def test_refusals(
         with_joint_model(stated(robot("panda"), **change), joint_model)
 
 
+def test_a_joint_that_cannot_be_driven_moves_in_no_joint_model() -> None:
+    table = {"kind": "elastic", "stiffness": 1e4, "joints": {"elbow_joint": JointTransmissionSpec("locked")}}
+    found = stated(robot("ur5"), **table)
+    for joint_model in ("reflected", "link", "elastic"):
+        assert np.isinf(with_joint_model(found, joint_model).model.armature).sum() == 1  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="one posture"):
+        export(objective(with_joint_model(found, "elastic"), "tool0"), Path())
+
+
 def test_links_without_inertia_are_named() -> None:
     made = arm([Z, Y], [0.3, 0.4], floating=False)
     model = pin.Model(made.model)

@@ -67,6 +67,8 @@ class ImpactContact:
                 where="impulse",
                 hint=f"give {1 / LARGEST:g} to {LARGEST:g} N·s",
             )
+        if isinstance(self.friction, str) or self.friction is None:
+            raise ContactError(f"the coefficient is {self.friction!r}", where="friction", hint="give a number")
         if not 0 <= self.friction <= LARGEST:
             raise ContactError(
                 f"the coefficient is {self.friction:g}", where="friction", hint=f"give 0 to {LARGEST:g}"

@@ -21,10 +21,11 @@ import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError
+from impact_posture.impact.elastic_joints import ElasticImpact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.robot.joint_model import transmissions, with_joint_model
+from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.settings import MATERIALS, JointModel
 
 # ∫₀¹ dz/√(1 − z^{5/2}), the time to greatest compression in units of δ/v for the force κδ^{3/2}.
@@ -195,7 +196,8 @@ def compression(
     time = force = x = None
     by_material: dict[str, float] = {}
     if contact is not None:
-        time, force = contact.compression_time(found.G, speed), contact.peak_force(found.G, speed)
+        numbers = contact.compression_time(found.G, speed), contact.peak_force(found.G, speed)
+        time, force = (value if np.isfinite(value) else None for value in numbers)
     if springs is not None:
         G, C = springs
         if contact is not None:
@@ -209,21 +211,17 @@ def compression(
 
 
 def springs_along(case: ImpactCase, q: Array) -> tuple[float, float] | None:
-    """Return ``G = jM⁻¹jᵀ`` of the links alone, 1/kg, and ``C = jK⁻¹jᵀ`` of the joint springs, m/N.
+    """Return ``G = jM⁻¹jᵀ`` of the links alone, 1/kg, and the compliance C of the contact on the joint springs, m/N.
 
     Returns:
-        ``None`` if no joint that moves the contact has a spring of known stiffness.
+        ``None`` if no spring of known stiffness gives way to the contact.
     """
-    table = transmissions(case.robot)
-    if not table.elastic.any():
+    try:
+        compliance = ElasticImpact(case).compliance(q)
+    except InputError:
         return None
-    links = ImpactCase(
-        with_joint_model(case.robot, "link"), case.contact, case.metric, case.supports, case.compliance
-    )
-    oracle = ImpactOracle(links).at(q)
-    j = oracle.n @ oracle.J
-    compliance = float(np.sum(j[table.elastic] ** 2 / table.stiffness[table.elastic]))
-    return (oracle.quantities(q).G, compliance) if compliance > 0 else None
+    links = replace(case, robot=with_joint_model(case.robot, "link"))
+    return (ImpactOracle(links).quantities(q).G, compliance) if compliance > 0 else None
 
 
 def both_models(objective: ImpactObjective) -> dict[JointModel, ImpactObjective]:

@@ -130,7 +130,7 @@ class ElasticImpact:
         rotor = x.copy()
         rotor[self.joints], torque[self.joints] = impulse[:m] / self.rotors, force[:m]
         peak_square, peak[self.joints] = c.peaks()
-        square, softness = float(x @ oracle.weigh(x)), self._compliance()
+        square, softness = float(x @ oracle.weigh(x)), self.compliance(q)
         return ElasticResponse(
             stiffness=float(stiffness),
             speed=float(speed),
@@ -178,7 +178,7 @@ class ElasticImpact:
         """Check the stiffness, and solve for a unit approach speed."""
         if not _SOFTEST <= stiffness <= _STIFFEST:
             hint = f"give {_SOFTEST:g} to {_STIFFEST:g} N/m"
-            raise InputError(f"is {stiffness:g} N/m", where="contact stiffness", hint=hint)
+            raise InputError(f"is {stiffness:g} N/m", where="contact_stiffness", hint=hint)
         oracle = self.oracle.at(q)
         rows = np.vstack([np.eye(oracle.robot.nv)[self.joints], -oracle.n @ oracle.J])
         if oracle.quantities(q).blocked:
@@ -189,9 +189,10 @@ class ElasticImpact:
         kappa, d = np.append(self.kappa, float(stiffness)), np.append(self.d, 0.0)
         return _Compression((A + A.T) / 2, columns, kappa, d, oracle)
 
-    def _compliance(self) -> float:
-        """Return ``C`` at the last configuration: rotors and feet held, the base too unless it stands on feet."""
-        oracle, feet = self.oracle, self.oracle.Js
+    def compliance(self, q: Array) -> float:
+        """Return ``C`` at ``q``, m/N: rotors and feet held, the base too unless it stands on feet."""
+        oracle = self.oracle.at(q)
+        feet = oracle.Js
         moving = np.append(np.arange(6 if len(feet) else 0), self.joints)
         j, held = (oracle.n @ oracle.J)[moving], feet[:, moving]
         K = np.append(np.zeros(len(moving) - len(self.joints)), self.kappa)
@@ -252,7 +253,7 @@ class _Compression:
             t += step
             if t * self._fastest > _LONGEST:
                 what = "joints are too stiff or too damped for a contact as soft as this one"
-                raise InputError(what, where="contact stiffness", hint="raise it, or state a rigid transmission")
+                raise InputError(what, where="contact_stiffness", hint="raise it, or state a rigid transmission")
             state = scipy.linalg.expm(step * self._generator) @ state
         return t, state
 

@@ -70,7 +70,7 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
         bounds = requirements.least_mobility, requirements.largest_jump
         if requirements.keep_contacts:
             constraints += _kept_feet(objective, numeric, requirements.friction)
-        constraints += [ImpactLimits(single, *bounds) for single in objective.singles if _bounded(bounds)]
+        constraints += _limits(objective, bounds)
         constraints += _in_every_variant(objective, numeric, requirements.friction, bounds, constraints)
     lower, upper = _bounds(robot, chart, given, requirements)
     more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
@@ -160,8 +160,10 @@ def _contact_constraints(
     return [HeldPosition(f"position of {contact.frame}", point, target.translation)]
 
 
-def _bounded(bounds: tuple[float, float]) -> bool:
-    return bounds[0] > 0 or np.isfinite(bounds[1])
+def _limits(objective: ImpactObjective, bounds: tuple[float, float], variant: str = "") -> list[Constraint]:
+    """One constraint for each contact, none where nothing is bounded or all joints are locked."""
+    made = [ImpactLimits(single, *bounds, variant) for single in objective.singles]
+    return [limits for limits in made if limits.rows]
 
 
 def _kept_feet(objective: ImpactObjective, numeric: Numeric, friction: float) -> list[Constraint]:
@@ -197,8 +199,7 @@ def _in_every_variant(
             found += [CenterOfMassOverFeet(c.normals, c.offsets, c.margin, loaded) for c in centers]
         if kept:
             found += [KeptFeet(single, numeric, friction, variant.name) for single in member.singles]
-        if _bounded(bounds):
-            found += [ImpactLimits(single, *bounds, variant.name) for single in member.singles]
+        found += _limits(member, bounds, variant.name)
     return found
 
 

@@ -56,6 +56,10 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
     if "contact" in over:
         data.pop("frame", None)
         data.pop("normal", None)
+    if "contact_duration" in over:
+        data.pop("contact_stiffness", None)
+    if "contact_stiffness" in over:
+        data.pop("contact_duration", None)
     if "posture" in over:
         data.pop("q", None)
     return validate(ProblemSettings, data | over, str(path))
@@ -133,6 +137,8 @@ def _least_mobility(settings: ProblemSettings) -> float:
                 where=name,
                 hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
             )
+        if asked and settings.speed == 0:
+            raise InputError("needs an approach speed", where=name, hint="give `speed` above zero")
     contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
     if settings.max_force is None or contact is None:
         return 0.0
@@ -196,10 +202,10 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
 def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
     contact = impact.contact
     if not impact.objective.others:
-        one = {"frame": contact.frame, "normal": contact.normal, "offset": contact.offset}
-        return one | {"contact": None, "impulse": contact.impulse}
+        keys = ("frame", "normal", "offset", "friction", "impulse")
+        return {key: getattr(contact, key) for key in keys} | {"contact": None}
     texts = tuple(f"{c.frame}:{','.join(map(repr, c.normal))}:{c.impulse!r}" for c in impact.objective.contacts)
-    return {"frame": None, "normal": None, "offset": None, "contact": texts}
+    return {"frame": None, "normal": None, "offset": None, "contact": texts, "friction": contact.friction}
 
 
 def _resolved_variants(variants: Sequence[ModelVariant]) -> dict[str, object]:

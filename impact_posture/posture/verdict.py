@@ -14,7 +14,9 @@ from impact_posture.impact.resolved_impact import ResolvedImpact
 from impact_posture.impact.velocity_jump import Jump
 from impact_posture.tables import json_block
 
-Outcome = Literal["better", "better at the price of force", "no better", "worse", "unknown"]
+Outcome = Literal[
+    "better", "better at the price of force", "better at the price of impulse", "no better", "worse", "unknown"
+]
 
 # A change below this share is none.
 _SAME = 0.01
@@ -57,8 +59,9 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
         return Verdict("unknown", f"no verdict: {why}.", None, None, None, ())
     jump, impulse = _change(pair[0].norm, pair[1].norm), _change(pair[0].impulse_size, pair[1].impulse_size)
     force = _force_change(before, after)
-    heavier = max(impulse, force or 0.0) > _SAME
-    outcome: Outcome = "better at the price of force" if heavier else "better"
+    outcome: Outcome = "better at the price of impulse" if impulse > _SAME else "better"
+    if (force or 0.0) > _SAME:
+        outcome = "better at the price of force"
     if jump > _SAME:
         outcome = "worse"
     elif jump > -_SAME:
@@ -71,7 +74,7 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
     line = f"verdict: {outcome}. At {impact.speed:g} m/s {contact} {', '.join(parts[:-1])} and {parts[-1]}."
     advice = (
         *_without_friction(before, after, jump),
-        *_better_objective(impact, outcome, force or 0.0),
+        *_better_objective(impact, outcome),
         *_other_joint_model(impact, before, after),
     )
     return Verdict(outcome, line, jump, impulse, force, advice)
@@ -121,13 +124,13 @@ def _without_friction(before: Evaluation, after: Evaluation, jump: float) -> Ite
         yield f"without friction the jump {_words(change)}"
 
 
-def _better_objective(impact: ResolvedImpact, outcome: Outcome, force: float) -> Iterator[str]:
+def _better_objective(impact: ResolvedImpact, outcome: Outcome) -> Iterator[str]:
     objective = impact.objective
     if outcome in ("worse", "no better") and objective.kind != "coulomb" and not objective.others:
         kind = "sticking" if objective.normal_cone_deg else "coulomb"
         if kind != objective.kind:
             yield f"`objective='{kind}'` minimizes this jump; '{objective.kind}' minimizes another quantity"
-    if outcome == "better at the price of force" and force > _SAME:
+    if outcome == "better at the price of force":
         yield "`max_force` bounds the force"
 
 

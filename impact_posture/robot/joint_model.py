@@ -79,26 +79,23 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
     """Return the robot as an impact meets it.
 
     ``reflected`` keeps the armature at all joints.  ``link`` leaves it out, except at joints whose transmission is
-    ``rigid``, and joints whose transmission is ``locked`` do not move.  ``locked`` holds all joints, as position
-    control with stiff gears does, so that only a floating base moves.  ``elastic`` leaves the armature out at joints
-    with springs of known stiffness, whose rotors then follow
+    ``rigid``.  ``locked`` holds all joints, as position control with stiff gears does, so that only a floating base
+    moves.  Joints whose transmission is ``locked`` move in no joint model.  ``elastic`` leaves the armature out at
+    joints with springs of known stiffness, whose rotors then follow
     (:mod:`impact_posture.impact.elastic_joints`); H, G, V, S and E are those of the first moment.
 
     Raises:
         InertiaError: The mass matrix is singular without the rotors.
         InputError: Nothing is left that moves, or ``elastic`` finds no spring.
     """
-    stated = robot.armature
+    stated, found = robot.armature, transmissions(robot)
     armature = stated.copy()
     joints = np.arange(robot.nv) >= (6 if robot.floating else 0)
     if joint_model == "link":
-        found = transmissions(robot)
         armature = np.where(joints & ~found.rigid, 0.0, armature)
-        armature[found.locked] = np.inf
     elif joint_model == "locked":
         armature[joints] = np.inf
     elif joint_model == "elastic":
-        found = transmissions(robot)
         # A rotor without inertia holds nothing against its spring.
         springs = found.elastic & (stated > 0)
         if not springs.any():
@@ -107,7 +104,8 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
                 where="joint_model",
                 hint="state stiffness in robot.toml [transmission] and the inertia of the rotors in [armature]",
             )
-        armature = np.where(found.locked, np.inf, np.where(springs, 0.0, armature))
+        armature = np.where(springs, 0.0, armature)
+    armature[found.locked] = np.inf
     if (np.isinf(armature) | ~joints).all() and not robot.floating:
         raise InputError(
             f"all joints of {robot.name} are locked, so nothing moves in an impact",
@@ -128,11 +126,11 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
 
 def describe_joints(robot: Robot) -> str:
     """Say in words what the impact meets at the joints."""
-    if robot.joint_model == "reflected":
-        return "reflected (links and rotors)"
     armature = np.asarray(robot.model.armature)[6 if robot.floating else 0 :]
     held, kept = int(np.isinf(armature).sum()), int((np.isfinite(armature) & (armature > 0)).sum())
     parts = [f"{held} of {len(armature)} joints rigid"] if held else []
+    if robot.joint_model == "reflected":
+        parts.insert(0, "links and rotors")
     if robot.joint_model == "elastic":
         parts.insert(0, "rotors on springs; H, G, V, S, E of the first moment")
     if robot.joint_model == "link":
