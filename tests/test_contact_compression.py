@@ -208,7 +208,7 @@ def test_a_tool_that_may_tilt_does_at_least_as_well() -> None:
             if isinstance(constraint, AxisInCone):
                 degrees = float(pose.partition(":")[2])
                 numeric = Numeric(prepared.problem.robot.model)
-                assert constraint.evaluate(numeric.at(found.q))[0][0] >= np.cos(np.deg2rad(degrees)) - 1e-9
+                assert -constraint.evaluate(numeric.at(found.q))[0][0] >= np.cos(np.deg2rad(degrees)) - 1e-9
                 jacobian = constraint.evaluate(numeric.at(found.q))[1]
                 tilt = partial(_value_at, constraint, numeric)
                 measured = central_gradient(tilt, prepared.problem.robot.model, found.q, 1e-4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,10 @@ from matplotlib.patches import Patch
 
 from impact_posture.arrays import Array
 from impact_posture.escape import plot_label
+from impact_posture.impact.coulomb_contacts import CoulombJump, coulomb_jump
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.impact.velocity_jump import tangent_units
-from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, BLUE, INK, VERMILLION, framed, shared_legend
+from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, INK, VERMILLION, framed, shared_legend
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
 _ROW = 0.17
@@ -23,24 +25,24 @@ def jump_figure(view: ResultView) -> Figure:
     """Draw Δν as horizontal bars: left ``a = M⁻¹Jᵀn`` per N·s, right ``a(1+e)v/G`` for the approach speed v.
 
     Velocities of different units (base linear, base angular, turning and sliding joints) have panels of their own.
-    Diamonds on the right show the jump where the contact point sticks, where that exists.
+    Diamonds on the right show the jump with the friction of the contact, where that exists.
     """
     groups = groups_of(view)
     gain = (1 + view.restitution) * view.speed
     states = (view.before, view.after)
-    stuck = [None if state.sticking_jump is None else gain * state.sticking_jump for state in states]
+    rubbed = [coulomb_jump(view.objective, q, gain) for q in (view.q_initial, view.q_optimal)]
     columns: list[tuple[str, str, list[Array], list[Array | None], str]] = [
         ("per impulse of 1 N·s", "/(N·s)", [state.jump for state in states], [None, None], _norms(view, "H", 1.0)),
         (
             f"for an approach at {view.speed:g} m/s, e = {view.restitution:g}",
             "",
             [gain / state.G * state.jump if state.G > 0 else 0 * state.jump for state in states],
-            stuck,
-            _norms(view, "V", gain),
+            [None if jump is None else jump.velocity for jump in rubbed],
+            _norms(view, "V", gain) + _with_friction(rubbed),
         ),
     ]
     heights = [0.42 + _ROW * len(indices) for _, indices, _ in groups]
-    with framed(*header_lines(view), sum(heights) + 0.75, _notes(view, stuck)) as (figure, body):
+    with framed(*header_lines(view), sum(heights) + 0.75, _notes(view, rubbed)) as (figure, body):
         panels: Any = body.subplots(len(groups), 2, squeeze=False, sharey="row", height_ratios=heights)
         for row, (name, indices, unit) in zip(panels, groups, strict=True):
             names = [view.robot.tangent_names[k].removeprefix("base ") for k in indices]
@@ -53,7 +55,7 @@ def jump_figure(view: ResultView) -> Figure:
         for axes, (title, _, _, _, norm) in zip(panels[0], columns, strict=True):
             axes.set_title(f"{title}\n{norm}", parse_math=False)
         body.align_ylabels(list(panels[:, 0]))
-        shared_legend(body, _handles(stuck), "upper")
+        shared_legend(body, _handles(rubbed), "upper")
     return figure
 
 
@@ -89,28 +91,37 @@ def _norms(view: ResultView, name: str, gain: float) -> str:
     def norm(state: ImpactQuantities) -> str:
         return number(gain * float(np.sqrt(max(getattr(state, name), 0.0))))
 
-    unit = jump_unit(view)
-    factor = "" if gain == 1 else f"{gain:g} m/s · "
-    return f"‖Δν‖ = {factor}√{name} = {norm(view.before)} → {norm(view.after)} {unit}"
+    # The unit of both columns stands once, in the narrower title.
+    factor, unit = ("", f" {jump_unit(view)}") if gain == 1 else (f"{gain:g} m/s · ", "")
+    return f"‖Δν‖ = {factor}√{name} = {norm(view.before)} → {norm(view.after)}{unit}"
 
 
-def _notes(view: ResultView, stuck: list[Array | None]) -> list[str]:
+def _with_friction(jumps: Sequence[CoulombJump | None]) -> str:
+    """Return the norms of the diamonds."""
+    first, second = jumps
+    if first is None or second is None:
+        return ""
+    return f"\nwith friction {first.friction:g}: ‖Δν‖ = {number(first.norm)} → {number(second.norm)}"
+
+
+def _notes(view: ResultView, rubbed: Sequence[CoulombJump | None]) -> list[str]:
     notes = "Bars: no friction. A posture can lower one column and raise the other: the impulse grows as G falls."
     still = [word for word, state in (("before", view.before), ("after", view.after)) if not state.G > 0]
     if still:
         notes += f" The contact cannot move along n {' and '.join(still)} (G = 0): no jump for an approach."
-    if all(point is None for point in stuck):
-        return [notes + " S is undefined here: no sticking jump."]
-    return [notes + " Diamonds: the contact point sticks (no slip), as S counts it."]
+    named = [(word, jump) for word, jump in zip(("before", "after"), rubbed, strict=True) if jump is not None]
+    if not named:
+        return [notes + " With friction the jump is undefined here."]
+    fates = " and ".join(f"{'sticks' if jump.sticks else 'slips'} {word}" for word, jump in named)
+    return [notes + f" Diamonds: with friction {named[0][1].friction:g} the contact point {fates}."]
 
 
-def _handles(stuck: list[Array | None]) -> list[Any]:
+def _handles(rubbed: Sequence[CoulombJump | None]) -> list[Any]:
     handles: list[Any] = [Patch(label="before", **BEFORE_BAR), Patch(label="after", **AFTER_BAR)]
-    for word, color, point in zip(("before", "after"), (VERMILLION, BLUE), stuck, strict=True):
-        if point is not None:
-            edge = color if word == "before" else INK
+    for word, edge, jump in zip(("before", "after"), (VERMILLION, INK), rubbed, strict=True):
+        if jump is not None:
             handles.append(
                 Line2D([], [], linestyle="", marker="D", markersize=4, color="white", markeredgecolor=edge,
-                       label=f"{word}, sticking")
+                       label=f"{word}, with friction")
             )  # fmt: skip
     return handles

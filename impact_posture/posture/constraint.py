@@ -203,7 +203,7 @@ class HeldPose(Constraint):
 
 
 class AxisInCone(Constraint):
-    """An axis of the frame stays within a cone: ``dᵀR(q)c ≥ cos α``; the frame may turn about the axis.
+    """An axis of the frame stays within a cone: ``−dᵀR(q)c ≤ −cos α``; the frame may turn about the axis.
 
     Args:
         name: Name of the constraint.
@@ -216,7 +216,7 @@ class AxisInCone(Constraint):
     def __init__(self, name: str, point: PointOnLink, axis: Array, direction: Array, degrees: float) -> None:
         self.name, self.point, self._degrees = name, point, degrees
         self.parameters = np.concatenate([axis, direction])
-        self.lower, self.upper = np.array([np.cos(np.deg2rad(degrees))]), np.array([np.inf])
+        self.lower, self.upper = np.array([-np.inf]), np.array([-np.cos(np.deg2rad(degrees))])
 
     def describe(self) -> str:
         """See :class:`Constraint`."""
@@ -224,13 +224,13 @@ class AxisInCone(Constraint):
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
         """See :class:`Constraint`."""
-        return ca.dot(tree.rotation(self.point) @ parameters[:3], parameters[3:])
+        return -ca.dot(tree.rotation(self.point) @ parameters[:3], parameters[3:])
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
         axis, direction = self.parameters[:3], self.parameters[3:]
         now = model.placement(self.point).rotation @ axis
-        return np.array([now @ direction]), (model.jacobian(self.point)[3:].T @ np.cross(now, direction))[None, :]
+        return -np.array([now @ direction]), (model.jacobian(self.point)[3:].T @ np.cross(direction, now))[None, :]
 
 
 class HeldTurn(Constraint):

@@ -30,7 +30,6 @@ class Transmissions:
     """Transmission of each velocity entry; a floating base has none.
 
     Attributes:
-        stated: Whether robot.toml names the kind.
         rigid: Whether the rotor moves with the link.
         locked: Whether the joint cannot be driven from its link.
         stiffness: Of the spring between rotor and link, N·m/rad (N/m if prismatic), shape (nv,); infinite where
@@ -38,7 +37,6 @@ class Transmissions:
         damping: Of the damper beside it, N·m·s/rad (N·s/m), shape (nv,).
     """
 
-    stated: Mask
     rigid: Mask
     locked: Mask
     stiffness: Array
@@ -58,16 +56,14 @@ def transmissions(robot: Robot) -> Transmissions:
     """
     spec, model, nv = robot.spec.transmission, robot.model, robot.nv
     none = np.zeros(nv, dtype=bool)
-    found = Transmissions(none, none.copy(), none.copy(), np.full(nv, np.inf), np.zeros(nv))
+    found = Transmissions(none, none.copy(), np.full(nv, np.inf), np.zeros(nv))
     for joint in spec.joints:
         if joint not in robot.locked:
             joint_index(model, joint, f"{robot.name} [transmission.joints]")
     for joint in robot.joint_names:
         own = spec.joints.get(joint, JointTransmissionSpec())
         kind, entries = own.kind or spec.kind, v_slice(model, robot.joint_id(joint))
-        found.stated[entries], found.rigid[entries], found.locked[entries] = (
-            kind is not None, kind == "rigid", kind == "locked",
-        )  # fmt: skip
+        found.rigid[entries], found.locked[entries] = kind == "rigid", kind == "locked"
         stiffness = own.stiffness or spec.stiffness
         if stiffness is not None:
             found.stiffness[entries] = stiffness

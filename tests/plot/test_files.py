@@ -112,7 +112,7 @@ def test_degenerate_robot_draws(pendulum: ResultView) -> None:
     words = {
         "classical": "force unbounded: a strip",
         "ellipsoid": "S undefined",
-        "jump": "no sticking jump",
+        "jump": "Diamonds: with friction 0.7 the contact point",
         "nullspace": "S is undefined along the path",
         "postures": "seen along −x",
         "tradeoff": "S is undefined at these postures",
