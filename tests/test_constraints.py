@@ -13,9 +13,9 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.impact.contact import point_on
-from impact_posture.posture.constraint import (
+from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.pose_constraints import (
     CenterOfMassOverFeet,
-    Constraint,
     HeldOrientation,
     HeldPose,
     HeldPosition,

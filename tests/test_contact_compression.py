@@ -27,9 +27,9 @@ from impact_posture.impact.contact_compression import (
 from impact_posture.impact.elastic_joints import elastic_response
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.posture.constraint import AxisInCone
 from impact_posture.posture.impact_limits import ImpactLimits
 from impact_posture.posture.pareto import pareto_front
+from impact_posture.posture.pose_constraints import AxisInCone
 from impact_posture.posture.problem_settings import prepare, read_settings
 from impact_posture.posture.solve import solve
 from impact_posture.robot.joint_model import with_joint_model

@@ -18,8 +18,8 @@ from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.worst_case import ModelSet
-from impact_posture.posture.constraint import CenterOfMassOverFeet
 from impact_posture.posture.kept_feet import KeptFeet
+from impact_posture.posture.pose_constraints import CenterOfMassOverFeet
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.robustness import Robustness, VariantOptimum, solve_robustly

@@ -42,10 +42,12 @@ class Guess:
     Attributes:
         values: Values, shape (k,).
         lower: Lower bounds, shape (k,); minus infinity where there is none.
+        upper: Upper bounds, shape (k,); ``None`` for none.
     """
 
     values: Array
     lower: Array
+    upper: Array | None = None
 
     @staticmethod
     def unbounded(values: Array) -> Guess:

@@ -14,18 +14,18 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.impact.objective import ImpactObjective, Objective
-from impact_posture.posture.constraint import (
+from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.impact_limits import ImpactLimits
+from impact_posture.posture.kept_feet import KeptFeet
+from impact_posture.posture.pose_constraints import (
     AxisInCone,
     CenterOfMassOverFeet,
-    Constraint,
     HeldOrientation,
     HeldPose,
     HeldPosition,
     PositionBox,
     base_point,
 )
-from impact_posture.posture.impact_limits import ImpactLimits
-from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.regular import pin_undetermined, regularize
 from impact_posture.robot.robot import Robot

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -11,8 +13,9 @@ from numpy.typing import NDArray
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.posture.constraint import Linearization
 from impact_posture.posture.posture_distance import distance_gradient
-from impact_posture.posture.problem import PostureProblem, equality_jacobian, null_space
+from impact_posture.posture.problem import PostureProblem, held_rows, null_space
 from impact_posture.tables import json_block
 
 # An inequality closer than this (m, rad) may have a multiplier.  The product of both is the complementarity.
@@ -20,6 +23,8 @@ _ACTIVE = 1e-3
 # Members of a maximum count if they are at most this share of f₀ below it.  The tolerance of the solver is a share of
 # f₀ as well, and large for an objective that fell by orders of magnitude.  Complementarity allows twice this gap.
 _TIED = 5e-8
+# Weight of complementarity beside stationarity: the ratio of their tolerances.
+_COMPLEMENTARITY = 10.0
 # A multiplier below this is rounding.
 _MULTIPLIER = 1e-6
 
@@ -85,32 +90,46 @@ class Certificate:
         return {key: value for key, value in json_block(self).items() if key != "active"}
 
 
-def certify(problem: PostureProblem, q: Array, scale: float) -> Certificate:
-    """Certify ``q``; ``scale`` is the initial objective f₀."""
+def certify(problem: PostureProblem, q: Array, scale: float, auxiliaries: Array | None = None) -> Certificate:
+    """Certify ``q``.
+
+    Args:
+        problem: The posture problem.
+        q: The posture, shape (nq,).
+        scale: The initial objective f₀.
+        auxiliaries: Auxiliaries of the constraints at ``q``; by default the guesses of the constraints.
+    """
     numeric = Numeric(problem.robot.model)
     gradients, gaps = objective_gradients(problem, q, scale)
     numeric.at(q)
     errors = [c.pose_error(numeric) for c in problem.constraints]
-    near, violation = _inequalities(problem, numeric)
+    own = problem.guess(numeric).values if auxiliaries is None else auxiliaries
+    parts = [c.linearize(numeric, z) for c, z in zip(problem.constraints, problem.split(numeric, own), strict=True)]
+    rows = _Rows(problem.robot.nv, parts)
     limits, limit_violation = _limits(problem, q)
-    near += limits
-    weights, multipliers, residual = _multipliers(
-        gradients, equality_jacobian(problem, numeric), np.array([row.outward for row in near])
-    )
+    near = [*rows.near(), *(replace(row, outward=rows.pad(row.outward)) for row in limits)]
+    held = rows.pad(held_rows(problem.robot, problem.requirements.hold))
+    weights, multipliers, residual = _multipliers(rows.pad(gradients), np.vstack([held, rows.equalities()]), near)
     products = [abs(float(m) * row.slack) for row, m in zip(near, multipliers, strict=True)]
-    active = tuple(
-        Active(row.name, row.side, float(m)) for row, m in zip(near, multipliers, strict=True) if m > _MULTIPLIER
-    )
     return Certificate(
         stationarity=float(np.abs(residual).max()),
-        primal=max(violation, limit_violation),
+        primal=max(rows.violation(), limit_violation),
         complementarity=max([*products, float(weights @ gaps)]),
         pose_error_m=max((e[0] for e in errors), default=0.0),
         pose_error_rad=max((e[1] for e in errors), default=0.0),
         limits=limit_violation,
         recomputed_with=f"pinocchio {pin.__version__}",
-        active=active,
+        active=_active(near, multipliers),
     )
+
+
+def _active(near: Sequence[_Near], multipliers: Array) -> tuple[Active, ...]:
+    """Inequalities with a multiplier.  Rows of one name are one inequality; a row without a name belongs to another."""
+    found: dict[tuple[str, str], float] = {}
+    for row, multiplier in zip(near, multipliers, strict=True):
+        if row.name and multiplier > _MULTIPLIER:
+            found[row.name, row.side] = found.get((row.name, row.side), 0.0) + float(multiplier)
+    return tuple(Active(*key, multiplier) for key, multiplier in found.items())
 
 
 def objective_gradients(problem: PostureProblem, q: Array, scale: float) -> tuple[Array, Array]:
@@ -143,17 +162,50 @@ def _near_bounds(name: str, value: float, low: float, high: float, gradient: Arr
     return [side for side in sides if side.slack < _ACTIVE]
 
 
-def _inequalities(problem: PostureProblem, numeric: Numeric) -> tuple[list[_Near], float]:
-    """Inequality rows near their bound, and the largest violation of all constraints."""
-    near: list[_Near] = []
-    violation = 0.0
-    for c in problem.constraints:
-        value, jacobian = c.evaluate(numeric)
-        violation = max(violation, float(np.abs(c.excess(value)).max()))
-        if not c.equality:
-            for k in range(c.rows):
-                near += _near_bounds(c.row_name(k), value[k], c.lower[k], c.upper[k], jacobian[k])
-    return near, violation
+class _Rows:
+    """Rows of all constraints over the tangent space and the auxiliaries.
+
+    Args:
+        nv: Dimension of the tangent space.
+        parts: Rows of each constraint.
+    """
+
+    def __init__(self, nv: int, parts: Sequence[Linearization]) -> None:
+        self._parts, self._nv = parts, nv
+        ends = np.cumsum([nv, *[part.auxiliary.shape[1] for part in parts]])
+        self._width = int(ends[-1])
+        self._at = [slice(start, stop) for start, stop in pairwise(ends)]
+
+    def pad(self, tangent: Array) -> Array:
+        """Return tangent rows, or one row, with zeros for the auxiliaries."""
+        zeros = np.zeros((*tangent.shape[:-1], self._width - self._nv))
+        return np.concatenate([tangent, zeros], axis=-1)
+
+    def _jacobian(self, index: int) -> Array:
+        rows = self.pad(self._parts[index].posture)
+        rows[:, self._at[index]] = self._parts[index].auxiliary
+        return rows
+
+    def equalities(self) -> Array:
+        """Return the Jacobian of all equalities."""
+        found = [np.zeros((0, self._width))]
+        found += [self._jacobian(k)[part.lower == part.upper] for k, part in enumerate(self._parts)]
+        return np.vstack(found)
+
+    def near(self) -> list[_Near]:
+        """Return the inequalities near their bounds."""
+        found: list[_Near] = []
+        for k, part in enumerate(self._parts):
+            jacobian = self._jacobian(k)
+            for row in np.flatnonzero(part.lower != part.upper):
+                bounds = part.value[row], part.lower[row], part.upper[row]
+                found += _near_bounds(part.names[row], *bounds, jacobian[row])
+        return found
+
+    def violation(self) -> float:
+        """Return the largest violation."""
+        outside = [np.maximum(part.lower - part.value, part.value - part.upper) for part in self._parts]
+        return float(np.concatenate([np.zeros(1), *outside]).max())
 
 
 def _limits(problem: PostureProblem, q: Array) -> tuple[list[_Near], float]:
@@ -174,10 +226,12 @@ def _limits(problem: PostureProblem, q: Array) -> tuple[list[_Near], float]:
     return near, float(worst)
 
 
-def _multipliers(gradients: Array, equalities: Array, inequalities: Array) -> tuple[Array, Array, Array]:
+def _multipliers(gradients: Array, equalities: Array, near: Sequence[_Near]) -> tuple[Array, Array, Array]:
     """Weights of the gradients (≥ 0, sum 1) and multipliers of the inequalities (≥ 0) with the least residual.
 
     Multipliers of equalities have any sign, so all gradients are projected onto the null space of the equalities.
+    The product of each multiplier and its slack is a residual as well.  Else a row that is near and not active could
+    take the part of an active one.
 
     Returns:
         Weights, multipliers and residual.
@@ -185,14 +239,17 @@ def _multipliers(gradients: Array, equalities: Array, inequalities: Array) -> tu
     count = len(gradients)
     free = null_space(equalities)
     reduced = gradients @ free
-    if not free.shape[1] or (count == 1 and not len(inequalities)):
-        return np.eye(count)[0], np.zeros(len(inequalities)), free @ reduced[0]
-    bounds = inequalities @ free if len(inequalities) else np.zeros((0, free.shape[1]))
+    if not free.shape[1] or (count == 1 and not near):
+        return np.eye(count)[0], np.zeros(len(near)), free @ reduced[0]
+    bounds = np.array([row.outward for row in near]).reshape(len(near), len(free)) @ free
+    slack = np.diag([_COMPLEMENTARITY * row.slack for row in near])
     if count == 1:
-        multipliers = nonnegative_least_squares(bounds.T, -reduced[0])
+        right = np.concatenate([-reduced[0], np.zeros(len(near))])
+        multipliers = nonnegative_least_squares(np.vstack([bounds.T, slack]), right)
         return np.ones(1), multipliers, free @ (reduced[0] + bounds.T @ multipliers)
     # A row with the sum 1 scales the solution, and does not turn the least residual.
-    system = np.hstack([np.vstack([reduced.T, np.ones(count)]), np.vstack([bounds.T, np.zeros(len(bounds))])])
+    left = np.vstack([reduced.T, np.zeros((len(near), count)), np.ones(count)])
+    system = np.hstack([left, np.vstack([bounds.T, slack, np.zeros(len(near))])])
     found = nonnegative_least_squares(system, np.eye(len(system))[-1])
     found = found / found[:count].sum()
     weights, multipliers = found[:count], found[count:]

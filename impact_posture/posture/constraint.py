@@ -1,22 +1,59 @@
 """Constraints on a posture, each as an expression and in Pinocchio's numbers.
 
-To add a constraint, derive from :class:`Constraint` and implement ``symbolic`` and ``evaluate``.  The program, the
-search for feasible starts, the certificate and the elastic diagnosis need nothing else.
+To add a constraint, derive from :class:`Constraint` and implement ``evaluate``, and ``symbolic`` or, with auxiliary
+unknowns, ``lift``, ``guess`` and ``linearize``.  The program, the search for feasible starts, the certificate and the
+elastic diagnosis need nothing else.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Self
 
 import casadi as ca
 import numpy as np
-import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.dynamics.spatial import quaternion_product
-from impact_posture.dynamics.tree import PointOnLink, Tree
+from impact_posture.dynamics.tree import Tree
+from impact_posture.impact.lifted import Guess
+
+
+@dataclass(frozen=True)
+class LiftedRows:
+    """A constraint in the unknowns of the program: ``lower ≤ g(q, z) ≤ upper`` with auxiliaries z.
+
+    Attributes:
+        rows: ``g(q, z)``, shape (m, 1).
+        variables: ``z``, shape (k, 1).
+        slack: Sum of those auxiliaries that relax rows, meters; the program drives it to zero.
+    """
+
+    rows: ca.SX
+    variables: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
+    slack: ca.SX = field(default_factory=lambda: ca.SX(1, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """Rows of a constraint near a posture, over the tangent space and the auxiliaries that the certificate keeps.
+
+    Attributes:
+        names: Name of each row.
+        value: ``g(q, z)``, shape (m,).
+        lower: Lower bounds, shape (m,).
+        upper: Upper bounds, shape (m,).
+        posture: Tangent Jacobian ``∂g/∂q``, shape (m, nv).
+        auxiliary: ``∂g/∂z``, shape (m, k).
+    """
+
+    names: list[str]
+    value: Array
+    lower: Array
+    upper: Array
+    posture: Array
+    auxiliary: Array
 
 
 class Constraint(ABC):
@@ -27,16 +64,18 @@ class Constraint(ABC):
         parameters: Numbers that may change without rebuilding the program (targets, polygons).
         lower: Lower bounds, shape (rows,).
         upper: Upper bounds, shape (rows,).
+        projected: Whether starts are pulled onto it; else the program alone satisfies it.
     """
 
     name: str
     parameters: Array
     lower: Array
     upper: Array
+    projected: bool = True
 
     @property
     def rows(self) -> int:
-        """Number of scalar constraints."""
+        """Number of scalar constraints on ``c(q)``."""
         return int(self.lower.size)
 
     @property
@@ -49,13 +88,45 @@ class Constraint(ABC):
         """Text that distinguishes it apart from parameters and bounds; part of the key of the compile cache."""
         return f"{type(self).__name__}:{self.name}:{self.rows}"
 
-    @abstractmethod
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
         """Return ``c(q)`` as an expression, shape (rows, 1), of a ``tree`` that was built with ``chart_x``."""
+        raise NotImplementedError(f"{type(self).__name__} has a lifted form only")
 
     @abstractmethod
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """Return ``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``model.q``."""
+
+    # ---- lifted form, by default without auxiliaries ----------------------------------------------------------
+
+    def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
+        """Return the rows of the program, with their auxiliaries."""
+        return LiftedRows(self.symbolic(tree, parameters))
+
+    @property
+    def lifted_bounds(self) -> tuple[Array, Array]:
+        """Bounds of the rows of :meth:`lift`, shape (m,) each."""
+        return self.lower, self.upper
+
+    def guess(self, model: Numeric) -> Guess:
+        """Return the auxiliaries to start from at ``model.q``, with their bounds."""
+        return Guess(np.zeros(0), np.zeros(0))
+
+    def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
+        """Return the rows at ``model.q`` in Pinocchio's numbers; those far from their bounds may be left out.
+
+        Args:
+            model: The model at the posture.
+            auxiliaries: Values of the auxiliaries of :meth:`lift`, shape (k,).
+        """
+        value, jacobian = self.evaluate(model)
+        names = [self.row_name(row) for row in range(self.rows)]
+        return Linearization(names, value, self.lower, self.upper, jacobian, np.zeros((self.rows, 0)))
+
+    def grown(self, model: Numeric) -> Self:
+        """Return the constraint with the parts that its program lacks at ``model.q``; itself if it lacks none."""
+        return self
+
+    # ---- words ------------------------------------------------------------------------------------------------
 
     def excess(self, value: Array) -> Array:
         """Return how far ``c(q)`` lies outside its bounds, signed, shape (rows,)."""
@@ -72,247 +143,3 @@ class Constraint(ABC):
     def pose_error(self, model: Numeric) -> tuple[float, float]:
         """Return the error of a held pose in meters and radians; zeros for other constraints."""
         return 0.0, 0.0
-
-
-class HeldPosition(Constraint):
-    """The point stays at ``p*``: ``p(q) − p* = 0``, world axes, meters."""
-
-    def __init__(self, name: str, point: PointOnLink, target: Array) -> None:
-        self.name, self.point = name, point
-        self.parameters = np.array(target, dtype=float)
-        self.lower = self.upper = np.zeros(3)
-
-    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
-        return tree.position(self.point) - parameters
-
-    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
-        return model.placement(self.point).translation - self.parameters, model.jacobian(self.point)[:3]
-
-    def pose_error(self, model: Numeric) -> tuple[float, float]:
-        """See :class:`Constraint`."""
-        return float(np.linalg.norm(self.evaluate(model)[0])), 0.0
-
-
-class PositionBox(HeldPosition):
-    """The point stays within a box around ``p*``: ``|p(q) − p*| ≤ half``, world axes, meters."""
-
-    def __init__(self, name: str, point: PointOnLink, target: Array, half: Sequence[float]) -> None:
-        super().__init__(name, point, target)
-        self.upper = np.array(half, dtype=float)
-        self.lower = -self.upper
-
-    def describe(self) -> str:
-        """See :class:`Constraint`."""
-        return f"{super().describe()} (" + " × ".join(f"±{v:g}" for v in self.upper) + " m)"
-
-    def row_name(self, row: int) -> str:
-        """See :class:`Constraint`."""
-        return f"{self.name} along {'xyz'[row]}"
-
-    def pose_error(self, model: Numeric) -> tuple[float, float]:
-        """Return the distance outside the box."""
-        outside = np.maximum(np.abs(self.evaluate(model)[0]) - self.upper, 0.0)
-        return float(np.linalg.norm(outside)), 0.0
-
-
-class HeldOrientation(Constraint):
-    """The frame keeps its orientation, or the direction of one of its axes.
-
-    ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)`` is the vector part of the error quaternion, polynomial in half angles.  It is
-    smooth, and the rotation vector in radians to first order.  It is zero at the target only, and largest at 180°,
-    where a skew-symmetric error is zero again.  The first two components alone hold the direction of ``axis``.
-
-    Args:
-        name: Name of the constraint.
-        point: Point on the link whose orientation is held.
-        target: Desired world rotation, shape (3, 3).
-        axis: Axis in the frame whose direction is held and about which it may turn; ``None`` holds all three.
-    """
-
-    def __init__(self, name: str, point: PointOnLink, target: Array, axis: Array | None = None) -> None:
-        self.name, self.point, self.target = name, point, np.array(target, dtype=float)
-        self.axis = axis
-        width = 3 if axis is None else 2
-        right = np.eye(3) if axis is None else _rotation_to(axis)
-        left = self.target @ right
-        self.parameters = np.concatenate([_coefficients(left.T), _coefficients(right)])
-        self.lower = self.upper = np.zeros(width)
-
-    def describe(self) -> str:
-        """See :class:`Constraint`."""
-        return super().describe() + ("" if self.axis is None else " (tilt zero, yaw free)")
-
-    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
-        error = quaternion_product(quaternion_product(parameters[:4], tree.quaternion(self.point)), parameters[4:8])
-        return 2 * error[: self.rows]
-
-    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
-        right = pin.Quaternion(self.parameters[4:8])
-        placement = model.placement(self.point)
-        error = pin.Quaternion(self.parameters[:4]) * pin.Quaternion(placement.rotation) * right
-        vector, w = np.array(error.coeffs()[:3]), float(error.w)
-        sign = 1.0 if w >= 0 else -1.0
-        # d(2 vec(Q)) = (w I + [v]×) ω in the axes that Q turns: those of the frame times `right`.
-        body = (placement.rotation @ right.matrix()).T @ model.jacobian(self.point)[3:]
-        J = (w * np.eye(3) + pin.skew(vector)) @ body
-        return sign * 2 * vector[: self.rows], sign * J[: self.rows]
-
-    def pose_error(self, model: Numeric) -> tuple[float, float]:
-        """See :class:`Constraint`."""
-        rotation = model.placement(self.point).rotation
-        if self.axis is None:
-            return 0.0, float(np.linalg.norm(pin.log3(self.target.T @ rotation)))
-        now, wanted = rotation @ self.axis, self.target @ self.axis
-        return 0.0, float(np.arctan2(np.linalg.norm(np.cross(now, wanted)), now @ wanted))
-
-
-class HeldPose(Constraint):
-    """The frame keeps position and orientation: six rows, or five with a free spin."""
-
-    def __init__(self, name: str, point: PointOnLink, target: pin.SE3, axis: Array | None = None) -> None:
-        self.name = name
-        self._parts: tuple[Constraint, ...] = (
-            HeldPosition(name, point, target.translation),
-            HeldOrientation(name, point, target.rotation, axis),
-        )
-        self.parameters = np.concatenate([p.parameters for p in self._parts])
-        self.lower = self.upper = np.zeros(sum(p.rows for p in self._parts))
-
-    def describe(self) -> str:
-        """See :class:`Constraint`."""
-        return super().describe() + ("" if self.rows == 6 else " (position and normal; spin free)")
-
-    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
-        position, orientation = self._parts
-        return ca.vertcat(position.symbolic(tree, parameters[:3]), orientation.symbolic(tree, parameters[3:]))
-
-    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
-        values, jacobians = zip(*(p.evaluate(model) for p in self._parts), strict=True)
-        return np.concatenate(values), np.vstack(jacobians)
-
-    def pose_error(self, model: Numeric) -> tuple[float, float]:
-        """See :class:`Constraint`."""
-        position, orientation = self._parts
-        return position.pose_error(model)[0], orientation.pose_error(model)[1]
-
-
-class AxisInCone(Constraint):
-    """An axis of the frame stays within a cone: ``−dᵀR(q)c ≤ −cos α``; the frame may turn about the axis.
-
-    Args:
-        name: Name of the constraint.
-        point: Point on the link that the frame belongs to.
-        axis: Unit axis ``c`` in the frame, shape (3,).
-        direction: Axis ``d`` of the cone, world, shape (3,).
-        degrees: Half angle α of the cone, degrees.
-    """
-
-    def __init__(self, name: str, point: PointOnLink, axis: Array, direction: Array, degrees: float) -> None:
-        self.name, self.point, self._degrees = name, point, degrees
-        self.parameters = np.concatenate([axis, direction])
-        self.lower, self.upper = np.array([-np.inf]), np.array([-np.cos(np.deg2rad(degrees))])
-
-    def describe(self) -> str:
-        """See :class:`Constraint`."""
-        return f"{self.name} at most {self._degrees:g}°, spin free"
-
-    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
-        return -ca.dot(tree.rotation(self.point) @ parameters[:3], parameters[3:])
-
-    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
-        axis, direction = self.parameters[:3], self.parameters[3:]
-        now = model.placement(self.point).rotation @ axis
-        return -np.array([now @ direction]), (model.jacobian(self.point)[3:].T @ np.cross(direction, now))[None, :]
-
-
-class HeldTurn(Constraint):
-    """The base does not turn about one of its axes: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
-
-    Args:
-        point: Origin of the base.
-        target: Orientation without a turn, shape (3, 3).
-        axis: Unit axis in the base, shape (3,).
-        name: Name of the constraint.
-    """
-
-    def __init__(self, point: PointOnLink, target: Array, axis: Array, name: str) -> None:
-        self.name = name
-        self._whole = HeldOrientation(name, point, target)
-        self._axis = np.array(axis, dtype=float)
-        self.parameters = np.concatenate([self._whole.parameters, self._axis])
-        self.lower = self.upper = np.zeros(1)
-
-    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
-        return ca.dot(parameters[8:], self._whole.symbolic(tree, parameters[:8]))
-
-    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
-        value, jacobian = self._whole.evaluate(model)
-        return np.array([self._axis @ value]), (self._axis @ jacobian)[None, :]
-
-
-class CenterOfMassOverFeet(Constraint):
-    """The center of mass stays above the feet: ``A xy − b ≤ −margin``, meters.
-
-    Args:
-        normals: Outward unit normals of the support polygon's edges, shape (k, 2).
-        offsets: ``b``, shape (k,).
-        margin: Least distance from the edges.
-        loaded: Another model and its name, whose center of mass counts; ``None`` for the model of the problem.
-    """
-
-    def __init__(
-        self, normals: Array, offsets: Array, margin: float, loaded: tuple[pin.Model, str] | None = None
-    ) -> None:
-        self.name = "center of mass over the feet" + (f" with {loaded[1]}" if loaded else "")
-        self.normals, self.offsets, self.margin = normals, offsets, margin
-        self._model = loaded[0] if loaded else None
-        self._k = len(offsets)
-        self.parameters = np.concatenate([normals.T.reshape(-1), offsets])
-        self.lower = np.full(self._k, -np.inf)
-        self.upper = np.full(self._k, -margin)
-
-    def describe(self) -> str:
-        """See :class:`Constraint`."""
-        return f"{self.name}, {self.margin:g} m inside the support polygon"
-
-    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
-        k, own = self._k, tree if self._model is None else Tree(self._model, tree.q)
-        center = own.center_of_mass()
-        return parameters[:k] * center[0] + parameters[k : 2 * k] * center[1] - parameters[2 * k :]
-
-    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
-        k = self._k
-        normals = self.parameters[: 2 * k].reshape(2, k).T
-        own = model if self._model is None else Numeric(self._model).at(model.q)
-        center, jacobian = own.center_of_mass()
-        return normals @ center[:2] - self.parameters[2 * k :], normals @ jacobian[:2]
-
-    def row_name(self, row: int) -> str:
-        """See :class:`Constraint`."""
-        return f"{self.name} (edge {row})"
-
-
-def base_point() -> PointOnLink:
-    """Return the origin of the link of a floating base."""
-    return PointOnLink(1, np.zeros(3), np.eye(3))
-
-
-def _coefficients(rotation: Array) -> Array:
-    return np.array(pin.Quaternion(np.asarray(rotation)).coeffs())
-
-
-def _rotation_to(axis: Array) -> Array:
-    """A rotation that takes e_z to ``axis``."""
-    return np.array(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(axis, dtype=float)).matrix())

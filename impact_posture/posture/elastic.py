@@ -46,12 +46,13 @@ def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAn
     for attempt in range(tries):
         start = problem.given if attempt == 0 else random_posture(problem, chart, rng, near=attempt % 2 == 1)
         x = np.clip(chart.to_x(start), problem.lower, problem.upper)
+        guess = problem.guess(Numeric(problem.robot.model).at(chart.to_q(x)))
         answer = run_solver(
             solver,
-            x0=np.concatenate([x, np.full(2 * rows, 0.1)]),
+            x0=np.concatenate([x, np.full(2 * rows, 0.1), guess.values]),
             p=np.concatenate([chart.to_x(problem.given), *[c.parameters for c in problem.constraints]]),
-            lbx=np.concatenate([problem.lower, np.zeros(2 * rows)]),
-            ubx=np.concatenate([problem.upper, np.full(2 * rows, np.inf)]),
+            lbx=np.concatenate([problem.lower, np.zeros(2 * rows), guess.lower]),
+            ubx=np.concatenate([problem.upper, np.full(2 * rows, np.inf), guess.upper]),
             lbg=np.concatenate([norms, lower_rows]),
             ubg=np.concatenate([norms, upper_rows]),
         )
@@ -67,15 +68,15 @@ def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAn
 def _build(problem: PostureProblem, chart: Chart) -> tuple[ca.Function, int]:
     x, reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
     tree = Tree(problem.robot.model, chart.configuration(x), x)
-    rows, targets = problem.row_expressions(tree)
-    stacked = ca.vertcat(ca.SX(0, 1), *rows)
-    k = stacked.numel()
+    lifted, targets = problem.lift(tree)
+    k = lifted.rows.numel()
     up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
+    away = distance_squared(chart, tree.q, chart.configuration(reference))
     program = {
-        "x": ca.vertcat(x, up, down),
+        "x": ca.vertcat(x, up, down, lifted.variables),
         "p": ca.vertcat(reference, *targets),
-        "f": ca.sum1(up + down) + 1e-6 * distance_squared(chart, tree.q, chart.configuration(reference)),
-        "g": ca.vertcat(chart.norms(x), stacked + up - down),
+        "f": ca.sum1(up + down) + lifted.slack + 1e-6 * away,
+        "g": ca.vertcat(chart.norms(x), lifted.rows + up - down),
     }
     return ca.nlpsol("elastic", "ipopt", program, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8}), k
 

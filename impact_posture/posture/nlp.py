@@ -32,6 +32,7 @@ import threadpoolctl
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.compiled import CompileMode, compiled_solver
 from impact_posture.posture.posture_distance import distance_squared
@@ -58,6 +59,8 @@ IPOPT_OPTIONS: dict[str, Any] = {
 # The equations of the dual of a cone are quadratic, and violated equations let the bound ``t`` fall.  A step that
 # violates them strongly to lower the objective never comes back.
 _WORST_OPTIONS = {"ipopt.theta_max_fact": 1.0}
+# Price of a meter of slack in units of the scale.  It has to exceed what a meter of freedom is worth, and 2 did not.
+SLACK_PRICE = 50.0
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -71,6 +74,7 @@ class SolveRecord:
         iterations: Iterations of IPOPT.
         time_s: Wall time of the call.
         cpu_s: Processor time of the call, all threads together.
+        auxiliaries: Final auxiliaries of the constraints, shape (k,).
     """
 
     q: Array
@@ -78,6 +82,7 @@ class SolveRecord:
     iterations: int
     time_s: float
     cpu_s: float
+    auxiliaries: Array
 
     @property
     def converged(self) -> bool:
@@ -93,7 +98,6 @@ class PostureNLP:
         problem: The posture problem.
         chart: Coordinates of the robot.
         solver: ``nlpsol`` of CasADi.
-        size: Number of unknowns, of which the first ``chart.nx`` are ``x``.
         bounded: Number of last rows that are inequalities ``≤ 0`` of the objective.
         build_time_s: Time to build and compile the program.
         compiled: Whether its functions run as machine code.
@@ -103,7 +107,6 @@ class PostureNLP:
     problem: PostureProblem
     chart: Chart
     solver: ca.Function
-    size: int
     bounded: int
     build_time_s: float
     compiled: bool
@@ -121,16 +124,24 @@ class PostureNLP:
         x = np.clip(self.chart.to_x(start), problem.lower, problem.upper)
         scale = scale or problem.objective.value(self.chart.to_q(x))
         guess = problem.objective.guess(self.chart.to_q(x), scale, attempt)
-        lower, upper = np.concatenate([problem.lower, guess.lower]), np.full(self.size, np.inf)
-        upper[:nx] = problem.upper
+        own = problem.guess(Numeric(problem.robot.model).at(self.chart.to_q(x)))
+        lower = np.concatenate([problem.lower, guess.lower, own.lower])
+        upper = np.concatenate([problem.upper, np.full(guess.values.size, np.inf), own.upper])
         began, busy = time.perf_counter(), time.process_time()
         p = parameters(problem, self.chart, scale)
-        x0 = np.concatenate([x, guess.values])
+        x0 = np.concatenate([x, guess.values, own.values])
         answer = run_solver(self.solver, x0=x0, lbx=lower, ubx=upper, p=p, **_row_bounds(problem, self))
         elapsed, busy = time.perf_counter() - began, time.process_time() - busy
         stats = self.solver.stats()
-        q = self.chart.to_q(np.array(answer["x"]).reshape(-1)[:nx])
-        return SolveRecord(q, str(stats["return_status"]), int(stats["iter_count"]), elapsed, busy)
+        found = np.array(answer["x"]).reshape(-1)
+        return SolveRecord(
+            q=self.chart.to_q(found[:nx]),
+            status=str(stats["return_status"]),
+            iterations=int(stats["iter_count"]),
+            time_s=elapsed,
+            cpu_s=busy,
+            auxiliaries=found[nx + guess.values.size :],
+        )
 
 
 class _CasadiOpenBLAS(threadpoolctl.OpenBLASController):  # type: ignore[misc]
@@ -195,9 +206,8 @@ def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts:
     symbols, bounded = program(problem, chart)
     options = IPOPT_OPTIONS | (_WORST_OPTIONS if problem.objective.attempts > 1 else {})
     built = compiled_solver(problem, symbols, options, compile, starts)
-    size = int(symbols["x"].numel())
     took = time.perf_counter() - began
-    return PostureNLP(problem, chart, built.solver, size, bounded, took, built.compiled, built.fault)
+    return PostureNLP(problem, chart, built.solver, bounded, took, built.compiled, built.fault)
 
 
 def program(problem: PostureProblem, chart: Chart) -> tuple[dict[str, ca.SX], int]:
@@ -208,13 +218,13 @@ def program(problem: PostureProblem, chart: Chart) -> tuple[dict[str, ca.SX], in
     reference = ca.SX.sym("reference", chart.nx)
     tree = Tree(problem.robot.model, chart.configuration(x), x)
     lifted = problem.objective.lift(tree, own, scale)
-    rows, targets = problem.row_expressions(tree)
+    constraints, targets = problem.lift(tree)
     value = lifted.value / scale + weight * distance_squared(chart, tree.q, chart.configuration(reference))
     symbols = {
-        "x": ca.vertcat(x, lifted.variables),
+        "x": ca.vertcat(x, lifted.variables, constraints.variables),
         "p": ca.vertcat(own, scale, weight, reference, *targets),
-        "f": value,
-        "g": ca.vertcat(chart.norms(x), *rows, lifted.residual, lifted.inequalities),
+        "f": value + SLACK_PRICE * constraints.slack,
+        "g": ca.vertcat(chart.norms(x), constraints.rows, lifted.residual, lifted.inequalities),
     }
     return symbols, int(lifted.inequalities.numel())
 

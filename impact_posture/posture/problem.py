@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -12,8 +12,9 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
+from impact_posture.impact.lifted import Guess
 from impact_posture.impact.objective import ImpactObjective, Objective
-from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.constraint import Constraint, LiftedRows
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import BaseMode, Vector3
 
@@ -109,23 +110,56 @@ class PostureProblem:
 
     def carried(self, index: int) -> list[int]:
         """Return the rows of constraint ``index`` that the program carries."""
-        return list(self.rows[index]) if self.rows else list(range(self.constraints[index].rows))
+        return list(self.rows[index]) if self.rows else list(range(len(self.constraints[index].lifted_bounds[0])))
 
     @property
     def row_bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of all rows that the program carries."""
-        carried = [(c, self.carried(i)) for i, c in enumerate(self.constraints)]
+        carried = [(*c.lifted_bounds, self.carried(i)) for i, c in enumerate(self.constraints)]
         empty = np.zeros(0)
         return (
-            np.concatenate([empty, *[c.lower[rows] for c, rows in carried]]),
-            np.concatenate([empty, *[c.upper[rows] for c, rows in carried]]),
+            np.concatenate([empty, *[lower[rows] for lower, _, rows in carried]]),
+            np.concatenate([empty, *[upper[rows] for _, upper, rows in carried]]),
         )
 
-    def row_expressions(self, tree: Tree) -> tuple[list[ca.SX], list[ca.SX]]:
-        """Return the rows that the program carries as expressions, and the symbols of their parameters."""
+    def lift(self, tree: Tree) -> tuple[LiftedRows, list[ca.SX]]:
+        """Return the rows that the program carries with all auxiliaries, and the symbols of their parameters."""
         symbols = [ca.SX.sym(f"p{index}", len(c.parameters)) for index, c in enumerate(self.constraints)]
-        pairs = enumerate(zip(self.constraints, symbols, strict=True))
-        return [c.symbolic(tree, p)[self.carried(index)] for index, (c, p) in pairs], symbols
+        lifted = [c.lift(tree, p) for c, p in zip(self.constraints, symbols, strict=True)]
+        rows = [part.rows[self.carried(index)] for index, part in enumerate(lifted)]
+        slack = sum((part.slack for part in lifted), ca.SX(0))
+        empty = ca.SX(0, 1)
+        variables = ca.vertcat(empty, *[part.variables for part in lifted])
+        return LiftedRows(ca.vertcat(empty, *rows), variables, slack), symbols
+
+    def guess(self, numeric: Numeric) -> Guess:
+        """Return the auxiliaries of all constraints to start from at ``numeric.q``, with their bounds."""
+        parts, empty = [c.guess(numeric) for c in self.constraints], np.zeros(0)
+        above = [np.full(part.values.size, np.inf) if part.upper is None else part.upper for part in parts]
+        return Guess(
+            np.concatenate([empty, *[part.values for part in parts]]),
+            np.concatenate([empty, *[part.lower for part in parts]]),
+            np.concatenate([empty, *above]),
+        )
+
+    def split(self, numeric: Numeric, auxiliaries: Array) -> list[Array]:
+        """Return the auxiliaries of each constraint."""
+        counts = [c.guess(numeric).values.size for c in self.constraints]
+        return np.split(auxiliaries, np.cumsum(counts)[:-1]) if counts else []
+
+    def grown(self, postures: Sequence[Array]) -> PostureProblem:
+        """Return the problem with the parts that its program lacks at any of the postures; itself if none."""
+        constraints, numeric = list(self.constraints), Numeric(self.robot.model)
+        for q in postures:
+            numeric.at(q)
+            constraints = [c.grown(numeric) for c in constraints]
+        if all(one is other for one, other in zip(constraints, self.constraints, strict=True)):
+            return self
+        rows = tuple(
+            kept if now is before else tuple(range(len(now.lifted_bounds[0])))
+            for kept, now, before in zip(self.rows, constraints, self.constraints, strict=False)
+        )
+        return replace(self, constraints=tuple(constraints), rows=rows)
 
     def violations(self, numeric: Numeric) -> list[Array]:
         """Return the signed violation of each constraint at ``numeric.q``, shape (rows,) each; zero if satisfied."""

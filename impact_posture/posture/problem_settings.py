@@ -14,7 +14,7 @@ from impact_posture.impact.contact_compression import ContactStiffness
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, resolve
 from impact_posture.posture.build_problem import build_problem
-from impact_posture.posture.constraint import CenterOfMassOverFeet
+from impact_posture.posture.pose_constraints import CenterOfMassOverFeet
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.robot.model_variant import ModelVariant
 from impact_posture.robot.robot_loader import from_folder, names_a_path

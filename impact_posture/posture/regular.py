@@ -11,7 +11,8 @@ import pinocchio as pin
 from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.objective import Objective
-from impact_posture.posture.constraint import Constraint, HeldPosition, HeldTurn, base_point
+from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.pose_constraints import HeldPosition, HeldTurn, base_point
 from impact_posture.posture.problem import (
     RANK_TOLERANCE,
     PostureProblem,
@@ -150,6 +151,6 @@ def _independent_rows(problem: PostureProblem, numeric: Numeric) -> tuple[tuple[
     count = int((np.abs(np.diag(triangle)) > RANK_TOLERANCE).sum())
     chosen = {labels[k] for k in order[:count]}
     return tuple(
-        tuple(row for row in range(c.rows) if not c.equality or (index, row) in chosen)
+        tuple(row for row in range(len(c.lifted_bounds[0])) if not c.equality or (index, row) in chosen)
         for index, c in enumerate(problem.constraints)
     )

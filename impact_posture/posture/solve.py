@@ -216,12 +216,12 @@ def _initial_objective(problem: PostureProblem, initial: Array) -> float:
 def run_start(nlp: PostureNLP, start: Array, scale: float) -> tuple[SolveRecord, Certificate]:
     """Solve from a feasible start and certify the end; try the other guesses of the objective if it fails."""
     record = nlp.solve(start, scale=scale)
-    certificate = certify(nlp.problem, record.q, scale)
+    certificate = certify(nlp.problem, record.q, scale, record.auxiliaries)
     for attempt in range(1, nlp.problem.objective.attempts):
         if certificate.holds():
             break
         again = nlp.solve(start, scale=scale, attempt=attempt)
-        certificate = certify(nlp.problem, again.q, scale)
+        certificate = certify(nlp.problem, again.q, scale, again.auxiliaries)
         record = replace(
             again,
             iterations=record.iterations + again.iterations,

@@ -35,7 +35,13 @@ def _rows(name: str, count: int) -> Iterator[list[str]]:
     nlp = build_nlp(problem, compile="never")
     starts, scale = feasible_starts(problem, count, seed=2), problem.objective.value(problem.given)
     records = [run_start(nlp, start, scale)[0] for start in starts]
-    yield _row(name, "lifted", nlp.size, nlp.solver, [(r.time_s, r.iterations, r.converged) for r in records])
+    yield _row(
+        name,
+        "lifted",
+        nlp.solver.size1_in("x0"),
+        nlp.solver,
+        [(r.time_s, r.iterations, r.converged) for r in records],
+    )
     solver = _reduced(nlp)
     yield _row(name, "reduced", nlp.chart.nx, solver, [_run(nlp, solver, start, scale) for start in starts])
 

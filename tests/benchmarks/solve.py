@@ -57,7 +57,7 @@ def _row(case: Case, problem: PostureProblem, starts: Sequence[Vector], way: str
     wall, busy = (statistics.median(getattr(record, what) for record, _ in runs) for what in ("time_s", "cpu_s"))
     return [
         case.name,
-        str(nlp.size),
+        str(nlp.solver.size1_in("x0")),
         way,
         f"{cold:.1f}",
         f"{busy_building:.1f}",
