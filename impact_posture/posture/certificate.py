@@ -124,7 +124,7 @@ def certify(problem: PostureProblem, q: Array, scale: float, auxiliaries: Array 
 
 
 def _active(near: Sequence[_Near], multipliers: Array) -> tuple[Active, ...]:
-    """Inequalities with a multiplier.  Rows of one name are one inequality; a row without a name belongs to another."""
+    """Inequalities with a multiplier; rows of one name are one, and a row without a name belongs to another."""
     found: dict[tuple[str, str], float] = {}
     for row, multiplier in zip(near, multipliers, strict=True):
         if row.name and multiplier > _MULTIPLIER:
