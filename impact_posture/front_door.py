@@ -31,7 +31,8 @@ from impact_posture.posture.problem import PostureProblem as CoreProblem
 from impact_posture.posture.problem_settings import Prepared, prepare, requirements
 from impact_posture.posture.result import result_document
 from impact_posture.posture.robustness import Robustness, solve_robustly
-from impact_posture.posture.solve import PostureSolution, Progress
+from impact_posture.posture.search import Progress
+from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
 from impact_posture.result_folder import FORMATS, Finish, Written, result_view, write_result
 from impact_posture.robot.joint_model import with_joint_model

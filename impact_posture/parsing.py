@@ -74,8 +74,8 @@ def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
     return tuple(found)
 
 
-def parse_stiffness(text: str) -> float | str:
-    """Read ``--contact-stiffness``: a number, or else the name of a material."""
+def parse_number_or_name(text: str) -> float | str:
+    """Read a number, or else a name."""
     try:
         return float(text)
     except ValueError:

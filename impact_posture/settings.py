@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from impact_posture import setting as demand
-from impact_posture.parsing import parse_armature, parse_payloads, parse_stiffness
+from impact_posture.parsing import parse_armature, parse_number_or_name, parse_payloads
 from impact_posture.setting import CONTACT, METRIC, OUTPUT, ROBOT, TASK, Setting
 from impact_posture.tables import STRICT
 
@@ -35,6 +35,8 @@ TransmissionKind = Literal["rigid", "elastic", "locked"]
 # Mechanics of Materials, 5th ed. (steel; oak in bending; rubber; concrete).
 MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0.48), "ground": (24e9, 0.15)}
 
+# Least distance (m) of links that stay apart, and edge length (m) of a surface that ends before the robot's stand.
+CLEARANCE, PATCH = 0.001, 0.3
 # Coulomb coefficient of an ordinary surface.
 FRICTION = 0.7
 # Number of distances of --tradeoff without a number.
@@ -143,7 +145,7 @@ class ImpactSettings(RobotSettings):
         str | float | None,
         Setting(
             f"Stiffness of the contact, or what a steel tip touches: {', '.join(MATERIALS)}.",
-            CONTACT, "N/M|MATERIAL", "not known", parse=parse_stiffness,
+            CONTACT, "N/M|MATERIAL", "not known", parse=parse_number_or_name,
             **demand.between(1.0, 1e12, "N/m", tuple(MATERIALS)),
         ),
     ] = None  # fmt: skip
@@ -218,6 +220,32 @@ class ImpactSettings(RobotSettings):
         ),
     ] = None  # fmt: skip
     support_compliance: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """A box or a sphere that stands in the world.
+
+    Attributes:
+        name: Name in messages.
+        box: Edge lengths, m.
+        sphere: Radius, m.
+        position: Center, world, m.
+        quaternion: Orientation of the box, x y z w.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+
+    name: str
+    box: Annotated[Vector3 | None, Setting("", **demand.LENGTHS)] = None
+    sphere: Annotated[float | None, Setting("", **demand.ABOVE_ZERO)] = None
+    position: Annotated[Vector3, Setting("", **demand.NUMBERS)] = (0.0, 0.0, 0.0)
+    quaternion: Annotated[tuple[float, float, float, float], Setting("", **demand.DIRECTION)] = (0.0, 0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        """Refuse an obstacle that is neither or both."""
+        if (self.box is None) == (self.sphere is None):
+            raise ValueError(f"obstacle '{self.name}' is one of box (edge lengths, m) and sphere (radius, m)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,6 +334,25 @@ class ProblemSettings(ImpactSettings):
             **demand.between(1e-6, 1e9, "N·m·s/rad"),
         ),
     ] = None  # fmt: skip
+    collision: Annotated[
+        bool,
+        Setting(
+            "Keep the links clear of each other, the surface, the ground and obstacles.", TASK,
+            option="--collision/--no-collision",
+        ),
+    ] = True  # fmt: skip
+    clearance: Annotated[
+        float, Setting("Least distance of links that stay apart, m.", TASK, **demand.between(1e-4, 1.0, "m"))
+    ] = CLEARANCE
+    surface: Annotated[
+        str | float | None,
+        Setting(
+            "Surface at the contact: its plane, none, or the edge length of a square of it in m.", TASK,
+            "plane|none|M", f"the plane, or {PATCH:g} where the robot stands behind it", parse=parse_number_or_name,
+            **demand.between(1e-3, 1e3, "m", ("plane", "none")),
+        ),
+    ] = None  # fmt: skip
+    obstacles: tuple[Obstacle, ...] = ()
     limit_margin: Annotated[
         float | None,
         Setting("Distance from the joint limits, rad or m.", TASK, default="robot.toml's", **demand.ZERO_OR_MORE),

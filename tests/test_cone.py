@@ -26,7 +26,8 @@ from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.nlp import build_nlp
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.problem_settings import prepare
-from impact_posture.posture.solve import run_start, solve
+from impact_posture.posture.search import run_start
+from impact_posture.posture.solve import solve
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import ObjectiveKind
 from tests.command import run

@@ -70,6 +70,7 @@ class Kinematics:
         self._parents = [int(p) for p in model.parents]
         self._extra = dict(extra_inertia or {})
         self._R: ByJoint = {}
+        self._placed: dict[tuple[int, int], tuple[ca.SX, ca.SX]] = {}
         self._p: ByJoint = {}
         self._rest: ByJoint = {}
         self._inertia: ByJoint = {}
@@ -127,6 +128,32 @@ class Kinematics:
             turned = quaternion_product(rest, joint_quaternion(slot.kind, self._x[slot.x]))
             found[i] = quaternion_product(found[parent], turned)
         return found
+
+    def relative(self, base: int, joint: int) -> tuple[ca.SX, ca.SX]:
+        """Return rotation (3, 3) and origin (3,) of a link in the coordinates of another, along the way between them.
+
+        They do not depend on the joints below both links, which world placements would bring in.
+        """
+        chain = self._chain(base)
+        meeting = next(i for i in self._chain(joint) if i in chain)
+        (R_base, p_base), (R, p) = (self._below(meeting, i) for i in (base, joint))
+        return R_base.T @ R, R_base.T @ (p - p_base)
+
+    def _chain(self, joint: int) -> list[int]:
+        """A joint and those below it, down to the world."""
+        chain = [joint]
+        while chain[-1]:
+            chain.append(self._parents[chain[-1]])
+        return chain
+
+    def _below(self, base: int, joint: int) -> tuple[ca.SX, ca.SX]:
+        """Placement of a link in the coordinates of a link below it."""
+        if joint == base:
+            return ca.SX.eye(3), ca.SX.zeros(3)
+        if (base, joint) not in self._placed:
+            R, p = self._below(base, self._parents[joint])
+            self._placed[base, joint] = R @ self._R[joint], p + R @ self._p[joint]
+        return self._placed[base, joint]
 
     def position(self, point: PointOnLink) -> ca.SX:
         """Return the world position of a point, shape (3,)."""

@@ -28,6 +28,7 @@ from impact_posture.posture.pose_constraints import (
 )
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.regular import pin_undetermined, regularize
+from impact_posture.posture.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
 from impact_posture.setting import tilt_of
 
@@ -74,10 +75,32 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
         constraints += _in_every_variant(objective, numeric, requirements.friction, bounds, constraints)
     lower, upper = _bounds(robot, chart, given, requirements)
     more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
+    clear, around = [], None
+    if requirements.collision:
+        around = _surroundings(objective, numeric, requirements, list(struck.values()))
+        clear, notes = around.constraints(), [*notes, *around.notes]
     problem = PostureProblem(
-        robot, objective, requirements, given, (*constraints, *more), lower, upper, notes=(*decided, *notes)
-    )
+        robot, objective, requirements, given, (*constraints, *more, *clear), lower, upper,
+        notes=(*decided, *notes), surroundings=around,
+    )  # fmt: skip
     return regularize(problem)
+
+
+def _surroundings(
+    objective: Objective,
+    numeric: Numeric,
+    requirements: Requirements,
+    struck: Sequence[tuple[ImpactContact, str]],
+) -> Surroundings:
+    """What the links stay clear of; a push (a free contact pose) has no surface."""
+    found = Surroundings(objective.robot, numeric, requirements.hold, requirements.clearance)
+    found.add_ground(objective.supports)
+    for contact, mode in struck:
+        if mode != "free" and requirements.surface != "none":
+            width = float("inf") if requirements.surface == "plane" else requirements.surface
+            found.add_surface(contact, width if width is None else float(width))
+    found.add_obstacles(requirements.obstacles)
+    return found
 
 
 def _check(robot: Robot, requirements: Requirements) -> None:

@@ -8,6 +8,7 @@ elastic diagnosis need nothing else.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -54,6 +55,22 @@ class Linearization:
     upper: Array
     posture: Array
     auxiliary: Array
+
+    @staticmethod
+    def joined(parts: Sequence[Linearization], nv: int) -> Linearization:
+        """Return the rows of several parts, each with auxiliaries of its own."""
+        ends = np.cumsum([0, *[part.auxiliary.shape[1] for part in parts]])
+        auxiliary = np.zeros((sum(len(part.names) for part in parts), ends[-1]))
+        row = 0
+        for part, start, stop in zip(parts, ends[:-1], ends[1:], strict=True):
+            auxiliary[row : row + len(part.names), start:stop] = part.auxiliary
+            row += len(part.names)
+        empty = np.zeros(0)
+        value, lower, upper = (
+            np.concatenate([empty, *[getattr(part, key) for part in parts]]) for key in ("value", "lower", "upper")
+        )
+        posture = np.vstack([np.zeros((0, nv)), *[part.posture for part in parts]])
+        return Linearization([name for part in parts for name in part.names], value, lower, upper, posture, auxiliary)
 
 
 class Constraint(ABC):
@@ -131,6 +148,10 @@ class Constraint(ABC):
     def excess(self, value: Array) -> Array:
         """Return how far ``c(q)`` lies outside its bounds, signed, shape (rows,)."""
         return value - np.clip(value, self.lower, self.upper)
+
+    def conflicts(self, excess: Array) -> dict[str, float]:
+        """Return names of what is violated, and by how much."""
+        return {self.name: float(np.linalg.norm(excess))}
 
     def describe(self) -> str:
         """Describe the constraint in one line."""

@@ -18,6 +18,8 @@ from impact_posture.posture.starts import random_posture
 
 # A constraint with a violation below this (m, rad) is satisfied.
 _KEPT = 1e-6
+# Most times that the program grows for one start.
+_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -26,11 +28,13 @@ class ElasticAnswer:
 
     Attributes:
         q: Configuration with the least violation, shape (nq,).
+        problem: The problem with all parts that its program needed.
         conflicts: Violated constraints and their violation; empty if all are satisfied.
         at_limits: Joints on a limit at ``q``.
     """
 
     q: Array
+    problem: PostureProblem
     conflicts: dict[str, float]
     at_limits: tuple[str, ...]
 
@@ -38,25 +42,17 @@ class ElasticAnswer:
 def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAnswer:
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures."""
     chart = Chart(problem.robot.model)
-    solver, rows = _build(problem, chart)
-    lower_rows, upper_rows = problem.row_bounds
-    norms = np.zeros(len(chart.quaternion_slices()))
     rng = np.random.default_rng(seed)
+    solver = _build(problem, chart)
     best: ElasticAnswer | None = None
     for attempt in range(tries):
         start = problem.given if attempt == 0 else random_posture(problem, chart, rng, near=attempt % 2 == 1)
-        x = np.clip(chart.to_x(start), problem.lower, problem.upper)
-        guess = problem.guess(Numeric(problem.robot.model).at(chart.to_q(x)))
-        answer = run_solver(
-            solver,
-            x0=np.concatenate([x, np.full(2 * rows, 0.1), guess.values]),
-            p=np.concatenate([chart.to_x(problem.given), *[c.parameters for c in problem.constraints]]),
-            lbx=np.concatenate([problem.lower, np.zeros(2 * rows), guess.lower]),
-            ubx=np.concatenate([problem.upper, np.full(2 * rows, np.inf), guess.upper]),
-            lbg=np.concatenate([norms, lower_rows]),
-            ubg=np.concatenate([norms, upper_rows]),
-        )
-        found = _judge(problem, chart, chart.to_q(np.array(answer["x"]).reshape(-1)[: chart.nx]))
+        for _ in range(_ROUNDS):
+            found = _relax(problem, chart, solver, start)
+            if found.problem is problem:
+                break
+            problem = found.problem
+            solver = _build(problem, chart)
         if best is None or sum(found.conflicts.values()) < sum(best.conflicts.values()):
             best = found
         if not best.conflicts:
@@ -65,7 +61,27 @@ def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAn
     return best
 
 
-def _build(problem: PostureProblem, chart: Chart) -> tuple[ca.Function, int]:
+def _relax(problem: PostureProblem, chart: Chart, solver: ca.Function, start: Array) -> ElasticAnswer:
+    """Minimize the slack from one posture; the answer's problem has grown if the program lacked parts."""
+    lower_rows, upper_rows = problem.row_bounds
+    rows = len(lower_rows)
+    norms = np.zeros(len(chart.quaternion_slices()))
+    x = np.clip(chart.to_x(start), problem.lower, problem.upper)
+    guess = problem.guess(Numeric(problem.robot.model).at(chart.to_q(x)))
+    answer = run_solver(
+        solver,
+        x0=np.concatenate([x, np.full(2 * rows, 0.1), guess.values]),
+        p=np.concatenate([chart.to_x(problem.given), *[c.parameters for c in problem.constraints]]),
+        lbx=np.concatenate([problem.lower, np.zeros(2 * rows), guess.lower]),
+        ubx=np.concatenate([problem.upper, np.full(2 * rows, np.inf), guess.upper]),
+        lbg=np.concatenate([norms, lower_rows]),
+        ubg=np.concatenate([norms, upper_rows]),
+    )
+    q = chart.to_q(np.array(answer["x"]).reshape(-1)[: chart.nx])
+    return _judge(problem.grown([q]), chart, q)
+
+
+def _build(problem: PostureProblem, chart: Chart) -> ca.Function:
     x, reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
     tree = Tree(problem.robot.model, chart.configuration(x), x)
     lifted, targets = problem.lift(tree)
@@ -78,16 +94,16 @@ def _build(problem: PostureProblem, chart: Chart) -> tuple[ca.Function, int]:
         "f": ca.sum1(up + down) + lifted.slack + 1e-6 * away,
         "g": ca.vertcat(chart.norms(x), lifted.rows + up - down),
     }
-    return ca.nlpsol("elastic", "ipopt", program, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8}), k
+    return ca.nlpsol("elastic", "ipopt", program, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8})
 
 
 def _judge(problem: PostureProblem, chart: Chart, q: Array) -> ElasticAnswer:
     numeric = Numeric(problem.robot.model).at(q)
     conflicts: dict[str, float] = {}
     for constraint, excess in zip(problem.constraints, problem.violations(numeric), strict=True):
-        violation = float(np.linalg.norm(excess))
-        if violation > _KEPT:
-            conflicts[constraint.name] = conflicts.get(constraint.name, 0.0) + violation
+        for name, violation in constraint.conflicts(excess).items():
+            if violation > _KEPT:
+                conflicts[name] = conflicts.get(name, 0.0) + violation
     x = chart.to_x(q)
     limits = []
     for slot in chart.slots:
@@ -97,4 +113,4 @@ def _judge(problem: PostureProblem, chart: Chart, q: Array) -> ElasticAnswer:
             limits.append(f"'{slot.name}' at its lower limit")
         elif problem.upper[slot.x] - x[slot.x] < 1e-4:
             limits.append(f"'{slot.name}' at its upper limit")
-    return ElasticAnswer(q, conflicts, tuple(limits))
+    return ElasticAnswer(q, problem, conflicts, tuple(limits))

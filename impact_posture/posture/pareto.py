@@ -30,7 +30,8 @@ from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.nlp import PostureNLP, build_nlp
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.rulers import DistanceRuler, ForceRuler, Ruler
-from impact_posture.posture.solve import PostureSolution, Progress, run_start, solve
+from impact_posture.posture.search import Progress, run_start
+from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.posture.tradeoff import TradeOff, TradePoint, find_knee
 
 # A move below this (rad, m) is zero.

@@ -15,8 +15,9 @@ from impact_posture.errors import InputError
 from impact_posture.impact.lifted import Guess
 from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.constraint import Constraint, LiftedRows
+from impact_posture.posture.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
-from impact_posture.settings import BaseMode, Vector3
+from impact_posture.settings import CLEARANCE, BaseMode, Obstacle, Vector3
 
 # A direction of the tangent space is held if a unit step along it moves a constraint by more than this.
 RANK_TOLERANCE = 1e-7
@@ -43,6 +44,10 @@ class Requirements:
         friction: Friction coefficient for ``keep_contacts``.
         least_mobility: Least G of each contact, 1/kg, for the bound on the peak force; 0 for none.
         largest_jump: Largest jump of a joint per approach speed; infinite for no bound.
+        collision: Keep the links clear of each other, the surface, the ground and the obstacles.
+        clearance: Least distance of all of these, m.
+        surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` to decide by the robot.
+        obstacles: Bodies in the world.
         limit_margin: Distance from the joint limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
     """
@@ -63,6 +68,10 @@ class Requirements:
     friction: float = 0.7
     least_mobility: float = 0.0
     largest_jump: float = float("inf")
+    collision: bool = False
+    clearance: float = CLEARANCE
+    surface: str | float | None = None
+    obstacles: tuple[Obstacle, ...] = ()
     limit_margin: float = 0.0
     regularization: float = 0.0
 
@@ -81,6 +90,7 @@ class PostureProblem:
         upper: Upper bounds, shape (nx,).
         rows: Rows of each constraint that the program carries; empty for all rows.
         notes: Decisions that the builder made for the user, one line each.
+        surroundings: The bodies that the robot stays clear of; ``None`` without this demand.
     """
 
     robot: Robot
@@ -92,6 +102,7 @@ class PostureProblem:
     upper: Array
     rows: tuple[tuple[int, ...], ...] = ()
     notes: tuple[str, ...] = ()
+    surroundings: Surroundings | None = None
 
     @property
     def impact(self) -> ImpactObjective:

@@ -16,7 +16,8 @@ from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.caveats import percent
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.solve import SAME_POSTURE, PostureSolution, Progress, solve, wrapped_difference
+from impact_posture.posture.search import Progress
+from impact_posture.posture.solve import SAME_POSTURE, PostureSolution, solve, wrapped_difference
 from impact_posture.robot.model_variant import between
 from impact_posture.tables import json_block
 

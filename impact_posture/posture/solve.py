@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -13,18 +12,15 @@ import pinocchio as pin
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.errors import ContactError, Infeasible, MetricError, SolverFailed
+from impact_posture.errors import ContactError, Infeasible, SolverFailed
 from impact_posture.posture.caveats import notes_on_impacts
-from impact_posture.posture.certificate import Certificate, certify
+from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.elastic import elastic
-from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp, one_blas_thread
-from impact_posture.posture.posture_distance import distance
+from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
+from impact_posture.posture.search import Progress, Run, Search, feasible
 from impact_posture.posture.starts import Projector, feasible_start
-from impact_posture.processes import fork_map
-
-Progress = Callable[[int, int], None]
 
 # Optima closer than this in posture (tangent norm) and in objective (relative) are the same optimum.
 SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
@@ -96,15 +92,6 @@ class PostureSolution:
         return 1 - objective.value(self.q) / objective.value(self.initial)
 
 
-@dataclass(frozen=True)
-class _Run:
-    start: Array | None
-    record: SolveRecord | None
-    objective: float
-    minimized: float
-    certificate: Certificate | None
-
-
 @one_blas_thread()
 def solve(
     problem: PostureProblem,
@@ -122,13 +109,13 @@ def solve(
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
         SolverFailed: No run ended at a certified posture.
     """
-    initial = _initial(problem, seed)
-    began = time.perf_counter()
-    nlp = build_nlp(problem, compile=compile, starts=starts)
+    problem, initial = _initial(problem, seed)
     scale = _initial_objective(problem, initial)
-    job = _Job(nlp, (initial, *guesses), scale, seed)
-    runs = _run_all(job, starts, jobs, progress)
-    good = [r for r in runs if r.certificate is not None and r.certificate.holds()]
+    began = time.perf_counter()
+    search = Search(problem, (initial, *guesses), scale, starts=starts, seed=seed, compile=compile)
+    runs = search.run(jobs, progress)
+    problem, nlp = search.problem, search.nlp
+    good = [r for r in runs if r.good]
     if not good:
         raise _failure(runs)
     # Of equally good runs the first counts, so that the solution does not depend on the speed of processes.
@@ -145,6 +132,11 @@ def solve(
         notes.append("no better posture found: the initial one is already (locally) optimal for this impact")
     optima = distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None])
     notes += notes_on_impacts(problem.objective, initial, q)
+    if touching := [r.collisions[0] for r in runs if r.collisions]:
+        notes.append(
+            f"{len(touching)} certified postures left out, because original shapes touch there: "
+            f"{' / '.join(touching[0])}"
+        )
     hits = sum(o.hits for o in optima)
     if len(optima) > 1 and optima[0].hits == 1 and hits >= _MANY:
         notes.append(
@@ -163,21 +155,24 @@ def solve(
         certified_starts=len(good),
         status=best.record.status,
         iterations=best.record.iterations,
-        solve_time_s=time.perf_counter() - began - nlp.build_time_s,
-        build_time_s=nlp.build_time_s,
+        solve_time_s=time.perf_counter() - began - search.build_time_s,
+        build_time_s=search.build_time_s,
         compiled=nlp.compiled,
         notes=(*problem.notes, *notes),
         compiler_fault=nlp.compiler_fault,
     )
 
 
-def _initial(problem: PostureProblem, seed: int) -> Array:
-    """The given posture pulled onto the constraints, or the first other start that reaches them."""
-    for index in range(5):
-        start = feasible_start(problem, index, seed)
-        if start is not None:
-            return start
-    answer = elastic(problem, seed)
+def _initial(problem: PostureProblem, seed: int) -> tuple[PostureProblem, Array]:
+    """The given posture moved onto the constraints, or the first other start that reaches them.
+
+    Constraints without projection need the elastic program, and its problem has the parts that it needed.
+    """
+    starts = (feasible_start(problem, index, seed) for index in range(5))
+    start = next((q for q in starts if q is not None), None)
+    if start is not None and feasible(problem, start):
+        return problem, start
+    answer = elastic(problem if start is None else replace(problem, given=start), seed)
     if answer.conflicts:
         limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
         raise Infeasible(
@@ -190,7 +185,7 @@ def _initial(problem: PostureProblem, seed: int) -> Array:
             where="problem",
             hint="start from a `posture` nearer to the target",
         )
-    return found.q
+    return replace(answer.problem, given=problem.given), found.q
 
 
 def _initial_objective(problem: PostureProblem, initial: Array) -> float:
@@ -210,64 +205,6 @@ def _initial_objective(problem: PostureProblem, initial: Array) -> float:
             hint="choose another frame, normal or posture: an impact along it moves nothing",
         )
     return value
-
-
-@one_blas_thread()
-def run_start(nlp: PostureNLP, start: Array, scale: float) -> tuple[SolveRecord, Certificate]:
-    """Solve from a feasible start and certify the end; try the other guesses of the objective if it fails."""
-    record = nlp.solve(start, scale=scale)
-    certificate = certify(nlp.problem, record.q, scale, record.auxiliaries)
-    for attempt in range(1, nlp.problem.objective.attempts):
-        if certificate.holds():
-            break
-        again = nlp.solve(start, scale=scale, attempt=attempt)
-        certificate = certify(nlp.problem, again.q, scale, again.auxiliaries)
-        record = replace(
-            again,
-            iterations=record.iterations + again.iterations,
-            time_s=record.time_s + again.time_s,
-            cpu_s=record.cpu_s + again.cpu_s,
-        )
-    return record, certificate
-
-
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """Data of all starts: the program, the first starts, the scale, and the seed of the other starts."""
-
-    nlp: PostureNLP
-    known: tuple[Array, ...]
-    scale: float
-    seed: int
-
-
-def _run(job: _Job, index: int) -> _Run:
-    nlp, scale = job.nlp, job.scale
-    start = job.known[index] if index < len(job.known) else feasible_start(nlp.problem, index, job.seed)
-    if start is None:
-        return _Run(None, None, np.inf, np.inf, None)
-    try:
-        record, certificate = run_start(nlp, start, scale)
-        objective = nlp.problem.objective.value(record.q)
-    except MetricError:
-        # This start led to a posture where the objective does not exist.  The other starts go on.
-        return _Run(start, None, np.inf, np.inf, None)
-    problem = nlp.problem
-    minimized = objective / scale
-    if problem.requirements.regularization:
-        minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
-    return _Run(start, record, objective, minimized, certificate)
-
-
-def _run_all(job: _Job, starts: int, jobs: int, progress: Progress | None) -> list[_Run]:
-    runs: dict[int, _Run] = {}
-    # A fork takes longer than three starts.
-    with fork_map(partial(_run, job), starts, jobs if starts > 3 else 1) as results:
-        for index, run in results:
-            runs[index] = run
-            if progress:
-                progress(len(runs), starts)
-    return [runs[index] for index in range(starts)]
 
 
 def distinct(problem: PostureProblem, ends: list[tuple[Array, float]]) -> tuple[Optimum, ...]:
@@ -293,12 +230,18 @@ def wrapped_difference(problem: PostureProblem, one: Array, other: Array) -> Arr
     return step
 
 
-def _failure(runs: list[_Run]) -> SolverFailed:
+def _failure(runs: list[Run]) -> SolverFailed:
     solved = [r for r in runs if r.record is not None and r.certificate is not None]
     words = sorted({r.record.status for r in solved if r.record is not None})
     if not solved:
         return SolverFailed(
             "the objective does not exist where the starts ended", where="solver", hint="choose another `objective`"
+        )
+    if touching := [r.collisions[0] for r in solved if r.collisions]:
+        return SolverFailed(
+            f"original shapes touch at all {len(touching)} certified postures: {' / '.join(touching[0])}",
+            where="solver",
+            hint="try more `starts`, another `posture`, or a larger `clearance`",
         )
     nearest = min((r.certificate for r in solved if r.certificate), key=lambda c: c.stationarity)
     return SolverFailed(

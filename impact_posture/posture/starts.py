@@ -15,6 +15,8 @@ from impact_posture.posture.problem import PostureProblem, held_rows
 
 _ATTEMPTS = 20
 _STEPS = 80
+# Most postures on the projected constraints that one start chooses from.
+_CANDIDATES = 5
 # This share of the size of a singular matrix makes it regular.
 _ROUNDING = 1e-13
 
@@ -33,7 +35,7 @@ class Projection:
 
 
 class Projector:
-    """Levenberg–Marquardt onto the constraints within the limits; held joints do not move.
+    """Levenberg–Marquardt onto the projected constraints within the limits; held joints do not move.
 
     Args:
         problem: The posture problem.
@@ -56,6 +58,8 @@ class Projector:
         self.numeric.at(q)
         values, jacobians = [np.zeros(0)], [np.zeros((0, self.problem.robot.nv))]
         for constraint in self.problem.constraints:
+            if not constraint.projected:
+                continue
             value, jacobian = constraint.evaluate(self.numeric)
             violation = constraint.excess(value)
             values.append(violation)
@@ -63,6 +67,12 @@ class Projector:
                 jacobian = np.where((violation != 0)[:, None], jacobian, 0.0)
             jacobians.append(jacobian)
         return np.concatenate(values), np.vstack(jacobians)
+
+    def outside(self, q: Array) -> float:
+        """Return the violation of the constraints that are not projected, summed."""
+        self.numeric.at(q)
+        free = [c for c in self.problem.constraints if not c.projected]
+        return float(sum(np.abs(c.excess(c.evaluate(self.numeric)[0])).sum() for c in free))
 
     def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
         """Pull ``q`` onto the constraints.  The result may still violate them."""
@@ -103,19 +113,25 @@ def feasible_start(problem: PostureProblem, index: int, seed: int, tolerance: fl
     """Return the ``index``-th feasible start of a seed; ``None`` if no attempt reached the constraints.
 
     Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near it, even starts anywhere within
-    the limits.  Near starts reach the constraints more often, far starts find other optima.
+    the limits.  Near starts reach the constraints more often, far starts find other optima.  Of a few postures that
+    reach them, the first counts that satisfies the constraints without projection too, else the first of all.
     """
     projector = Projector(problem)
     if index == 0:
         found = projector.project(problem.given)
         return found.q if found.violation <= tolerance else None
     rng = np.random.default_rng([seed, index])
+    first, tried = None, 0
     for attempt in range(_ATTEMPTS):
         near = (index + attempt) % 2 == 1
         found = projector.project(random_posture(problem, projector.chart, rng, near=near))
         if found.violation <= tolerance:
-            return found.q
-    return None
+            if projector.outside(found.q) <= tolerance:
+                return found.q
+            first, tried = found.q if first is None else first, tried + 1
+            if tried == _CANDIDATES:
+                break
+    return first
 
 
 def random_posture(problem: PostureProblem, chart: Chart, rng: np.random.Generator, *, near: bool) -> Array:

@@ -11,7 +11,8 @@ from unittest.mock import patch
 
 from impact_posture.posture.nlp import PostureNLP, build_nlp
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.solve import run_start, solve
+from impact_posture.posture.search import run_start
+from impact_posture.posture.solve import solve
 from impact_posture.toolchain import find_compiler
 from tests.benchmarks.cases import CASES, Case
 from tests.benchmarks.core import Request, Vector, cell, crba_time, feasible_starts, machine, table

@@ -1,0 +1,151 @@
+"""Bodies that stay apart: the robot's own links, the surface, the ground and obstacles."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from typing import Self
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.arrays import Array
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import Tree
+from impact_posture.impact.lifted import Guess
+from impact_posture.posture.constraint import Constraint, LiftedRows, Linearization
+from impact_posture.posture.separator import Body, Corners, Separator
+
+# Pairs closer than this (m) beyond their clearance are computed exactly; a bound is enough for the others.
+_NEAR = 0.01
+# A pair is missing in the program if it violates its clearance by more than this (m), half of what certifies.
+_MISSING = 5e-9
+# Most pairs that one posture adds to the program, the deepest first.
+_MOST = 6
+
+
+class Clearance(Constraint):
+    """``distance(a, b) − clearance ≥ 0`` for pairs of bodies; the program has the pairs that were found to matter.
+
+    A pair that no solve brings close costs nothing.  :meth:`grown` adds pairs that the end of a solve violates.
+
+    Args:
+        name: Name of the constraint.
+        separators: The pairs.
+        words: Description in one line.
+        active: Pairs in the program, by index, with the corners that have rows there.
+    """
+
+    projected = False
+
+    def __init__(
+        self, name: str, separators: Sequence[Separator], words: str, active: Mapping[int, Corners] | None = None
+    ) -> None:
+        self.name, self._separators, self._words = name, tuple(separators), words
+        self.active: Mapping[int, Corners] = active or {}
+        self.parameters = np.zeros(0)
+        self.lower, self.upper = np.zeros(len(self._separators)), np.full(len(self._separators), np.inf)
+        bodies: dict[int, Body] = {}
+        for one in self._separators:
+            bodies |= {id(one.a): one.a, id(one.b): one.b}
+        self._bodies = list(bodies.values())
+        where = {key: k for k, key in enumerate(bodies)}
+        self._first = np.array([where[id(one.a)] for one in self._separators], dtype=int)
+        self._second = np.array([where[id(one.b)] for one in self._separators], dtype=int)
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return self._words
+
+    @property
+    def structure(self) -> str:
+        """See :class:`Constraint`."""
+        content = "".join(one.content(corners) for _, one, corners in self._program)
+        return f"{super().structure}:{hashlib.sha256(content.encode()).hexdigest()[:16]}"
+
+    def row_name(self, row: int) -> str:
+        """See :class:`Constraint`."""
+        return self._separators[row].name
+
+    def conflicts(self, excess: Array) -> dict[str, float]:
+        """See :class:`Constraint`."""
+        return {self.row_name(int(k)): float(abs(excess[k])) for k in np.flatnonzero(excess)}
+
+    # ---- numbers ----------------------------------------------------------------------------------------------
+
+    def _bound(self, model: Numeric) -> Array:
+        """Return lower bounds on all distances, from a sphere around each body."""
+        centers, reach = np.zeros((len(self._bodies), 3)), np.zeros(len(self._bodies))
+        normals: dict[int, Array] = {}
+        for k, body in enumerate(self._bodies):
+            at = body.placement(model)
+            centers[k] = at.translation if body.hull is None else at.act(body.hull.center)
+            reach[k] = 0.0 if body.hull is None else body.hull.reach
+            if body.normal is not None:
+                normals[k] = at.rotation @ body.normal
+                centers[k] += body.offset * normals[k]
+        apart = centers[self._first] - centers[self._second]
+        bound = np.linalg.norm(apart, axis=1)
+        for k, normal in normals.items():
+            mine = self._second == k
+            bound[mine] = apart[mine] @ normal
+        margins = np.array([one.margin for one in self._separators])
+        return np.asarray(bound - reach[self._first] - reach[self._second] - margins)
+
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
+        """See :class:`Constraint`; a distance beyond 1 cm may be a lower bound, with a zero Jacobian."""
+        values, jacobian = self._bound(model), np.zeros((self.rows, model.model.nv))
+        for k in np.flatnonzero(values < _NEAR):
+            one = self._separators[int(k)]
+            values[k], normal, points = one.distance(model)
+            jacobian[k] = normal @ (one.a.jacobian(model, points[0]) - one.b.jacobian(model, points[1]))
+        return values, jacobian
+
+    def grown(self, model: Numeric) -> Self:
+        """See :class:`Constraint`."""
+        values, active = self.evaluate(model)[0], dict(self.active)
+        added = 0
+        for k in np.argsort(values, kind="stable"):
+            if values[k] >= -_MISSING or added == _MOST:
+                break
+            new, old = self._separators[int(k)].corners(model), active.get(int(k), Corners(frozenset(), frozenset()))
+            if not (new.a <= old.a and new.b <= old.b):
+                active[int(k)] = Corners(old.a | new.a, old.b | new.b)
+                added += 1
+        return type(self)(self.name, self._separators, self._words, active) if added else self
+
+    # ---- lifted form ------------------------------------------------------------------------------------------
+
+    @property
+    def _program(self) -> list[tuple[int, Separator, Corners]]:
+        return [(k, self._separators[k], corners) for k, corners in self.active.items()]
+
+    def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
+        """See :class:`Constraint`."""
+        parts = [one.lift(tree, f"{self.name}{k}", corners) for k, one, corners in self._program]
+        rows, variables = (
+            ca.vertcat(ca.SX(0, 1), *[getattr(part, key) for part in parts]) for key in ("rows", "variables")
+        )
+        return LiftedRows(rows, variables, sum((part.slack for part in parts), ca.SX(0)))
+
+    @property
+    def lifted_bounds(self) -> tuple[Array, Array]:
+        """See :class:`Constraint`."""
+        lower, upper = (
+            [np.zeros(0), *[one.bounds(corners)[side] for _, one, corners in self._program]] for side in (0, 1)
+        )
+        return np.concatenate(lower), np.concatenate(upper)
+
+    def guess(self, model: Numeric) -> Guess:
+        """See :class:`Constraint`."""
+        parts = [one.guess(model) for _, one, _ in self._program]
+        values, lower = ([np.zeros(0), *[getattr(part, key) for part in parts]] for key in ("values", "lower"))
+        return Guess(np.concatenate(values), np.concatenate(lower))
+
+    def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
+        """See :class:`Constraint`; the rows of pairs that are near, in the program or not."""
+        counts = [one.count for _, one, _ in self._program]
+        own = dict(zip(self.active, np.split(auxiliaries, np.cumsum(counts)[:-1]), strict=False)) if counts else {}
+        values = self.evaluate(model)[0]
+        parts = [self._separators[int(k)].linearize(model, own.get(int(k))) for k in np.flatnonzero(values < 1e-3)]
+        return Linearization.joined(parts, model.model.nv)

@@ -1,0 +1,233 @@
+"""A plane between two bodies as unknowns of the program: a proof that they do not touch.
+
+Two convex bodies do not touch if a plane separates them (S. Boyd and L. Vandenberghe, Convex Optimization, 2004,
+section 2.5).  With the plane ``{y: n·y = c}`` in the axes of body b, sweep radii r and the clearance δ, corners x of
+a and y of b satisfy::
+
+    m·x + d + s ≥ r_a + r_b + δ,      n·y − c ≤ 0,      n·n ≤ 1,
+    m = Qᵀn,   d = n·t − c            (Q, t: placement of a in the axes of b)
+
+Every row of a corner is linear in the unknowns (n, c, m, d, s), and only four equations of a pair see the posture.
+The slack s lets a solver start from bodies that penetrate each other.  A half-space has a known plane, and drops n
+and c.  The program has rows of those corners only that a plane could meet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.arrays import Array
+from impact_posture.collision.swept_hull import SweptHull, separation
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import PointOnLink, Tree
+from impact_posture.impact.lifted import Guess
+from impact_posture.posture.constraint import LiftedRows, Linearization
+
+# A slack starts so far (m) above the penetration, and a normal at this length, inside their bounds.
+_ABOVE, _LENGTH = 0.01, 0.98
+# Tangent of the tilt at which more corners of a body get a row, and the sides to which it tilts.
+_TILT = 0.5
+_AROUND = np.array([[0.0, 0.0], *[[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4]])
+# Rows of corners farther than this (m) from their plane have no multiplier.
+_NEAR = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A swept hull that moves with a link, stands in the world, or moves with a point without turning.
+
+    Attributes:
+        name: Name in messages.
+        hull: Corners and sweep radius in the axes of ``point``; ``None`` for the half-space behind a plane.
+        point: The point and axes that carry it; joint 0 is the world.
+        turns: Whether it turns with the link; else it keeps world axes.
+        normal: Unit normal out of the half-space, in the same axes, shape (3,).
+        offset: Height of its plane ``{y: normal·y = offset}``, m.
+    """
+
+    name: str
+    hull: SweptHull | None
+    point: PointOnLink
+    turns: bool = True
+    normal: Array | None = None
+    offset: float = 0.0
+
+    @staticmethod
+    def of_link(hull: SweptHull) -> Body:
+        """Return a body of the robot, or of the world."""
+        return Body(hull.name, hull, PointOnLink(hull.joint, np.zeros(3), np.eye(3)))
+
+    def placement(self, model: Numeric) -> pin.SE3:
+        """Return the placement of its axes in the world."""
+        found = model.placement(self.point)
+        return found if self.turns else pin.SE3(np.eye(3), found.translation)
+
+    def jacobian(self, model: Numeric, position: Array) -> Array:
+        """Return the Jacobian of a point of the body at ``position`` in the world, shape (3, nv)."""
+        joint = self.point.joint
+        if joint == 0:
+            return np.zeros((3, model.model.nv))
+        if not self.turns:
+            return model.jacobian(self.point)[:3]
+        return model.jacobian(PointOnLink(joint, model.data.oMi[joint].actInv(position), np.eye(3)))[:3]
+
+
+class Corners(NamedTuple):
+    """Corners of two bodies that have rows in the program, as indices."""
+
+    a: frozenset[int]
+    b: frozenset[int]
+
+
+class Separator:
+    """The rows and unknowns that keep body ``a`` clear of body ``b``.
+
+    Args:
+        a: A swept hull.
+        b: A swept hull, or a half-space.
+        margin: Clearance δ, meters.
+    """
+
+    def __init__(self, a: Body, b: Body, margin: float) -> None:
+        assert a.hull is not None  # noqa: S101 (narrows a type)
+        self.a, self.b, self.name = a, b, f"{a.name} / {b.name}"
+        self._x, self._y = a.hull.vertices, np.zeros((0, 3)) if b.hull is None else b.hull.vertices
+        self.gap = a.hull.radius + (0.0 if b.hull is None else b.hull.radius) + margin
+        self.margin = margin
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
+        return 5 if self.known else 9
+
+    @property
+    def known(self) -> bool:
+        """Whether the plane is known."""
+        return self.b.normal is not None
+
+    def bounds(self, corners: Corners) -> tuple[Array, Array]:
+        """Return the bounds of the rows of :meth:`lift`."""
+        first, second, own = len(corners.a), len(corners.b), 0 if self.known else 1
+        lower = np.concatenate([np.zeros(4), np.full(first, self.gap), np.full(second + own, -np.inf)])
+        upper = np.concatenate([np.zeros(4), np.full(first, np.inf), np.zeros(second), np.ones(own)])
+        return lower, upper
+
+    def content(self, corners: Corners) -> str:
+        """Return a text with everything that shapes the rows."""
+        bodies = [(b.point.joint, b.point.position.tolist(), b.point.rotation.tolist()) for b in (self.a, self.b)]
+        normal = None if self.b.normal is None else self.b.normal.tolist()
+        points = self._x[sorted(corners.a)].tolist(), self._y[sorted(corners.b)].tolist()
+        return repr((bodies, self.b.turns, normal, self.b.offset, points))
+
+    def lift(self, tree: Tree, label: str, corners: Corners) -> LiftedRows:
+        """Return the rows, the unknowns ``n, c, m, d, s`` (``m, d, s`` for a half-space), and the slack."""
+        plane = ca.SX(0, 1) if self.known else ca.SX.sym(f"plane{label}", 4)
+        m, d, s = ca.SX.sym(f"m{label}", 3), ca.SX.sym(f"d{label}"), ca.SX.sym(f"s{label}")
+        n, c = (ca.SX(self.b.normal), ca.SX(self.b.offset)) if self.known else (plane[:3], plane[3])
+        Q, t = self._relative(tree)
+        rows = [m - Q.T @ n, d - (ca.dot(n, t) - c), ca.SX(self._x[sorted(corners.a)]) @ m + d + s]
+        if not self.known:
+            rows += [ca.SX(self._y[sorted(corners.b)]) @ n - c, ca.dot(n, n)]
+        return LiftedRows(ca.vertcat(*rows), ca.vertcat(plane, m, d, s), s)
+
+    def corners(self, model: Numeric) -> Corners:
+        """Return the corners that a plane between the closest points meets first, as it is and tilted a little."""
+        normal = self.distance(model)[1]
+        across = np.linalg.svd(normal[None])[2][1:]
+        directions = normal + _TILT * _AROUND @ across
+        first, second = (directions @ body.placement(model).rotation for body in (self.a, self.b))
+        return Corners(
+            frozenset(int(k) for k in (first @ self._x.T).argmin(axis=1)),
+            frozenset(int(k) for k in (second @ self._y.T).argmax(axis=1)) if len(self._y) else frozenset(),
+        )
+
+    def _relative(self, tree: Tree) -> tuple[ca.SX, ca.SX]:
+        """Placement of ``a`` in the axes of ``b``."""
+        if self.b.turns:
+            R, p = tree.relative(self.b.point.joint, self.a.point.joint)
+            axes = ca.SX(self.b.point.rotation).T
+            return axes @ R, axes @ (p - ca.SX(self.b.point.position))
+        R, p = tree.relative(0, self.a.point.joint)
+        return R, p - tree.position(self.b.point)
+
+    def distance(self, model: Numeric) -> tuple[float, Array, Array]:
+        """Return the distance less the clearance, the normal from b to a and the closest points (2, 3), world axes."""
+        at_a, at_b = self.a.placement(model), self.b.placement(model)
+        if self.b.hull is not None:
+            assert self.a.hull is not None  # noqa: S101 (narrows a type)
+            found = separation(self.a.hull, at_a, self.b.hull, at_b)
+            return found.distance - self.margin, found.normal, np.array([found.point_a, found.point_b])
+        n = at_b.rotation @ self.b.normal
+        points = self._x @ at_a.rotation.T + at_a.translation
+        heights = (points - at_b.translation) @ n - self.b.offset
+        lowest = points[int(np.argmin(heights))]
+        return float(heights.min()) - self.gap, n, np.array([lowest, lowest - heights.min() * n])
+
+    def guess(self, model: Numeric) -> Guess:
+        """Return the unknowns at the closest points, with their bounds."""
+        value, normal, _ = self.distance(model)
+        n, c = self._plane(model, normal)
+        n = n if self.known else _LENGTH * n
+        relative = self.b.placement(model).actInv(self.a.placement(model))
+        plane = [] if self.known else [*n, c]
+        values = np.array(
+            [*plane, *(relative.rotation.T @ n), n @ relative.translation - c, max(0.0, -value) + _ABOVE]
+        )
+        lower = np.full(len(values), -np.inf)
+        lower[-1] = 0.0
+        return Guess(values, lower)
+
+    def _plane(self, model: Numeric, normal: Array) -> tuple[Array, float]:
+        """The plane in the axes of ``b`` with a world normal, in the middle between the swept bodies."""
+        if self.b.normal is not None:
+            return self.b.normal, self.b.offset
+        relative = self.b.placement(model).actInv(self.a.placement(model))
+        n = self.b.placement(model).rotation.T @ normal
+        points = self._x @ relative.rotation.T + relative.translation
+        return n, float((points @ n).min() - self.gap + (self._y @ n).max()) / 2
+
+    def linearize(self, model: Numeric, unknowns: Array | None) -> Linearization:
+        """Return the rows of corners near the plane over the tangent space and (n, c); see :class:`Constraint`.
+
+        Args:
+            model: The model at the posture.
+            unknowns: Those of :meth:`lift`; ``None`` for the plane between the closest points.
+        """
+        at_a, at_b, nv = self.a.placement(model), self.b.placement(model), model.model.nv
+        if unknowns is None or self.known:
+            n, c = self._plane(model, self.distance(model)[1])
+        else:
+            n, c = unknowns[:3], float(unknowns[3])
+        world = at_b.rotation @ n
+        names, value, lower, upper, posture, plane = [], [], [], [], [], []
+
+        def add(name: str, row: tuple[float, float, float], J: Array, derivative: Array) -> None:
+            names.append(name)
+            for values, entry in zip((value, lower, upper), row, strict=True):
+                values.append(entry)
+            posture.append(J)
+            plane.append(derivative)
+
+        for x in self._x:
+            corner = at_a.act(x)
+            seen = at_b.actInv(corner)
+            height = float(n @ seen) - c
+            if height < self.gap + _NEAR:
+                J = world @ (self.a.jacobian(model, corner) - self.b.jacobian(model, corner))
+                add(self.name, (height, self.gap, np.inf), J, np.append(seen, -1.0))
+        for y in self._y:
+            height = float(n @ y) - c
+            if height > -_NEAR:
+                add("", (height, -np.inf, 0.0), np.zeros(nv), np.append(y, -1.0))
+        if not self.known:
+            add("", (float(n @ n), -np.inf, 1.0), np.zeros(nv), np.append(2 * n, 0.0))
+        width = 0 if self.known else 4
+        return Linearization(
+            names, np.array(value), np.array(lower), np.array(upper), np.array(posture).reshape(-1, nv),
+            np.array(plane).reshape(-1, 4)[:, :width],
+        )  # fmt: skip

@@ -1,0 +1,189 @@
+"""What the robot must stay clear of: itself, the surface that it strikes, the ground under its feet, obstacles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.arrays import Array
+from impact_posture.collision.mesh_check import mesh_collisions
+from impact_posture.collision.obstacle import obstacle_hull
+from impact_posture.collision.shapes import load_shapes
+from impact_posture.collision.swept_hull import SweptHull
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.impact.contact import ImpactContact, Support, point_on
+from impact_posture.posture.clearance import Clearance
+from impact_posture.posture.separator import Body, Separator
+from impact_posture.robot.robot import Robot
+from impact_posture.settings import PATCH, Obstacle
+
+# A body that cannot move and lies this far (m) behind the plane of the surface shows that the surface ends before it.
+_BEHIND = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpace:
+    """The half-space behind a plane, at one posture.
+
+    Attributes:
+        name: Name in messages.
+        point: A point of the plane, world, shape (3,), m.
+        normal: Unit normal out of it, world, shape (3,).
+        exempt: Joints whose links may be behind it.
+    """
+
+    name: str
+    point: Array
+    normal: Array
+    exempt: frozenset[int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Wall:
+    """A plane or a body that the links must stay clear of, but those that are exempt."""
+
+    body: Body
+    exempt: frozenset[int]
+
+
+class Surroundings:
+    """The bodies around a robot at a given posture, and the constraints that keep it clear of them.
+
+    Args:
+        robot: The robot.
+        numeric: The model at the given posture.
+        held: Joints that do not move.
+        clearance: Least distance of all pairs, m.
+    """
+
+    def __init__(self, robot: Robot, numeric: Numeric, held: Sequence[str], clearance: float) -> None:
+        self.robot, self.shapes = robot, load_shapes(robot)
+        self._clearance, self._numeric = clearance, numeric
+        self._bodies = [Body.of_link(hull) for hull in self.shapes.bodies]
+        self._group = _rigid_groups(robot, held)
+        self._walls: list[_Wall] = []
+        self._still = {0}
+        self.notes: list[str] = list(self.shapes.warnings)
+
+    # ---- what is there ----------------------------------------------------------------------------------------
+
+    def add_ground(self, supports: Sequence[Support]) -> None:
+        """Put level ground under the lowest foot; the feet may touch it."""
+        if not supports:
+            return
+        feet = [point_on(self.robot, s.frame, s.offset) for s in supports]
+        height = min(float(self._numeric.placement(foot).translation[2]) for foot in feet)
+        exempt = self._rigid(foot.joint for foot in feet)
+        self._still |= exempt
+        up = np.array([0.0, 0.0, 1.0])
+        body = Body("ground", None, PointOnLink(0, np.array([0.0, 0.0, height]), np.eye(3)), normal=up)
+        self._walls.append(_Wall(body, exempt))
+
+    def add_surface(self, contact: ImpactContact, width: float | None) -> None:
+        """Put the surface behind a contact: the whole plane, or a square patch of it.
+
+        The plane passes through the contact point, or behind the link of the contact (with what held joints fix to
+        it) if that reaches farther at the given posture.  This link may touch it.  The surface is a patch as well if
+        a foot or a fixed base lies behind the plane, because then it ends before it reaches there.
+
+        Args:
+            contact: The contact.
+            width: Edge length of the patch, m; infinite for the plane, ``None`` to decide.
+        """
+        point = point_on(self.robot, contact.frame, contact.offset)
+        turns = contact.normal_frame == "contact"
+        n = np.array(contact.normal)
+        name = f"surface at {contact.frame}"
+        exempt = self._rigid([point.joint])
+        own = [b for b in self._bodies if b.point.joint in exempt]
+        plane = Body(name, None, point, turns, n)
+        depth = max([0.0, *[-self._height(body, plane) for body in own]])
+        plane = replace(plane, offset=-depth)
+        behind = [b for b in self._bodies if self._is_still(b) and self._height(b, plane) < -_BEHIND]
+        behind = [b for b in behind if b.point.joint not in exempt]
+        if width is None and behind:
+            width = PATCH
+            self.notes.append(
+                f"{behind[0].name} lies behind the plane of the {name}, so the surface is taken as a patch of "
+                f"{width:g} m × {width:g} m (`surface`)"
+            )
+        if width is None or not np.isfinite(width):
+            self._walls.append(_Wall(plane, exempt))
+            return
+        corners = _box_behind(n, width) - depth * n
+        hull = SweptHull(name, name, point.joint, corners, 0.0)
+        self._walls.append(_Wall(Body(name, hull, point, turns), exempt))
+
+    def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Add bodies that stand in the world."""
+        for obstacle in obstacles:
+            self._walls.append(_Wall(Body.of_link(obstacle_hull(obstacle)), frozenset()))
+
+    # ---- what follows -----------------------------------------------------------------------------------------
+
+    def constraints(self) -> list[Clearance]:
+        """Return one constraint for the links among themselves, and one for each wall."""
+        near = f"at least {1e3 * self._clearance:g} mm apart"
+        pairs = [Separator(self._bodies[i], self._bodies[j], self._clearance) for i, j in self.shapes.pairs]
+        found = [Clearance("self-collision", pairs, f"links {near} ({len(pairs)} pairs)")] if pairs else []
+        for wall in self._walls:
+            apart = [
+                Separator(body, wall.body, self._clearance)
+                for body in self._bodies
+                if body.point.joint not in wall.exempt and not (self._is_fixed(body) and wall.body.point.joint == 0)
+            ]
+            if apart:
+                found.append(Clearance(wall.body.name, apart, f"links and {wall.body.name} {near}"))
+        return found
+
+    def collisions(self, q: Array) -> list[tuple[str, str]]:
+        """Return the original shapes that touch each other, the surface, the ground or an obstacle at ``q``."""
+        numeric = Numeric(self.robot.model).at(q)
+        planes, solids = [], []
+        for wall in self._walls:
+            at = wall.body.placement(numeric)
+            if wall.body.normal is not None:
+                n = at.rotation @ wall.body.normal
+                planes.append(HalfSpace(wall.body.name, at.translation + wall.body.offset * n, n, wall.exempt))
+            elif wall.body.hull is not None:
+                hull = wall.body.hull
+                corners = hull.vertices @ at.rotation.T + at.translation
+                solids.append((SweptHull(hull.name, hull.link, 0, corners, hull.radius), wall.exempt))
+        return mesh_collisions(self.robot, self.shapes, q, solids, planes)
+
+    # ---- helpers ----------------------------------------------------------------------------------------------
+
+    def _rigid(self, joints: Iterable[int]) -> frozenset[int]:
+        """The joints whose links do not move relative to one of these."""
+        groups = {self._group[joint] for joint in joints}
+        return frozenset(k for k, group in enumerate(self._group) if group in groups)
+
+    def _is_fixed(self, body: Body) -> bool:
+        return self._group[body.point.joint] == self._group[0]
+
+    def _is_still(self, body: Body) -> bool:
+        return self._is_fixed(body) or body.point.joint in self._still
+
+    def _height(self, body: Body, plane: Body) -> float:
+        return Separator(body, plane, 0.0).distance(self._numeric)[0]
+
+
+def _rigid_groups(robot: Robot, held: Sequence[str]) -> list[int]:
+    """The group of each joint of the model; links of one group do not move relative to each other."""
+    fixed = {robot.joint_id(joint) for joint in held}
+    group = list(range(robot.model.njoints))
+    for joint in range(1, robot.model.njoints):
+        if joint in fixed:
+            group[joint] = group[int(robot.model.parents[joint])]
+    return group
+
+
+def _box_behind(n: Array, width: float) -> Array:
+    """Corners of a box behind a plane, one face of which is a square of the plane around the origin, shape (8, 3)."""
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), n).matrix()
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-2, 0)]) * width / 2
+    return np.asarray(signs @ turn.T)

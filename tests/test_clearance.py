@@ -1,0 +1,195 @@
+"""Separating planes: their rows in numbers and as expressions, their derivatives, and the postures that they allow."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from impact_posture.collision.swept_hull import SweptHull
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import PointOnLink, Tree
+from impact_posture.errors import Infeasible
+from impact_posture.posture.clearance import Clearance
+from impact_posture.posture.problem_settings import prepare
+from impact_posture.posture.search import feasible
+from impact_posture.posture.separator import Body, Separator
+from impact_posture.posture.solve import solve
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import Obstacle, ProblemSettings
+
+BOX = np.array(list(product((-0.04, 0.05), (-0.03, 0.06), (-0.05, 0.07))))
+ROBOTS = ("tilthex_arm", "talos", "panda", "kinova")
+KINDS = ("pair", "world", "half-space", "in the frame", "with a point")
+
+
+def _separator(robot: Robot, kind: str) -> Separator:
+    last, first = robot.model.njoints - 1, 1
+    a = Body.of_link(SweptHull("a", "a", last, BOX, 0.01))
+    point = PointOnLink(first, np.array([0.1, -0.2, 0.05]), pin.exp3(np.array([0.3, 0.2, -0.5])))
+    normal = np.array([0.6, 0.0, 0.8])
+    b = {
+        "pair": Body.of_link(SweptHull("b", "b", first, 1.5 * BOX, 0.02)),
+        "world": Body.of_link(SweptHull("b", "b", 0, 2 * BOX + 0.1, 0.0)),
+        "half-space": Body("b", None, PointOnLink(0, np.array([0.0, 0.1, -0.3]), np.eye(3)), normal=normal),
+        "in the frame": Body("b", None, point, normal=normal, offset=-0.1),
+        "with a point": Body("b", SweptHull("b", "b", first, BOX, 0.005), point, turns=False),
+    }[kind]
+    return Separator(a, b, 0.002)
+
+
+def _random(robot: Robot, rng: np.random.Generator) -> np.ndarray:
+    return pin.integrate(robot.model, pin.neutral(robot.model), rng.normal(size=robot.nv) * 0.8)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_placements_along_the_way_are_those_of_pinocchio(name: str) -> None:
+    robot, rng = load_robot(name), np.random.default_rng(5)
+    q = ca.SX.sym("q", robot.nq)
+    tree, numeric = Tree(robot.model, q), Numeric(robot.model)
+    pairs = [tuple(rng.integers(0, robot.model.njoints, 2)) for _ in range(6)] + [(0, robot.model.njoints - 1)]
+    expressions = [part for pair in pairs for part in tree.relative(int(pair[0]), int(pair[1]))]
+    function = ca.Function("relative", [q], expressions)
+    posture = _random(robot, rng)
+    numeric.at(posture)
+    found = function(posture)
+    for k, (base, joint) in enumerate(pairs):
+        expected = numeric.data.oMi[int(base)].actInv(numeric.data.oMi[int(joint)])
+        assert np.allclose(np.array(found[2 * k]), expected.rotation, atol=1e-12)
+        assert np.allclose(np.array(found[2 * k + 1]).ravel(), expected.translation, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str, kind: str) -> None:
+    robot, rng = load_robot(name), np.random.default_rng(1)
+    separator, numeric, chart = _separator(robot, kind), Numeric(robot.model), Chart(robot.model)
+    x = ca.SX.sym("x", chart.nx)
+    tree = Tree(robot.model, chart.configuration(x), x)
+    apart = 0
+    for _ in range(6):
+        q = _random(robot, rng)
+        distance = separator.distance(numeric.at(q))[0]
+        corners = separator.corners(numeric)
+        lifted = separator.lift(tree, "", corners)
+        rows = ca.Function("rows", [x, lifted.variables], [lifted.rows])
+        guess = separator.guess(numeric).values.copy()
+        assert len(guess) == separator.count
+        # Without the slack.
+        guess[-1] = 0.0
+        value = np.array(rows(chart.to_x(q), guess)).ravel()
+        lower, upper = separator.bounds(corners)
+        outside = np.maximum(lower - value, value - upper)
+        # The guess of the normal is 2 % short, so a gap of a few millimeters may not show.
+        assert (outside.max() < 1e-9) == (distance > 0) or abs(distance) < 0.03
+        apart += distance > 0.03
+    assert apart
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_linearization_is_the_derivative_of_the_rows(name: str, kind: str) -> None:
+    """Against manifold differences of the heights of all corners over a fixed plane."""
+    robot, rng = load_robot(name), np.random.default_rng(2)
+    separator, numeric = _separator(robot, kind), Numeric(robot.model)
+    q = _random(robot, rng)
+    plane = np.zeros(separator.count)
+    plane[:4] = [*rng.normal(size=3), 50.0]
+    rows = separator.linearize(numeric.at(q), plane)
+    if not separator.known:
+        # A plane far on the other side of both bodies: every corner violates it, so every one has a row.
+        assert len(rows.names) == len(separator.a.hull.vertices) + 1
+
+    def heights(posture: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
+        return separator.linearize(numeric.at(posture), unknowns).value
+
+    if not len(rows.value):
+        # A half-space that the body is clear of.
+        assert separator.distance(numeric.at(q))[0] > 0
+        return
+    h = 1e-6
+    for k, unit in enumerate(np.eye(robot.nv)):
+        ahead, behind = (heights(pin.integrate(robot.model, q, s * h * unit), plane) for s in (1, -1))
+        if len(ahead) == len(behind) == len(rows.value):
+            assert np.allclose((ahead - behind) / (2 * h), rows.posture[:, k], atol=2e-8)
+    for k in range(rows.auxiliary.shape[1]):
+        step = np.eye(separator.count)[k] * h
+        difference = (heights(q, plane + step) - heights(q, plane - step)) / (2 * h)
+        assert np.allclose(difference, rows.auxiliary[:, k], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["tilthex_arm", "panda"])
+def test_distances_and_their_gradient(name: str) -> None:
+    robot, rng = load_robot(name), np.random.default_rng(4)
+    constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
+    numeric, h, seen = Numeric(robot.model), 1e-6, 0
+    for _ in range(40):
+        q = _random(robot, rng)
+        value, jacobian = constraint.evaluate(numeric.at(q))
+        for row in np.flatnonzero(np.abs(jacobian).max(axis=1) > 0):
+            numbers = []
+            for unit in np.eye(robot.nv):
+                ahead, behind = (
+                    constraint.evaluate(numeric.at(pin.integrate(robot.model, q, s * h * unit)))[0][row]
+                    for s in (1, -1)
+                )
+                numbers.append((ahead - behind) / (2 * h))
+            # Two edges of boxes that are not parallel: the distance is smooth.
+            seen += bool(np.allclose(numbers, jacobian[row], atol=1e-5))
+            assert value[row] < 0.01
+    assert seen > 10
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_bound_on_distances_is_one(seed: int) -> None:
+    """Spheres around the bodies are never farther apart than the distance that counts."""
+    robot = load_robot("tilthex_arm")
+    separators = [_separator(robot, kind) for kind in KINDS]
+    constraint = Clearance("c", separators, "words")
+    numeric = Numeric(robot.model).at(_random(robot, np.random.default_rng(seed)))
+    values = constraint.evaluate(numeric)[0]
+    exact = np.array([one.distance(numeric)[0] for one in separators])
+    assert (values <= exact + 1e-9).all()
+    assert ((values < 0) == (exact < 0)).all()
+
+
+def _problem(**changes: object) -> ProblemSettings:
+    return ProblemSettings(robot="tilthex_arm", frame="ee", normal=(0.0, 0.0, 1.0), **changes)  # type: ignore[arg-type]
+
+
+def test_a_body_in_the_way_of_the_optimum() -> None:
+    """The optimum without the obstacle runs through it; with it, it touches the obstacle and certifies."""
+    free = solve(prepare(_problem()).problem, starts=4, jobs=1, compile="never")
+    model = free.problem.robot.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, free.q)
+    elbow = tuple(float(v) for v in data.oMi[model.njoints - 1].translation)
+    blocked = prepare(_problem(obstacles=(Obstacle(name="ball", sphere=0.06, position=elbow),))).problem
+    assert not feasible(blocked, free.q)
+    found = solve(blocked, starts=8, jobs=1, compile="never")
+    assert found.certificate.holds()
+    assert feasible(found.problem, found.q)
+    touched = [active for active in found.certificate.active if active.constraint.endswith("/ ball")]
+    assert touched and all(active.multiplier > 0 for active in touched)
+    objective = found.problem.objective
+    assert objective.value(free.q) < objective.value(found.q)
+
+
+def test_what_is_impossible_is_named() -> None:
+    """An obstacle around the contact point can never be left, whatever the posture."""
+    robot = load_robot("tilthex_arm")
+    numeric = Numeric(robot.model).at(robot.posture())
+    tool = numeric.data.oMi[robot.model.njoints - 1].translation
+    around = Obstacle(name="block", box=(0.1, 0.1, 0.1), position=tuple(float(v) for v in tool))
+    with pytest.raises(Infeasible) as caught:
+        solve(prepare(_problem(obstacles=(around,), contact_pose="full", base="fixed")).problem, jobs=1)
+    assert "block" in str(caught.value)
+    assert caught.value.exit_code == 3
