@@ -60,7 +60,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
     model, warnings = build_model(urdf, free_flyer=root == "free-flyer", accept_inertias=spec.model.accept_inertias)
     _remount(model, options.mounting, name)
-    srdf = _srdf(spec, options, base)
+    srdf = srdf_path(spec, options, base)
     _override_limits(model, spec, name)
     postures, default = named_postures(model, srdf, spec, root, name)
     armature_source = set_armature(model, spec, srdf, options.armature, name)
@@ -168,7 +168,12 @@ def locate(robot: str, options: LoadOptions) -> Located:
     return Located(spec, urdf, source, base, spec.name or urdf.stem)
 
 
-def _srdf(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
+def srdf_path(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
+    """Return the SRDF of a robot, or ``None``.
+
+    Raises:
+        UrdfError: There is no such file.
+    """
     text = options.srdf or spec.model.srdf
     if text is None:
         return None

@@ -87,7 +87,7 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
     """
     root = _parse(path)
     try:
-        with _quiet_stderr() as words:
+        with quiet_stderr() as words:
             model = pin.buildModelFromUrdf(str(path), *([pin.JointModelFreeFlyer()] if free_flyer else []))
     except Exception as error:  # Pinocchio raises ValueError, RuntimeError or IndexError, by version and fault.
         said = words[0] or str(error)
@@ -131,7 +131,7 @@ def _nameless_file() -> IO[bytes]:
 
 
 @contextlib.contextmanager
-def _quiet_stderr() -> Iterator[list[str]]:
+def quiet_stderr() -> Iterator[list[str]]:
     """Keep the output of the URDF parser off the terminal, and yield its first error line in a list."""
     words = [""]
     with _nameless_file() as sink:

@@ -1,0 +1,136 @@
+"""The collision shapes of a robot: its swept hulls, and which of them have to keep apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.collision.bodies import Body, merged_bodies
+from impact_posture.collision.geometry import Geometry, geometry_key, load_geometry
+from impact_posture.collision.hull_fit import Fit, fit_hull
+from impact_posture.collision.pairs import Pair, hindered, mostly_touching, pairs_of, touch_of
+from impact_posture.collision.shape_cache import StoredHull, StoredShapes, read_shapes, write_shapes
+from impact_posture.collision.swept_hull import SweptHull
+from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.robot.robot import Robot
+
+NO_SHAPES = "the robot has no shapes, so collisions are checked by joint origins only"
+
+
+@dataclass(frozen=True, eq=False)
+class RobotShapes:
+    """The collision shapes of a robot.
+
+    Attributes:
+        bodies: Swept hulls that hold all shapes.
+        pairs: Bodies that have to keep apart, as indices into ``bodies``, shape (k, 2).
+        always_touching: Names of shapes that touch at the default posture and at most others, so that they overlap by
+            design and need not keep apart.
+        hulls_touching: Names of bodies whose hulls touch at most of the postures at which their shapes do not.  They
+            are in no pair of hulls, and only the check on the shapes finds their collisions.
+        warnings: Shapes that are left out, and what a robot without shapes means; one line each.
+        robot: The robot, for the shapes themselves.
+    """
+
+    bodies: tuple[SweptHull, ...]
+    pairs: NDArray[np.int_]
+    always_touching: tuple[tuple[str, str], ...]
+    hulls_touching: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+    robot: Robot
+
+    @cached_property
+    def geometry(self) -> pin.GeometryModel:
+        """The shapes themselves, with the pairs that have to keep apart."""
+        loaded = load_geometry(self.robot, read_urdf_shapes(self.robot)[0])
+        names = [shape.name for shape in loaded.model.geometryObjects]
+        touching = set(self.always_touching)
+        for i, j in pairs_of(loaded.apart):
+            if (names[i], names[j]) not in touching:
+                loaded.model.addCollisionPair(pin.CollisionPair(i, j))
+        return loaded.model
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What shapes are made of; equal keys and warnings make equal shapes."""
+
+    key: str
+    robot: Robot = field(compare=False)
+    described: list[UrdfShape] = field(compare=False)
+    warnings: tuple[str, ...]
+
+
+@lru_cache(maxsize=16)
+def load_shapes(robot: Robot) -> RobotShapes:
+    """Return the collision shapes of a robot from its URDF, with the visual ones of links that have no others.
+
+    The fit is kept in memory, and in the cache of the user by the content of the URDF and its meshes.
+    """
+    described, warnings = read_urdf_shapes(robot)
+    return _shapes(_Source(geometry_key(robot, described), robot, described, tuple(warnings)))
+
+
+@lru_cache(maxsize=16)
+def _shapes(source: _Source) -> RobotShapes:
+    stored = read_shapes(source.key, int(source.robot.model.njoints))
+    if stored is None:
+        stored = _fit(source.robot, source.described)
+        write_shapes(source.key, stored)
+    bodies = tuple(_hull(hull) for hull in stored.bodies)
+    warnings = (*source.warnings, *stored.warnings, *(() if bodies else (NO_SHAPES,)))
+    pairs = np.array(stored.pairs, dtype=int).reshape(-1, 2)
+    return RobotShapes(bodies, pairs, stored.always_touching, stored.hulls_touching, warnings, source.robot)
+
+
+def _fit(robot: Robot, described: list[UrdfShape]) -> StoredShapes:
+    """Load the shapes, fit their hulls, and find the pairs."""
+    loaded = load_geometry(robot, described)
+    shapes, apart = loaded.model.geometryObjects, loaded.apart
+    touching = mostly_touching(robot, shapes, pairs_of(apart))
+    for i, j in touching:
+        apart[i, j] = apart[j, i] = False
+    merged = merged_bodies(shapes, apart)
+    bodies = tuple(_stored(body, loaded) for body in merged)
+    # The shapes of a body have to keep apart from the same shapes.
+    first = [body.shapes[0] for body in merged]
+    pairs = pairs_of(apart[np.ix_(first, first)])
+    touch = touch_of(shapes)
+
+    def bodies_touch(pair: Pair, data: pin.Data) -> bool:
+        a, b = (merged[k].shapes for k in pair)
+        return any(touch((i, j), data) for i in a for j in b)
+
+    out = set(hindered(robot, [_hull(body) for body in bodies], pairs, bodies_touch))
+    return StoredShapes(
+        bodies=bodies,
+        pairs=tuple(pair for pair in pairs if pair not in out),
+        always_touching=tuple((shapes[i].name, shapes[j].name) for i, j in touching),
+        hulls_touching=tuple((bodies[i].name, bodies[j].name) for i, j in sorted(out)),
+        warnings=loaded.warnings,
+    )
+
+
+def _stored(body: Body, loaded: Geometry) -> StoredHull:
+    """Fit the hull of a body; that of a single ball or capsule is exact."""
+    shape = loaded.model.geometryObjects[body.shapes[0]]
+    alone, solid, at = len(body.shapes) == 1, shape.geometry, shape.placement
+    if alone and isinstance(solid, coal.Sphere):
+        fit = Fit(np.array([at.translation]), float(solid.radius))
+    elif alone and isinstance(solid, coal.Capsule):
+        ends = [at.act(np.array([0.0, 0.0, side * solid.halfLength])) for side in (-1, 1)]
+        fit = Fit(np.array(ends), float(solid.radius))
+    else:
+        fit = fit_hull(np.vstack(body.corners))
+    vertices = tuple((float(x), float(y), float(z)) for x, y, z in fit.vertices)
+    link = loaded.links[body.shapes[0]]
+    return StoredHull(shape.name, link, int(shape.parentJoint), vertices, fit.radius)
+
+
+def _hull(stored: StoredHull) -> SweptHull:
+    return SweptHull(stored.name, stored.link, stored.joint, np.array(stored.vertices, dtype=float), stored.radius)

@@ -1,0 +1,141 @@
+"""Sphere-swept convex hulls, and their signed distance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.arrays import Array
+
+MOST_VERTICES = 40
+"""Most vertices of a hull, because each one is a row of a separating plane."""
+
+# A flat set of points is thickened to this half thickness (m), and a thinner one is a segment or a point.
+_THIN = 1e-4
+_GJK_TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class SweptHull:
+    """The points within ``radius`` of a convex hull that moves with a joint.
+
+    Attributes:
+        name: Unique name in messages: the link, with ``[k]`` if the link has several shapes.
+        link: Name of the link.
+        joint: Index of the joint in the model; 0 is the world.
+        vertices: Corners of the hull in the axes of the joint, shape (k, 3) with k ≤ 40, m.
+        radius: Sweep radius, m.
+    """
+
+    name: str
+    link: str
+    joint: int
+    vertices: Array
+    radius: float
+
+    @cached_property
+    def center(self) -> Array:
+        """Middle of the box around the vertices, in the axes of the joint, shape (3,), m."""
+        return np.asarray((self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2)
+
+    @cached_property
+    def reach(self) -> float:
+        """Radius of a sphere about ``center`` that holds the swept hull, m."""
+        return float(np.linalg.norm(self.vertices - self.center, axis=1).max()) + self.radius
+
+    @cached_property
+    def faces(self) -> Array:
+        """Triangles of the hull as indices into ``vertices``, shape (n, 3); none for a point or a segment."""
+        from scipy.spatial import ConvexHull, QhullError
+
+        if len(self.vertices) < 4:
+            return np.array([[0, 1, 2], [0, 2, 1]] if len(self.vertices) == 3 else np.zeros((0, 3)), dtype=int)
+        try:
+            return np.asarray(ConvexHull(self.vertices).simplices)
+        except QhullError:
+            # A hull as flat as a rounding error: qhull joggles its corners.
+            return np.asarray(ConvexHull(self.vertices, qhull_options="QJ").simplices)
+
+    @cached_property
+    def solid(self) -> tuple[Any, pin.SE3]:
+        """The swept hull as a shape of coal, and its placement in the axes of the joint."""
+        if len(self.vertices) == 1:
+            return coal.Sphere(self.radius), pin.SE3(np.eye(3), self.vertices[0])
+        if len(self.vertices) == 2:
+            span = self.vertices[1] - self.vertices[0]
+            turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), span).matrix()
+            return coal.Capsule(self.radius, float(np.linalg.norm(span))), pin.SE3(turn, self.center)
+        # A vertex without a face has no neighbors, so coal would not find its way from there.
+        used, faces = np.unique(self.faces, return_inverse=True)
+        points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+        points.extend(list(self.vertices[used]))
+        triangles.extend([coal.Triangle(*face) for face in faces.reshape(-1, 3).tolist()])
+        shape = coal.Convex(points, triangles)
+        shape.setSweptSphereRadius(self.radius)
+        return shape, pin.SE3.Identity()
+
+
+class Separation(NamedTuple):
+    """Signed distance of two swept hulls.
+
+    Attributes:
+        distance: Distance with the sweep radii, m; negative where the hulls penetrate each other.
+        normal: Unit normal from ``b`` to ``a`` in world axes, shape (3,).
+        point_a: Closest point of ``a`` in the world, shape (3,), m.
+        point_b: Closest point of ``b`` in the world, shape (3,), m.
+    """
+
+    distance: float
+    normal: Array
+    point_a: Array
+    point_b: Array
+
+
+def separation(a: SweptHull, placement_a: pin.SE3, b: SweptHull, placement_b: pin.SE3) -> Separation:
+    """Return the signed distance of two swept hulls whose joints are at these placements in the world."""
+    (shape_a, local_a), (shape_b, local_b) = a.solid, b.solid
+    request, result = coal.DistanceRequest(True), coal.DistanceResult()
+    request.gjk_tolerance = _GJK_TOLERANCE
+    at_a, at_b = placement_a * local_a, placement_b * local_b
+    distance = coal.distance(shape_a, transform(at_a), shape_b, transform(at_b), request, result)
+    if not np.isfinite(result.normal).all():
+        # A corner on a corner leaves coal without a direction, which a nanometer gives it.
+        at_a.translation = at_a.translation + np.array([0.6, 0.64, 0.48]) * 1e-9
+        result = coal.DistanceResult()
+        distance = coal.distance(shape_a, transform(at_a), shape_b, transform(at_b), request, result)
+    points = np.array(result.getNearestPoint1()), np.array(result.getNearestPoint2())
+    return Separation(float(distance), -np.array(result.normal), *points)
+
+
+def transform(placement: pin.SE3) -> Any:
+    """Return a placement as coal takes it."""
+    return coal.Transform3s(placement.rotation, placement.translation)
+
+
+def hull_corners(points: Array) -> Array:
+    """Return the corners of the convex hull of points, shape (k, 3); one or two of them, or a slab, if it is flat.
+
+    The corners of a flat set lie up to 0.1 mm beside it, so that its hull has a volume.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    middle = points.mean(axis=0)
+    axes = np.linalg.eigh((points - middle).T @ (points - middle))[1]
+    along = (points - middle) @ axes[:, ::-1]
+    extent = np.ptp(along, axis=0)
+    if extent[0] < _THIN:
+        return np.asarray(middle[None])
+    if extent[1] < _THIN:
+        ends = along[[np.argmin(along[:, 0]), np.argmax(along[:, 0])], :1]
+        return np.asarray(middle + ends * axes[:, 2])
+    if extent[2] < _THIN:
+        points = np.vstack([points - _THIN * axes[:, 0], points + _THIN * axes[:, 0]])
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except QhullError:
+        return np.asarray(points[ConvexHull(points, qhull_options="QJ").vertices])

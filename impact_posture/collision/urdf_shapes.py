@@ -1,0 +1,209 @@
+"""Shapes of the links of a URDF, and what is wrong with those that cannot be used."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.arrays import Array
+from impact_posture.errors import one_line
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import locate, srdf_path
+from impact_posture.robot.urdf import quiet_stderr
+
+# A shape larger than this (m), and larger than so many times the robot, is in millimeters.
+_LARGEST = 5.0
+_LARGEST_SHARE = 10.0
+# Loading takes about 20 times the size of a binary STL in memory.
+_LARGEST_FILE = 200_000_000
+# Attributes with the sizes of a shape, and how many numbers each has.
+_SIZES = {
+    "box": {"size": 3},
+    "sphere": {"radius": 1},
+    "cylinder": {"radius": 1, "length": 1},
+    "capsule": {"radius": 1, "length": 1},
+    "mesh": {"scale": 3},
+}
+
+
+class UnusableShape(Exception):
+    """A shape that is left out; the text says why and what to do."""
+
+
+@dataclass(frozen=True)
+class UrdfShape:
+    """A shape as the URDF describes it.
+
+    Attributes:
+        name: Unique name: the link, with ``[k]`` if the link has several shapes.
+        link: Name of the link.
+        placement: Placement in the axes of the link.
+        kind: Tag of the URDF, such as ``box`` or ``mesh``.
+        sizes: Numbers of the tag in the order of the URDF, m; the scale of a mesh.
+        mesh: File of a mesh.
+    """
+
+    name: str
+    link: str
+    placement: pin.SE3
+    kind: str
+    sizes: tuple[float, ...]
+    mesh: Path | None = None
+
+    def load(self, largest: float) -> Any:
+        """Return the shape of coal.
+
+        Args:
+            largest: Largest extent (m) that a shape in meters can have.
+
+        Raises:
+            UnusableShape: The mesh cannot be read, is empty, has numbers that are not finite, or is in millimeters.
+        """
+        match self.kind:
+            case "box":
+                shape = coal.Box(*self.sizes)
+            case "sphere":
+                shape = coal.Sphere(*self.sizes)
+            case "cylinder":
+                shape = coal.Cylinder(*self.sizes)
+            case "capsule":
+                shape = coal.Capsule(*self.sizes)
+            case _:
+                return self._load_mesh(largest)
+        if max(self.sizes) > largest:
+            raise UnusableShape(f"its <{self.kind}> has a size of {max(self.sizes):.3g} m; give sizes in meters")
+        return shape
+
+    def _load_mesh(self, largest: float) -> Any:
+        try:
+            with quiet_stderr():
+                # Loaded one by one, because the loader keeps what it loads.
+                shape = coal.MeshLoader().load(str(self.mesh), np.array(self.sizes))
+        except Exception:  # The loader passes on whatever assimp raises.
+            raise UnusableShape(
+                f"{self.mesh} is no mesh that can be read, or an empty one; export it again"
+            ) from None
+        points = mesh_points(shape)
+        if not np.isfinite(points).all():
+            raise UnusableShape(f"{self.mesh} has vertices that are not finite; export it again")
+        extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+        if extent <= 0:
+            raise UnusableShape(f"{self.mesh} has no extent; export it again")
+        if extent > largest:
+            hint = 'give it in meters or write scale="0.001 0.001 0.001"'
+            raise UnusableShape(f"{self.mesh} is {extent:.3g} m large, so it is in millimeters; {hint}")
+        return shape
+
+
+def mesh_points(shape: Any) -> Array:
+    """Return the vertices of a mesh of coal, shape (n, 3)."""
+    return np.asarray(shape.vertices(), dtype=float).reshape(-1, 3)
+
+
+def largest_extent(robot: Robot) -> float:
+    """Return the extent (m) above which a shape must be in millimeters: 5 m, and ten times the robot's own extent."""
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, robot.posture())
+    points = [data.oMi[i].act(np.array(robot.model.inertias[i].lever)) for i in range(1, robot.model.njoints)]
+    points += [np.array(data.oMi[i].translation) for i in range(1, robot.model.njoints)]
+    return max(_LARGEST, _LARGEST_SHARE * float(np.linalg.norm(np.ptp(np.array(points), axis=0))))
+
+
+def read_urdf_shapes(robot: Robot) -> tuple[list[UrdfShape], list[str]]:
+    """Read the collision shapes of a URDF, and the visual ones of links without.
+
+    Meshes are found but not read.
+
+    Returns:
+        The shapes, and one line for each shape left out.
+    """
+    if robot.settings is None:
+        return [], []
+    located = locate(robot.settings.robot, robot.settings)
+    folders = [Path(folder).expanduser() for folder in robot.settings.package_dir]
+    folders += [located.folder / Path(folder).expanduser() for folder in located.spec.model.package_dirs]
+    folders += [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
+    shapes, warnings = [], []
+    for link in ET.parse(located.urdf).getroot().iter("link"):
+        name = link.get("name", "")
+        tags = link.findall("collision") or link.findall("visual")
+        for k, tag in enumerate(tags):
+            called = name if len(tags) == 1 else f"{name}[{k}]"
+            try:
+                shapes.append(_read(tag, called, name, located.urdf, folders))
+            except UnusableShape as fault:
+                warnings.append(left_out(called, fault))
+    return shapes, warnings
+
+
+def left_out(name: str, fault: UnusableShape) -> str:
+    """Return the line about a shape that is left out."""
+    return one_line(f"shape {name} is left out: {fault}")
+
+
+def disabled_links(robot: Robot) -> set[frozenset[str]]:
+    """Return the pairs of links that the SRDF allows to touch."""
+    if robot.settings is None:
+        return set()
+    located = locate(robot.settings.robot, robot.settings)
+    path = srdf_path(located.spec, robot.settings, located.folder)
+    if path is None:
+        return set()
+    tags = ET.parse(path).getroot().iter("disable_collisions")
+    return {frozenset((tag.get("link1", ""), tag.get("link2", ""))) for tag in tags}
+
+
+def _read(tag: ET.Element, name: str, link: str, urdf: Path, folders: Sequence[Path]) -> UrdfShape:
+    shape = next(iter(tag.findall("geometry/*")), None)
+    if shape is None or shape.tag not in _SIZES:
+        known = ", ".join(_SIZES)
+        raise UnusableShape(f"its <geometry> is {'empty' if shape is None else f'<{shape.tag}>'}; give {known}")
+    sizes: list[float] = []
+    for attribute, count in _SIZES[shape.tag].items():
+        text = shape.get(attribute) or ("1 1 1" if attribute == "scale" else "")
+        sizes += _numbers(text, count, f"<{shape.tag} {attribute}>")
+    if min(sizes) <= 0 and (shape.tag != "mesh" or 0.0 in sizes):
+        raise UnusableShape(f"its <{shape.tag}> has a size of {min(sizes):g}; give sizes above zero")
+    origin = tag.find("origin")
+    xyz, rpy = (
+        _numbers("0 0 0" if origin is None else origin.get(key, "0 0 0"), 3, f"<origin {key}>")
+        for key in ("xyz", "rpy")
+    )
+    placement = pin.SE3(pin.rpy.rpyToMatrix(np.array(rpy)), np.array(xyz))
+    mesh = _find_mesh(shape.get("filename", ""), urdf, folders) if shape.tag == "mesh" else None
+    return UrdfShape(name, link, placement, shape.tag, tuple(sizes), mesh)
+
+
+def _numbers(text: str, count: int, where: str) -> list[float]:
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise UnusableShape(f"its {where} is '{text}'; give {count} finite number{'s' if count > 1 else ''}")
+    return numbers
+
+
+def _find_mesh(text: str, urdf: Path, folders: Sequence[Path]) -> Path:
+    """Return the file of a mesh; a ``package://`` path starts from a package folder or a folder above the URDF."""
+    scheme, colon, rest = text.partition("://")
+    if scheme == "file":
+        paths = [Path(unquote(rest))]
+    else:
+        paths = [folder / rest for folder in (*folders, *urdf.absolute().parents)] if colon else [urdf.parent / text]
+    for path in paths:
+        if path.is_file():
+            if path.stat().st_size > _LARGEST_FILE:
+                raise UnusableShape(f"{path} is larger than {_LARGEST_FILE // 1_000_000} MB; simplify the mesh")
+            return path
+    hint = "name the folder above the package with `package_dir`" if scheme == "package" else "correct the path"
+    raise UnusableShape(f"no mesh '{text}'; {hint}")
