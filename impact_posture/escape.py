@@ -9,6 +9,7 @@ import json
 import re
 import unicodedata
 import zlib
+from dataclasses import asdict, is_dataclass
 
 # ASCII for the symbols of our texts, because a compiler may not read others in C comments.
 _ASCII = str.maketrans({"·": " ", "²": "^2", "×": "x", "λ": "l", "ε": "eps", "⁻": "^-", "¹": "1"})
@@ -67,6 +68,8 @@ def toml(value: object) -> str:
     Raises:
         UnicodeEncodeError: A text contains half a surrogate pair (a path that is not UTF-8), which TOML forbids.
     """
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {key: item for key, item in asdict(value).items() if item is not None}
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{toml(str(key))} = {toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list | tuple):

@@ -9,14 +9,16 @@ Nothing heavy is imported here, because ``--help`` reads this module.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from impact_posture import setting as demand
+from impact_posture.errors import InputError
 from impact_posture.parsing import parse_armature, parse_number_or_name, parse_payloads
 from impact_posture.setting import CONTACT, METRIC, OUTPUT, ROBOT, TASK, Setting
-from impact_posture.tables import STRICT
+from impact_posture.tables import STRICT, Checked
 
 Vector3 = tuple[float, float, float]
 Root = Literal["free-flyer", "fixed"]
@@ -223,29 +225,41 @@ class ImpactSettings(RobotSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Obstacle:
-    """A box or a sphere that stands in the world.
+class Obstacle(Checked):
+    """A box or a ball that the robot stays clear of.
 
     Attributes:
         name: Name in messages.
-        box: Edge lengths, m.
-        sphere: Radius, m.
-        position: Center, world, m.
-        quaternion: Orientation of the box, x y z w.
+        box: Edge lengths of a box along its own axes, m.
+        sphere: Radius of a ball, m.
+        position: Center in the world, m.
+        quaternion: Orientation of a box in the world, x y z w.
+
+    Raises:
+        InputError: A value does not fit, there is not exactly one of ``box`` and ``sphere``, or the quaternion has no
+            unit length.
     """
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
     name: str
-    box: Annotated[Vector3 | None, Setting("", **demand.LENGTHS)] = None
-    sphere: Annotated[float | None, Setting("", **demand.ABOVE_ZERO)] = None
-    position: Annotated[Vector3, Setting("", **demand.NUMBERS)] = (0.0, 0.0, 0.0)
-    quaternion: Annotated[tuple[float, float, float, float], Setting("", **demand.DIRECTION)] = (0.0, 0.0, 0.0, 1.0)
+    box: Annotated[Vector3 | None, Setting("Edge lengths, m.", **demand.LENGTHS)] = None
+    sphere: Annotated[float | None, Setting("Radius, m.", **demand.ABOVE_ZERO)] = None
+    position: Annotated[Vector3, Setting("Center in the world, m.", **demand.NUMBERS)] = (0.0, 0.0, 0.0)
+    quaternion: Annotated[
+        tuple[float, float, float, float], Setting("Orientation x y z w.", **demand.NUMBERS)
+    ] = (0.0, 0.0, 0.0, 1.0)  # fmt: skip
 
     def __post_init__(self) -> None:
-        """Refuse an obstacle that is neither or both."""
+        """Check the values."""
+        super().__post_init__()
+        where = f"obstacle '{self.name}'"
         if (self.box is None) == (self.sphere is None):
-            raise ValueError(f"obstacle '{self.name}' is one of box (edge lengths, m) and sphere (radius, m)")
+            what = "neither `box` nor `sphere`" if self.box is None else "both `box` and `sphere`"
+            raise InputError(f"has {what}", where=where, hint="give one of them")
+        norm = math.hypot(*self.quaternion)
+        if abs(norm - 1) > 1e-3:
+            raise InputError(
+                f"the quaternion has norm {norm:.4g}", where=where, hint="give a unit quaternion x y z w"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,10 +18,11 @@ from impact_posture.arrays import Array
 from impact_posture.collision import shape_cache
 from impact_posture.collision import shapes as collision_shapes
 from impact_posture.collision.mesh_check import mesh_collisions
-from impact_posture.collision.obstacle import Obstacle
+from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import NO_SHAPES, RobotShapes, load_shapes
 from impact_posture.errors import InputError, SpecError
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.settings import Obstacle
 from impact_posture.tables import validate
 
 TETRAHEDRON = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
@@ -283,12 +284,14 @@ def test_a_box_stands_where_it_is_put(seed: int) -> None:
     random = np.random.default_rng(seed)
     edges, position, quaternion = random.uniform(0.1, 2, 3), random.normal(size=3), random.normal(size=4)
     quaternion /= np.linalg.norm(quaternion)
-    box = Obstacle(
-        name="box",
-        box=tuple(edges.tolist()),
-        position=tuple(position.tolist()),
-        quaternion=tuple(quaternion.tolist()),
-    ).hull
+    box = obstacle_hull(
+        Obstacle(
+            name="box",
+            box=tuple(edges.tolist()),
+            position=tuple(position.tolist()),
+            quaternion=tuple(quaternion.tolist()),
+        )
+    )
     local = (box.vertices - position) @ pin.XYZQUATToSE3(np.r_[position, quaternion]).rotation
     np.testing.assert_allclose(np.abs(local), np.tile(edges / 2, (8, 1)), atol=1e-12)
     assert box.joint == 0 and box.name == "box"
@@ -311,6 +314,6 @@ def test_an_impossible_obstacle_is_refused(values: dict[str, object], words: str
 
 def test_an_obstacle_of_a_file_is_checked() -> None:
     made = validate(Obstacle, {"name": "ball", "sphere": 0.5, "position": [0, 0, 1]}, "problem.toml")
-    assert made.hull.radius == 0.5 and made.hull.vertices.tolist() == [[0, 0, 1]]
+    assert obstacle_hull(made).radius == 0.5 and obstacle_hull(made).vertices.tolist() == [[0, 0, 1]]
     with pytest.raises(SpecError, match="did you mean position"):
         validate(Obstacle, {"name": "ball", "sphere": 0.5, "positon": [0, 0, 1]}, "problem.toml")

@@ -1,4 +1,4 @@
-"""Separating planes: their rows in numbers and as expressions, their derivatives, and the postures that they allow."""
+"""Separating planes: their rows in numbers and as expressions, their derivatives, the postures that they allow."""
 
 from __future__ import annotations
 
@@ -67,15 +67,14 @@ def test_placements_along_the_way_are_those_of_pinocchio(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("kind", KINDS)
-def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str, kind: str) -> None:
+def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str) -> None:
     robot, rng = load_robot(name), np.random.default_rng(1)
-    separator, numeric, chart = _separator(robot, kind), Numeric(robot.model), Chart(robot.model)
+    numeric, chart = Numeric(robot.model), Chart(robot.model)
     x = ca.SX.sym("x", chart.nx)
     tree = Tree(robot.model, chart.configuration(x), x)
-    apart = 0
-    for _ in range(6):
-        q = _random(robot, rng)
+    apart = touching = 0
+    for kind, _ in product(KINDS, range(6)):
+        separator, q = _separator(robot, kind), _random(robot, rng)
         distance = separator.distance(numeric.at(q))[0]
         corners = separator.corners(numeric)
         lifted = separator.lift(tree, "", corners)
@@ -88,9 +87,10 @@ def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str, kind: str) -
         lower, upper = separator.bounds(corners)
         outside = np.maximum(lower - value, value - upper)
         # The guess of the normal is 2 % short, so a gap of a few millimeters may not show.
-        assert (outside.max() < 1e-9) == (distance > 0) or abs(distance) < 0.03
-        apart += distance > 0.03
-    assert apart
+        if abs(distance) > 0.03:
+            assert (outside.max() < 1e-9) == (distance > 0)
+            apart, touching = apart + (distance > 0), touching + (distance < 0)
+    assert apart and touching
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -132,7 +132,7 @@ def test_distances_and_their_gradient(name: str) -> None:
     numeric, h, seen = Numeric(robot.model), 1e-6, 0
     for _ in range(40):
         q = _random(robot, rng)
-        value, jacobian = constraint.evaluate(numeric.at(q))
+        jacobian = constraint.evaluate(numeric.at(q))[1]
         for row in np.flatnonzero(np.abs(jacobian).max(axis=1) > 0):
             numbers = []
             for unit in np.eye(robot.nv):
@@ -143,7 +143,6 @@ def test_distances_and_their_gradient(name: str) -> None:
                 numbers.append((ahead - behind) / (2 * h))
             # Two edges of boxes that are not parallel: the distance is smooth.
             seen += bool(np.allclose(numbers, jacobian[row], atol=1e-5))
-            assert value[row] < 0.01
     assert seen > 10
 
 
@@ -171,8 +170,9 @@ def test_a_body_in_the_way_of_the_optimum() -> None:
     model = free.problem.robot.model
     data = model.createData()
     pin.forwardKinematics(model, data, free.q)
-    elbow = tuple(float(v) for v in data.oMi[model.njoints - 1].translation)
-    blocked = prepare(_problem(obstacles=(Obstacle(name="ball", sphere=0.06, position=elbow),))).problem
+    # The last link moves with the contact frame, which is held; the one before it does not.
+    shoulder = tuple(float(v) for v in data.oMi[model.njoints - 2].translation)
+    blocked = prepare(_problem(obstacles=(Obstacle(name="ball", sphere=0.05, position=shoulder),))).problem
     assert not feasible(blocked, free.q)
     found = solve(blocked, starts=8, jobs=1, compile="never")
     assert found.certificate.holds()

@@ -15,12 +15,13 @@ from scipy.spatial import ConvexHull
 
 from impact_posture.arrays import Array
 from impact_posture.collision.mesh_check import mesh_collisions
-from impact_posture.collision.obstacle import Obstacle
+from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import load_shapes
 from impact_posture.collision.swept_hull import SweptHull, separation
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.urdf import resolve_path, robots_data
+from impact_posture.settings import Obstacle
 from tests.test_swept_hull import distance_of_hulls
 
 ROBOTS = ("tilthex_arm", "panda", "solo8", "talos")
@@ -139,7 +140,7 @@ def test_obstacles_and_planes_are_found_by_name() -> None:
     hand = np.array(data.oMf[robot.frame_id("panda_hand")].act(np.array([0.0, 0.0, 0.04])))
     ball = Obstacle(name="ball", sphere=0.02, position=tuple(hand.tolist()))
     far = Obstacle(name="far", box=(0.1, 0.1, 0.1), position=(5.0, 0.0, 0.0))
-    hits = mesh_collisions(robot, shapes, q, obstacles=[ball.hull, far.hull])
+    hits = mesh_collisions(robot, shapes, q, obstacles=[(obstacle_hull(ball), ()), (obstacle_hull(far), ())])
     assert {name for _, name in hits} == {"ball"}
     assert {shape.partition("[")[0] for shape, _ in hits} <= {"panda_hand", "panda_leftfinger", "panda_rightfinger"}
     # The whole robot is above its base, but for what the base itself reaches below.

@@ -19,7 +19,7 @@ from impact_posture_cli.settings_options import _settings_of
 from tests.command import run
 
 # What a problem.toml alone can say.
-NO_OPTION = {"robot", "schema", "q", "support_compliance", "mounting"}
+NO_OPTION = {"robot", "schema", "q", "support_compliance", "mounting", "obstacles"}
 
 
 def test_every_setting_is_an_option_of_optimize() -> None:

@@ -12,9 +12,10 @@ from scipy.spatial import ConvexHull
 
 from impact_posture.arrays import Array
 from impact_posture.collision.hull_fit import fit_hull
-from impact_posture.collision.obstacle import Obstacle
+from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shape_points import shape_points
 from impact_posture.collision.swept_hull import MOST_VERTICES, SweptHull, hull_corners, separation
+from impact_posture.settings import Obstacle
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -59,7 +60,7 @@ def test_distance_is_that_of_the_quadratic_program(seed: int, count_a: int, coun
 
 def test_penetration_is_the_shortest_way_out() -> None:
     """Two boxes 1 m wide, 0.9 m apart along x, with 2 cm of sweep in all."""
-    box = Obstacle(name="box", box=(1.0, 1.0, 1.0)).hull
+    box = obstacle_hull(Obstacle(name="box", box=(1.0, 1.0, 1.0)))
     swept = hull(box.vertices, 0.01)
     found = separation(swept, pin.SE3(np.eye(3), np.array([0.9, 0.1, 0.2])), swept, pin.SE3.Identity())
     assert found.distance == pytest.approx(-0.12, abs=1e-6)
@@ -116,7 +117,7 @@ def test_points_hold_a_primitive_shape(kind: str) -> None:
 
 
 def test_faces_are_those_of_the_hull() -> None:
-    box = Obstacle(name="box", box=(0.2, 0.4, 0.6), position=(1.0, 0.0, 0.0)).hull
+    box = obstacle_hull(Obstacle(name="box", box=(0.2, 0.4, 0.6), position=(1.0, 0.0, 0.0)))
     assert ConvexHull(box.vertices).volume == pytest.approx(0.048)
     assert box.faces.shape == (12, 3)
     np.testing.assert_allclose(box.center, [1, 0, 0])
@@ -126,7 +127,7 @@ def test_faces_are_those_of_the_hull() -> None:
 
 def test_a_corner_on_a_corner_has_a_distance() -> None:
     """All pairs of corners of two boxes that touch there, with the first corner at the origin."""
-    box = Obstacle(name="box", box=(1.0, 1.0, 1.0), position=(0.5, 0.5, 0.5)).hull
+    box = obstacle_hull(Obstacle(name="box", box=(1.0, 1.0, 1.0), position=(0.5, 0.5, 0.5)))
     for corner in box.vertices:
         for point in (hull(corner[None], 0.01), hull(corner[None])):
             found = separation(point, pin.SE3.Identity(), box, pin.SE3.Identity())

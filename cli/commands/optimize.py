@@ -183,6 +183,9 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
         f"certificate ({found.recomputed_with}): stationarity {found.stationarity:.1e}, "
         f"violation {found.primal:.1e}, pose error {found.pose_error_m:.1e} m, {found.pose_error_rad:.1e} rad"
     )
+    if "collision" in document:
+        at = document["collision"]["optimal"]
+        page.line(f"no collision; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
     optima = ", ".join(f"{number(o.objective)} ({o.hits}×)" for o in solution.optima[:5])
     more = f" and {len(solution.optima) - 5} more" if len(solution.optima) > 5 else ""
     page.line(

@@ -18,6 +18,9 @@ TOLERANCE = 1e-6
 """Depth (m) up to which two shapes may be in each other, because a solver lets hulls touch within its tolerance."""
 
 
+Standing = tuple[SweptHull, Collection[int]]
+
+
 class Plane(Protocol):
     """A plane that shapes stay in front of."""
 
@@ -42,7 +45,7 @@ def mesh_collisions(
     robot: Robot,
     shapes: RobotShapes,
     q: Array,
-    obstacles: Sequence[SweptHull] = (),
+    obstacles: Sequence[Standing] = (),
     planes: Sequence[Plane] = (),
 ) -> list[tuple[str, str]]:
     """Return what collides at a posture, by the shapes of the URDF.
@@ -53,7 +56,7 @@ def mesh_collisions(
         robot: The robot.
         shapes: Its shapes.
         q: The posture, shape (nq,).
-        obstacles: Swept hulls in the world, with joint 0.
+        obstacles: Swept hulls in the world, with joint 0, each with the joints whose shapes may touch it.
         planes: Planes that the shapes have to stay in front of.
 
     Returns:
@@ -77,10 +80,11 @@ def mesh_collisions(
     return found
 
 
-def _scene(obstacles: Sequence[SweptHull], planes: Sequence[Plane], joint: int) -> Iterator[tuple[str, Any, pin.SE3]]:
+def _scene(obstacles: Sequence[Standing], planes: Sequence[Plane], joint: int) -> Iterator[tuple[str, Any, pin.SE3]]:
     """Yield name, shape and placement of everything that the shapes of a joint stay clear of."""
-    for obstacle in obstacles:
-        yield obstacle.name, *obstacle.solid
+    for obstacle, exempt in obstacles:
+        if joint not in exempt:
+            yield obstacle.name, *obstacle.solid
     for plane in planes:
         if joint not in plane.exempt:
             normal = np.asarray(plane.normal, dtype=float)

@@ -43,6 +43,9 @@ def notes_on_impacts(objective: Objective, initial: Array, q: Array) -> list[str
 
 def caveats(prepared: Prepared, initial: Array, q: Array) -> list[str]:
     """Return warnings about hovering, the surface and the ground, for the initial and the optimal posture."""
+    around = prepared.problem.surroundings
+    if around is not None and around.shapes.bodies:
+        return _hover_warnings(prepared, q)
     return [*_hover_warnings(prepared, q), *_surface_warnings(prepared, initial, q), *_ground_warnings(prepared, q)]
 
 

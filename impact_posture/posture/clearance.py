@@ -98,8 +98,19 @@ class Clearance(Constraint):
         for k in np.flatnonzero(values < _NEAR):
             one = self._separators[int(k)]
             values[k], normal, points = one.distance(model)
-            jacobian[k] = normal @ (one.a.jacobian(model, points[0]) - one.b.jacobian(model, points[1]))
+            first, second = (b.rates(model, normal, p[None])[0] for b, p in zip((one.a, one.b), points, strict=True))
+            jacobian[k] = first - second
         return values, jacobian
+
+    def closest(self, model: Numeric) -> tuple[str, float]:
+        """Return the pair that is closest, and its distance less the clearance, m."""
+        bounds, found = self._bound(model), ("", np.inf)
+        for k in np.argsort(bounds, kind="stable"):
+            if bounds[k] >= found[1]:
+                break
+            one = self._separators[int(k)]
+            found = min(found, (one.name, one.distance(model)[0]), key=lambda pair: pair[1])
+        return found
 
     def grown(self, model: Numeric) -> Self:
         """See :class:`Constraint`."""

@@ -44,7 +44,7 @@ def result_document(
 ) -> dict[str, object]:
     """Return the content of ``result.json``; ``robustness`` and ``tradeoff`` are keys only if they are given."""
     initial, optimal = evaluations(prepared, solution)
-    impact = prepared.impact
+    impact, around = prepared.impact, prepared.problem.surroundings
     fault = [solution.compiler_fault] if solution.compiler_fault else []
     found = caveats(prepared, solution.initial, solution.q)
     warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *found)
@@ -60,6 +60,7 @@ def result_document(
         **({} if robustness is None else {"robustness": robustness.to_dict()}),
         "redundancy": solution.redundancy,
         "certificate": solution.certificate.to_dict(),
+        **({"collision": around.to_dict(solution.initial, solution.q)} if around and around.shapes.bodies else {}),
         "active": [json_block(active) for active in solution.certificate.active],
         "solver": {
             **{key: getattr(solution, key) for key in _SOLVER},

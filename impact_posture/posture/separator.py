@@ -67,14 +67,19 @@ class Body:
         found = model.placement(self.point)
         return found if self.turns else pin.SE3(np.eye(3), found.translation)
 
-    def jacobian(self, model: Numeric, position: Array) -> Array:
-        """Return the Jacobian of a point of the body at ``position`` in the world, shape (3, nv)."""
-        joint = self.point.joint
-        if joint == 0:
-            return np.zeros((3, model.model.nv))
-        if not self.turns:
-            return model.jacobian(self.point)[:3]
-        return model.jacobian(PointOnLink(joint, model.data.oMi[joint].actInv(position), np.eye(3)))[:3]
+    def rates(self, model: Numeric, direction: Array, positions: Array) -> Array:
+        """Return the tangent gradients of the heights of points of the body, shape (k, nv).
+
+        Args:
+            model: The model at the posture.
+            direction: Direction ``n`` of the heights ``n·x``, world, shape (3,).
+            positions: Places of the points in the world, shape (k, 3).
+        """
+        if self.point.joint == 0:
+            return np.zeros((len(positions), model.model.nv))
+        J = model.jacobian(self.point)
+        turning = np.cross(positions - model.placement(self.point).translation, direction) @ J[3:]
+        return np.asarray(direction @ J[:3] + (turning if self.turns else np.zeros_like(turning)))
 
 
 class Corners(NamedTuple):
@@ -128,7 +133,10 @@ class Separator:
         """Return the rows, the unknowns ``n, c, m, d, s`` (``m, d, s`` for a half-space), and the slack."""
         plane = ca.SX(0, 1) if self.known else ca.SX.sym(f"plane{label}", 4)
         m, d, s = ca.SX.sym(f"m{label}", 3), ca.SX.sym(f"d{label}"), ca.SX.sym(f"s{label}")
-        n, c = (ca.SX(self.b.normal), ca.SX(self.b.offset)) if self.known else (plane[:3], plane[3])
+        if self.b.normal is None:
+            n, c = plane[:3], plane[3]
+        else:
+            n, c = ca.SX(self.b.normal), ca.SX(self.b.offset)
         Q, t = self._relative(tree)
         rows = [m - Q.T @ n, d - (ca.dot(n, t) - c), ca.SX(self._x[sorted(corners.a)]) @ m + d + s]
         if not self.known:
@@ -156,7 +164,7 @@ class Separator:
         return R, p - tree.position(self.b.point)
 
     def distance(self, model: Numeric) -> tuple[float, Array, Array]:
-        """Return the distance less the clearance, the normal from b to a and the closest points (2, 3), world axes."""
+        """Return the distance less the clearance, the normal from b to a, the closest points (2, 3), in the world."""
         at_a, at_b = self.a.placement(model), self.b.placement(model)
         if self.b.hull is not None:
             assert self.a.hull is not None  # noqa: S101 (narrows a type)
@@ -203,31 +211,25 @@ class Separator:
             n, c = self._plane(model, self.distance(model)[1])
         else:
             n, c = unknowns[:3], float(unknowns[3])
+        corners = self._x @ at_a.rotation.T + at_a.translation
+        seen = (corners - at_b.translation) @ at_b.rotation
+        near = seen @ n - c < self.gap + _NEAR
+        corners, seen = corners[near], seen[near]
         world = at_b.rotation @ n
-        names, value, lower, upper, posture, plane = [], [], [], [], [], []
-
-        def add(name: str, row: tuple[float, float, float], J: Array, derivative: Array) -> None:
-            names.append(name)
-            for values, entry in zip((value, lower, upper), row, strict=True):
-                values.append(entry)
-            posture.append(J)
-            plane.append(derivative)
-
-        for x in self._x:
-            corner = at_a.act(x)
-            seen = at_b.actInv(corner)
-            height = float(n @ seen) - c
-            if height < self.gap + _NEAR:
-                J = world @ (self.a.jacobian(model, corner) - self.b.jacobian(model, corner))
-                add(self.name, (height, self.gap, np.inf), J, np.append(seen, -1.0))
-        for y in self._y:
-            height = float(n @ y) - c
-            if height > -_NEAR:
-                add("", (height, -np.inf, 0.0), np.zeros(nv), np.append(y, -1.0))
-        if not self.known:
-            add("", (float(n @ n), -np.inf, 1.0), np.zeros(nv), np.append(2 * n, 0.0))
-        width = 0 if self.known else 4
+        rates = self.a.rates(model, world, corners) - self.b.rates(model, world, corners)
+        first, infinite = len(seen), np.inf
+        names = [self.name] * first
+        if self.known:
+            lower, upper = np.full(first, self.gap), np.full(first, infinite)
+            return Linearization(names, seen @ n - c, lower, upper, rates, np.zeros((first, 0)))
+        own = self._y[self._y @ n - c > -_NEAR]
+        others = len(own) + 1
+        plane = np.vstack([np.c_[seen, -np.ones(first)], np.c_[own, -np.ones(len(own))], [[*(2 * n), 0.0]]])
         return Linearization(
-            names, np.array(value), np.array(lower), np.array(upper), np.array(posture).reshape(-1, nv),
-            np.array(plane).reshape(-1, 4)[:, :width],
-        )  # fmt: skip
+            names=[*names, *[""] * others],
+            value=np.concatenate([seen @ n - c, own @ n - c, [n @ n]]),
+            lower=np.concatenate([np.full(first, self.gap), np.full(others, -infinite)]),
+            upper=np.concatenate([np.full(first, infinite), np.zeros(len(own)), [1.0]]),
+            posture=np.vstack([rates, np.zeros((others, nv))]),
+            auxiliary=plane,
+        )

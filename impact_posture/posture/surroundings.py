@@ -68,6 +68,12 @@ class Surroundings:
         self._walls: list[_Wall] = []
         self._still = {0}
         self.notes: list[str] = list(self.shapes.warnings)
+        if touching := self.shapes.always_touching:
+            self.notes.append(
+                f"{len(touching)} pairs of shapes may touch, because they do so at most postures: "
+                + ", ".join(" / ".join(pair) for pair in touching[:3])
+                + (", …" if len(touching) > 3 else "")
+            )
 
     # ---- what is there ----------------------------------------------------------------------------------------
 
@@ -77,7 +83,7 @@ class Surroundings:
             return
         feet = [point_on(self.robot, s.frame, s.offset) for s in supports]
         height = min(float(self._numeric.placement(foot).translation[2]) for foot in feet)
-        exempt = self._rigid(foot.joint for foot in feet)
+        exempt = self._rigid([0, *(foot.joint for foot in feet)])
         self._still |= exempt
         up = np.array([0.0, 0.0, 1.0])
         body = Body("ground", None, PointOnLink(0, np.array([0.0, 0.0, height]), np.eye(3)), normal=up)
@@ -121,7 +127,7 @@ class Surroundings:
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Add bodies that stand in the world."""
         for obstacle in obstacles:
-            self._walls.append(_Wall(Body.of_link(obstacle_hull(obstacle)), frozenset()))
+            self._walls.append(_Wall(Body.of_link(obstacle_hull(obstacle)), self._rigid([0])))
 
     # ---- what follows -----------------------------------------------------------------------------------------
 
@@ -134,11 +140,29 @@ class Surroundings:
             apart = [
                 Separator(body, wall.body, self._clearance)
                 for body in self._bodies
-                if body.point.joint not in wall.exempt and not (self._is_fixed(body) and wall.body.point.joint == 0)
+                if body.point.joint not in wall.exempt
             ]
             if apart:
                 found.append(Clearance(wall.body.name, apart, f"links and {wall.body.name} {near}"))
         return found
+
+    def closest(self, q: Array) -> dict[str, object]:
+        """Return the bodies that are closest at ``q``, and their distance, m."""
+        numeric = Numeric(self.robot.model).at(q)
+        name, value = min((c.closest(numeric) for c in self.constraints()), key=lambda pair: pair[1])
+        return {"closest": name, "distance": value + self._clearance}
+
+    def to_dict(self, initial: Array, optimal: Array) -> dict[str, object]:
+        """Return the ``collision`` block of ``result.json``."""
+        shapes = self.shapes
+        return {
+            "shapes": len(shapes.bodies),
+            "clearance": self._clearance,
+            "always_touching": [list(pair) for pair in shapes.always_touching],
+            "hulls_touching": [list(pair) for pair in shapes.hulls_touching],
+            "initial": self.closest(initial),
+            "optimal": self.closest(optimal),
+        }
 
     def collisions(self, q: Array) -> list[tuple[str, str]]:
         """Return the original shapes that touch each other, the surface, the ground or an obstacle at ``q``."""
