@@ -25,6 +25,8 @@ _ACTIVE = 1e-3
 _TIED = 5e-8
 # Weight of complementarity beside stationarity: the ratio of their tolerances.
 _COMPLEMENTARITY = 10.0
+# A violation above this (m, rad) is far from what certifies.
+_HOPELESS = 1e-4
 # A multiplier below this is rounding.
 _MULTIPLIER = 1e-6
 
@@ -108,6 +110,9 @@ def certify(problem: PostureProblem, q: Array, scale: float, auxiliaries: Array 
     rows = _Rows(problem.robot.nv, parts)
     limits, limit_violation = _limits(problem, q)
     near = [*rows.near(), *(replace(row, outward=rows.pad(row.outward)) for row in limits)]
+    if rows.violation() > _HOPELESS:
+        # No multiplier makes this a solution, and to find the best ones takes long.
+        near = []
     held = rows.pad(held_rows(problem.robot, problem.requirements.hold))
     weights, multipliers, residual = _multipliers(rows.pad(gradients), np.vstack([held, rows.equalities()]), near)
     products = [abs(float(m) * row.slack) for row, m in zip(near, multipliers, strict=True)]

@@ -8,6 +8,7 @@ from typing import Self
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
@@ -18,6 +19,8 @@ from impact_posture.posture.separator import Body, Corners, Separator
 
 # Pairs closer than this (m) beyond their clearance are computed exactly; a bound is enough for the others.
 _NEAR = 0.01
+# The certificate sees the rows of pairs closer than this (m) beyond their clearance.
+_ROWS = 1e-3
 # A pair is missing in the program if it violates its clearance by more than this (m), half of what certifies.
 _MISSING = 5e-9
 # Most pairs that one posture adds to the program, the deepest first.
@@ -51,6 +54,7 @@ class Clearance(Constraint):
         self._bodies = list(bodies.values())
         where = {key: k for k, key in enumerate(bodies)}
         self._first = np.array([where[id(one.a)] for one in self._separators], dtype=int)
+        self._margins = np.array([one.margin for one in self._separators])
         self._second = np.array([where[id(one.b)] for one in self._separators], dtype=int)
 
     def describe(self) -> str:
@@ -73,38 +77,47 @@ class Clearance(Constraint):
 
     # ---- numbers ----------------------------------------------------------------------------------------------
 
-    def _bound(self, model: Numeric) -> Array:
-        """Return lower bounds on all distances, from a sphere around each body."""
-        centers, reach = np.zeros((len(self._bodies), 3)), np.zeros(len(self._bodies))
-        normals: dict[int, Array] = {}
-        for k, body in enumerate(self._bodies):
-            at = body.placement(model)
-            centers[k] = at.translation if body.hull is None else at.act(body.hull.center)
+    def _placed(self, model: Numeric) -> tuple[list[pin.SE3], Array]:
+        """Return the placements of the bodies, and lower bounds on all distances from a sphere around each body."""
+        at = [body.placement(model) for body in self._bodies]
+        centers, reach = np.zeros((len(at), 3)), np.zeros(len(at))
+        for k, (body, placement) in enumerate(zip(self._bodies, at, strict=True)):
+            centers[k] = placement.translation if body.hull is None else placement.act(body.hull.center)
             reach[k] = 0.0 if body.hull is None else body.hull.reach
-            if body.normal is not None:
-                normals[k] = at.rotation @ body.normal
-                centers[k] += body.offset * normals[k]
         apart = centers[self._first] - centers[self._second]
         bound = np.linalg.norm(apart, axis=1)
-        for k, normal in normals.items():
-            mine = self._second == k
-            bound[mine] = apart[mine] @ normal
-        margins = np.array([one.margin for one in self._separators])
-        return np.asarray(bound - reach[self._first] - reach[self._second] - margins)
+        for k in {int(k) for k in self._second}:
+            body = self._bodies[k]
+            if body.normal is not None:
+                mine = self._second == k
+                bound[mine] = apart[mine] @ (at[k].rotation @ body.normal) - body.offset
+        return at, bound - reach[self._first] - reach[self._second] - self._margins
+
+    def _distances(self, model: Numeric, within: float) -> tuple[Array, dict[int, tuple[Array, Array]]]:
+        """Return all distances, exact below ``within`` and else lower bounds, and normal and points of the former."""
+        at, values = self._placed(model)
+        found = {}
+        for k in map(int, np.flatnonzero(values < within)):
+            values[k], *found[k] = self._separators[k].distance_at(at[self._first[k]], at[self._second[k]])
+        return values, found
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`; a distance beyond 1 cm may be a lower bound, with a zero Jacobian."""
-        values, jacobian = self._bound(model), np.zeros((self.rows, model.model.nv))
-        for k in np.flatnonzero(values < _NEAR):
-            one = self._separators[int(k)]
-            values[k], normal, points = one.distance(model)
+        values, found = self._distances(model, _NEAR)
+        jacobian = np.zeros((self.rows, model.model.nv))
+        for k, (normal, points) in found.items():
+            one = self._separators[k]
             first, second = (b.rates(model, normal, p[None])[0] for b, p in zip((one.a, one.b), points, strict=True))
             jacobian[k] = first - second
         return values, jacobian
 
+    def value(self, model: Numeric) -> Array:
+        """See :class:`Constraint`."""
+        return self._distances(model, 0.0)[0]
+
     def closest(self, model: Numeric) -> tuple[str, float]:
         """Return the pair that is closest, and its distance less the clearance, m."""
-        bounds, found = self._bound(model), ("", np.inf)
+        bounds, found = self._placed(model)[1], ("", np.inf)
         for k in np.argsort(bounds, kind="stable"):
             if bounds[k] >= found[1]:
                 break
@@ -114,7 +127,7 @@ class Clearance(Constraint):
 
     def grown(self, model: Numeric) -> Self:
         """See :class:`Constraint`."""
-        values, active = self.evaluate(model)[0], dict(self.active)
+        values, active = self.value(model), dict(self.active)
         added = 0
         for k in np.argsort(values, kind="stable"):
             if values[k] >= -_MISSING or added == _MOST:
@@ -157,6 +170,6 @@ class Clearance(Constraint):
         """See :class:`Constraint`; the rows of pairs that are near, in the program or not."""
         counts = [one.count for _, one, _ in self._program]
         own = dict(zip(self.active, np.split(auxiliaries, np.cumsum(counts)[:-1]), strict=False)) if counts else {}
-        values = self.evaluate(model)[0]
-        parts = [self._separators[int(k)].linearize(model, own.get(int(k))) for k in np.flatnonzero(values < 1e-3)]
+        values = self._distances(model, _ROWS)[0]
+        parts = [self._separators[int(k)].linearize(model, own.get(int(k))) for k in np.flatnonzero(values < _ROWS)]
         return Linearization.joined(parts, model.model.nv)

@@ -113,6 +113,10 @@ class Constraint(ABC):
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """Return ``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``model.q``."""
 
+    def value(self, model: Numeric) -> Array:
+        """Return ``c(q)`` alone; exact where it violates a bound."""
+        return self.evaluate(model)[0]
+
     # ---- lifted form, by default without auxiliaries ----------------------------------------------------------
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:

@@ -174,7 +174,7 @@ class PostureProblem:
 
     def violations(self, numeric: Numeric) -> list[Array]:
         """Return the signed violation of each constraint at ``numeric.q``, shape (rows,) each; zero if satisfied."""
-        return [constraint.excess(constraint.evaluate(numeric)[0]) for constraint in self.constraints]
+        return [constraint.excess(constraint.value(numeric)) for constraint in self.constraints]
 
     def describe(self) -> list[str]:
         """Describe the constraints, one line each."""

@@ -23,7 +23,7 @@ Progress = Callable[[int, int], None]
 # A constraint with a violation up to this (m, rad) is satisfied.
 FEASIBLE = 1e-8
 # Starts that run before the others, and most rounds in which the program grows.
-_FIRST, _ROUNDS = 2, 12
+_FIRST, _ROUNDS = 2, 8
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,6 @@ class Run:
         objective: Objective at the end.
         minimized: Objective in units of the initial one, with the regularization.
         certificate: Certificate of the end.
-        collisions: Original shapes that touch at the certified end, though their hulls do not.
     """
 
     start: Array | None = None
@@ -44,12 +43,11 @@ class Run:
     objective: float = np.inf
     minimized: float = np.inf
     certificate: Certificate | None = None
-    collisions: tuple[tuple[str, str], ...] = ()
 
     @property
     def good(self) -> bool:
-        """Whether the end is certified and no original shapes touch there."""
-        return self.certificate is not None and self.certificate.holds() and not self.collisions
+        """Whether the end is certified."""
+        return self.certificate is not None and self.certificate.holds()
 
 
 @one_blas_thread()
@@ -156,8 +154,7 @@ class Search:
         minimized = objective / scale
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
-        hits = problem.surroundings.collisions(record.q) if problem.surroundings and certificate.holds() else []
-        return Run(start, record, objective, minimized, certificate, tuple(hits))
+        return Run(start, record, objective, minimized, certificate)
 
 
 def feasible(problem: PostureProblem, q: Array) -> bool:

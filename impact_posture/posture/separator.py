@@ -164,8 +164,11 @@ class Separator:
         return R, p - tree.position(self.b.point)
 
     def distance(self, model: Numeric) -> tuple[float, Array, Array]:
+        """See :meth:`distance_at`."""
+        return self.distance_at(self.a.placement(model), self.b.placement(model))
+
+    def distance_at(self, at_a: pin.SE3, at_b: pin.SE3) -> tuple[float, Array, Array]:
         """Return the distance less the clearance, the normal from b to a, the closest points (2, 3), in the world."""
-        at_a, at_b = self.a.placement(model), self.b.placement(model)
         if self.b.hull is not None:
             assert self.a.hull is not None  # noqa: S101 (narrows a type)
             found = separation(self.a.hull, at_a, self.b.hull, at_b)

@@ -115,9 +115,16 @@ def solve(
     search = Search(problem, (initial, *guesses), scale, starts=starts, seed=seed, compile=compile)
     runs = search.run(jobs, progress)
     problem, nlp = search.problem, search.nlp
-    good = [r for r in runs if r.good]
-    if not good:
+    certified = [r for r in runs if r.good]
+    if not certified:
         raise _failure(runs)
+    good, touching = _last_word(problem, certified)
+    if not good:
+        raise SolverFailed(
+            f"original shapes touch at all {len(certified)} certified postures: {touching}",
+            where="solver",
+            hint="try more `starts`, another `posture`, or a larger `clearance`",
+        )
     # Of equally good runs the first counts, so that the solution does not depend on the speed of processes.
     best = min(good, key=lambda r: round(r.minimized, 9))
     assert best.record is not None and best.certificate is not None  # noqa: S101 (narrows types)
@@ -132,11 +139,9 @@ def solve(
         notes.append("no better posture found: the initial one is already (locally) optimal for this impact")
     optima = distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None])
     notes += notes_on_impacts(problem.objective, initial, q)
-    if touching := [r.collisions[0] for r in runs if r.collisions]:
-        notes.append(
-            f"{len(touching)} certified postures left out, because original shapes touch there: "
-            f"{' / '.join(touching[0])}"
-        )
+    if touching:
+        count = len(certified) - len(good)
+        notes.append(f"{count} certified postures left out, because original shapes touch there: {touching}")
     hits = sum(o.hits for o in optima)
     if len(optima) > 1 and optima[0].hits == 1 and hits >= _MANY:
         notes.append(
@@ -161,6 +166,28 @@ def solve(
         notes=(*problem.notes, *notes),
         compiler_fault=nlp.compiler_fault,
     )
+
+
+def _last_word(problem: PostureProblem, runs: list[Run]) -> tuple[list[Run], str]:
+    """The runs at whose ends no original shapes touch, and two shapes that do at another end."""
+    if problem.surroundings is None:
+        return runs, ""
+    good, touching, known = [], "", []
+    for run in runs:
+        assert run.record is not None  # noqa: S101 (narrows a type)
+        q = run.record.q
+        # The verdict on one end of a group of equal ones is that on all.
+        found = next(
+            (hits for other, hits in known if np.linalg.norm(wrapped_difference(problem, other, q)) < 1e-6), None
+        )
+        if found is None:
+            found = problem.surroundings.collisions(q)
+            known.append((q, found))
+        if found:
+            touching = " / ".join(found[0])
+        else:
+            good.append(run)
+    return good, touching
 
 
 def _initial(problem: PostureProblem, seed: int) -> tuple[PostureProblem, Array]:
@@ -236,12 +263,6 @@ def _failure(runs: list[Run]) -> SolverFailed:
     if not solved:
         return SolverFailed(
             "the objective does not exist where the starts ended", where="solver", hint="choose another `objective`"
-        )
-    if touching := [r.collisions[0] for r in solved if r.collisions]:
-        return SolverFailed(
-            f"original shapes touch at all {len(touching)} certified postures: {' / '.join(touching[0])}",
-            where="solver",
-            hint="try more `starts`, another `posture`, or a larger `clearance`",
         )
     nearest = min((r.certificate for r in solved if r.certificate), key=lambda c: c.stationarity)
     return SolverFailed(

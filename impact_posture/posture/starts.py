@@ -16,7 +16,7 @@ from impact_posture.posture.problem import PostureProblem, held_rows
 _ATTEMPTS = 20
 _STEPS = 80
 # Most postures on the projected constraints that one start chooses from.
-_CANDIDATES = 5
+_CANDIDATES = 3
 # This share of the size of a singular matrix makes it regular.
 _ROUNDING = 1e-13
 
@@ -72,7 +72,7 @@ class Projector:
         """Return the violation of the constraints that are not projected, summed."""
         self.numeric.at(q)
         free = [c for c in self.problem.constraints if not c.projected]
-        return float(sum(np.abs(c.excess(c.evaluate(self.numeric)[0])).sum() for c in free))
+        return float(sum(np.abs(c.excess(c.value(self.numeric))).sum() for c in free))
 
     def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
         """Pull ``q`` onto the constraints.  The result may still violate them."""
