@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.collision.pairs import pairs_apart
+from impact_posture.collision.shape_points import shape_points
 from impact_posture.collision.urdf_shapes import (
     UnusableShape,
     UrdfShape,
@@ -20,6 +22,9 @@ from impact_posture.collision.urdf_shapes import (
 )
 from impact_posture.libraries import source_key
 from impact_posture.robot.robot import Robot
+
+# Turns the y axis of a mesh up.
+_UPRIGHT = pin.SE3(pin.rpy.rpyToMatrix(np.pi / 2, 0.0, 0.0), np.zeros(3))
 
 
 class Geometry(NamedTuple):
@@ -40,22 +45,57 @@ class Geometry(NamedTuple):
 
 def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
     """Load the shapes that a URDF describes; a mesh that cannot be used is left out with a warning."""
-    model, geometry, largest = robot.model, pin.GeometryModel(), largest_extent(robot)
-    links, warnings = [], []
+    model, largest = robot.model, largest_extent(robot)
+    kept, solids, warnings = [], [], []
     for shape in described:
         try:
-            solid = shape.load(largest)
+            solids.append(shape.load(largest))
+            kept.append(shape)
         except UnusableShape as fault:
             warnings.append(left_out(shape.name, fault))
-            continue
+    objects = _placed(model, kept, solids, turned=False)
+    if any(shape.y_up for shape in kept):
+        turned = _placed(model, kept, solids, turned=True)
+        if _gaps(model, turned) < _gaps(model, objects) / 2:
+            objects = turned
+            warnings.append("meshes with y up are turned to z up, because only then do the links reach their joints")
+    geometry = pin.GeometryModel()
+    for solid in objects:
+        geometry.addGeometryObject(solid)
+    links = tuple(shape.link for shape in kept)
+    apart = pairs_apart(model, [int(solid.parentJoint) for solid in objects], links, disabled_links(robot))
+    return Geometry(geometry, links, apart, tuple(warnings))
+
+
+def _placed(
+    model: pin.Model, shapes: list[UrdfShape], solids: list[Any], *, turned: bool
+) -> list[pin.GeometryObject]:
+    """Return the shapes at their joints; ``turned`` obeys the files that say that y is up.
+
+    ROS ignores what COLLADA files say about it, so most URDFs are written for meshes as they are.
+    """
+    found = []
+    for shape, solid in zip(shapes, solids, strict=True):
         index = model.getFrameId(shape.link, pin.FrameType.BODY)
         frame = model.frames[index]
-        placement = frame.placement * shape.placement
-        geometry.addGeometryObject(pin.GeometryObject(shape.name, frame.parentJoint, index, placement, solid))
-        links.append(shape.link)
-    joints = [int(solid.parentJoint) for solid in geometry.geometryObjects]
-    apart = pairs_apart(model, joints, links, disabled_links(robot))
-    return Geometry(geometry, tuple(links), apart, tuple(warnings))
+        placement = frame.placement * shape.placement * (_UPRIGHT if turned and shape.y_up else pin.SE3.Identity())
+        found.append(pin.GeometryObject(shape.name, frame.parentJoint, index, placement, solid))
+    return found
+
+
+def _gaps(model: pin.Model, objects: list[pin.GeometryObject]) -> float:
+    """Return the sum of the distances between joints and the boxes around the shapes of the links before them, m."""
+    boxes: dict[int, list[Array]] = {}
+    for solid in objects:
+        points = shape_points(solid.geometry) @ solid.placement.rotation.T + solid.placement.translation
+        boxes.setdefault(int(solid.parentJoint), []).append(np.array([points.min(axis=0), points.max(axis=0)]))
+    total = 0.0
+    for parent, placement in zip(model.parents, model.jointPlacements, strict=True):
+        point = np.array(placement.translation)
+        total += min(
+            (float(np.linalg.norm(point - np.clip(point, *box))) for box in boxes.get(int(parent), [])), default=0
+        )
+    return total
 
 
 def geometry_key(robot: Robot, described: list[UrdfShape]) -> str:

@@ -6,6 +6,7 @@ import os
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -23,6 +24,8 @@ from impact_posture.robot.urdf import quiet_stderr
 # A shape larger than this (m), and larger than so many times the robot, is in millimeters.
 _LARGEST = 5.0
 _LARGEST_SHARE = 10.0
+# A COLLADA file says within so many bytes which axis is up.
+_HEAD = 10_000
 # Loading takes about 20 times the size of a binary STL in memory.
 _LARGEST_FILE = 200_000_000
 # Attributes with the sizes of a shape, and how many numbers each has.
@@ -58,6 +61,14 @@ class UrdfShape:
     kind: str
     sizes: tuple[float, ...]
     mesh: Path | None = None
+
+    @cached_property
+    def y_up(self) -> bool:
+        """Whether the mesh is a COLLADA file that says that y is up."""
+        if self.mesh is None or self.mesh.suffix.lower() != ".dae":
+            return False
+        with self.mesh.open("rb") as file:
+            return b"<up_axis>Y_UP" in file.read(_HEAD)
 
     def load(self, largest: float) -> Any:
         """Return the shape of coal.

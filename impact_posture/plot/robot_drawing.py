@@ -14,16 +14,20 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from impact_posture.arrays import Array
 from impact_posture.plot.labels import Label, draw_arrow, draw_end_on
 from impact_posture.plot.shapes import COORDINATE_PLANES, XY, XZ, YZ, Plane, outline, square, upright_plane
+from impact_posture.plot.silhouette import NOTE, draw_silhouettes, silhouette_handles
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.space import Space, frame_space
 from impact_posture.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, VERMILLION, framed, shared_legend
 from impact_posture.plot.view import ResultView, contact_letters, header_lines
 
-STICKS = "Sticks join joint origins. They do not show the shapes of the links."
+STICKS = "Sticks join joint origins."
+_NO_SHAPES = "They do not show the shapes of the links."
 _ENDS = "The last stick of a chain ends at the last frame of its link, or at the center of mass of the link."
 _NORMAL = "n points out of the surface, towards the robot."
 _BODY = "The body is the box between the hips, of no true height."
 HATCH = "/////"
+# 3-D axes number the areas from 3 up, whatever their order.
+_FRONT = 50.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +71,8 @@ def postures_figure(view: ResultView) -> Figure:
     where it moves or turns; feet and rotors where there are any.
     """
     first, second = (
-        build_skeleton(view.robot, q, view.objective.contacts, view.objective.supports)
-        for q in (view.q_initial, view.q_optimal)
+        build_skeleton(view.robot, q, view.objective.contacts, view.objective.supports, collisions)
+        for q, collisions in zip((view.q_initial, view.q_optimal), view.collisions, strict=True)
     )
     points = np.vstack([first.points, second.points])
     surfaces = surfaces_of(first, second, contact_letters(view), 0.3 * max(float(np.ptp(points, axis=0).max()), 1e-3))
@@ -91,13 +95,15 @@ def postures_figure(view: ResultView) -> Figure:
         frame_flat(flat, low, high, 6)
         flat.grid(True)
         flat.set(xlabel=f"{plane.right}  [m]", ylabel=f"{plane.up}  [m]", title="seen along " + depth_of(plane))
-        shared_legend(body, _handles(second, surfaces), "lower")
+        shared_legend(body, _handles(first, second, surfaces), "lower")
     return figure
 
 
 def stick_notes(state: Skeleton) -> list[str]:
     """Return the notes on sticks and body."""
-    return [STICKS, *([_BODY] if len(state.body) else [])]
+    if state.hulls:
+        return [STICKS, NOTE]
+    return [f"{STICKS} {_NO_SHAPES}", *([_BODY] if len(state.body) else [])]
 
 
 def side_plane(first: Skeleton, second: Skeleton) -> Plane:
@@ -176,6 +182,8 @@ def depth_of(plane: Plane) -> str:
 
 def _draw(axes: Any, points: Array, plane: Plane | None, **look: Any) -> None:
     """Plot points of shape (3, k), projected where there is a plane."""
+    if plane is None:
+        look["zorder"] += _FRONT
     axes.plot(*(points if plane is None else plane.axes @ points), **look)
 
 
@@ -189,11 +197,16 @@ def _fill(axes: Any, faces: list[Array], plane: Plane | None, color: str, zorder
 
 
 def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane | None) -> None:
-    """Draw links, body, rotors, joints, base, feet and contacts; in 3-D, or projected where there is a plane."""
+    """Draw a robot; in 3-D, or projected where there is a plane.
+
+    It has links, shapes (a body without them), rotors, joints, base, feet and contacts.
+    """
     for bone in state.bones:
         _draw(axes, bone.T, plane, solid_capstyle="round", **line)
     color, thin = line["color"], line | {"linewidth": 0.8, "zorder": 2.0}
-    if len(state.body):
+    if state.hulls:
+        draw_silhouettes(axes, state.hulls, color, plane)
+    elif len(state.body):
         _body(axes, state.body, line, plane)
     for circle, arm in zip(state.rotors, state.arms, strict=True):
         _fill(axes, [circle], plane, color, 1.5)
@@ -258,12 +271,13 @@ def robot_handles(state: Skeleton, lines: dict[str, dict[str, Any]], color: str)
     return [Line2D([], [], label=word, **look) for word, look in looks]
 
 
-def _handles(state: Skeleton, surfaces: list[Surface]) -> list[Any]:
+def _handles(other: Skeleton, state: Skeleton, surfaces: list[Surface]) -> list[Any]:
     handles = robot_handles(state, {"before": BEFORE, "after": AFTER}, GRAY)
     for color, word in {GRAY: "surface", VERMILLION: "surface before", BLUE: "surface after"}.items():
         if any(s.color == color for s in surfaces):
             handles.append(Patch(facecolor="none", edgecolor=color, hatch=HATCH, linewidth=0, label=word))
-    if len(state.body):
+    handles += silhouette_handles([*other.hulls, *state.hulls], BLUE)
+    if len(state.body) and not state.hulls:
         handles.append(Patch(facecolor=BLUE, alpha=0.12, label="body"))
     if len(state.rotors):
         handles.append(Line2D([], [], color=BLUE, linewidth=0.8, label="rotors"))

@@ -1,8 +1,8 @@
-"""Sticks of the robot from the model alone, without meshes."""
+"""Sticks of the robot from the model alone, and the hulls of its shapes where it has any."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ import pinocchio as pin
 from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.impact.contact import ImpactContact, Support, point_on
+from impact_posture.plot.silhouette import PlacedHull, place_hulls
 from impact_posture.robot.robot import Robot
 
 # Least height of a body, as a part of its shorter side.
@@ -31,6 +32,7 @@ class Skeleton:
         normals: World unit normals, shape (c, 3).
         feet: Contact points of the supports, shape (f, 3).
         rotors: Circles of the propellers, shape (r, 3, points).
+        hulls: Hulls of the collision shapes; empty for a robot without shapes.
     """
 
     bones: Array
@@ -41,6 +43,7 @@ class Skeleton:
     normals: Array
     feet: Array
     rotors: Array
+    hulls: tuple[PlacedHull, ...] = ()
 
     @property
     def contact(self) -> Array:
@@ -63,17 +66,22 @@ class Skeleton:
         """All points that the figure has to show, shape (m, 3)."""
         circles = self.rotors.transpose(0, 2, 1).reshape(-1, 3)
         origin = np.asarray(self.base.translation)[None]
-        return np.vstack([self.bones.reshape(-1, 3), origin, self.body, self.contacts, self.feet, circles])
+        shapes = [hull.vertices for hull in self.hulls] or [self.body]
+        return np.vstack([self.bones.reshape(-1, 3), origin, *shapes, self.contacts, self.feet, circles])
 
 
 def build_skeleton(
-    robot: Robot, q: Array, contacts: Sequence[ImpactContact], supports: Sequence[Support] = ()
+    robot: Robot,
+    q: Array,
+    contacts: Sequence[ImpactContact],
+    supports: Sequence[Support] = (),
+    collisions: Iterable[tuple[str, str]] = (),
 ) -> Skeleton:
     """Place the sticks at ``q``, shape (nq,).
 
     A bone joins a joint's origin to its parent's; a base that carries four joints or more is a box instead.  Contacts
     and feet hang on their links; the last link of a chain without one goes on to its farthest frame, or to its center
-    of mass where it has none.
+    of mass where it has none.  Shapes in ``collisions``, pairs of names, are marked.
     """
     model = robot.model
     data = model.createData()
@@ -116,6 +124,7 @@ def build_skeleton(
         normals=np.array(normals),
         feet=np.array(ends[len(contacts) :]).reshape(-1, 3),
         rotors=_rotors(robot, places),
+        hulls=place_hulls(robot, data, collisions),
     )
 
 

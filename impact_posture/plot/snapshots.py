@@ -1,4 +1,4 @@
-"""Figure ``snapshots``: sticks of the robot at three instants of a run, a row for each controller."""
+"""Figure ``snapshots``: sticks and shapes of the robot at three instants of a run, a row for each controller."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from impact_posture.plot.robot_drawing import (
 )
 from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.shapes import Plane
+from impact_posture.plot.silhouette import silhouette_handles
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.style import (
     BLUE,
@@ -168,7 +169,7 @@ def _push(axes: Any, contact: Array, arrow: Array, *, acting: bool) -> None:
 
 
 def _handles(state: Skeleton, view: RunView) -> list[Any]:
-    handles = robot_handles(state, {"now": _NOW, "start": _START}, BLUE)
+    handles = [*robot_handles(state, {"now": _NOW, "start": _START}, BLUE), *silhouette_handles(state.hulls, BLUE)]
     if view.surface is not None:
         return [*handles, Patch(facecolor=PALE, edgecolor=GRAY, hatch=HATCH, linewidth=0, label="surface")]
     arrow: dict[str, Any] = {"linestyle": "", "marker": r"$\rightarrow$", "markersize": 11, "color": VERMILLION}

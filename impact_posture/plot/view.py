@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -74,6 +75,7 @@ class ResultView:
         path: Quantities along the null-space path between them, if known.
         tradeoff: The trade-off of objective against distance, if it was computed.
         title: First line of every figure; robot and contact frame if empty.
+        collisions: Names of the shapes that collide, in pairs, before and after.
     """
 
     robot: Robot
@@ -85,6 +87,7 @@ class ResultView:
     path: NullSpacePath | None = None
     tradeoff: TradeOffData | None = None
     title: str = ""
+    collisions: tuple[Sequence[tuple[str, str]], Sequence[tuple[str, str]]] = ((), ())
 
     @cached_property
     def before(self) -> ImpactQuantities:

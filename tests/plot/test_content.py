@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 
+import matplotlib.colors
 import numpy as np
 import pinocchio as pin
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from mpl_toolkits.mplot3d import proj3d
 
+from impact_posture.collision.shapes import load_shapes
 from impact_posture.errors import InputError
 from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.plot import FIGURES, ResultView, postures_figure
@@ -23,7 +29,7 @@ from impact_posture.plot.shapes import (
     half_width,
 )
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
-from impact_posture.plot.style import WIDTH, style, wrap
+from impact_posture.plot.style import ORANGE, WIDTH, style, wrap
 from impact_posture.plot.view import SEPARATOR, contact_letters, header_lines, number
 from impact_posture.posture.null_space_path import NullSpacePath
 from tests.plot.views import PENDULUM, make_view, text_of
@@ -303,7 +309,68 @@ def test_a_base_with_legs_is_a_body(name: str) -> None:
     assert np.ptp(corners[:, 2]) > 0.3 * np.ptp(hips, axis=0)[:2].min()
     # It stands for the sticks from the base to the hips.
     assert not any(np.allclose(end, base.translation) for bone in seen.bones for end in bone)
-    assert "body" in text_of(postures_figure(view)).split(" | ")
+    # The shapes show the body better.  A robot without shapes has its box.
+    assert "body" not in text_of(postures_figure(view)).split(" | ")
+    bare = dataclasses.replace(view, robot=dataclasses.replace(view.robot, settings=None))
+    assert "body" in text_of(postures_figure(bare)).split(" | ")
+
+
+def silhouettes(axes: Axes) -> list[PathPatch]:
+    return [
+        patch for patch in axes.get_children() if isinstance(patch, PathPatch) and patch.get_path().codes is not None
+    ]
+
+
+def test_silhouettes_are_the_shadows_of_the_hulls(talos: ResultView, panda: ResultView, tilthex: ResultView) -> None:
+    for view in (talos, panda, tilthex):
+        figure = postures_figure(view)
+        space, flat = figure.axes
+        states = [skeleton(view, q) for q in (view.q_initial, view.q_optimal)]
+        plane = side_plane(*states)
+        bodies = load_shapes(view.robot).bodies
+        for state, patch in zip(states, silhouettes(flat), strict=True):
+            rings = [Path(ring) for ring in patch.get_path().to_polygons(closed_only=False)]
+            assert len(rings) == len(state.hulls) == len(bodies)
+            for ring, hull in zip(rings, state.hulls, strict=True):
+                shadow = hull.vertices @ plane.axes.T
+                assert (
+                    ring.contains_points(shadow, radius=1e-9).all()
+                    or ring.contains_points(shadow, radius=-1e-9).all()
+                )
+                # In every direction it is the sweep that the outline is farther out.
+                around = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 6, 20)])
+                out = (ring.vertices @ around.T).max(axis=0) - (shadow @ around.T).max(axis=0)
+                assert (out <= max(hull.radius, 1e-4) + 1e-12).all() and (out >= 0.86 * hull.radius).all()
+        data = view.robot.model.createData()
+        pin.forwardKinematics(view.robot.model, data, view.q_optimal)
+        for body, hull in zip(bodies, states[1].hulls, strict=True):
+            np.testing.assert_allclose(hull.vertices[0], data.oMi[body.joint].act(body.vertices[0]), atol=1e-12)
+        # In 3-D the corners of each hull are in its outline on the picture.
+        for state, patch in zip(states, silhouettes(space), strict=True):
+            rings = [Path(ring) for ring in patch.get_path().to_polygons(closed_only=False)]
+            for ring, hull in zip(rings, state.hulls, strict=True):
+                seen = np.array(proj3d.proj_transform(*hull.vertices.T, space.get_proj())[:2]).T
+                assert ring.contains_points(seen, radius=1e-9).all() or ring.contains_points(seen, radius=-1e-9).all()
+
+
+def test_shapes_in_collision_have_a_color_and_a_name(talos: ResultView) -> None:
+    hit = (("gripper_right_base_link", "leg_right_3_link"), ("arm_right_7_link", "the wall"))
+    figure = postures_figure(dataclasses.replace(talos, collisions=((), hit)))
+    assert "in collision" in text_of(figure).split(" | ")
+    for axes in figure.axes:
+        *free, marked = silhouettes(axes)
+        assert matplotlib.colors.to_hex(marked.get_facecolor()) == ORANGE.lower() and len(free) == 2
+        assert len(marked.get_path().to_polygons()) == 3
+    assert "in collision" in text_of(postures_figure(dataclasses.replace(talos, collisions=(hit, ())))).split(" | ")
+    assert "in collision" not in text_of(postures_figure(talos)).split(" | ")
+
+
+def test_a_robot_without_shapes_is_drawn_by_its_sticks(pendulum: ResultView) -> None:
+    bare = dataclasses.replace(pendulum, robot=dataclasses.replace(pendulum.robot, settings=None))
+    figure = postures_figure(bare)
+    assert not any(silhouettes(axes) for axes in figure.axes)
+    assert "They do not show the shapes of the links." in text_of(figure)
+    assert "shapes" not in text_of(figure).split(" | ")
 
 
 def test_no_body_without_legs(tilthex: ResultView, talos: ResultView, panda: ResultView) -> None:
