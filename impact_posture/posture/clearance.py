@@ -40,6 +40,7 @@ class Clearance(Constraint):
     """
 
     projected = False
+    grows = True
 
     def __init__(
         self, name: str, separators: Sequence[Separator], words: str, active: Mapping[int, Corners] | None = None

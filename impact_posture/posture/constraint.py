@@ -82,6 +82,7 @@ class Constraint(ABC):
         lower: Lower bounds, shape (rows,).
         upper: Upper bounds, shape (rows,).
         projected: Whether starts are pulled onto it; else the program alone satisfies it.
+        grows: Whether :meth:`grown` may add parts to its program.
     """
 
     name: str
@@ -89,6 +90,7 @@ class Constraint(ABC):
     lower: Array
     upper: Array
     projected: bool = True
+    grows: bool = False
 
     @property
     def rows(self) -> int:

@@ -205,7 +205,8 @@ def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts:
     chart = Chart(problem.robot.model)
     symbols, bounded = program(problem, chart)
     options = IPOPT_OPTIONS | (_WORST_OPTIONS if problem.objective.attempts > 1 else {})
-    built = compiled_solver(problem, symbols, options, compile, starts)
+    # A program that grows is soon another one, so it is not worth compiling.
+    built = compiled_solver(problem, symbols, options, compile, 1 if problem.grows else starts)
     took = time.perf_counter() - began
     return PostureNLP(problem, chart, built.solver, bounded, took, built.compiled, built.fault)
 

@@ -42,6 +42,8 @@ _EQUAL = 1e-9
 _RISE = 1e-6
 # Number of other optima with a path of their own, and rounds of trying the paths of neighbors.
 _PATHS, _ROUNDS = 3, 3
+# Most times that the program of one point grows.
+_GROWTH = 8
 # Starts of the search for the posture with the least force.
 _FORCE_STARTS = 8
 
@@ -80,7 +82,7 @@ def pareto_front(
     nlp = build_nlp(bounded, compile=compile, starts=2 * points)
     began = time.perf_counter()
     levels = [float(v) for v in least + (most - least) * np.arange(points + 1) / points]
-    curve = _Curve(bounded, nlp, ruler, levels)
+    curve = _Curve(bounded, nlp, ruler, levels, compile)
     curve.follow(solution, progress)
     return curve.finish(solution, time.perf_counter() - began, nlp.build_time_s, [])
 
@@ -127,8 +129,15 @@ class _Found:
 class _Curve:
     """The curve during the search."""
 
-    def __init__(self, problem: PostureProblem, nlp: PostureNLP | None, ruler: Ruler, levels: list[float]) -> None:
-        self._problem, self._nlp, self._ruler, self._levels = problem, nlp, ruler, levels
+    def __init__(
+        self,
+        problem: PostureProblem,
+        nlp: PostureNLP | None,
+        ruler: Ruler,
+        levels: list[float],
+        compile: CompileMode = "auto",
+    ) -> None:
+        self._problem, self._nlp, self._ruler, self._levels, self._compile = problem, nlp, ruler, levels, compile
         self._scale = problem.objective.value(ruler.nearest)
         self._best: list[_Found | None] = [None] * len(levels)
         self._tried: set[tuple[int, bytes]] = set()
@@ -187,7 +196,12 @@ class _Curve:
         self._tried.add(key)
         start = self._ruler.within(start, level)
         try:
-            record, certificate = run_start(replace(self._nlp, problem=self._at(level)), start, self._scale)
+            for _ in range(_GROWTH):
+                record, certificate = run_start(replace(self._nlp, problem=self._at(level)), start, self._scale)
+                grown = self._problem.grown([record.q])
+                if grown is self._problem:
+                    break
+                self._problem, self._nlp, start = grown, build_nlp(grown, compile=self._compile), record.q
             self._take(k, path, record.q, certificate)
         except MetricError:
             # This path led to a posture where the objective does not exist.

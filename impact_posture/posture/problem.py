@@ -158,6 +158,11 @@ class PostureProblem:
         counts = [c.guess(numeric).values.size for c in self.constraints]
         return np.split(auxiliaries, np.cumsum(counts)[:-1]) if counts else []
 
+    @property
+    def grows(self) -> bool:
+        """Whether the program may lack parts."""
+        return any(c.grows for c in self.constraints)
+
     def grown(self, postures: Sequence[Array]) -> PostureProblem:
         """Return the problem with the parts that its program lacks at any of the postures; itself if none."""
         constraints, numeric = list(self.constraints), Numeric(self.robot.model)

@@ -93,9 +93,7 @@ class Search:
     ) -> None:
         self.problem, self._known, self._scale, self._seed, self._compile = problem, known, scale, seed, compile
         self._starts = starts
-        self._grows = not all(c.projected for c in problem.constraints)
-        # A program that will grow is not worth compiling.
-        self.nlp = build_nlp(problem, compile=compile, starts=1 if self._grows else starts)
+        self.nlp = build_nlp(problem, compile=compile, starts=starts)
         self.build_time_s = self.nlp.build_time_s
         # A run goes on from where it ended without what the program lacked.
         self._ends: dict[int, Array] = {}
@@ -106,7 +104,7 @@ class Search:
         starts = self._starts
         # What the first starts lack is what most others will.
         waiting, later = list(range(starts)), []
-        if self._grows and starts > _FIRST:
+        if self.problem.grows and starts > _FIRST:
             waiting, later = waiting[:_FIRST], waiting[_FIRST:]
         retried: set[int] = set()
         for _ in range(_ROUNDS):

@@ -28,11 +28,15 @@ from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.impact.lifted import Guess
 from impact_posture.posture.constraint import LiftedRows, Linearization
 
+# Least n·n.  Without it a normal could shrink to zero where bodies penetrate each other, which leaves no way out.
+_SHORT = 0.8
 # A slack starts so far (m) above the penetration, and a normal at this length, inside their bounds.
 _ABOVE, _LENGTH = 0.01, 0.98
 # Tangent of the tilt at which more corners of a body get a row, and the sides to which it tilts.
 _TILT = 0.5
 _AROUND = np.array([[0.0, 0.0], *[[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4]])
+# A plane keeps corners on their sides if it cuts off less than this (m), half of what certifies.
+_KEPT = 5e-9
 # Rows of corners farther than this (m) from their plane have no multiplier.
 _NEAR = 1e-3
 
@@ -118,7 +122,9 @@ class Separator:
     def bounds(self, corners: Corners) -> tuple[Array, Array]:
         """Return the bounds of the rows of :meth:`lift`."""
         first, second, own = len(corners.a), len(corners.b), 0 if self.known else 1
-        lower = np.concatenate([np.zeros(4), np.full(first, self.gap), np.full(second + own, -np.inf)])
+        lower = np.concatenate(
+            [np.zeros(4), np.full(first, self.gap), np.full(second, -np.inf), np.full(own, _SHORT)]
+        )
         upper = np.concatenate([np.zeros(4), np.full(first, np.inf), np.zeros(second), np.ones(own)])
         return lower, upper
 
@@ -210,12 +216,12 @@ class Separator:
             unknowns: Those of :meth:`lift`; ``None`` for the plane between the closest points.
         """
         at_a, at_b, nv = self.a.placement(model), self.b.placement(model), model.model.nv
-        if unknowns is None or self.known:
-            n, c = self._plane(model, self.distance(model)[1])
-        else:
-            n, c = unknowns[:3], float(unknowns[3])
         corners = self._x @ at_a.rotation.T + at_a.translation
         seen = (corners - at_b.translation) @ at_b.rotation
+        n, c = (None, 0.0) if unknowns is None or self.known else (unknowns[:3], float(unknowns[3]))
+        # A plane of the program may cut corners that have no row there, and then the pair is not active.
+        if n is None or max((self._y @ n).max() - c, self.gap + c - (seen @ n).min()) > _KEPT:
+            n, c = self._plane(model, self.distance(model)[1])
         near = seen @ n - c < self.gap + _NEAR
         corners, seen = corners[near], seen[near]
         world = at_b.rotation @ n

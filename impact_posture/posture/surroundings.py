@@ -109,12 +109,11 @@ class Surroundings:
         plane = Body(name, None, point, turns, n)
         depth = max([0.0, *[-self._height(body, plane) for body in own]])
         plane = replace(plane, offset=-depth)
-        behind = [b for b in self._bodies if self._is_still(b) and self._height(b, plane) < -_BEHIND]
-        behind = [b for b in behind if b.point.joint not in exempt]
+        behind = self._stands_behind(plane, exempt)
         if width is None and behind:
             width = PATCH
             self.notes.append(
-                f"{behind[0].name} lies behind the plane of the {name}, so the surface is taken as a patch of "
+                f"{behind} lies behind the plane of the {name}, so the surface is taken as a patch of "
                 f"{width:g} m × {width:g} m (`surface`)"
             )
         if width is None or not np.isfinite(width):
@@ -178,6 +177,15 @@ class Surroundings:
                 corners = hull.vertices @ at.rotation.T + at.translation
                 solids.append((SweptHull(hull.name, hull.link, 0, corners, hull.radius), wall.exempt))
         return mesh_collisions(self.robot, self.shapes, q, solids, planes)
+
+    def _stands_behind(self, plane: Body, exempt: frozenset[int]) -> str:
+        """Name something that cannot move and lies behind a plane: a foot, or the place of a fixed base."""
+        still = (b for b in self._bodies if self._is_still(b) and b.point.joint not in exempt)
+        behind = [b.name for b in still if self._height(b, plane) < -_BEHIND]
+        if not behind and not self.robot.floating:
+            root = SweptHull("the base", "", 0, np.array([self.robot.model.jointPlacements[1].translation]), 0.0)
+            behind = ["the base"] if self._height(Body.of_link(root), plane) < -_BEHIND else []
+        return behind[0] if behind else ""
 
     # ---- helpers ----------------------------------------------------------------------------------------------
 

@@ -42,7 +42,7 @@ class Case:
     def settings(self) -> ProblemSettings:
         """The same as settings."""
         robot = str(ROOT / self.robot) if self.robot.endswith(".urdf") else self.robot
-        return make_settings({"robot": robot, "frame": self.frame, "normal": self.normal})
+        return make_settings({"robot": robot, "frame": self.frame, "normal": self.normal, "collision": True})
 
     def solve(self) -> tuple[Prepared, PostureSolution]:
         """Solve with the command's defaults."""
