@@ -16,14 +16,14 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import known_robots, load_robot
 from tests.benchmarks.core import Request, machine, table
 
-_HEAD = ("robot", "shapes", "hulls", "corners", "sweep, mm", "pairs of shapes", "of hulls", "fit, s", "at the default",
-         "overlap by design", "in hollows")  # fmt: skip
+_HEAD = ("robot", "shapes", "hulls", "corners", "sweep, mm", "pairs of shapes", "of hulls", "fit, s",
+         "at the default", "overlap by design", "in hollows")  # fmt: skip
 
 
 def lines(request: Request) -> Iterator[str]:
     """A row a robot."""
     yield "Corners: median of the hulls. Sweep: median and largest of the hulls that are no ball or capsule. Fit:"
-    yield "processor time with the loading of meshes. At the default: pairs of shapes and of hulls that collide there."
+    yield "processor time with the loading of meshes. At the default: shapes and hulls that collide there."
     yield machine("pin")
     yield ""
     yield from table(_HEAD, (_row(name) for name in known_robots() if request.only in name))
