@@ -20,7 +20,8 @@ from impact_posture.collision import shapes as collision_shapes
 from impact_posture.collision.mesh_check import mesh_collisions
 from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import NO_SHAPES, RobotShapes, load_shapes
-from impact_posture.errors import InputError, SpecError
+from impact_posture.errors import InputError, SpecError, UrdfError
+from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import Obstacle
 from impact_posture.tables import validate
@@ -142,6 +143,29 @@ def test_a_bad_description_is_left_out_by_name(tmp_path: Path, geometry: str, fa
 def test_a_ball_of_millimeters_is_left_out(tmp_path: Path) -> None:
     shapes = arm(tmp_path, '<sphere radius="50"/>')
     assert shapes.warnings == ("shape middle is left out: its <sphere> has a size of 50 m; give sizes in meters",)
+
+
+def test_files_that_change_after_loading_are_one_line(tmp_path: Path) -> None:
+    text = f'<robot name="arm">{link("base", BOX)}{link("middle", BOX)}{joint("base", "middle")}</robot>'
+    urdf, srdf = tmp_path / "arm.urdf", tmp_path / "arm.srdf"
+    urdf.write_text(text)
+    srdf.write_text('<robot name="arm"/>')
+
+    def load() -> Robot:
+        return load_robot(str(urdf), armature="none", srdf=str(srdf))
+
+    robot = load()
+    urdf.write_text(text.replace("</robot>", f"{link('new')}</robot>"))
+    with pytest.raises(UrdfError, match="has changed since the robot was loaded"):
+        load_shapes(robot)
+    urdf.unlink()
+    with pytest.raises(UrdfError, match="no such file"):
+        load_shapes(robot)
+    urdf.write_text(text)
+    robot = load()
+    srdf.write_text("<robot")
+    with pytest.raises(UrdfError, match="is no SRDF"):
+        load_shapes(robot)
 
 
 def test_an_open_mesh_is_closed_by_its_hull(tmp_path: Path) -> None:

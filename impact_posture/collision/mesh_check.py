@@ -97,6 +97,8 @@ def _deep(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> bool:
     if not coal.collide(a, transform(at_a), b, transform(at_b), request, result):
         return False
     normal = np.array(result.getContact(0).normal)
+    if not np.isfinite(normal).all():
+        return True
     for side in (-1, 1):
         moved = pin.SE3(at_a.rotation, at_a.translation + side * TOLERANCE * normal)
         if not coal.collide(a, transform(moved), b, transform(at_b), request, coal.CollisionResult()):

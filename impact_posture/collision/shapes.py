@@ -80,7 +80,7 @@ def load_shapes(robot: Robot) -> RobotShapes:
 def _shapes(source: _Source) -> RobotShapes:
     stored = read_shapes(source.key, int(source.robot.model.njoints))
     if stored is None:
-        stored = _fit(source.robot, source.described)
+        stored = fit_shapes(source.robot, source.described)
         write_shapes(source.key, stored)
     bodies = tuple(_hull(hull) for hull in stored.bodies)
     warnings = (*source.warnings, *stored.warnings, *(() if bodies else (NO_SHAPES,)))
@@ -88,7 +88,7 @@ def _shapes(source: _Source) -> RobotShapes:
     return RobotShapes(bodies, pairs, stored.always_touching, stored.hulls_touching, warnings, source.robot)
 
 
-def _fit(robot: Robot, described: list[UrdfShape]) -> StoredShapes:
+def fit_shapes(robot: Robot, described: list[UrdfShape]) -> StoredShapes:
     """Load the shapes, fit their hulls, and find the pairs."""
     loaded = load_geometry(robot, described)
     shapes, apart = loaded.model.geometryObjects, loaded.apart

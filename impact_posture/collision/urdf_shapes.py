@@ -16,10 +16,10 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.errors import one_line
+from impact_posture.errors import UrdfError, one_line
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate, srdf_path
-from impact_posture.robot.urdf import quiet_stderr
+from impact_posture.robot.urdf import parse_urdf, quiet_stderr
 
 # A shape larger than this (m), and larger than so many times the robot, is in millimeters.
 _LARGEST = 5.0
@@ -27,7 +27,7 @@ _LARGEST_SHARE = 10.0
 # A COLLADA file says within so many bytes which axis is up.
 _HEAD = 10_000
 # Loading takes about 20 times the size of a binary STL in memory.
-_LARGEST_FILE = 200_000_000
+_LARGEST_FILE = 100_000_000
 # Attributes with the sizes of a shape, and how many numbers each has.
 _SIZES = {
     "box": {"size": 3},
@@ -136,6 +136,9 @@ def read_urdf_shapes(robot: Robot) -> tuple[list[UrdfShape], list[str]]:
 
     Returns:
         The shapes, and one line for each shape left out.
+
+    Raises:
+        UrdfError: The URDF cannot be read any more, or it has other links than the robot.
     """
     if robot.settings is None:
         return [], []
@@ -144,8 +147,10 @@ def read_urdf_shapes(robot: Robot) -> tuple[list[UrdfShape], list[str]]:
     folders += [located.folder / Path(folder).expanduser() for folder in located.spec.model.package_dirs]
     folders += [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
     shapes, warnings = [], []
-    for link in ET.parse(located.urdf).getroot().iter("link"):
+    for link in parse_urdf(located.urdf).iter("link"):
         name = link.get("name", "")
+        if not robot.model.existFrame(name, pin.FrameType.BODY):
+            raise UrdfError("has changed since the robot was loaded", where=str(located.urdf), hint="load it again")
         tags = link.findall("collision") or link.findall("visual")
         for k, tag in enumerate(tags):
             called = name if len(tags) == 1 else f"{name}[{k}]"
@@ -169,7 +174,10 @@ def disabled_links(robot: Robot) -> set[frozenset[str]]:
     path = srdf_path(located.spec, robot.settings, located.folder)
     if path is None:
         return set()
-    tags = ET.parse(path).getroot().iter("disable_collisions")
+    try:
+        tags = ET.parse(path).getroot().iter("disable_collisions")
+    except (OSError, ET.ParseError) as error:
+        raise UrdfError(f"is no SRDF ({error})", where=str(path), hint="correct the SRDF") from None
     return {frozenset((tag.get("link1", ""), tag.get("link2", ""))) for tag in tags}
 
 
@@ -213,6 +221,8 @@ def _find_mesh(text: str, urdf: Path, folders: Sequence[Path]) -> Path:
         paths = [folder / rest for folder in (*folders, *urdf.absolute().parents)] if colon else [urdf.parent / text]
     for path in paths:
         if path.is_file():
+            if not os.access(path, os.R_OK):
+                raise UnusableShape(f"{path} cannot be read; change its permissions")
             if path.stat().st_size > _LARGEST_FILE:
                 raise UnusableShape(f"{path} is larger than {_LARGEST_FILE // 1_000_000} MB; simplify the mesh")
             return path

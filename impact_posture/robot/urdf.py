@@ -85,7 +85,7 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
         UrdfError: The file is missing or is no URDF, Pinocchio rejects its tree, or it has too many joints.
         InertiaError: A link has a mass or inertia that no rigid body has.
     """
-    root = _parse(path)
+    root = parse_urdf(path)
     try:
         with quiet_stderr() as words:
             model = pin.buildModelFromUrdf(str(path), *([pin.JointModelFreeFlyer()] if free_flyer else []))
@@ -103,7 +103,12 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
     return model, check_inertias(root, model, path, accept_inertias)
 
 
-def _parse(path: Path) -> ET.Element:
+def parse_urdf(path: Path) -> ET.Element:
+    """Return the root of the URDF at ``path``.
+
+    Raises:
+        UrdfError: The file is missing or is no URDF.
+    """
     if path.is_dir():
         raise UrdfError("is a folder", where=str(path), hint="name the .urdf file in it")
     try:
