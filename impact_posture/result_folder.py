@@ -179,7 +179,19 @@ def _view(
         restitution=impact.restitution,
         path=path,
         tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
+        collisions=_collisions(prepared, initial, optimal),
     )
+
+
+def _collisions(prepared: Prepared, *postures: np.ndarray) -> Any:
+    """Shapes that touch at each of two postures, for an optimization that does not keep them apart."""
+    if prepared.problem.surroundings is not None:
+        return (), ()
+    from impact_posture.collision.mesh_check import mesh_collisions
+    from impact_posture.collision.shapes import load_shapes
+
+    shapes = load_shapes(prepared.impact.robot)
+    return tuple(mesh_collisions(prepared.impact.robot, shapes, q) for q in postures)
 
 
 def _tradeoff_data(points: Sequence[dict[str, Any]], against: Against) -> TradeOffData | None:

@@ -96,33 +96,28 @@ def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_linearization_is_the_derivative_of_the_rows(name: str, kind: str) -> None:
-    """Against manifold differences of the heights of all corners over a fixed plane."""
+    """Against manifold differences of the heights of corners over a plane."""
     robot, rng = load_robot(name), np.random.default_rng(2)
     separator, numeric = _separator(robot, kind), Numeric(robot.model)
-    q = _random(robot, rng)
-    plane = np.zeros(separator.count)
-    plane[:4] = [*rng.normal(size=3), 50.0]
-    rows = separator.linearize(numeric.at(q), plane)
-    if not separator.known:
-        # A plane far on the other side of both bodies: every corner violates it, so every one has a row.
-        assert len(rows.names) == len(separator.a.hull.vertices) + 1
+    q, n = _random(robot, rng), rng.normal(size=3)
+    # A plane far on the wrong side of both bodies, so that every corner has a row.
+    height = 50.0
+    rows = separator.linearize_at(numeric.at(q), n, height)
+    assert len(rows.names) == len(BOX) + (0 if separator.known else 1)
 
-    def heights(posture: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
-        return separator.linearize(numeric.at(posture), unknowns).value
+    def heights(posture: np.ndarray, normal: np.ndarray, c: float) -> np.ndarray:
+        return separator.linearize_at(numeric.at(posture), normal, c).value
 
-    if not len(rows.value):
-        # A half-space that the body is clear of.
-        assert separator.distance(numeric.at(q))[0] > 0
-        return
     h = 1e-6
     for k, unit in enumerate(np.eye(robot.nv)):
-        ahead, behind = (heights(pin.integrate(robot.model, q, s * h * unit), plane) for s in (1, -1))
-        if len(ahead) == len(behind) == len(rows.value):
-            assert np.allclose((ahead - behind) / (2 * h), rows.posture[:, k], atol=2e-8)
-    for k in range(rows.auxiliary.shape[1]):
-        step = np.eye(separator.count)[k] * h
-        difference = (heights(q, plane + step) - heights(q, plane - step)) / (2 * h)
-        assert np.allclose(difference, rows.auxiliary[:, k], atol=1e-6)
+        ahead, behind = (heights(pin.integrate(robot.model, q, s * h * unit), n, height) for s in (1, -1))
+        assert np.allclose((ahead - behind) / (2 * h), rows.posture[:, k], atol=1e-7)
+    if not separator.known:
+        for k, unit in enumerate(np.eye(3)):
+            difference = (heights(q, n + h * unit, height) - heights(q, n - h * unit, height)) / (2 * h)
+            assert np.allclose(difference, rows.auxiliary[:, k], atol=1e-6)
+        difference = (heights(q, n, height + h) - heights(q, n, height - h)) / (2 * h)
+        assert np.allclose(difference, rows.auxiliary[:, 3], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "panda"])

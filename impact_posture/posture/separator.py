@@ -215,13 +215,18 @@ class Separator:
             model: The model at the posture.
             unknowns: Those of :meth:`lift`; ``None`` for the plane between the closest points.
         """
+        if unknowns is not None and not self.known:
+            found = self.linearize_at(model, unknowns[:3], float(unknowns[3]))
+            # A plane of the program may cut corners that have no row there, and then the pair is not active.
+            if max((found.lower - found.value).max(), (found.value - found.upper).max()) <= _KEPT:
+                return found
+        return self.linearize_at(model, *self._plane(model, self.distance(model)[1]))
+
+    def linearize_at(self, model: Numeric, n: Array, c: float) -> Linearization:
+        """Return the rows for the plane ``{y: n·y = c}`` in the axes of body b."""
         at_a, at_b, nv = self.a.placement(model), self.b.placement(model), model.model.nv
         corners = self._x @ at_a.rotation.T + at_a.translation
         seen = (corners - at_b.translation) @ at_b.rotation
-        n, c = (None, 0.0) if unknowns is None or self.known else (unknowns[:3], float(unknowns[3]))
-        # A plane of the program may cut corners that have no row there, and then the pair is not active.
-        if n is None or max((self._y @ n).max() - c, self.gap + c - (seen @ n).min()) > _KEPT:
-            n, c = self._plane(model, self.distance(model)[1])
         near = seen @ n - c < self.gap + _NEAR
         corners, seen = corners[near], seen[near]
         world = at_b.rotation @ n
