@@ -37,6 +37,7 @@ class PathSpace:
         self.problem, self.model = problem, problem.robot.model
         self.projector = Projector(problem)
         self.free = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) == 0
+        self._inequalities = any(not c.equality for c in problem.constraints)
         self._reach = lever_arms(self.projector.chart, self.model)
 
     def violation(self, q: Array) -> tuple[float, float]:
@@ -63,23 +64,31 @@ class PathSpace:
         """Return the tangent norm ``‖other ⊖ one‖``, rad mixed with m."""
         return float(np.linalg.norm(self.difference(one, other)))
 
-    def pulled(self, q: Array, step: Array) -> Array | None:
+    def pulled(self, q: Array, step: Array | None = None) -> Array | None:
         """Return ``q ⊕ step`` pulled onto the constraints, or ``None`` if it does not reach them."""
-        found = self.projector.project(np.asarray(pin.integrate(self.model, q, step))).q
+        found = self.projector.project(q if step is None else np.asarray(pin.integrate(self.model, q, step))).q
         return found if self.valid(found) else None
 
     def checks(self, step: Array) -> int:
-        """Return the number of parts of a tangent step in which no frame moves more than the check distance."""
-        return max(1, int(np.ceil(float(self._reach @ np.abs(step)) / CHECK_DISTANCE)))
+        """Return the number of parts of a tangent step in which no frame moves more than the check distance.
+
+        Without inequalities there is nothing to meet between two postures, and the parts are steps of a walk.
+        """
+        moved = float(self._reach @ np.abs(step)) / CHECK_DISTANCE if self._inequalities else 0.0
+        return max(1, int(np.ceil(max(moved, float(np.linalg.norm(step)) / STEP))))
 
     def clear(self, one: Array, other: Array) -> bool:
         """Return whether the motion from ``one`` to ``other`` along the constraints is valid; the ends are not checked.
 
-        The postures between are those of the straight motion, pulled onto the constraints.
+        Each posture between is the next part of the straight motion to ``other``, pulled onto the constraints.
         """
-        step = self.difference(one, other)
-        parts = self.checks(step)
-        return all(self.pulled(one, step * (k / parts)) is not None for k in range(1, parts))
+        parts, q = self.checks(self.difference(one, other)), one
+        for left in range(parts, 1, -1):
+            moved = self.pulled(q, self.difference(q, other) / left)
+            if moved is None:
+                return False
+            q = moved
+        return True
 
     def clear_path(self, postures: Sequence[Array]) -> bool:
         """Return whether all motions between consecutive postures are valid."""
@@ -110,6 +119,17 @@ class PathSpace:
             if moved is None or self.distance(moved, target) > size - _PROGRESS * STEP:
                 return path
             path.append(moved)
+
+    def unwound(self, start: Array, target: Array) -> Array:
+        """Return ``target`` with revolute joints turned by full turns to be nearest to ``start``, within their limits."""
+        target = target.copy()
+        for slot in self.projector.chart.slots:
+            if slot.kind.family == "revolute":
+                turns = np.round((target[slot.q] - start[slot.q]) / (2 * np.pi))
+                nearer = target[slot.q] - 2 * np.pi * turns
+                if ((self.problem.lower[slot.x] <= nearer) & (nearer <= self.problem.upper[slot.x])).all():
+                    target[slot.q] = nearer
+        return target
 
     def length(self, postures: Sequence[Array]) -> float:
         """Return the tangent length of a path, rad mixed with m."""

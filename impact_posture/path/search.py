@@ -16,8 +16,9 @@ from impact_posture.posture.problem import equality_jacobian, null_space, rank
 _CURVE_END = 1e-4
 # Steps on a self-motion curve: 500 rad at the usual step, more than any curve within joint limits.
 _CURVE_STEPS = 10_000
-# A path longer than the straight distance of its ends by more than this share is shortened.
-_DETOUR = 0.02
+# A path is shortened if it exceeds the straight distance of its ends by more than a share: by an elastic band, and
+# before it by shortcuts, whose walks cost more.
+_BENT, _DETOUR = 0.02, 0.2
 _SHORTCUTS = 24
 # Postures of the elastic bands, and sweeps over each.
 _BANDS, _SWEEPS = (9, 17, 33), 12
@@ -112,27 +113,28 @@ def shortened(space: PathSpace, postures: Sequence[Array], seed: int = 0) -> lis
 
     A shortcut is a walk between two postures of the path that is shorter than the path between them.  The elastic
     band moves each posture to the middle of its neighbors and pulls it onto the constraints, on finer and finer
-    bands.  A change is kept only if the whole motion stays valid.  A path that is almost straight is returned as is.
+    bands.  The last band is kept only if its whole motion is valid.  A path that is almost straight is returned as is.
     """
     path, rng = list(postures), np.random.default_rng(seed)
     straight = space.distance(path[0], path[-1])
     for _ in range(_SHORTCUTS):
-        if len(path) < 3 or space.length(path) < straight * (1 + _DETOUR):
-            return path
+        if space.length(path) < straight * (1 + _DETOUR):
+            break
         i, j = sorted(rng.choice(len(path), 2, replace=False))
         between = space.walk(path[i], path[j]) if j - i > 1 else []
         if between and between[-1] is path[j] and space.length(between) < space.length(path[i : j + 1]):
             path = [*path[:i], *between, *path[j + 1 :]]
+    if space.length(path) < straight * (1 + _BENT):
+        return path
+    band = path
     for count in _BANDS:
-        band = even(space, path, count)
+        band = even(space, band, count)
         for _ in range(_SWEEPS):
             for k in range(1, count - 1):
                 to_middle = (space.difference(band[k], band[k - 1]) + space.difference(band[k], band[k + 1])) / 2
                 moved = space.pulled(band[k], to_middle)
                 band[k] = band[k] if moved is None else moved
-        if space.length(band) < space.length(path) and space.clear_path(band):
-            path = band
-    return path
+    return band if space.length(band) < space.length(path) and space.clear_path(band) else path
 
 
 def even(space: PathSpace, postures: Sequence[Array], count: int) -> list[Array]:

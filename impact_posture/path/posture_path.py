@@ -1,0 +1,162 @@
+"""A path from the start to the optimum that satisfies all constraints, timed within the robot's limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from impact_posture.arrays import Array
+from impact_posture.errors import PostureError
+from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.curve import fitted_curve
+from impact_posture.path.path_space import PathSpace
+from impact_posture.path.search import PathSearch, shortened
+from impact_posture.path.timing import limit_shares, timed
+from impact_posture.posture.solve import PostureSolution
+
+# Optima that are tried, best first.
+_OPTIMA = 5
+EVALUATIONS = 20_000
+# A path shorter than this (tangent length) is no motion, and a smaller relative gain is none.
+_NO_MOTION, _NO_GAIN = 1e-6, 1e-6
+# Visited postures that are evaluated where no optimum is reached.
+_MOST_VISITED = 400
+
+
+@dataclass(frozen=True, eq=False)
+class PosturePath:
+    """A motion from the start to the optimum, or to the best posture that is reached.
+
+    Attributes:
+        found: Whether the path ends at the optimum.
+        reason: Why it does not, or what the timing leaves out; empty if there is nothing to say.
+        method: How the path was found: ``continuation``, ``self-motion curve`` or ``sampling``; empty without one.
+        timing: ``time-optimal`` or ``scaled``; empty without a motion.
+        objective: Objective at the end of the path.
+        t: Times, s, shape (n,); a single zero if the start is the end.
+        q: Postures on the constraints, shape (n, nq).
+        v: Velocities ``ν``, shape (n, nv).
+        a: Accelerations ``ν̇``, shape (n, nv).
+        length: Tangent length of the path, rad mixed with m.
+        max_violation: Largest violation of a constraint or joint limit at the postures.
+        limits: Largest shares of the limits and the active one.
+    """
+
+    found: bool
+    reason: str
+    method: str
+    timing: str
+    objective: float
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    length: float
+    max_violation: float
+    limits: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def duration(self) -> float:
+        """Duration, s."""
+        return float(self.t[-1])
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return {
+            "found": self.found,
+            "reason": self.reason,
+            "method": self.method,
+            "timing": self.timing,
+            "duration_s": self.duration,
+            "length": self.length,
+            "points": len(self.t),
+            "max_violation": self.max_violation,
+            "objective": self.objective,
+            "q": self.q[-1].tolist(),
+            "limits": self.limits,
+        }
+
+
+def posture_path(solution: PostureSolution, *, seed: int = 0, evaluations: int = EVALUATIONS) -> PosturePath:
+    """Find a path from ``solution.initial`` to ``solution.q`` along which all constraints hold, and time it.
+
+    If the optimum is not reached, the next certified optima are tried, best first, then the best posture on the way.
+
+    Args:
+        solution: A solved posture problem.
+        seed: Seed of the samples.
+        evaluations: Evaluations of the constraints that the sampling planner may take for each optimum.
+
+    Raises:
+        PostureError: The start violates the constraints.
+        InputError: A package is not installed.
+    """
+    space = PathSpace(solution.problem)
+    start = solution.initial
+    if not space.valid(start):
+        raise PostureError("violates the constraints", where="the start of the path", hint="start from another `posture`")
+    search = PathSearch(space, start, seed, evaluations)
+    postures, index = _reached(solution, search)
+    reasons = []
+    if index != 0:
+        reasons.append(_failure(solution, search, index))
+    method, curve = search.method, None
+    if len(postures) > 1:
+        short = shortened(space, postures, seed)
+        curve = fitted_curve(space, short) or fitted_curve(space, postures)
+        if curve is None:
+            reasons.append("no smooth curve through the path satisfies the constraints")
+            postures = postures[:1]
+    objective = float(solution.problem.objective.value(postures[-1]))
+    if curve is None:
+        still = np.zeros((1, space.model.nv))
+        found = index == 0 and len(reasons) == 0
+        return PosturePath(
+            found, "; ".join(reasons), "", "", objective, np.zeros(1), start[None], still, still, 0.0,
+            max(space.violation(start)),
+        )  # fmt: skip
+    requirements = solution.problem.requirements
+    limits = ActuatorLimits(solution.problem.robot, solution.problem.objective.supports, requirements.friction)
+    motion = timed(space, curve, limits)
+    q = np.array([space.projector.project(curve.at(z)).q for z in motion.z])
+    return PosturePath(
+        index == 0,
+        "; ".join([*reasons, *motion.notes]),
+        method,
+        motion.method,
+        objective,
+        motion.t,
+        q,
+        motion.v,
+        motion.a,
+        space.length(q),
+        max(max(space.violation(one)) for one in q),
+        limit_shares(space, motion, q, limits),
+    )
+
+
+def _reached(solution: PostureSolution, search: PathSearch) -> tuple[list[Array], int | None]:
+    """Return postures to the best optimum that is reached and its index, or to the best posture visited and ``None``."""
+    space, objective = search.space, solution.problem.objective
+    others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
+    for index, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):
+        end = space.pulled(space.unwound(search.start, q))
+        postures = None if end is None else search.to(end)
+        if postures is not None:
+            return (postures, index) if space.length(postures) > _NO_MOTION else (postures[:1], index)
+    every = search.visited[:: max(1, len(search.visited) // _MOST_VISITED)]
+    best = min(every, key=objective.value)
+    postures = search.to(best) if objective.value(best) < objective.value(search.start) * (1 - _NO_GAIN) else None
+    return postures or [search.start], None
+
+
+def _failure(solution: PostureSolution, search: PathSearch, index: int | None) -> str:
+    """Say why the optimum is not reached, and what is instead."""
+    if search.whole:
+        why = "the self-motion curve through the start, followed to its ends, does not meet the optimum"
+    else:
+        why = "no path to the optimum was found at this contact pose, which does not prove that there is none"
+    if index is None:
+        return f"{why}; the path ends at the best posture that was reached"
+    return f"{why}; the path ends at the best optimum that was reached, number {index + 1} of {len(solution.optima)}"
