@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.errors import PostureError
+from impact_posture.errors import InputError, PostureError
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import fitted_curve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.search import PathSearch, shortened
-from impact_posture.path.timing import limit_shares, timed
+from impact_posture.path.timing import LimitUse, limit_use, timed
 from impact_posture.posture.solve import PostureSolution
 
 # Optima that are tried, best first.
@@ -40,7 +41,8 @@ class PosturePath:
         a: Accelerations ``ν̇``, shape (n, nv).
         length: Tangent length of the path, rad mixed with m.
         max_violation: Largest violation of a constraint or joint limit at the postures.
-        limits: Largest shares of the limits and the active one.
+        use: Shares of the limits over time; ``None`` without a motion.
+        objectives: Objective at the times of ``use``, shape (m,).
     """
 
     found: bool
@@ -54,7 +56,8 @@ class PosturePath:
     a: Array
     length: float
     max_violation: float
-    limits: dict[str, object] = field(default_factory=dict)
+    use: LimitUse | None = None
+    objectives: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def duration(self) -> float:
@@ -74,8 +77,21 @@ class PosturePath:
             "max_violation": self.max_violation,
             "objective": self.objective,
             "q": self.q[-1].tolist(),
-            "limits": self.limits,
+            "limits": self.use.largest if self.use else {},
         }
+
+
+def check_packages() -> None:
+    """Check that the packages of the extra ``path`` are installed, before anything takes time.
+
+    Raises:
+        InputError: A package is not installed.
+    """
+    for package, name in (("ompl", "OMPL"), ("toppra", "toppra")):
+        if find_spec(package) is None:
+            raise InputError(
+                f"{name} is not installed", where="the extra 'path'", hint="pip install 'impact-posture[path]'"
+            )
 
 
 def posture_path(solution: PostureSolution, *, seed: int = 0, evaluations: int = EVALUATIONS) -> PosturePath:
@@ -90,8 +106,9 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, evaluations: int =
 
     Raises:
         PostureError: The start violates the constraints.
-        InputError: A package is not installed.
+        InputError: A package of the extra ``path`` is not installed.
     """
+    check_packages()
     space = PathSpace(solution.problem)
     start = solution.initial
     if not space.valid(start):
@@ -120,6 +137,8 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, evaluations: int =
     limits = ActuatorLimits(solution.problem.robot, solution.problem.objective.supports, requirements.friction)
     motion = timed(space, curve, limits)
     q = np.array([space.projector.project(curve.at(z)).q for z in motion.z])
+    use = limit_use(space, motion, q, limits)
+    at = np.searchsorted(motion.t, use.at)
     return PosturePath(
         index == 0,
         "; ".join([*reasons, *motion.notes]),
@@ -132,7 +151,8 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, evaluations: int =
         motion.a,
         space.length(q),
         max(max(space.violation(one)) for one in q),
-        limit_shares(space, motion, q, limits),
+        use,
+        np.array([solution.problem.objective.value(q[k]) for k in at]),
     )
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError
 from impact_posture.path.path_space import STEP, PathSpace
 from impact_posture.posture.problem import rank
 
@@ -31,18 +30,9 @@ def sampled_path(space: PathSpace, start: Array, target: Array, seed: int, evalu
         target: Last posture, shape (nq,), valid.
         seed: Seed of the samples.
         evaluations: Number of evaluations of the constraints after which the search ends.
-
-    Raises:
-        InputError: OMPL is not installed.
     """
-    try:
-        from ompl import base, geometric, util
-    except ImportError:
-        raise InputError(
-            "no walk reaches the optimum, and the sampling planner OMPL is not installed",
-            where="the extra 'path'",
-            hint="pip install 'impact-posture[path]'",
-        ) from None
+    from ompl import base, geometric, util
+
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(seed + 1)
     manifold = _Manifold(space, start)

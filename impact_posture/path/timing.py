@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 
 # Time between two points of a trajectory, s, and the least number of points.
 SAMPLE_TIME, _LEAST_POINTS = 0.01, 21
-# Grid points of the time-optimal parametrization, and instants at which a floating robot is checked.
-_GRID, INSTANTS = 400, 61
+# Grid points of the time-optimal parametrization: more, if a limit is exceeded between them by more than this share.
+_GRIDS, DISCRETIZATION = (200, 400, 800, 1600), 0.01
+# Instants at which a scaled motion is checked.
+INSTANTS = 61
 # Joint speed where the robot's data limit nothing, rad/s or m/s.
 _DEFAULT_SPEED = 1.0
 # From this share on, a limit is active.
@@ -54,20 +56,11 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
     """Return the fastest motion within velocities and torques (TOPP-RA, Pham and Pham 2018), ``None`` if none exists.
 
     For a fixed base with joints of one axis, whose torque limits are known.
-
-    Raises:
-        InputError: The package toppra is not installed.
     """
-    try:
-        from toppra import SplineInterpolator
-        from toppra.algorithm import TOPPRA
-        from toppra.constraint import DiscretizationType, JointTorqueConstraint, JointVelocityConstraint
-    except ImportError:
-        raise InputError(
-            "the package toppra, which finds the fastest motion along a path, is not installed",
-            where="the extra 'path'",
-            hint="pip install 'impact-posture[path]'",
-        ) from None
+    from toppra import SplineInterpolator
+    from toppra.algorithm import TOPPRA
+    from toppra.constraint import DiscretizationType, JointTorqueConstraint, JointVelocityConstraint
+
     speed, effort = velocity_limits(space), limits.effort
     # Joints without a limit get a bound that nothing reaches; the solver takes no infinities.
     bound = np.where(np.isfinite(speed), speed, 1e6)
@@ -82,12 +75,19 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
             discretization_scheme=DiscretizationType.Interpolation,
         ),
     ]  # fmt: skip
-    spline = SplineInterpolator(curve.s, curve.z)
-    found = TOPPRA(constraints, spline, gridpoints=np.linspace(0.0, 1.0, _GRID + 1)).compute_trajectory()
-    if found is None:
-        return None
-    t = _times(float(found.duration))
-    z, v, a = (np.asarray(found(t, order)) for order in range(3))
+    # By path length, because TOPP-RA loses digits where the speed along the path is far from 1.
+    size = space.length([curve.at(z) for z in curve.z])
+    spline = SplineInterpolator(size * curve.s, curve.z)
+    for grid in _GRIDS:
+        found = TOPPRA(constraints, spline, gridpoints=np.linspace(0.0, size, grid + 1)).compute_trajectory()
+        if found is None:
+            return None
+        t = _times(float(found.duration))
+        z, v, a = (np.asarray(found(t, order)) for order in range(3))
+        # The limits hold at grid points alone.
+        used = np.array([used_torque(*at) for at in zip(z, v, a, strict=True)])
+        if max(float(np.abs(used).max()), float((np.abs(v) / bound).max())) < 1 + DISCRETIZATION:
+            break
     return TimedCurve(t, z, v, a, "time-optimal")
 
 
@@ -100,19 +100,19 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     notes, tau = [], np.linspace(0.0, 1.0, INSTANTS)
     rates = [_rates(curve, float(x)) for x in tau]
     speed, known = velocity_limits(space), not limits.missing
-    least = [0.0]
     if known:
         zero = np.zeros(space.model.nv)
-        for q, v, a in rates:
-            rest = limits.load(q, zero, zero)
-            rate = limits.largest_rate(q, rest, limits.load(q, v, a) - rest)
-            least.append(np.inf if not rate else rate**-0.5)
-    if not np.isfinite(max(least)):
-        known, least = False, [0.0]
-        notes.append("torques, thrusts or friction cannot hold a posture of the path at rest: timed by velocities alone")
-    elif limits.missing:
-        notes.append(f"{limits.missing}: timed by velocities alone")
+        rests = [(q, limits.load(q, zero, zero)) for q, _, _ in rates]
+        found = [
+            limits.largest_rate(q, rest, limits.load(q, v, a) - rest)
+            for (q, v, a), (_, rest) in zip(rates, rests, strict=True)
+        ]
+        known = all(found)
+        least = [rate**-0.5 for rate in found if rate]
     if not known:
+        why = limits.missing or _cannot_hold(space, limits, rests)
+        notes.append(f"{why}: timed by velocities alone")
+        least = [0.0]
         speed = np.where(np.isfinite(speed), speed, _DEFAULT_SPEED)
         if not np.isfinite(velocity_limits(space)).all():
             notes.append(f"where no velocity limit is known, {_DEFAULT_SPEED:g} rad/s or m/s counts")
@@ -129,12 +129,21 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     )
 
 
-def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
-    """Return the motion along a curve: time-optimal for a fixed base with known torques, else scaled.
+def _cannot_hold(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple[Array, Array]]) -> str:
+    """Say why the robot cannot rest everywhere on a path, from its postures and their loads at rest."""
+    shares = [limits.shares(q, load) for q, load in loads]
+    held = [share for share in shares if share is not None]
+    if len(held) < len(shares):
+        return "rotors or friction cannot hold all postures of the path at rest"
+    torque = np.max([share.torque for share in held], axis=0)
+    if max(float(share.thrust.max(initial=0.0)) for share in held) > torque.max(initial=0.0):
+        return "the rotors cannot hold all postures of the path at rest"
+    name = space.problem.robot.tangent_names[-len(torque) + int(torque.argmax())]
+    return f"{name} would need {torque.max():.3g} times its torque limit at rest on the path"
 
-    Raises:
-        InputError: A package is not installed.
-    """
+
+def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
+    """Return the motion along a curve: time-optimal for a fixed base with known torques, else scaled."""
     axes = all(slot.kind.family in _ONE_AXIS for slot in space.projector.chart.slots)
     if not limits.missing and axes and not space.problem.robot.floating:
         fastest = time_optimal(space, curve, limits)
@@ -143,36 +152,55 @@ def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCu
     return scaled(space, curve, limits)
 
 
-def limit_shares(space: PathSpace, motion: TimedCurve, postures: Array, limits: ActuatorLimits) -> dict[str, object]:
-    """Return the largest shares of the limits along a motion, the joint or rotor of each, and the active limit."""
-    robot = space.problem.robot
-    speed = velocity_limits(space)
-    used = (np.abs(motion.v) / speed).max(axis=0)
-    found: dict[str, object] = {"velocity": float(used.max()), "velocity_of": robot.tangent_names[int(used.argmax())]}
-    torque, thrust = [], []
-    if not limits.missing:
-        # A linear program an instant is only needed for forces that are not determined.
-        every = range(len(motion.t)) if not robot.floating else _instants(len(motion.t))
-        for k in every:
-            shares = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
-            if shares is not None:
-                torque.append(shares.torque)
-                thrust.append(shares.thrust)
+@dataclass(frozen=True, eq=False)
+class LimitUse:
+    """The shares of the limits that a motion takes over time; 1 is at a limit.
+
+    Attributes:
+        at: Times, s, shape (m,).
+        velocity: Largest share of a velocity limit at each time, shape (m,).
+        torque: Largest share of a torque limit, NaN where not known, shape (m,).
+        thrust: Largest share of half of a thrust's range, from its middle, NaN where not known, shape (m,).
+        largest: Largest shares, whose they are, and the active limit, as in ``result.json``.
+    """
+
+    at: Array
+    velocity: Array
+    torque: Array
+    thrust: Array
+    largest: dict[str, object]
+
+
+def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: ActuatorLimits) -> LimitUse:
+    """Return the shares of the limits along a motion with its postures on the constraints, shape (n, nq).
+
+    Forces of feet and of more than six rotors are not determined: those count whose largest share is least.
+    """
+    robot, count = space.problem.robot, len(motion.t)
+    # A floating robot takes a linear program an instant.
+    every = sorted({round(k) for k in np.linspace(0, count - 1, INSTANTS)}) if robot.floating else range(count)
     joints = robot.tangent_names[6 if robot.floating else 0 :]
-    rotors = [r.name for r in robot.spec.propulsion.rotors] if robot.spec.propulsion else []
-    for name, values, names in (("torque", torque, joints), ("thrust", thrust, rotors)):
-        largest = np.max(values, axis=0) if values and len(values[0]) else None
-        found[name] = None if largest is None else float(largest.max())
-        found[f"{name}_of"] = None if largest is None else names[int(largest.argmax())]
-    sizes = {name: float(found[name] or 0.0) for name in ("velocity", "torque", "thrust")}  # type: ignore[arg-type]
+    rotors = [r.name for r in robot.spec.propulsion.rotors] if robot.floating and robot.spec.propulsion else []
+    torque, thrust = np.full((len(every), len(joints)), np.nan), np.full((len(every), len(rotors)), np.nan)
+    for row, k in enumerate(() if limits.missing else every):
+        shares = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
+        if shares is not None:
+            torque[row], thrust[row] = shares.torque, shares.thrust
+    velocity = np.abs(motion.v[list(every)]) / velocity_limits(space)
+    largest: dict[str, object] = {}
+    sizes: dict[str, float] = {}
+    for name, used, names in (
+        ("velocity", velocity, robot.tangent_names), ("torque", torque, joints), ("thrust", thrust, rotors)
+    ):  # fmt: skip
+        known = bool(np.isfinite(used).any())
+        place = int(np.nanargmax(used)) % used.shape[1] if known else 0
+        sizes[name] = float(np.nanmax(used)) if known else 0.0
+        largest |= {name: sizes[name] if known else None, f"{name}_of": names[place] if known else None}
     most = max(sizes, key=lambda name: sizes[name])
-    friction = bool(space.problem.objective.supports) and not limits.missing and not motion.notes
-    found["active"] = most if sizes[most] > _ACTIVE else "friction" if friction else None
-    return found
-
-
-def _instants(count: int) -> list[int]:
-    return sorted({round(k) for k in np.linspace(0, count - 1, INSTANTS)})
+    standing = bool(space.problem.objective.supports) and not motion.notes
+    largest["active"] = most if sizes[most] > _ACTIVE else "friction" if standing else None
+    peaks = [used.max(axis=1, initial=-np.inf) for used in (velocity, torque, thrust)]
+    return LimitUse(motion.t[list(every)], *(np.where(np.isfinite(peak), peak, np.nan) for peak in peaks), largest)
 
 
 def _times(duration: float) -> Array:

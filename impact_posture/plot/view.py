@@ -24,6 +24,7 @@ from impact_posture.settings import Against
 
 # Imported for its name alone, because the figures need no solver.
 if TYPE_CHECKING:
+    from impact_posture.path.posture_path import PosturePath
     from impact_posture.posture.null_space_path import NullSpacePath
 
 # Separator of the facts in a header line.
@@ -73,6 +74,7 @@ class ResultView:
         restitution: Coefficient of restitution e, in [0, 1].
         path: Quantities along the null-space path between them, if known.
         tradeoff: The trade-off of objective against distance, if it was computed.
+        motion: The path to the optimum over time, if it was searched.
         title: First line of every figure; robot and contact frame if empty.
     """
 
@@ -84,6 +86,7 @@ class ResultView:
     restitution: float = 0.0
     path: NullSpacePath | None = None
     tradeoff: TradeOffData | None = None
+    motion: PosturePath | None = None
     title: str = ""
 
     @cached_property
