@@ -51,8 +51,8 @@ from impact_posture.tables import validate
 
 # The C export and the pictures are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
-    from impact_posture.path.posture_path import PosturePath
     from impact_posture.codegen.export import Export
+    from impact_posture.path.posture_path import PosturePath
 
 
 class ImpactObjective(core.ImpactObjective):

@@ -81,14 +81,14 @@ class ActuatorLimits:
         return None if found is None else float("inf") if found[0] > _MOST * (1 - 1e-9) else float(found[0])
 
     def shares(self, q: Array, load: Array) -> Shares | None:
-        """Return the shares of the limits at a load, where the largest is least; ``None`` if the cones do not allow it."""
+        """Return the shares of the limits at a load, where the largest is least; ``None`` if the cones forbid it."""
         if not self._base:
             return Shares(np.abs(load) / self.effort, np.zeros(0))
         found = self._program(q, load, load, largest=False)
         return None if found is None else found[1]
 
     def _program(self, q: Array, rest: Array, dynamic: Array, *, largest: bool) -> tuple[float, Shares] | None:
-        """Maximize λ with all limits, or minimize the share of the limits; the variables are ``[thrusts, f, λ or σ]``."""
+        """Maximize λ within all limits, or minimize the share of the limits σ, over ``[thrusts, f, λ or σ]``."""
         from scipy.optimize import linprog
 
         base, rotors, limited = self._base, self._allocation.shape[1], np.isfinite(self.effort)

@@ -17,6 +17,9 @@ from impact_posture.path.posture_path import PosturePath
 from impact_posture.path.timing import LimitUse
 from impact_posture.robot.robot import Robot
 
+_SHARES = ("at", "velocity", "torque", "thrust")
+# Fields of a path that result.json has.
+_BLOCK = ("found", "reason", "method", "timing", "objective", "length", "max_violation")
 _BASE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -33,7 +36,7 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
         head = [f"{kind}:{name}" for kind, each in (("q", names), ("v", columns), ("a", columns)) for name in each]
         writer.writerow(["t", *head])
         writer.writerows(np.column_stack([path.t, angles, path.v, path.a]).tolist())
-    use = {} if path.use is None else {name: getattr(path.use, name) for name in ("at", "velocity", "torque", "thrust")}
+    use = {} if path.use is None else {name: getattr(path.use, name) for name in _SHARES}
     np.savez_compressed(
         folder / "path.npz", t=path.t, q=path.q, v=path.v, a=path.a, objective=path.objectives,
         **{f"share_{name}": values for name, values in use.items()},
@@ -46,11 +49,11 @@ def read_path(folder: Path, block: Mapping[str, Any]) -> PosturePath:
     with np.load(folder / "path.npz") as arrays:
         shares = {key.removeprefix("share_"): arrays[key] for key in arrays.files if key.startswith("share_")}
         return PosturePath(
-            **{key: block[key] for key in ("found", "reason", "method", "timing", "objective", "length", "max_violation")},
+            **{key: block[key] for key in _BLOCK},
             **{key: arrays[key] for key in ("t", "q", "v", "a")},
             use=LimitUse(**shares, largest=block["limits"]) if shares else None,
             objectives=arrays["objective"],
-        )  # fmt: skip
+        )
 
 
 def positions(robot: Robot, q: Array) -> tuple[list[str], Array]:
@@ -88,4 +91,5 @@ def _trajectory(robot: Robot, path: PosturePath, angles: Array) -> str:
     lines = ["# trajectory_msgs/JointTrajectory"]
     if robot.floating:
         lines.append("# The base floats: its pose over time is in path.csv (q:base ...).")
-    return "\n".join(lines) + "\n" + str(yaml.safe_dump(message, sort_keys=False, default_flow_style=None, width=10**6))
+    lines.append(yaml.safe_dump(message, sort_keys=False, default_flow_style=None, width=10**6))
+    return "\n".join(lines)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -78,7 +79,7 @@ class PathSpace:
         return max(1, int(np.ceil(max(moved, float(np.linalg.norm(step)) / STEP))))
 
     def clear(self, one: Array, other: Array) -> bool:
-        """Return whether the motion from ``one`` to ``other`` along the constraints is valid; the ends are not checked.
+        """Return whether the motion from ``one`` to ``other`` along the constraints is valid between its ends.
 
         Each posture between is the next part of the straight motion to ``other``, pulled onto the constraints.
         """
@@ -90,9 +91,9 @@ class PathSpace:
             q = moved
         return True
 
-    def clear_path(self, postures: Sequence[Array]) -> bool:
+    def clear_path(self, postures: Iterable[Array]) -> bool:
         """Return whether all motions between consecutive postures are valid."""
-        return all(self.clear(a, b) for a, b in zip(postures, postures[1:], strict=False))
+        return all(self.clear(a, b) for a, b in pairwise(postures))
 
     def take(self, q: Array, step: Array) -> Array | None:
         """Take a tangent step along the constraints; ``None`` if it is blocked or jumps to another branch."""
@@ -121,7 +122,7 @@ class PathSpace:
             path.append(moved)
 
     def unwound(self, start: Array, target: Array) -> Array:
-        """Return ``target`` with revolute joints turned by full turns to be nearest to ``start``, within their limits."""
+        """Return ``target`` after full turns of revolute joints, within their limits, that bring it nearest to ``start``."""
         target = target.copy()
         for slot in self.projector.chart.slots:
             if slot.kind.family == "revolute":
@@ -131,9 +132,9 @@ class PathSpace:
                     target[slot.q] = nearer
         return target
 
-    def length(self, postures: Sequence[Array]) -> float:
+    def length(self, postures: Iterable[Array]) -> float:
         """Return the tangent length of a path, rad mixed with m."""
-        return sum(self.distance(a, b) for a, b in zip(postures, postures[1:], strict=False))
+        return sum(self.distance(a, b) for a, b in pairwise(postures))
 
 
 def lever_arms(chart: Chart, model: pin.Model) -> Array:

@@ -112,7 +112,7 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, evaluations: int =
     space = PathSpace(solution.problem)
     start = solution.initial
     if not space.valid(start):
-        raise PostureError("violates the constraints", where="the start of the path", hint="start from another `posture`")
+        raise PostureError("violates the constraints", where="path", hint="start from another `posture`")
     search = PathSearch(space, start, seed, evaluations)
     postures, index = _reached(solution, search)
     reasons = []
@@ -157,7 +157,7 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, evaluations: int =
 
 
 def _reached(solution: PostureSolution, search: PathSearch) -> tuple[list[Array], int | None]:
-    """Return postures to the best optimum that is reached and its index, or to the best posture visited and ``None``."""
+    """Return postures to the best optimum that is reached and its index, else to the best posture visited."""
     space, objective = search.space, solution.problem.objective
     others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
     for index, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):

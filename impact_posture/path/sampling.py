@@ -94,7 +94,7 @@ class _Manifold:
         return np.asarray(pin.integrate(self._space.model, self._start, self._step(z)))
 
     def coordinates(self, q: Array) -> Array:
-        return self._space.difference(self._start, q)[self._space.free]
+        return np.asarray(self._space.difference(self._start, q)[self._space.free])
 
     def equalities(self, z: Array) -> tuple[Array, Array]:
         """Return the independent equalities and their Jacobian by ``z``; OMPL asks for both, one after the other."""

@@ -74,7 +74,7 @@ class PathSearch:
     def _redundancy(self) -> int:
         """The degrees of freedom that the equalities leave at the start."""
         space = self.space
-        return space.model.nv - rank(equality_jacobian(space.problem, space.projector.numeric.at(self.start)))
+        return int(space.model.nv) - rank(equality_jacobian(space.problem, space.projector.numeric.at(self.start)))
 
     def _along_curve(self, target: Array) -> list[Array] | None:
         if self._curves is None:
@@ -113,7 +113,7 @@ def shortened(space: PathSpace, postures: Sequence[Array], seed: int = 0) -> lis
 
     A shortcut is a walk between two postures of the path that is shorter than the path between them.  The elastic
     band moves each posture to the middle of its neighbors and pulls it onto the constraints, on finer and finer
-    bands.  The last band is kept only if its whole motion is valid.  A path that is almost straight is returned as is.
+    bands.  The last band is kept only if its whole motion is valid.  A path that is almost straight stays as it is.
     """
     path, rng = list(postures), np.random.default_rng(seed)
     straight = space.distance(path[0], path[-1])

@@ -200,7 +200,8 @@ def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: Act
     standing = bool(space.problem.objective.supports) and not motion.notes
     largest["active"] = most if sizes[most] > _ACTIVE else "friction" if standing else None
     peaks = [used.max(axis=1, initial=-np.inf) for used in (velocity, torque, thrust)]
-    return LimitUse(motion.t[list(every)], *(np.where(np.isfinite(peak), peak, np.nan) for peak in peaks), largest)
+    at_most, torques, thrusts = (np.where(np.isfinite(peak), peak, np.nan) for peak in peaks)
+    return LimitUse(motion.t[list(every)], at_most, torques, thrusts, largest)
 
 
 def _times(duration: float) -> Array:

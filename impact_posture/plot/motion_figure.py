@@ -14,13 +14,15 @@ from impact_posture.plot.view import ResultView, header_lines, objective_unit
 
 # Joints that move most get a curve in color and a name; the others are gray.
 _NAMED = 8
+# A joint that moves less is not drawn, rad or m.
+_MOVES = 1e-4
 _SHARES: dict[str, dict[str, Any]] = {
     "velocity": {"color": BLUE, "linestyle": "-"},
     "torque": {"color": VERMILLION, "linestyle": (0, (5, 2))},
     "thrust": {"color": GREEN, "linestyle": (0, (1, 1))},
 }
 _SCALED = (
-    "One time scale for the whole motion, so that the fastest instant just meets a limit. Torques, thrusts and forces "
+    "One time scale for the whole motion: its fastest instant just meets a limit. Torques, thrusts and forces "
     "on the feet that are not determined are those whose largest share is least."
 )
 _OPTIMAL = "Time-optimal: at each instant a limit is met, up to 1 % between grid points."
@@ -35,13 +37,15 @@ def motion_figure(view: ResultView) -> Figure:
     motion = view.motion
     if motion is None or motion.use is None:
         raise InputError("there is no motion to draw", where="figure path", hint="run optimize again with `path`")
-    notes = [_SCALED if motion.timing == "scaled" else _OPTIMAL, *([f"Note: {motion.reason}."] if motion.reason else [])]
+    notes = [_SCALED if motion.timing == "scaled" else _OPTIMAL]
+    notes += [f"Note: {motion.reason}."] if motion.reason else []
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
         joints, objective, shares = body.subplots(3, 1, sharex=True, height_ratios=[1.4, 1, 1])
         # The integral of the velocities, which has no jump where an angle wraps.
         steps = np.diff(motion.t)[:, None] * (motion.v[1:] + motion.v[:-1]) / 2
         moved = np.vstack([np.zeros_like(motion.v[:1]), np.cumsum(steps, axis=0)])
-        most = np.argsort(-np.ptp(moved, axis=0), kind="stable")
+        span = np.ptp(moved, axis=0)
+        most = [k for k in np.argsort(-span, kind="stable") if span[k] > _MOVES]
         for rank, k in enumerate(most):
             look: dict[str, Any] = {"color": GRAY, "linewidth": 0.6}
             if rank < _NAMED:
