@@ -41,21 +41,26 @@ class PathSpace:
         self._inequalities = any(not c.equality for c in problem.constraints)
         self._reach = lever_arms(self.projector.chart, self.model)
 
-    def violation(self, q: Array) -> tuple[float, float]:
-        """Return the largest violation of an equality, and of an inequality or joint limit, at ``q``, shape (nq,)."""
+    def violations(self, q: Array) -> list[tuple[str, float, float]]:
+        """Return name, violation and tolerance of each constraint and of the joint limits at ``q``, shape (nq,)."""
         found = self.problem.violations(self.projector.numeric.at(q))
-        worst = [0.0, 0.0]
-        for constraint, rows in zip(self.problem.constraints, found, strict=True):
-            kind = 0 if constraint.equality else 1
-            worst[kind] = max(worst[kind], float(np.abs(rows).max(initial=0.0)))
         x = self.projector.chart.to_x(q)
         outside = np.abs(x - np.clip(x, self.problem.lower, self.problem.upper)).max(initial=0.0)
-        return worst[0], max(worst[1], float(outside))
+        return [
+            *(
+                (c.name, float(np.abs(rows).max(initial=0.0)), EQUALITY if c.equality else INEQUALITY)
+                for c, rows in zip(self.problem.constraints, found, strict=True)
+            ),
+            ("joint limits", float(outside), INEQUALITY),
+        ]
 
     def valid(self, q: Array) -> bool:
         """Return whether ``q``, shape (nq,), satisfies all constraints."""
-        equality, inequality = self.violation(q)
-        return equality <= EQUALITY and inequality <= INEQUALITY
+        return all(size <= tolerance for _, size, tolerance in self.violations(q))
+
+    def worst(self, q: Array) -> float:
+        """Return the largest violation at ``q``, shape (nq,)."""
+        return max(size for _, size, _ in self.violations(q))
 
     def difference(self, one: Array, other: Array) -> Array:
         """Return ``other ⊖ one``, shape (nv,)."""
@@ -122,7 +127,7 @@ class PathSpace:
             path.append(moved)
 
     def unwound(self, start: Array, target: Array) -> Array:
-        """Return ``target`` after full turns of revolute joints, within their limits, that bring it nearest to ``start``."""
+        """Return ``target`` with revolute joints turned by full turns, within their limits, to be near ``start``."""
         target = target.copy()
         for slot in self.projector.chart.slots:
             if slot.kind.family == "revolute":

@@ -8,7 +8,8 @@ from importlib.util import find_spec
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError, PostureError
+from impact_posture.errors import InputError
+from impact_posture.impact.objective import Objective
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import fitted_curve
 from impact_posture.path.path_space import PathSpace
@@ -105,55 +106,50 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, evaluations: int =
         evaluations: Evaluations of the constraints that the sampling planner may take for each optimum.
 
     Raises:
-        PostureError: The start violates the constraints.
         InputError: A package of the extra ``path`` is not installed.
     """
     check_packages()
-    space = PathSpace(solution.problem)
-    start = solution.initial
-    if not space.valid(start):
-        raise PostureError("violates the constraints", where="path", hint="start from another `posture`")
+    space, start, objective = PathSpace(solution.problem), solution.initial, solution.problem.objective
+    violated = [name for name, size, tolerance in space.violations(start) if size > tolerance]
+    if violated:
+        return _still(space, objective, start, f"the start violates: {', '.join(violated)}")
     search = PathSearch(space, start, seed, evaluations)
     postures, index = _reached(solution, search)
-    reasons = []
-    if index != 0:
-        reasons.append(_failure(solution, search, index))
-    method, curve = search.method, None
-    if len(postures) > 1:
-        short = shortened(space, postures, seed)
-        curve = fitted_curve(space, short) or fitted_curve(space, postures)
-        if curve is None:
-            reasons.append("no smooth curve through the path satisfies the constraints")
-            postures = postures[:1]
-    objective = float(solution.problem.objective.value(postures[-1]))
+    failure = "" if index == 0 else _failure(solution, search, index)
+    if len(postures) == 1:
+        return _still(space, objective, start, failure)
+    method = search.method
+    curve = fitted_curve(space, shortened(space, postures, seed)) or fitted_curve(space, postures)
     if curve is None:
-        still = np.zeros((1, space.model.nv))
-        found = index == 0 and len(reasons) == 0
-        return PosturePath(
-            found, "; ".join(reasons), "", "", objective, np.zeros(1), start[None], still, still, 0.0,
-            max(space.violation(start)),
-        )  # fmt: skip
+        return _still(space, objective, start, "no smooth curve through the path satisfies the constraints")
     requirements = solution.problem.requirements
-    limits = ActuatorLimits(solution.problem.robot, solution.problem.objective.supports, requirements.friction)
+    limits = ActuatorLimits(solution.problem.robot, objective.supports, requirements.friction)
     motion = timed(space, curve, limits)
     q = np.array([space.projector.project(curve.at(z)).q for z in motion.z])
     use = limit_use(space, motion, q, limits)
     at = np.searchsorted(motion.t, use.at)
     return PosturePath(
         index == 0,
-        "; ".join([*reasons, *motion.notes]),
+        "; ".join(filter(None, [failure, *motion.notes])),
         method,
         motion.method,
-        objective,
+        float(objective.value(q[-1])),
         motion.t,
         q,
         motion.v,
         motion.a,
-        space.length(q),
-        max(max(space.violation(one)) for one in q),
+        space.length(list(q)),
+        max(map(space.worst, q)),
         use,
-        np.array([solution.problem.objective.value(q[k]) for k in at]),
+        np.array([objective.value(q[k]) for k in at]),
     )
+
+
+def _still(space: PathSpace, objective: Objective, q: Array, reason: str) -> PosturePath:
+    """Return the path of a robot that stays at its start; it is the optimum if there is no reason why not."""
+    rest = np.zeros((1, space.model.nv))
+    value = float(objective.value(q))
+    return PosturePath(not reason, reason, "", "", value, np.zeros(1), q[None], rest, rest, 0.0, space.worst(q))
 
 
 def _reached(solution: PostureSolution, search: PathSearch) -> tuple[list[Array], int | None]:
