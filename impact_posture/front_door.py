@@ -328,7 +328,7 @@ class PostureResult:
             seed: Seed of the sampling planner.
 
         Raises:
-            InputError: A package of the extra ``path`` is needed and not installed.
+            InputError: The package of the extra ``path`` is not installed.
         """
         from impact_posture.path.posture_path import posture_path
 

@@ -54,9 +54,9 @@ def optimize(
         from impact_posture.result_folder import FORMATS, default_out
 
         if settings.path:
-            from impact_posture.path.posture_path import check_packages
+            from impact_posture.path.posture_path import check_package
 
-            check_packages()
+            check_package()
         page = Page(quiet=quiet or json)
         prepared = prepare(settings)
         folder = Path(out) if out else default_out(prepared)

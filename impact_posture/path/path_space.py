@@ -86,19 +86,23 @@ class PathSpace:
     def clear(self, one: Array, other: Array) -> bool:
         """Return whether the motion from ``one`` to ``other`` along the constraints is valid between its ends.
 
-        Each posture between is the next part of the straight motion to ``other``, pulled onto the constraints.
+        The postures between are those of the straight motion, pulled onto the constraints.  A part that becomes much
+        longer than planned has met something.
         """
-        parts, q = self.checks(self.difference(one, other)), one
-        for left in range(parts, 1, -1):
-            moved = self.pulled(q, self.difference(q, other) / left)
-            if moved is None:
+        whole, q = self.difference(one, other), one
+        parts = self.checks(whole)
+        longest = _JUMP * float(np.linalg.norm(whole)) / parts
+        for k in range(1, parts + 1):
+            moved = self.pulled(one, whole * (k / parts)) if k < parts else other
+            if moved is None or self.distance(q, moved) > longest:
                 return False
             q = moved
         return True
 
     def clear_path(self, postures: Iterable[Array]) -> bool:
-        """Return whether all motions between consecutive postures are valid."""
-        return all(self.clear(a, b) for a, b in pairwise(postures))
+        """Return whether all postures and all motions between consecutive ones are valid."""
+        path = list(postures)
+        return all(map(self.valid, path)) and all(self.clear(a, b) for a, b in pairwise(path))
 
     def take(self, q: Array, step: Array) -> Array | None:
         """Take a tangent step along the constraints; ``None`` if it is blocked or jumps to another branch."""

@@ -13,13 +13,12 @@ from impact_posture.impact.objective import Objective
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import fitted_curve
 from impact_posture.path.path_space import PathSpace
-from impact_posture.path.search import PathSearch, shortened
+from impact_posture.path.search import SAMPLES, PathSearch, shortened
 from impact_posture.path.timing import LimitUse, limit_use, timed
 from impact_posture.posture.solve import PostureSolution
 
 # Optima that are tried, best first.
 _OPTIMA = 5
-EVALUATIONS = 20_000
 # A path shorter than this (tangent length) is no motion, and a smaller relative gain is none.
 _NO_MOTION, _NO_GAIN = 1e-6, 1e-6
 # Visited postures that are evaluated where no optimum is reached.
@@ -82,20 +81,21 @@ class PosturePath:
         }
 
 
-def check_packages() -> None:
-    """Check that the packages of the extra ``path`` are installed, before anything takes time.
+def check_package() -> None:
+    """Check that the package of the extra ``path`` is installed, before anything takes time.
 
     Raises:
-        InputError: A package is not installed.
+        InputError: It is not.
     """
-    for package, name in (("ompl", "OMPL"), ("toppra", "toppra")):
-        if find_spec(package) is None:
-            raise InputError(
-                f"{name} is not installed", where="the extra 'path'", hint="pip install 'impact-posture[path]'"
-            )
+    if find_spec("toppra") is None:
+        raise InputError(
+            "toppra, which times a motion, is not installed",
+            where="the extra 'path'",
+            hint="pip install 'impact-posture[path]'",
+        )
 
 
-def posture_path(solution: PostureSolution, *, seed: int = 0, evaluations: int = EVALUATIONS) -> PosturePath:
+def posture_path(solution: PostureSolution, *, seed: int = 0, samples: int = SAMPLES) -> PosturePath:
     """Find a path from ``solution.initial`` to ``solution.q`` along which all constraints hold, and time it.
 
     If the optimum is not reached, the next certified optima are tried, best first, then the best posture on the way.
@@ -103,17 +103,17 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, evaluations: int =
     Args:
         solution: A solved posture problem.
         seed: Seed of the samples.
-        evaluations: Evaluations of the constraints that the sampling planner may take for each optimum.
+        samples: Postures that the sampling planner may take for each optimum.
 
     Raises:
-        InputError: A package of the extra ``path`` is not installed.
+        InputError: The package of the extra ``path`` is not installed.
     """
-    check_packages()
+    check_package()
     space, start, objective = PathSpace(solution.problem), solution.initial, solution.problem.objective
     violated = [name for name, size, tolerance in space.violations(start) if size > tolerance]
     if violated:
         return _still(space, objective, start, f"the start violates: {', '.join(violated)}")
-    search = PathSearch(space, start, seed, evaluations)
+    search = PathSearch(space, start, seed, samples)
     postures, index = _reached(solution, search)
     failure = "" if index == 0 else _failure(solution, search, index)
     if len(postures) == 1:
@@ -153,18 +153,23 @@ def _still(space: PathSpace, objective: Objective, q: Array, reason: str) -> Pos
 
 
 def _reached(solution: PostureSolution, search: PathSearch) -> tuple[list[Array], int | None]:
-    """Return postures to the best optimum that is reached and its index, else to the best posture visited."""
+    """Return postures to the optimum and 0, or to the best that is reached and its index; ``None`` for no optimum."""
     space, objective = search.space, solution.problem.objective
     others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
-    for index, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):
+    postures, index, best = [search.start], None, objective.value(search.start) * (1 - _NO_GAIN)
+    for k, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):
         end = space.pulled(space.unwound(search.start, q))
-        postures = None if end is None else search.to(end)
-        if postures is not None:
-            return (postures, index) if space.length(postures) > _NO_MOTION else (postures[:1], index)
+        reached = search.to(end) if end is not None and (k == 0 or objective.value(end) < best) else None
+        if reached is not None:
+            postures, index = reached if space.length(reached) > _NO_MOTION else [search.start], k
+            best = objective.value(postures[-1]) * (1 - _NO_GAIN)
+            break
+    if index == 0:
+        return postures, index
     every = search.visited[:: max(1, len(search.visited) // _MOST_VISITED)]
-    best = min(every, key=objective.value)
-    postures = search.to(best) if objective.value(best) < objective.value(search.start) * (1 - _NO_GAIN) else None
-    return postures or [search.start], None
+    lowest = min(every, key=objective.value)
+    better = search.to(lowest) if objective.value(lowest) < best else None
+    return (postures, index) if better is None else (better, None)
 
 
 def _failure(solution: PostureSolution, search: PathSearch, index: int | None) -> str:

@@ -12,6 +12,8 @@ from impact_posture.path.path_space import STEP, PathSpace
 from impact_posture.path.sampling import sampled_path
 from impact_posture.posture.problem import equality_jacobian, null_space, rank
 
+# Postures that the sampling planner may take for a target.
+SAMPLES = 2000
 # The end of a self-motion curve is found within this tangent length.
 _CURVE_END = 1e-4
 # Steps on a self-motion curve: 500 rad at the usual step, more than any curve within joint limits.
@@ -31,16 +33,16 @@ class PathSearch:
         space: The postures that the constraints allow.
         start: First posture of all paths, shape (nq,), valid.
         seed: Seed of the samples.
-        evaluations: Evaluations of the constraints that the sampling planner may take for a target.
+        samples: Postures that the sampling planner may take for a target.
 
     Attributes:
         visited: Postures that are reached from the start.
         method: How the last path was found: ``continuation``, ``self-motion curve`` or ``sampling``.
     """
 
-    def __init__(self, space: PathSpace, start: Array, seed: int = 0, evaluations: int = 20_000) -> None:
+    def __init__(self, space: PathSpace, start: Array, seed: int = 0, samples: int = SAMPLES) -> None:
         self.space, self.start = space, start
-        self._seed, self._evaluations = seed, evaluations
+        self._seed, self._samples = seed, samples
         self.visited: list[Array] = [start]
         self.method = ""
         self._curves: list[list[Array]] | None = None
@@ -69,7 +71,9 @@ class PathSearch:
             self.method = "self-motion curve"
             return self._along_curve(target)
         self.method = "sampling"
-        return sampled_path(space, self.start, target, self._seed, self._evaluations)
+        path, reached = sampled_path(space, self.start, target, self._seed, self._samples)
+        self.visited += reached
+        return path
 
     def _redundancy(self) -> int:
         """The degrees of freedom that the equalities leave at the start."""
