@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from importlib import util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,24 +19,12 @@ from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import solve
 from impact_posture.robot.robot import Robot
 from tests.arms import Z, arm
-from tests.command import run
+from tests.command import refused, run
 from tests.helpers import robot
 from tests.settings import make_settings
 
 FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
-BLOCK = {
-    "found",
-    "reason",
-    "method",
-    "timing",
-    "duration_s",
-    "length",
-    "points",
-    "max_violation",
-    "objective",
-    "q",
-    "limits",
-}
+BLOCK = set("found reason method timing duration_s length points max_violation objective q limits".split())
 LIMITS = {"velocity", "velocity_of", "torque", "torque_of", "thrust", "thrust_of", "active"}
 
 
@@ -124,9 +112,8 @@ def test_names_that_would_break_a_file_come_back(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     here = tmp_path_factory.mktemp("path")
-    done = run(
-        "optimize", "tilthex_arm", "--normal", 0, 0, 1, "--path", "--out", "with", *FAST, cwd=here, pictures=["path"]
-    )
+    command = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--path", "--out", "with", *FAST)
+    done = run(*command, cwd=here, pictures=["path"])
     assert done.returncode == 0, done.stderr
     assert "path to the optimum by continuation: " in " ".join(done.stdout.split())
     return here / "with"
@@ -140,10 +127,8 @@ def test_the_command_leaves_the_path_in_its_folder(folder: Path) -> None:
     assert block["max_violation"] < 1e-8 and block["limits"]["active"] == "thrust"
     arrays = np.load(folder / "path.npz")
     assert arrays["q"][0] == pytest.approx(np.array(document["initial"]["q"]))
-    assert (
-        np.abs(pin.difference(robot("tilthex_arm").model, arrays["q"][-1], np.array(document["optimal"]["q"]))).max()
-        < 1e-5
-    )
+    left = pin.difference(robot("tilthex_arm").model, arrays["q"][-1], np.array(document["optimal"]["q"]))
+    assert np.abs(left).max() < 1e-5
     assert {p.name for p in folder.iterdir()} > {"path.csv", "path.npz", "path.yaml", "path.png"}
     assert (folder / "path.png").stat().st_size > 30_000
     assert "path = true" in (folder / "problem.toml").read_text()
@@ -157,20 +142,16 @@ def test_solved_again_from_its_problem_the_path_is_the_same(folder: Path, tmp_pa
 
 
 def test_plot_draws_the_path_of_a_folder(folder: Path, tmp_path: Path) -> None:
-    done = run("plot", folder, "--only", "path", "--out", tmp_path / "again", cwd=tmp_path, pictures=["path"])
+    done = run("plot", folder, "--out", tmp_path / "again", cwd=tmp_path, pictures=["path"])
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "again" / "path.png").stat().st_size > 30_000
 
 
 def test_without_the_extra_the_command_says_so_before_it_solves(tmp_path: Path) -> None:
     def hide() -> None:
-        known = util.find_spec
-        util.find_spec = lambda name, package=None: None if name == "toppra" else known(name, package)
+        sys.modules["toppra"] = None  # type: ignore[assignment]
 
     command = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--path", *FAST)
     done = run(*command, cwd=tmp_path, prepare=hide)
-    assert done.returncode == 1 and not done.stdout and not list(tmp_path.iterdir())
-    assert done.stderr.strip().endswith(
-        "toppra, which times a motion, is not installed; pip install 'impact-posture[path]'"
-    )
-    assert len(done.stderr.strip().splitlines()) == 1
+    refused(done, 1, "the extra 'path': toppra", "not installed; pip install 'impact-posture[path]'")
+    assert not done.stdout and not list(tmp_path.iterdir())

@@ -109,7 +109,7 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
         known = all(found)
         least = [rate**-0.5 for rate in found if rate]
     if not known:
-        why = limits.missing or _cannot_hold(space, limits, rests)
+        why = limits.missing or _cannot_move(space, limits, rests)
         notes.append(f"{why}: timed by velocities alone")
         least = [0.0]
         speed = np.where(np.isfinite(speed), speed, _DEFAULT_SPEED)
@@ -128,15 +128,18 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     )
 
 
-def _cannot_hold(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple[Array, Array]]) -> str:
-    """Say why the robot cannot rest everywhere on a path, from its postures and their loads at rest."""
+def _cannot_move(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple[Array, Array]]) -> str:
+    """Say why the limits allow no speed on a path, from its postures and their loads at rest."""
     shares = [limits.shares(q, load) for q, load in loads]
     held = [share for share in shares if share is not None]
     if len(held) < len(shares):
         return "rotors or friction cannot hold all postures of the path at rest"
     torque = np.max([share.torque for share in held], axis=0)
-    if max(float(share.thrust.max(initial=0.0)) for share in held) > torque.max(initial=0.0):
-        return "the rotors cannot hold all postures of the path at rest"
+    thrust = max(float(share.thrust.max(initial=0.0)) for share in held)
+    if max(thrust, float(torque.max(initial=0.0))) <= 1:
+        return "rotors or friction cannot accelerate the robot along the path at any speed"
+    if thrust > torque.max(initial=0.0):
+        return f"a rotor would need {thrust:.3g} times its range at rest on the path"
     name = space.problem.robot.tangent_names[-len(torque) + int(torque.argmax())]
     return f"{name} would need {torque.max():.3g} times its torque limit at rest on the path"
 
