@@ -76,6 +76,9 @@ def test_csv_npz_and_yaml_agree(settings: dict[str, object], tmp_path: Path) -> 
     assert np.abs(np.diff(values[:, 1 : 1 + nx], axis=0)).max() < 0.2
 
     block = json.loads(json.dumps(path.to_dict(), allow_nan=False))
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "result-json.md").read_text(encoding="utf-8")
+    for key in (*(BLOCK - {"limits"}), *(f"limits.{key}" for key in LIMITS)):
+        assert f"`path.{key}`" in page, key
     assert set(block) == BLOCK and set(block["limits"]) == LIMITS
     again = read_path(tmp_path, block)
     assert again.to_dict() == path.to_dict()
