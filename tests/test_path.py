@@ -157,6 +157,32 @@ def test_no_frame_moves_more_than_the_check_distance_between_two_checks() -> Non
                 before = now
 
 
+def test_the_same_holds_for_postures_that_a_disc_deflects() -> None:
+    problem = planar(RODS, [0.4, 0.5, -0.9, 0.6])
+    end = PathSpace(problem).projector.project(problem.given + np.array([0.9, -1.2, 0.5, 0.3])).q
+    straight = PathSpace(problem).walk(problem.given, end)
+    blocked = with_disc(problem, "link_2", elbows(RODS, straight[len(straight) // 2])[2], 0.02)
+    checked: list[Array] = []
+
+    class Recorded(PathSpace):
+        def pulled(self, q: Array, step: Array | None = None) -> Array | None:
+            found = super().pulled(q, step)
+            checked.extend([] if found is None else [found])
+            return found
+
+    space = Recorded(blocked)
+    path = PathSearch(space, problem.given).to(end)
+    assert path is not None
+    count = 0
+    for a, b in pairwise(path):
+        checked.clear()
+        assert space.clear(a, b)
+        points = [elbows(RODS, q) for q in (a, *checked, b)]
+        assert max(np.linalg.norm(p - q, axis=1).max() for p, q in pairwise(points)) <= CHECK_DISTANCE
+        count += len(checked)
+    assert count > len(path)
+
+
 # A crank that turns fully (0.1 + 0.5 < 0.4 + 0.4), so the two ways to assemble the linkage are two components.
 CRANK = [0.1, 0.4, 0.4]
 

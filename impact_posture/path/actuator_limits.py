@@ -49,7 +49,8 @@ class ActuatorLimits:
         self._robot, self._supports, self._friction = robot, tuple(supports), friction
         self._model = robot.model.copy()
         self._numeric = Numeric(robot.model)
-        self._model.armature = self._numeric.model.armature
+        # The rotors move with their joints, whatever an impact meets of them.
+        self._model.armature = np.where(np.isfinite(robot.armature), robot.armature, 0.0)
         self._data = self._model.createData()
         self._base = 6 if robot.floating else 0
         effort = np.array(self._model.effortLimit)[self._base :]

@@ -71,13 +71,17 @@ class PathCurve:
 
         It is taken at so many places that no frame moves more than the check distance between two of them.
         """
-        worst, parts = 0.0, max(1, self._space.checks(np.abs(np.diff(self.z, axis=0)).max(axis=0)))
+        worst, before, parts = (
+            0.0,
+            self.at(self.z[0]),
+            max(1, self._space.checks(np.abs(np.diff(self.z, axis=0)).max(axis=0))),
+        )
         for s in np.linspace(0.0, 1.0, parts * (len(self.s) - 1) + 1):
             off = self.posture(float(s))
             q = self._space.pulled(off)
-            if q is None:
+            if q is None or self._space.size(self._space.difference(before, q)) > 1:
                 return float("inf")
-            worst = max(worst, self._space.distance(off, q))
+            worst, before = max(worst, self._space.distance(off, q)), q
         return worst
 
 

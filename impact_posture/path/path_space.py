@@ -10,13 +10,13 @@ import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
-from impact_posture.posture.problem import PostureProblem, held_rows
+from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import Projector
 
 # Largest violation of equalities and of inequalities at a valid posture (m, rad, or the unit of the constraint).
 EQUALITY, INEQUALITY = 1e-6, 1e-8
 # No frame of the robot moves farther between two postures that are checked, m.
-CHECK_DISTANCE = 5e-3
+CHECK_DISTANCE = 1e-2
 # Tangent length of a step along the constraints, rad mixed with m.
 STEP = 0.05
 # A step that comes nearer to its target by less than this share of its length counts as stuck.
@@ -37,7 +37,6 @@ class PathSpace:
     def __init__(self, problem: PostureProblem) -> None:
         self.problem, self.model = problem, problem.robot.model
         self.projector = Projector(problem)
-        self.free = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) == 0
         self._inequalities = any(not c.equality for c in problem.constraints)
         self._reach = lever_arms(self.projector.chart, self.model)
 
@@ -75,26 +74,30 @@ class PathSpace:
         found = self.projector.project(q if step is None else np.asarray(pin.integrate(self.model, q, step))).q
         return found if self.valid(found) else None
 
-    def checks(self, step: Array) -> int:
-        """Return the number of parts of a tangent step in which no frame moves more than the check distance.
+    def size(self, step: Array) -> float:
+        """Return the size of a tangent step; between two postures that are checked it is at most 1.
 
-        Without inequalities there is nothing to meet between two postures, and the parts are steps of a walk.
+        That is the check distance for the frame that moves farthest, and two steps of a walk for the tangent norm.
+        Without inequalities there is nothing to meet between two postures, and the norm alone counts.
         """
         moved = float(self._reach @ np.abs(step)) / CHECK_DISTANCE if self._inequalities else 0.0
-        return max(1, int(np.ceil(max(moved, float(np.linalg.norm(step)) / STEP))))
+        return max(moved, float(np.linalg.norm(step)) / (_JUMP * STEP))
+
+    def checks(self, step: Array) -> int:
+        """Return the number of parts in which a tangent step is checked; each may double on the constraints."""
+        return max(1, int(np.ceil(_JUMP * self.size(step) - 1e-9)))
 
     def clear(self, one: Array, other: Array) -> bool:
         """Return whether the motion from ``one`` to ``other`` along the constraints is valid between its ends.
 
-        The postures between are those of the straight motion, pulled onto the constraints.  A part that becomes much
-        longer than planned has met something.
+        The postures between are those of the straight motion, pulled onto the constraints.  A part whose size exceeds
+        1 has met something.
         """
         whole, q = self.difference(one, other), one
         parts = self.checks(whole)
-        longest = _JUMP * float(np.linalg.norm(whole)) / parts
         for k in range(1, parts + 1):
             moved = self.pulled(one, whole * (k / parts)) if k < parts else other
-            if moved is None or self.distance(q, moved) > longest:
+            if moved is None or self.size(self.difference(q, moved)) > 1:
                 return False
             q = moved
         return True

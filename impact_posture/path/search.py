@@ -45,12 +45,13 @@ class PathSearch:
         self._seed, self._samples = seed, samples
         self.visited: list[Array] = [start]
         self.method = ""
-        self._curves: list[list[Array]] | None = None
+        self._curves: list[list[Array]] = []
+        self._ended: list[bool] = []
 
     @property
     def whole(self) -> bool:
         """Whether all postures that can be reached were followed."""
-        return self._curves is not None
+        return bool(self._ended) and all(self._ended)
 
     def to(self, target: Array) -> list[Array] | None:
         """Return postures from the start to ``target``, shape (nq,), with valid motions between them, or ``None``."""
@@ -81,7 +82,7 @@ class PathSearch:
         return int(space.model.nv) - rank(equality_jacobian(space.problem, space.projector.numeric.at(self.start)))
 
     def _along_curve(self, target: Array) -> list[Array] | None:
-        if self._curves is None:
+        if not self._curves:
             self._curves = [self._curve(1.0), self._curve(-1.0)]
             self.visited += [q for curve in self._curves for q in curve]
         for curve in self._curves:
@@ -92,14 +93,18 @@ class PathSearch:
         return None
 
     def _curve(self, sign: float) -> list[Array]:
-        """Follow the self-motion curve from the start in one direction, to its end or back to the start."""
+        """Follow the self-motion curve from the start in one direction, to its end or back to the start.
+
+        A singular posture, at which the curve may branch, is no end.
+        """
         space, curve, size = self.space, [self.start], STEP
         direction: Array | None = None
+        self._ended.append(False)
         while len(curve) < _CURVE_STEPS and size > _CURVE_END:
             q = curve[-1]
             tangents = null_space(equality_jacobian(space.problem, space.projector.numeric.at(q)))
             if tangents.shape[1] != 1:
-                break
+                return curve
             tangent = tangents[:, 0] * (sign if direction is None else np.sign(tangents[:, 0] @ direction) or 1.0)
             moved = space.take(q, tangent * size)
             if moved is None or space.difference(q, moved) @ tangent < size / 2:
@@ -109,6 +114,7 @@ class PathSearch:
             curve.append(moved)
             if len(curve) > 3 and space.distance(moved, self.start) < STEP and size == STEP:
                 break
+        self._ended[-1] = len(curve) < _CURVE_STEPS
         return curve
 
 
