@@ -13,7 +13,7 @@ from impact_posture.impact.objective import Objective
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import fitted_curve
 from impact_posture.path.path_space import PathSpace
-from impact_posture.path.search import SAMPLES, PathSearch, shortened
+from impact_posture.path.search import SAMPLES, Connection, connect, shortened
 from impact_posture.path.timing import LimitUse, limit_use, timed
 from impact_posture.posture.solve import PostureSolution
 
@@ -32,7 +32,7 @@ class PosturePath:
     Attributes:
         found: Whether the path ends at the optimum.
         reason: Why it does not, or what the timing leaves out; empty if there is nothing to say.
-        method: How the path was found: ``continuation``, ``self-motion curve`` or ``sampling``; empty without one.
+        method: How the path was found: ``continuation`` or ``sampling``; empty without a motion.
         timing: ``time-optimal`` or ``scaled``; empty without a motion.
         objective: Objective at the end of the path.
         t: Times, s, shape (n,); a single zero if the start is the end.
@@ -103,7 +103,7 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, samples: int = SAM
     Args:
         solution: A solved posture problem.
         seed: Seed of the samples.
-        samples: Postures that the sampling planner may take for each optimum.
+        samples: Postures and attempts that the search may take for each optimum.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed.
@@ -113,12 +113,10 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, samples: int = SAM
     violated = [name for name, size, tolerance in space.violations(start) if size > tolerance]
     if violated:
         return _still(space, objective, start, f"the start violates: {', '.join(violated)}")
-    search = PathSearch(space, start, seed, samples)
-    postures, index = _reached(solution, search)
-    failure = "" if index == 0 else _failure(solution, search, index)
+    found, failure = _reached(solution, space, seed, samples)
+    postures = found.path or [start]
     if len(postures) == 1:
         return _still(space, objective, start, failure)
-    method = search.method
     curve = fitted_curve(space, shortened(space, postures, seed)) or fitted_curve(space, postures)
     if curve is None:
         return _still(space, objective, start, "no smooth curve through the path satisfies the constraints")
@@ -129,9 +127,9 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, samples: int = SAM
     use = limit_use(space, motion, q, limits)
     at = np.searchsorted(motion.t, use.at)
     return PosturePath(
-        index == 0,
+        not failure,
         "; ".join(filter(None, [failure, *motion.notes])),
-        method,
+        found.method,
         motion.method,
         float(objective.value(q[-1])),
         motion.t,
@@ -152,32 +150,28 @@ def _still(space: PathSpace, objective: Objective, q: Array, reason: str) -> Pos
     return PosturePath(not reason, reason, "", "", value, np.zeros(1), q[None], rest, rest, 0.0, space.worst(q))
 
 
-def _reached(solution: PostureSolution, search: PathSearch) -> tuple[list[Array], int | None]:
-    """Return postures to the optimum and 0, or to the best that is reached and its index; ``None`` for no optimum."""
-    space, objective = search.space, solution.problem.objective
+def _reached(solution: PostureSolution, space: PathSpace, seed: int, samples: int) -> tuple[Connection, str]:
+    """Return the path to the optimum, or to the best posture that is reached and why it ends there."""
+    start, objective = solution.initial, solution.problem.objective
     others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
-    postures, index, best = [search.start], None, objective.value(search.start) * (1 - _NO_GAIN)
+    stay = found = Connection([start], [start], "")
+    end, visited = "", [start]
     for k, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):
-        end = space.pulled(space.unwound(search.start, q))
-        reached = search.to(end) if end is not None and (k == 0 or objective.value(end) < best) else None
-        if reached is not None:
-            postures, index = reached if space.length(reached) > _NO_MOTION else [search.start], k
-            best = objective.value(postures[-1]) * (1 - _NO_GAIN)
+        target = space.pulled(space.unwound(start, q))
+        if target is None or (k and objective.value(target) >= objective.value(start)):
+            continue
+        found = connect(space, start, target, seed, samples)
+        visited += found.reached
+        if found.path is not None:
+            if k == 0:
+                return (found if space.length(found.path) > _NO_MOTION else stay), ""
+            end = f"optimum that was reached, number {k + 1} of {len(solution.optima)}"
             break
-    if index == 0:
-        return postures, index
-    every = search.visited[:: max(1, len(search.visited) // _MOST_VISITED)]
-    lowest = min(every, key=objective.value)
-    better = search.to(lowest) if objective.value(lowest) < best else None
-    return (postures, index) if better is None else (better, None)
-
-
-def _failure(solution: PostureSolution, search: PathSearch, index: int | None) -> str:
-    """Say why the optimum is not reached, and what is instead."""
-    if search.whole:
-        why = "the self-motion curve through the start, followed to its ends, does not meet the optimum"
-    else:
-        why = "no path to the optimum was found at this contact pose, which does not prove that there is none"
-    if index is None:
-        return f"{why}; the path ends at the best posture that was reached"
-    return f"{why}; the path ends at the best optimum that was reached, number {index + 1} of {len(solution.optima)}"
+    best = objective.value(found.path[-1] if found.path else start) * (1 - _NO_GAIN)
+    lowest = min(visited[:: max(1, len(visited) // _MOST_VISITED)], key=objective.value)
+    if objective.value(lowest) < best:
+        found, end = connect(space, start, lowest, seed, samples), "posture that was reached"
+    return (found if found.path else stay), (
+        "no path to the optimum was found at this contact pose, which does not prove that there is none"
+        + (f"; the path ends at the best {end}" if found.path else "; nothing better than the start was reached")
+    )

@@ -1,23 +1,19 @@
-"""The search for a path on the constraints: walks, the whole self-motion curve, samples; then a shorter path."""
+"""The search for a path on the constraints: walks first, then trees of walks; and a shorter path."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.path.path_space import STEP, PathSpace
-from impact_posture.path.sampling import sampled_path
-from impact_posture.posture.problem import equality_jacobian, null_space, rank
+from impact_posture.path.path_space import PathSpace
+from impact_posture.posture.starts import random_posture
 
-# Postures that the sampling planner may take for a target.
+# Postures and attempts that the search may take for a target.
 SAMPLES = 2000
-# The end of a self-motion curve is found within this tangent length.
-_CURVE_END = 1e-4
-# Steps on a self-motion curve: 500 rad at the usual step, more than any curve within joint limits.
-_CURVE_STEPS = 10_000
 # A path is shortened if it exceeds the straight distance of its ends by more than a share: by an elastic band, and
 # before it by shortcuts, whose walks cost more.
 _BENT, _DETOUR = 0.02, 0.2
@@ -26,96 +22,79 @@ _SHORTCUTS = 24
 _BANDS, _SWEEPS = (9, 17, 33), 12
 
 
-class PathSearch:
-    """Paths from one posture to several targets.
+@dataclass(frozen=True, eq=False)
+class Connection:
+    """What was found between two postures.
+
+    Attributes:
+        path: Postures from one to the other with valid motions between them; ``None`` if no path was found.
+        reached: All postures that were reached from the first.
+        method: ``continuation`` if walks alone arrived, else ``sampling``.
+    """
+
+    path: list[Array] | None
+    reached: list[Array]
+    method: str
+
+
+class _Tree:
+    """Postures that are reached from a root by walks, with their tangent coordinates at the root."""
+
+    def __init__(self, space: PathSpace, root: Array) -> None:
+        self._space = space
+        self.postures, self._parents = [root], [-1]
+        self._places = np.zeros((1, space.model.nv))
+
+    def extend(self, target: Array) -> int:
+        """Walk from the nearest posture towards a target; return the index of the last posture."""
+        root = self.postures[0]
+        last = int(np.argmin(np.linalg.norm(self._places - self._space.difference(root, target), axis=1)))
+        walked = self._space.walk(self.postures[last], target)[1:]
+        for q in walked:
+            self.postures.append(q)
+            self._parents.append(last)
+            last = len(self.postures) - 1
+        self._places = np.vstack([self._places, *[self._space.difference(root, q) for q in walked]])
+        return last
+
+    def branch(self, index: int) -> list[Array]:
+        """Return the postures from the root to the one with this index."""
+        found = []
+        while index >= 0:
+            found.append(self.postures[index])
+            index = self._parents[index]
+        return found[::-1]
+
+
+def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, samples: int = SAMPLES) -> Connection:
+    """Search a path: walk from both ends towards each other, then grow trees of walks towards random postures, too.
+
+    The trees are CBiRRT's (Berenson et al. 2009).  OMPL 2.0 has planners on projected state spaces, which stop at
+    inequalities where walks slide along: on a planar arm beside discs they found 5 of 18 paths in the time in which
+    these trees found 18.  The effort is counted and not timed, so that the result depends on the seed alone.
 
     Args:
         space: The postures that the constraints allow.
-        start: First posture of all paths, shape (nq,), valid.
-        seed: Seed of the samples.
-        samples: Postures that the sampling planner may take for a target.
-
-    Attributes:
-        visited: Postures that are reached from the start.
-        method: How the last path was found: ``continuation``, ``self-motion curve`` or ``sampling``.
+        start: First posture, shape (nq,), valid.
+        target: Last posture, shape (nq,), valid.
+        seed: Seed of the random postures.
+        samples: Number of postures in both trees and of attempts to extend them at which the search ends.
     """
-
-    def __init__(self, space: PathSpace, start: Array, seed: int = 0, samples: int = SAMPLES) -> None:
-        self.space, self.start = space, start
-        self._seed, self._samples = seed, samples
-        self.visited: list[Array] = [start]
-        self.method = ""
-        self._curves: list[list[Array]] = []
-        self._ended: list[bool] = []
-
-    @property
-    def whole(self) -> bool:
-        """Whether all postures that can be reached were followed."""
-        return bool(self._ended) and all(self._ended)
-
-    def to(self, target: Array) -> list[Array] | None:
-        """Return postures from the start to ``target``, shape (nq,), with valid motions between them, or ``None``."""
-        space, self.method = self.space, "continuation"
-        if not space.valid(target):
-            return None
-        forward = space.walk(self.start, target)
-        self.visited += forward
-        if forward[-1] is target:
-            return forward
-        backward = space.walk(target, self.start)
-        if backward[-1] is self.start:
-            return backward[::-1]
-        middle = space.walk(forward[-1], backward[-1])
-        if middle[-1] is backward[-1]:
-            return [*forward, *middle[1:-1], *backward[::-1]]
-        if self._redundancy() == 1:
-            self.method = "self-motion curve"
-            return self._along_curve(target)
-        self.method = "sampling"
-        path, reached = sampled_path(space, self.start, target, self._seed, self._samples)
-        self.visited += reached
-        return path
-
-    def _redundancy(self) -> int:
-        """The degrees of freedom that the equalities leave at the start."""
-        space = self.space
-        return int(space.model.nv) - rank(equality_jacobian(space.problem, space.projector.numeric.at(self.start)))
-
-    def _along_curve(self, target: Array) -> list[Array] | None:
-        if not self._curves:
-            self._curves = [self._curve(1.0), self._curve(-1.0)]
-            self.visited += [q for curve in self._curves for q in curve]
-        for curve in self._curves:
-            nearest = int(np.argmin([self.space.distance(q, target) for q in curve]))
-            end = self.space.walk(curve[nearest], target)
-            if end[-1] is target:
-                return [*curve[:nearest], *end]
-        return None
-
-    def _curve(self, sign: float) -> list[Array]:
-        """Follow the self-motion curve from the start in one direction, to its end or back to the start.
-
-        A singular posture, at which the curve may branch, is no end.
-        """
-        space, curve, size = self.space, [self.start], STEP
-        direction: Array | None = None
-        self._ended.append(False)
-        while len(curve) < _CURVE_STEPS and size > _CURVE_END:
-            q = curve[-1]
-            tangents = null_space(equality_jacobian(space.problem, space.projector.numeric.at(q)))
-            if tangents.shape[1] != 1:
-                return curve
-            tangent = tangents[:, 0] * (sign if direction is None else np.sign(tangents[:, 0] @ direction) or 1.0)
-            moved = space.take(q, tangent * size)
-            if moved is None or space.difference(q, moved) @ tangent < size / 2:
-                size /= 2
-                continue
-            direction = tangent
-            curve.append(moved)
-            if len(curve) > 3 and space.distance(moved, self.start) < STEP and size == STEP:
-                break
-        self._ended[-1] = len(curve) < _CURVE_STEPS
-        return curve
+    rng, chart = np.random.default_rng(seed), space.projector.chart
+    ours, theirs = _Tree(space, start), _Tree(space, target)
+    growing, other, attempt = ours, theirs, 0
+    while len(ours.postures) + len(theirs.postures) + attempt <= samples:
+        near = attempt % 4 < 2
+        aim = random_posture(space.problem, chart, rng, near=near) if attempt else target
+        end = growing.extend(aim)
+        meeting = growing.postures[end]
+        last = 0 if meeting is target else other.extend(meeting)
+        if other.postures[last] is meeting:
+            halves = growing.branch(end), other.branch(last)[-2::-1]
+            path = [*halves[0], *halves[1]] if growing is ours else [*halves[1][::-1], *halves[0][::-1]]
+            return Connection(path, ours.postures, "sampling" if attempt else "continuation")
+        growing, other, attempt = other, growing, attempt + 1
+    return Connection(None, ours.postures, "sampling")
 
 
 def shortened(space: PathSpace, postures: Sequence[Array], seed: int = 0) -> list[Array]:
