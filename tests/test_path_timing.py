@@ -153,7 +153,7 @@ def test_a_posture_that_the_motor_cannot_hold_is_named() -> None:
     limits = ActuatorLimits(space.problem.robot, (), 0.7)
     motion = timing.timed(space, curve_of(space, 0.3), limits)
     held = 0.2 * 9.81 * 0.25 / 0.2
-    assert motion.notes == (f"joint_0 would need {held:.3g} times its torque limit at rest on the path: "
+    assert motion.notes == (f"joint_0 would need {held:.3g} times its limit at rest on the path: "
                             "timed by velocities alone",)  # fmt: skip
 
 
@@ -177,7 +177,7 @@ def test_a_light_standing_robot_rests_and_a_slippery_one_does_not(name: str) -> 
     rest = limits.load(q, zero, zero)
     sideways = limits.load(q, zero, np.eye(loaded.nv)[1]) - rest
     shares = limits.shares(q, rest)
-    assert shares is not None and shares.torque.max() < 1
+    assert shares is not None and shares.max() < 1
     rate = limits.largest_rate(q, rest, sideways)
     assert rate is not None
     # μ g bounds the acceleration of the mass center, whatever the motors can do.

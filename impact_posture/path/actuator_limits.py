@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -14,19 +13,6 @@ from impact_posture.impact.contact import Support, point_on
 from impact_posture.impact.contact_stability import FrictionCones
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits
 from impact_posture.robot.robot import Robot
-
-
-@dataclass(frozen=True)
-class Shares:
-    """Shares of the limits that a motion takes at an instant; 1 is at a limit.
-
-    Attributes:
-        torque: ``|τ|/τ_max`` of each joint entry, zero without a limit, shape (nv − 6,) or (nv,).
-        thrust: Distance of each thrust from the middle of its range over half of the range, shape (rotors,).
-    """
-
-    torque: Array
-    thrust: Array
 
 
 class ActuatorLimits:
@@ -42,6 +28,8 @@ class ActuatorLimits:
         friction: Friction coefficient of the feet.
 
     Attributes:
+        names: Names of the joint entries behind a floating base, then of the rotors.
+        effort: Torque limits of the joint entries, infinite where there is none.
         missing: Why the limits of this robot are not known; empty if they are.
     """
 
@@ -61,6 +49,8 @@ class ActuatorLimits:
         if propulsion is not None:
             self._allocation = allocation_matrix(robot.model, propulsion)
             self._low, self._high = thrust_limits(propulsion)
+        rotors = [] if propulsion is None else [rotor.name for rotor in propulsion.rotors]
+        self.names = [*robot.tangent_names[self._base :], *rotors]
         held = bool(self._supports) or propulsion is not None
         self.missing = ""
         if robot.floating and not held:
@@ -81,14 +71,18 @@ class ActuatorLimits:
         found = self._program(q, rest, dynamic, largest=True)
         return None if found is None else float("inf") if found[0] > _MOST * (1 - 1e-9) else float(found[0])
 
-    def shares(self, q: Array, load: Array) -> Shares | None:
-        """Return the shares of the limits at a load, where the largest is least; ``None`` if the cones forbid it."""
+    def shares(self, q: Array, load: Array) -> Array | None:
+        """Return the shares of the limits that a load takes, the largest as small as possible, by name.
+
+        The share of a joint is ``|τ|/τ_max``, or zero without a limit.  That of a rotor is the distance of its thrust
+        from the middle of its range over half of the range.  ``None`` if rotors or friction do not allow the load.
+        """
         if not self._base:
-            return Shares(np.abs(load) / self.effort, np.zeros(0))
+            return np.abs(load) / self.effort
         found = self._program(q, load, load, largest=False)
         return None if found is None else found[1]
 
-    def _program(self, q: Array, rest: Array, dynamic: Array, *, largest: bool) -> tuple[float, Shares] | None:
+    def _program(self, q: Array, rest: Array, dynamic: Array, *, largest: bool) -> tuple[float, Array] | None:
         """Maximize λ within all limits, or minimize the share of the limits σ, over ``[thrusts, f, λ or σ]``."""
         from scipy.optimize import linprog
 
@@ -127,7 +121,7 @@ class ActuatorLimits:
         y = found.x
         used = np.zeros(len(limited))
         used[limited] = np.abs(torque[:, :-1] @ y[:-1] + constant)
-        return float(y[-1]), Shares(used, np.abs(y[:rotors]))
+        return float(y[-1]), np.concatenate([used, np.abs(y[:rotors])])
 
     def _feet(self, q: Array) -> tuple[Array, Array]:
         """Return the stacked Jacobians of the supports, shape (forces, nv), and the pyramids ``A f ≤ 0``."""

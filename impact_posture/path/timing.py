@@ -134,14 +134,10 @@ def _cannot_move(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple
     held = [share for share in shares if share is not None]
     if len(held) < len(shares):
         return "rotors or friction cannot hold all postures of the path at rest"
-    torque = np.max([share.torque for share in held], axis=0)
-    thrust = max(float(share.thrust.max(initial=0.0)) for share in held)
-    if max(thrust, float(torque.max(initial=0.0))) <= 1:
+    worst = np.max(held, axis=0)
+    if worst.max() <= 1:
         return "rotors or friction cannot accelerate the robot along the path at any speed"
-    if thrust > torque.max(initial=0.0):
-        return f"a rotor would need {thrust:.3g} times its range at rest on the path"
-    name = space.problem.robot.tangent_names[-len(torque) + int(torque.argmax())]
-    return f"{name} would need {torque.max():.3g} times its torque limit at rest on the path"
+    return f"{limits.names[int(worst.argmax())]} would need {worst.max():.3g} times its limit at rest on the path"
 
 
 def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
@@ -180,20 +176,20 @@ def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: Act
     """
     robot, count = space.problem.robot, len(motion.t)
     # A floating robot takes a linear program an instant.
-    every = sorted({round(k) for k in np.linspace(0, count - 1, INSTANTS)}) if robot.floating else range(count)
-    joints = robot.tangent_names[6 if robot.floating else 0 :]
-    rotors = [r.name for r in robot.spec.propulsion.rotors] if robot.floating and robot.spec.propulsion else []
-    torque, thrust = np.full((len(every), len(joints)), np.nan), np.full((len(every), len(rotors)), np.nan)
-    for row, k in enumerate(() if limits.missing else every):
-        shares = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
-        if shares is not None:
-            torque[row], thrust[row] = shares.torque, shares.thrust
-    velocity = np.abs(motion.v[list(every)]) / velocity_limits(space)
+    every = sorted({round(k) for k in np.linspace(0, count - 1, INSTANTS)}) if robot.floating else list(range(count))
+    shares = np.full((len(every), len(limits.names)), np.nan)
+    for row, k in enumerate([] if limits.missing else every):
+        found = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
+        shares[row] = np.nan if found is None else found
+    joints = len(limits.effort)
+    groups = {
+        "velocity": (np.abs(motion.v[every]) / velocity_limits(space), robot.tangent_names),
+        "torque": (shares[:, :joints], limits.names[:joints]),
+        "thrust": (shares[:, joints:], limits.names[joints:]),
+    }
     largest: dict[str, object] = {}
     sizes: dict[str, float] = {}
-    for name, used, names in (
-        ("velocity", velocity, robot.tangent_names), ("torque", torque, joints), ("thrust", thrust, rotors)
-    ):  # fmt: skip
+    for name, (used, names) in groups.items():
         known = bool(np.isfinite(used).any())
         place = int(np.nanargmax(used)) % used.shape[1] if known else 0
         sizes[name] = float(np.nanmax(used)) if known else 0.0
@@ -201,9 +197,10 @@ def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: Act
     most = max(sizes, key=lambda name: sizes[name])
     standing = bool(space.problem.objective.supports) and not motion.notes
     largest["active"] = most if sizes[most] > _ACTIVE else "friction" if standing else None
-    peaks = [used.max(axis=1, initial=-np.inf) for used in (velocity, torque, thrust)]
-    at_most, torques, thrusts = (np.where(np.isfinite(peak), peak, np.nan) for peak in peaks)
-    return LimitUse(motion.t[list(every)], at_most, torques, thrusts, largest)
+    velocity, torque, thrust = (
+        used.max(axis=1) if used.shape[1] else np.full(len(every), np.nan) for used, _ in groups.values()
+    )
+    return LimitUse(motion.t[every], velocity, torque, thrust, largest)
 
 
 def _times(duration: float) -> Array:
