@@ -34,7 +34,9 @@ from tests.settings import make_settings
 
 
 class OutsideDisc(Constraint):
-    """A frame of a planar arm stays outside a disc: ``|p(q) − c|² ≥ r²``."""
+    """A frame of a planar arm stays outside a disc: ``|p(q) − c|² ≥ r²``; starts are not pulled onto it, walks are."""
+
+    projected = False
 
     def __init__(self, problem: PostureProblem, frame: str, center: Array, radius: float) -> None:
         self.name, self.parameters = f"disc at {frame}", np.zeros(0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import copy
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,6 +12,7 @@ import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
+from impact_posture.posture.constraint import Constraint
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import Projector
 
@@ -36,7 +39,8 @@ class PathSpace:
 
     def __init__(self, problem: PostureProblem) -> None:
         self.problem, self.model = problem, problem.robot.model
-        self.projector = Projector(problem)
+        # Starts need not be pulled onto every constraint, but a walk slides along what it meets.
+        self.projector = Projector(replace(problem, constraints=tuple(map(_projected, problem.constraints))))
         self._inequalities = any(not c.equality for c in problem.constraints)
         self._reach = lever_arms(self.projector.chart, self.model)
 
@@ -147,6 +151,12 @@ class PathSpace:
     def length(self, postures: Iterable[Array]) -> float:
         """Return the tangent length of a path, rad mixed with m."""
         return sum(self.distance(a, b) for a, b in pairwise(postures))
+
+
+def _projected(constraint: Constraint) -> Constraint:
+    made = copy(constraint)
+    made.projected = True
+    return made
 
 
 def lever_arms(chart: Chart, model: pin.Model) -> Array:
