@@ -34,7 +34,7 @@ from tests.settings import make_settings
 
 
 class OutsideDisc(Constraint):
-    """A frame of a planar arm stays outside a disc: ``|p(q) − c|² ≥ r²``; starts are not pulled onto it, walks are."""
+    """A frame of a planar arm stays outside a disc, ``|p(q) − c|² ≥ r²``; starts are not pulled onto it."""
 
     projected = False
 
