@@ -17,6 +17,7 @@ PICTURES = [
     ),
     ("anymal_c --normal 0 1 0 --normal-cone 20", {"ellipsoid": "cone"}),
     ("talos --frame gripper_right_base_link --normal -1 0 0 --tradeoff", {"tradeoff": "tradeoff"}),
+    ("tilthex_arm --frame ee --normal 0 0 1 --path", {"path": "path"}),
 ]
 
 

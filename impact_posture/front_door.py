@@ -53,6 +53,7 @@ from impact_posture.tables import validate
 # The C export and the pictures are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
+    from impact_posture.path.posture_path import PosturePath
 
 
 class ImpactObjective(core.ImpactObjective):
@@ -235,6 +236,7 @@ class PostureResult:
         solution: Result of the search.
         robustness: Cost and gain of the model variants; ``None`` without model variants.
         tradeoff: The best objective within each distance from the start; ``None`` before :meth:`trade_off`.
+        motion: The path from the start to the optimum; ``None`` before :meth:`path`.
     """
 
     def __init__(
@@ -243,9 +245,10 @@ class PostureResult:
         solution: PostureSolution,
         robustness: Robustness | None = None,
         tradeoff: TradeOff | None = None,
+        motion: PosturePath | None = None,
     ) -> None:
         self.problem, self.solution = problem, solution
-        self.robustness, self.tradeoff = robustness, tradeoff
+        self.robustness, self.tradeoff, self.motion = robustness, tradeoff, motion
 
     @property
     def q(self) -> Array:
@@ -274,7 +277,8 @@ class PostureResult:
         Raises:
             InputError: The objective is not that of an impact.
         """
-        return result_document(self._prepared, self.solution, self.robustness, self.tradeoff)
+        path = None if self.motion is None else self.motion.to_dict()
+        return result_document(self._prepared, self.solution, self.robustness, self.tradeoff, path)
 
     @property
     def _prepared(self) -> Prepared:
@@ -314,7 +318,23 @@ class PostureResult:
                 )
             force = impact.contact_stiffness, impact.speed
         curve = pareto_front(self.solution, points, force=force, compile=compile, progress=progress)
-        return PostureResult(self.problem, self.solution, self.robustness, curve)
+        return PostureResult(self.problem, self.solution, self.robustness, curve, self.motion)
+
+    def path(self, *, seed: int = 0) -> PostureResult:
+        """Return the same result with a path from the start to the optimum, timed within the robot's limits.
+
+        See :func:`~impact_posture.path.posture_path.posture_path`.
+
+        Args:
+            seed: Seed of the sampling planner.
+
+        Raises:
+            InputError: The package of the extra ``path`` is not installed.
+        """
+        from impact_posture.path.posture_path import posture_path
+
+        motion = posture_path(self.solution, seed=seed)
+        return PostureResult(self.problem, self.solution, self.robustness, self.tradeoff, motion)
 
     def save(
         self,
@@ -345,8 +365,8 @@ class PostureResult:
             OutputError: The folder exists without ``force``, or cannot be written.
         """
         return write_result(
-            self._prepared, self.solution, self.document, Path(out), tradeoff=self.tradeoff, force=force,
-            codegen=codegen, formats=formats, jobs=jobs, progress=progress, finish=finish,
+            self._prepared, self.solution, self.document, Path(out), tradeoff=self.tradeoff, motion=self.motion,
+            force=force, codegen=codegen, formats=formats, jobs=jobs, progress=progress, finish=finish,
         )  # fmt: skip
 
     def plot(
@@ -355,7 +375,8 @@ class PostureResult:
         """Draw the figures into a folder; return their paths."""
         from impact_posture.plot import draw_all
 
-        return draw_all(result_view(self._prepared, self.solution, self.document), Path(out), formats, only)
+        view = result_view(self._prepared, self.solution, self.document, self.motion)
+        return draw_all(view, Path(out), formats, only)
 
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
         """Write the C code as :meth:`ImpactObjective.export` does, with the optimal posture as a constant."""

@@ -27,6 +27,7 @@ from impact_posture.settings import Against
 # Matplotlib and the C export are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
+    from impact_posture.path.posture_path import PosturePath
     from impact_posture.plot import ResultView, TradeOffData
 
 FORMATS = ("png",)
@@ -65,6 +66,7 @@ def write_result(
     out: Path,
     *,
     tradeoff: TradeOff | None = None,
+    motion: PosturePath | None = None,
     force: bool = False,
     codegen: bool = True,
     formats: Sequence[str] = FORMATS,
@@ -80,6 +82,7 @@ def write_result(
         document: The content of ``result.json``, from :func:`~impact_posture.posture.result.result_document`.
         out: The folder.
         tradeoff: The trade-off, if it was computed.
+        motion: The path to the optimum, if it was searched.
         force: Replace an earlier result.
         codegen: Export, build and check the C code, too.
         formats: Formats of the figures.
@@ -98,6 +101,10 @@ def write_result(
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff))  # type: ignore[arg-type]
         _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
         (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
+        if motion is not None:
+            from impact_posture.path.files import write_path
+
+            write_path(folder, prepared.impact.robot, motion)
         request = (folder, solution.initial, solution.q, path, document, codegen, formats, jobs)
         for done, count, exported in (finish or partial(finish_result, prepared))(request):
             if exported is not None:
@@ -121,7 +128,8 @@ def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finish
     folder, initial, optimal, path, document, codegen, formats, jobs = request
     # The C code comes first, because it takes longest.
     tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
-    tasks += _drawings(_view(prepared, initial, optimal, path, document), folder, formats)
+    view = _view(prepared, initial, optimal, path, document, _motion(folder, document))
+    tasks += _drawings(view, folder, formats)
     with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
         for done, (index, result) in enumerate(results, start=1):
             yield done, len(tasks), result if codegen and index == 0 else None
@@ -154,10 +162,21 @@ def _drawings(view: ResultView, folder: Path, formats: Sequence[str]) -> list[Ca
     return [partial(draw_all, view, folder, formats, [name]) for name in drawable(view)]
 
 
-def result_view(prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> ResultView:
+def _motion(folder: Path, document: dict[str, Any]) -> PosturePath | None:
+    """Read the path of a result folder, if it has one."""
+    if "path" not in document:
+        return None
+    from impact_posture.path.files import read_path
+
+    return read_path(folder, document["path"])
+
+
+def result_view(
+    prepared: Prepared, solution: PostureSolution, document: dict[str, Any], motion: PosturePath | None = None
+) -> ResultView:
     """Return the view of a solution, from which its figures are drawn."""
     path = null_space_path(solution.problem, solution.initial, solution.q)
-    return _view(prepared, solution.initial, solution.q, path, document)
+    return _view(prepared, solution.initial, solution.q, path, document, motion)
 
 
 def _view(
@@ -166,6 +185,7 @@ def _view(
     optimal: np.ndarray,
     path: NullSpacePath,
     document: dict[str, Any],
+    motion: PosturePath | None,
 ) -> ResultView:
     from impact_posture.plot import ResultView
 
@@ -180,6 +200,7 @@ def _view(
         path=path,
         tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
         collisions=_collisions(prepared, initial, optimal),
+        motion=motion,
     )
 
 
@@ -238,7 +259,7 @@ def load_view(folder: Path) -> ResultView:
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
             for key in ("initial", "optimal")
         )
-        return _view(prepared, initial, optimal, path, document)
+        return _view(prepared, initial, optimal, path, document, _motion(folder, document))
     except _BROKEN as error:
         raise SpecError(
             f"is no whole result ({type(error).__name__}: {error})", where=str(folder), hint="run optimize again"

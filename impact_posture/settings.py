@@ -388,5 +388,8 @@ class ProblemSettings(ImpactSettings):
             "What --tradeoff bounds: the distance from the start, or the peak force of the impact.", TASK, "WHAT"
         ),
     ] = "distance"  # fmt: skip
+    path: Annotated[
+        bool, Setting("Find a path from the start to the optimum on which all constraints hold, and time it.", TASK)
+    ] = False
     starts: Annotated[int, Setting("Number of starting points of the search.", OUTPUT, **demand.ONE_OR_MORE)] = 16
     seed: Annotated[int, Setting("Seed of the random starts.", OUTPUT, **demand.ZERO_OR_MORE)] = 0

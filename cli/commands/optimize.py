@@ -53,6 +53,10 @@ def optimize(
         from impact_posture.posture.problem_settings import prepare
         from impact_posture.result_folder import FORMATS, default_out
 
+        if settings.path:
+            from impact_posture.path.posture_path import check_package
+
+            check_package()
         page = Page(quiet=quiet or json)
         prepared = prepare(settings)
         folder = Path(out) if out else default_out(prepared)
@@ -74,6 +78,9 @@ def optimize(
                 result = result.trade_off(
                     settings.tradeoff, settings.tradeoff_against, compile=compile, progress=advance
                 )
+        if settings.path:
+            with progress("planning", "paths", shown=shown, first="searching a path to the optimum"):
+                result = result.path(seed=settings.seed)
         if not json:
             # The result comes first, because figures and C code take longer.
             _summarize(page, prepared, result.solution, result.document)
@@ -194,6 +201,8 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     )
     if "tradeoff" in document:
         _tradeoff(page, document, [n for n in document["notes"] if n.startswith("trade-off:")])
+    if "path" in document:
+        _path(page, document["path"])
     # The warnings of the robot were printed before the solver started.
     page.warnings(document["warnings"][len(prepared.impact.warnings) :])
 
@@ -236,6 +245,23 @@ def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
     page.table(head, rows, right=range(7))
     for note in notes:
         page.line(note)
+
+
+def _path(page: Page, path: dict[str, Any]) -> None:
+    """Show the path to the optimum."""
+    page.gap()
+    end = "the optimum" if path["found"] else f"objective {number(path['objective'])}"
+    limit = path["limits"].get("active")
+    bound = f", bound by {limit}" if limit else ""
+    if path["points"] > 1:
+        page.line(
+            f"path to {end} by {path['method']}: {path['length']:.3g} rad (m) in {path['duration_s']:.3g} s"
+            f" ({path['timing']}{bound}), violation {path['max_violation']:.1e}"
+        )
+    else:
+        page.line("path: the start is the optimum" if path["found"] else "path: none leads away from the start")
+    if path["reason"]:
+        page.line(f"  {path['reason']}")
 
 
 def _redundancy(count: int) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from impact_posture.errors import NameNotFound
-from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, path_figures
+from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, motion_figure, path_figures
 from impact_posture.plot.bars import Bar, bars_figure, draw_bars
 from impact_posture.plot.robot_drawing import postures_figure
 from impact_posture.plot.run_figures import (
@@ -63,15 +63,17 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "nullspace": path_figures.path_figure,
     "classical": classical_figure.classical_figure,
     "tradeoff": path_figures.tradeoff_figure,
+    "path": motion_figure.motion_figure,
 }
 
 
 def drawable(view: ResultView) -> list[str]:
     """Return the names of the figures that the view has data for.
 
-    ``nullspace`` needs a path, ``tradeoff`` needs a trade-off.
+    ``nullspace`` needs a path, ``tradeoff`` a trade-off, ``path`` a motion.
     """
-    lacking = {"nullspace": view.path is None, "tradeoff": view.tradeoff is None}
+    still = view.motion is None or view.motion.use is None
+    lacking = {"nullspace": view.path is None, "tradeoff": view.tradeoff is None, "path": still}
     return [name for name in FIGURES if not lacking.get(name)]
 
 

@@ -25,6 +25,7 @@ from impact_posture.settings import Against
 
 # Imported for its name alone, because the figures need no solver.
 if TYPE_CHECKING:
+    from impact_posture.path.posture_path import PosturePath
     from impact_posture.posture.null_space_path import NullSpacePath
 
 # Separator of the facts in a header line.
@@ -74,6 +75,7 @@ class ResultView:
         restitution: Coefficient of restitution e, in [0, 1].
         path: Quantities along the null-space path between them, if known.
         tradeoff: The trade-off of objective against distance, if it was computed.
+        motion: The path to the optimum over time, if it was searched.
         title: First line of every figure; robot and contact frame if empty.
         collisions: Names of the shapes that collide, in pairs, before and after.
     """
@@ -86,6 +88,7 @@ class ResultView:
     restitution: float = 0.0
     path: NullSpacePath | None = None
     tradeoff: TradeOffData | None = None
+    motion: PosturePath | None = None
     title: str = ""
     collisions: tuple[Sequence[tuple[str, str]], Sequence[tuple[str, str]]] = ((), ())
 

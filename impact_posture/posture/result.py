@@ -41,8 +41,9 @@ def result_document(
     solution: PostureSolution,
     robustness: Robustness | None = None,
     tradeoff: TradeOff | None = None,
+    path: dict[str, object] | None = None,
 ) -> dict[str, object]:
-    """Return the content of ``result.json``; ``robustness`` and ``tradeoff`` are keys only if they are given."""
+    """Return the content of ``result.json``; the last three arguments are keys only if they are given."""
     initial, optimal = evaluations(prepared, solution)
     impact, around = prepared.impact, prepared.problem.surroundings
     fault = [solution.compiler_fault] if solution.compiler_fault else []
@@ -68,6 +69,7 @@ def result_document(
             "optima": [json_block(optimum) for optimum in solution.optima],
         },
         **curve,
+        **({} if path is None else {"path": path}),
         "notes": [*filter(None, [impact.choice]), *solution.notes, *(tradeoff.notes if tradeoff else ())],
         "warnings": list(dict.fromkeys(warnings)),
         "versions": versions(),

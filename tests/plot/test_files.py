@@ -26,8 +26,10 @@ def test_figures_are_written_in_all_formats(tilthex: ResultView, tmp_path: Path)
     first = draw_all(tilthex, tmp_path / "figures", FORMATS, only=["ellipsoid", "jump"])
     assert [p.name for p in first] == [f"{n}.{f}" for n in ("ellipsoid", "jump") for f in ("png", "svg", "pdf")]
     paths = first + draw_all(tilthex, tmp_path / "figures", (".PNG",), only=["postures"])
-    paths += draw_all(tilthex, tmp_path / "figures", ("svg", "svg"), only=["nullspace", "classical", "tradeoff"])
-    assert len(paths) == len(set(paths)) == 10
+    paths += draw_all(
+        tilthex, tmp_path / "figures", ("svg", "svg"), only=["nullspace", "classical", "tradeoff", "path"]
+    )
+    assert len(paths) == len(set(paths)) == 11
     assert {p.stem for p in paths} == set(FIGURES)
     for path in paths:
         assert path.stat().st_size > 8_000, path
@@ -114,6 +116,7 @@ def test_degenerate_robot_draws(pendulum: ResultView) -> None:
         "ellipsoid": "S undefined",
         "jump": "Diamonds: with friction 0.7 the contact point",
         "nullspace": "S is undefined along the path",
+        "path": "Note: a reason.",
         "postures": "seen along −x",
         "tradeoff": "S is undefined at these postures",
     }

@@ -13,6 +13,8 @@ from matplotlib.figure import Figure
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.path.posture_path import PosturePath
+from impact_posture.path.timing import LimitUse
 from impact_posture.plot import (
     ResultView,
     TradeOffData,
@@ -61,6 +63,7 @@ def make_view(
         way[-1],
         path=sample_path(objective, way) if path else None,
         tradeoff=trade_of(objective, way) if path else None,
+        motion=motion_of(objective, way, v) if path else None,
         **keys,  # type: ignore[arg-type]
     )
 
@@ -70,6 +73,17 @@ def trade_of(objective: ImpactObjective, way: list[np.ndarray], knee: int | None
     path = sample_path(objective, way)
     certified = np.arange(len(way)) != len(way) - 2
     return TradeOffData(path.s, path.s, path.objective, path.H, path.G, path.V, path.S, certified, knee)
+
+
+def motion_of(objective: ImpactObjective, way: list[np.ndarray], v: np.ndarray) -> PosturePath:
+    """A motion at a constant velocity in 1 s, whose thrusts are not known."""
+    t = np.linspace(0, 1, len(way))
+    use = LimitUse(t, np.full(t.size, 0.4), 0.5 + 0.3 * t, np.full(t.size, np.nan), {"active": None})
+    values = np.array([objective.value(q) for q in way])
+    return PosturePath(
+        False, "a reason", "continuation", "scaled", values[-1], t, np.array(way), np.tile(v, (t.size, 1)),
+        np.zeros((t.size, v.size)), float(np.linalg.norm(v)), 0.0, use, values,
+    )  # fmt: skip
 
 
 def spin(seed: int = 0) -> np.ndarray:

@@ -1,0 +1,96 @@
+"""A smooth curve through postures on the constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.arrays import Array
+from impact_posture.path.path_space import STEP, PathSpace
+from impact_posture.path.search import even
+
+# The curve leaves the constraints by no more than this tangent length; its samples are pulled onto them.
+DEVIATION = 1e-5
+# How often the number of knots is doubled to get there.
+_DOUBLINGS = 4
+# Step of central differences along the curve, whose length is 1.
+_STEP = 1e-5
+
+
+class PathCurve:
+    """The cubic spline ``q(s) = q₀ ⊕ z(s)``, ``0 ≤ s ≤ 1``, through postures.
+
+    Args:
+        space: The postures that the constraints allow.
+        postures: At least two, in order.
+
+    Attributes:
+        s: Places of the postures on the curve, evenly by path length, shape (n,).
+        z: Tangent coordinates of the postures at the first one, shape (n, nv).
+    """
+
+    def __init__(self, space: PathSpace, postures: Sequence[Array]) -> None:
+        from scipy.interpolate import CubicSpline
+
+        self._space, self._start = space, postures[0]
+        self.s = np.linspace(0.0, 1.0, len(postures))
+        z = np.array([space.difference(self._start, q) for q in postures])
+        for slot in space.projector.chart.slots:
+            # A continuous joint may turn more than once.
+            if slot.kind.family == "continuous":
+                z[:, slot.v] = np.unwrap(z[:, slot.v], axis=0)
+        self.z = z
+        self._spline = CubicSpline(self.s, z)
+
+    def at(self, z: Array) -> Array:
+        """Return the posture of tangent coordinates, ``q₀ ⊕ z``, shape (nq,)."""
+        return np.asarray(pin.integrate(self._space.model, self._start, z))
+
+    def coordinates(self, s: Array) -> Array:
+        """Return ``z(s)``, shape (n, nv)."""
+        return np.asarray(self._spline(s))
+
+    def posture(self, s: float) -> Array:
+        """Return ``q(s)``, shape (nq,)."""
+        return self.at(self._spline(s))
+
+    def velocity(self, s: float) -> Array:
+        """Return ``ν = dq/ds`` in the tangent space at ``q(s)``, shape (nv,)."""
+        turn = pin.dIntegrate(self._space.model, self._start, self._spline(s), pin.ARG1)
+        return np.asarray(turn @ self._spline(s, 1))
+
+    def acceleration(self, s: float) -> Array:
+        """Return ``dν/ds``, shape (nv,)."""
+        low, high = max(s - _STEP, 0.0), min(s + _STEP, 1.0)
+        return (self.velocity(high) - self.velocity(low)) / (high - low)
+
+    def deviation(self) -> float:
+        """Return the largest tangent distance of the curve to the constraints; infinite where it is not valid there.
+
+        It is taken at so many places that no frame moves more than the check distance between two of them.
+        """
+        worst, before, parts = (
+            0.0,
+            self.at(self.z[0]),
+            max(1, self._space.checks(np.abs(np.diff(self.z, axis=0)).max(axis=0))),
+        )
+        for s in np.linspace(0.0, 1.0, parts * (len(self.s) - 1) + 1):
+            off = self.posture(float(s))
+            q = self._space.pulled(off)
+            if q is None or self._space.size(self._space.difference(before, q)) > 1:
+                return float("inf")
+            worst, before = max(worst, self._space.distance(off, q)), q
+        return worst
+
+
+def fitted_curve(space: PathSpace, postures: Sequence[Array]) -> PathCurve | None:
+    """Return the curve through a path, with so many knots that it stays on the constraints; ``None`` if it cannot."""
+    count = max(5, int(np.ceil(space.length(postures) / (2 * STEP))) + 1)
+    for _ in range(_DOUBLINGS + 1):
+        curve = PathCurve(space, even(space, postures, count))
+        if curve.deviation() <= DEVIATION:
+            return curve
+        count = 2 * count - 1
+    return None

@@ -1,0 +1,183 @@
+"""The postures that the constraints of a problem allow, and steps between them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from copy import copy
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.arrays import Array
+from impact_posture.dynamics.chart import Chart
+from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.starts import Projector
+
+# Largest violation of equalities and of inequalities at a valid posture (m, rad, or the unit of the constraint).
+EQUALITY, INEQUALITY = 1e-6, 1e-8
+# No frame of the robot moves farther between two postures that are checked, m.
+CHECK_DISTANCE = 1e-2
+# Tangent length of a step along the constraints, rad mixed with m.
+STEP = 0.05
+# A step that comes nearer to its target by less than this share of its length counts as stuck.
+_PROGRESS = 0.05
+# A step on the constraints may be longer than planned by this factor.  A longer one has jumped to another branch.
+_JUMP = 2.0
+# Leading velocity entries of a joint that slide.
+_SLIDING = {"free-flyer": 3, "planar": 2, "prismatic": 1, "translation": 3}
+
+
+class PathSpace:
+    """Postures on the constraints of a problem, and motions between them that are checked on the way.
+
+    Args:
+        problem: The posture problem, whose constraints and joint limits hold along a path.
+    """
+
+    def __init__(self, problem: PostureProblem) -> None:
+        self.problem, self.model = problem, problem.robot.model
+        # Starts need not be pulled onto every constraint, but a walk slides along what it meets.
+        self.projector = Projector(replace(problem, constraints=tuple(map(_projected, problem.constraints))))
+        self._inequalities = any(not c.equality for c in problem.constraints)
+        self._reach = lever_arms(self.projector.chart, self.model)
+
+    def violations(self, q: Array) -> list[tuple[str, float, float]]:
+        """Return name, violation and tolerance of each constraint and of the joint limits at ``q``, shape (nq,)."""
+        found = self.problem.violations(self.projector.numeric.at(q))
+        x = self.projector.chart.to_x(q)
+        outside = np.abs(x - np.clip(x, self.problem.lower, self.problem.upper)).max(initial=0.0)
+        return [
+            *(
+                (c.name, float(np.abs(rows).max(initial=0.0)), EQUALITY if c.equality else INEQUALITY)
+                for c, rows in zip(self.problem.constraints, found, strict=True)
+            ),
+            ("joint limits", float(outside), INEQUALITY),
+        ]
+
+    def valid(self, q: Array) -> bool:
+        """Return whether ``q``, shape (nq,), satisfies all constraints."""
+        return all(size <= tolerance for _, size, tolerance in self.violations(q))
+
+    def worst(self, q: Array) -> float:
+        """Return the largest violation at ``q``, shape (nq,)."""
+        return max(size for _, size, _ in self.violations(q))
+
+    def difference(self, one: Array, other: Array) -> Array:
+        """Return ``other ⊖ one``, shape (nv,)."""
+        return np.array(pin.difference(self.model, one, other))
+
+    def distance(self, one: Array, other: Array) -> float:
+        """Return the tangent norm ``‖other ⊖ one‖``, rad mixed with m."""
+        return float(np.linalg.norm(self.difference(one, other)))
+
+    def pulled(self, q: Array, step: Array | None = None) -> Array | None:
+        """Return ``q ⊕ step`` pulled onto the constraints, or ``None`` if it does not reach them."""
+        found = self.projector.project(q if step is None else np.asarray(pin.integrate(self.model, q, step))).q
+        return found if self.valid(found) else None
+
+    def size(self, step: Array) -> float:
+        """Return the size of a tangent step; between two postures that are checked it is at most 1.
+
+        That is the check distance for the frame that moves farthest, and two steps of a walk for the tangent norm.
+        Without inequalities there is nothing to meet between two postures, and the norm alone counts.
+        """
+        moved = float(self._reach @ np.abs(step)) / CHECK_DISTANCE if self._inequalities else 0.0
+        return max(moved, float(np.linalg.norm(step)) / (_JUMP * STEP))
+
+    def checks(self, step: Array) -> int:
+        """Return the number of parts in which a tangent step is checked; each may double on the constraints."""
+        return max(1, int(np.ceil(_JUMP * self.size(step) - 1e-9)))
+
+    def clear(self, one: Array, other: Array) -> bool:
+        """Return whether the motion from ``one`` to ``other`` along the constraints is valid between its ends.
+
+        The postures between are those of the straight motion, pulled onto the constraints.  A part whose size exceeds
+        1 has met something.
+        """
+        whole, q = self.difference(one, other), one
+        parts = self.checks(whole)
+        for k in range(1, parts + 1):
+            moved = self.pulled(one, whole * (k / parts)) if k < parts else other
+            if moved is None or self.size(self.difference(q, moved)) > 1:
+                return False
+            q = moved
+        return True
+
+    def clear_path(self, postures: Iterable[Array]) -> bool:
+        """Return whether all postures and all motions between consecutive ones are valid."""
+        path = list(postures)
+        return all(map(self.valid, path)) and all(self.clear(a, b) for a, b in pairwise(path))
+
+    def take(self, q: Array, step: Array) -> Array | None:
+        """Take a tangent step along the constraints; ``None`` if it is blocked or jumps to another branch."""
+        moved = self.pulled(q, step)
+        if moved is None or self.distance(q, moved) > _JUMP * float(np.linalg.norm(step)):
+            return None
+        return moved if self.clear(q, moved) else None
+
+    def walk(self, start: Array, target: Array) -> list[Array]:
+        """Step from ``start`` towards ``target`` along the constraints, until it is reached or no step comes nearer.
+
+        The last posture is ``target`` itself if it was reached.  Inequalities deflect the steps, because a posture
+        is pulled onto them, too.
+        """
+        path = [start]
+        while True:
+            left = self.difference(path[-1], target)
+            size = float(np.linalg.norm(left))
+            if size <= STEP:
+                if self.clear(path[-1], target):
+                    path.append(target)
+                return path
+            moved = self.take(path[-1], left * (STEP / size))
+            if moved is None or self.distance(moved, target) > size - _PROGRESS * STEP:
+                return path
+            path.append(moved)
+
+    def unwound(self, start: Array, target: Array) -> Array:
+        """Return ``target`` with revolute joints turned by full turns, within their limits, to be near ``start``."""
+        target = target.copy()
+        for slot in self.projector.chart.slots:
+            if slot.kind.family == "revolute":
+                turns = np.round((target[slot.q] - start[slot.q]) / (2 * np.pi))
+                nearer = target[slot.q] - 2 * np.pi * turns
+                if ((self.problem.lower[slot.x] <= nearer) & (nearer <= self.problem.upper[slot.x])).all():
+                    target[slot.q] = nearer
+        return target
+
+    def length(self, postures: Iterable[Array]) -> float:
+        """Return the tangent length of a path, rad mixed with m."""
+        return sum(self.distance(a, b) for a, b in pairwise(postures))
+
+
+def _projected(constraint: Constraint) -> Constraint:
+    made = copy(constraint)
+    made.projected = True
+    return made
+
+
+def lever_arms(chart: Chart, model: pin.Model) -> Array:
+    """Return how far a frame can move per unit of each velocity entry, m/rad or 1, shape (nv,).
+
+    For a rotation this is the length of the longest chain of placements from the joint to a frame that it carries,
+    an upper bound on the distance of the frame from the axis.  Sliding joints on the chain add their largest travel.
+    """
+    depth = np.zeros(model.njoints)
+    for frame in model.frames:
+        depth[frame.parentJoint] = max(depth[frame.parentJoint], float(np.linalg.norm(frame.placement.translation)))
+    arms = np.zeros(model.nv)
+    for slot in reversed(chart.slots):
+        sliding = _SLIDING.get(slot.kind.family, 0)
+        arms[slot.v] = depth[slot.index]
+        arms[slot.v.start : slot.v.start + sliding] = 1.0
+        travel = 0.0
+        if slot.kind.family in ("prismatic", "translation"):
+            limits = np.abs(np.r_[model.lowerPositionLimit[slot.q], model.upperPositionLimit[slot.q]])
+            travel = float(np.linalg.norm(limits[limits < 1e10]))
+        parent = int(model.parents[slot.index])
+        along = float(np.linalg.norm(model.jointPlacements[slot.index].translation))
+        depth[parent] = max(depth[parent], depth[slot.index] + travel + along)
+    return arms
