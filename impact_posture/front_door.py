@@ -26,11 +26,12 @@ from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_su
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
+from impact_posture.posture.global_search import GlobalSearch, SelfMotionMap, check_searchable, search_globally
 from impact_posture.posture.pareto import pareto_front
 from impact_posture.posture.problem import PostureProblem as CoreProblem
 from impact_posture.posture.problem_settings import Prepared, prepare, requirements
 from impact_posture.posture.result import result_document
-from impact_posture.posture.robustness import Robustness, solve_robustly
+from impact_posture.posture.robustness import Robustness, compare_variants, solve_robustly
 from impact_posture.posture.solve import PostureSolution, Progress
 from impact_posture.posture.tradeoff import TradeOff
 from impact_posture.result_folder import FORMATS, Finish, Written, result_view, write_result
@@ -46,6 +47,7 @@ from impact_posture.settings import (
     ObjectiveKind,
     ProblemSettings,
     RobotSettings,
+    Search,
 )
 from impact_posture.tables import validate
 
@@ -234,6 +236,7 @@ class PostureResult:
         solution: Result of the search.
         robustness: Cost and gain of the model variants; ``None`` without model variants.
         tradeoff: The best objective within each distance from the start; ``None`` before :meth:`trade_off`.
+        global_search: Finding of the search ``global``; ``None`` without it.
     """
 
     def __init__(
@@ -242,9 +245,10 @@ class PostureResult:
         solution: PostureSolution,
         robustness: Robustness | None = None,
         tradeoff: TradeOff | None = None,
+        global_search: GlobalSearch | None = None,
     ) -> None:
         self.problem, self.solution = problem, solution
-        self.robustness, self.tradeoff = robustness, tradeoff
+        self.robustness, self.tradeoff, self.global_search = robustness, tradeoff, global_search
 
     @property
     def q(self) -> Array:
@@ -273,7 +277,11 @@ class PostureResult:
         Raises:
             InputError: The objective is not that of an impact.
         """
-        return result_document(self._prepared, self.solution, self.robustness, self.tradeoff)
+        return result_document(self._prepared, self.solution, self.robustness, self.tradeoff, self.global_search)
+
+    @property
+    def _mapped(self) -> SelfMotionMap | None:
+        return None if self.global_search is None else self.global_search.map
 
     @property
     def _prepared(self) -> Prepared:
@@ -313,7 +321,7 @@ class PostureResult:
                 )
             force = impact.contact_stiffness, impact.speed
         curve = pareto_front(self.solution, points, force=force, compile=compile, progress=progress)
-        return PostureResult(self.problem, self.solution, self.robustness, curve)
+        return PostureResult(self.problem, self.solution, self.robustness, curve, self.global_search)
 
     def save(
         self,
@@ -344,8 +352,8 @@ class PostureResult:
             OutputError: The folder exists without ``force``, or cannot be written.
         """
         return write_result(
-            self._prepared, self.solution, self.document, Path(out), tradeoff=self.tradeoff, force=force,
-            codegen=codegen, formats=formats, jobs=jobs, progress=progress, finish=finish,
+            self._prepared, self.solution, self.document, Path(out), tradeoff=self.tradeoff, mapped=self._mapped,
+            force=force, codegen=codegen, formats=formats, jobs=jobs, progress=progress, finish=finish,
         )  # fmt: skip
 
     def plot(
@@ -354,7 +362,8 @@ class PostureResult:
         """Draw the figures into a folder; return their paths."""
         from impact_posture.plot import draw_all
 
-        return draw_all(result_view(self._prepared, self.solution, self.document), Path(out), formats, only)
+        view = result_view(self._prepared, self.solution, self.document, self._mapped)
+        return draw_all(view, Path(out), formats, only)
 
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
         """Write the C code as :meth:`ImpactObjective.export` does, with the optimal posture as a constant."""
@@ -371,6 +380,7 @@ def optimize(
     seed: int = 0,
     jobs: int = 2,
     compile: CompileMode = "auto",
+    search: Search = "multistart",
     progress: Progress | None = None,
 ) -> PostureResult:
     """Find the posture with the least objective, from many starts, and certify it.
@@ -381,11 +391,22 @@ def optimize(
         seed: Seed of the random starts.
         jobs: Processes that search side by side.
         compile: Whether the program is compiled: ``auto`` (if it pays), ``always`` or ``never``.
+        search: ``multistart``, or ``global`` (:func:`~impact_posture.posture.global_search.search_globally`).
         progress: Called after each start with the numbers done and in all.
 
     Raises:
+        InputError: The problem is none for the search ``global``.
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
         SolverFailed: No run ended at a certified posture.
     """
+    _check_choice("search", search, get_args(Search))
+    if search == "global":
+        check_searchable(problem.problem)
     found = solve_robustly(problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress)
-    return PostureResult(problem, found.solution, found.robustness)
+    if search == "multistart":
+        return PostureResult(problem, found.solution, found.robustness)
+    best = search_globally(found.solution, seed=seed, jobs=jobs, compile=compile, progress=progress)
+    robustness = found.robustness and compare_variants(
+        best.solution, [variant.q for variant in found.robustness.model_variants], seed
+    )
+    return PostureResult(problem, best.solution, robustness, global_search=best.search)

@@ -28,6 +28,7 @@ ContactPose = Literal["full", "position", "aligned", "free", "box"]
 BaseMode = Literal["free", "level", "fixed", "box"]
 SupportKind = Literal["point", "surface"]
 Against = Literal["distance", "force"]
+Search = Literal["multistart", "global"]
 JointModel = Literal["reflected", "link", "locked", "elastic"]
 TransmissionKind = Literal["rigid", "elastic", "locked"]
 
@@ -327,5 +328,12 @@ class ProblemSettings(ImpactSettings):
             "What --tradeoff bounds: the distance from the start, or the peak force of the impact.", TASK, "WHAT"
         ),
     ] = "distance"  # fmt: skip
+    search: Annotated[
+        Search,
+        Setting(
+            "multistart, or global: all self-motions with 1 or 2 degrees of freedom left, else hops from the best.",
+            OUTPUT, "HOW",
+        ),
+    ] = "multistart"  # fmt: skip
     starts: Annotated[int, Setting("Number of starting points of the search.", OUTPUT, **demand.ONE_OR_MORE)] = 16
     seed: Annotated[int, Setting("Seed of the random starts.", OUTPUT, **demand.ZERO_OR_MORE)] = 0

@@ -26,6 +26,7 @@ from impact_posture.plot.run_figures import (
     metric_figure,
 )
 from impact_posture.plot.run_view import RunView, Span
+from impact_posture.plot.self_motion_figure import self_motion_figure
 from impact_posture.plot.snapshots import draw_snapshots, snapshots_figure
 from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save
 from impact_posture.plot.view import ResultView, TradeOffData
@@ -53,6 +54,7 @@ __all__ = [
     "metric_figure",
     "postures_figure",
     "save",
+    "self_motion_figure",
     "snapshots_figure",
 ]
 
@@ -63,15 +65,19 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "nullspace": path_figures.path_figure,
     "classical": classical_figure.classical_figure,
     "tradeoff": path_figures.tradeoff_figure,
+    "self_motion": self_motion_figure,
 }
+
+# Figures that are drawn only if the view has this field.
+_NEEDED = {"nullspace": "path", "tradeoff": "tradeoff", "self_motion": "self_motion"}
 
 
 def drawable(view: ResultView) -> list[str]:
     """Return the names of the figures that the view has data for.
 
-    ``nullspace`` needs a path, ``tradeoff`` needs a trade-off.
+    ``nullspace`` needs a path, ``tradeoff`` a trade-off, and ``self_motion`` a map.
     """
-    lacking = {"nullspace": view.path is None, "tradeoff": view.tradeoff is None}
+    lacking = {name: getattr(view, field) is None for name, field in _NEEDED.items()}
     return [name for name in FIGURES if not lacking.get(name)]
 
 

@@ -24,6 +24,7 @@ from impact_posture.settings import Against
 
 # Imported for its name alone, because the figures need no solver.
 if TYPE_CHECKING:
+    from impact_posture.posture.global_search import SelfMotionMap
     from impact_posture.posture.null_space_path import NullSpacePath
 
 # Separator of the facts in a header line.
@@ -73,6 +74,7 @@ class ResultView:
         restitution: Coefficient of restitution e, in [0, 1].
         path: Quantities along the null-space path between them, if known.
         tradeoff: The trade-off of objective against distance, if it was computed.
+        self_motion: The map of the self-motion manifold, if it was computed.
         title: First line of every figure; robot and contact frame if empty.
     """
 
@@ -84,6 +86,7 @@ class ResultView:
     restitution: float = 0.0
     path: NullSpacePath | None = None
     tradeoff: TradeOffData | None = None
+    self_motion: SelfMotionMap | None = None
     title: str = ""
 
     @cached_property

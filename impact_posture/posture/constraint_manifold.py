@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart, JointSlot
-from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.constraint import Constraint

@@ -167,7 +167,7 @@ def _embedded(manifold: ConstraintManifold, x: Array, basis: Array) -> Array:
     return np.asarray(found / np.linalg.norm(found, axis=2, keepdims=True))
 
 
-# ---- one degree of freedom ---------------------------------------------------------------------------------------------
+# ---- one degree of freedom -----------------------------------------------------------------------------------
 
 
 def _curve(manifold: ConstraintManifold, x: Array) -> Component:
@@ -221,7 +221,7 @@ def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple
     return nodes, lengths, "unfinished"
 
 
-# ---- two degrees of freedom --------------------------------------------------------------------------------------------
+# ---- two degrees of freedom ----------------------------------------------------------------------------------
 
 
 def _surface(manifold: ConstraintManifold, x: Array) -> Component:
