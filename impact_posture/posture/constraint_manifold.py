@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart, JointSlot
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.constraint import Constraint
@@ -58,9 +59,11 @@ class ConstraintManifold:
         x, v = ca.SX.sym("x", self.chart.nx), ca.SX.sym("v", self.chart.nv)
         tree = Tree(model, self.chart.configuration(x), x)
         motion = _tangent_map(self.chart.slots, tree.q, self.chart.nx)
-        self._inequalities = [c for c in problem.constraints if not c.equality]
+        self._inequalities = [c for c in problem.constraints if not c.equality and c.projected]
+        # A constraint that only the program satisfies may have no expression in q alone.
+        self._others = [c for c in problem.constraints if not c.projected]
         held = held_rows(problem.robot, problem.requirements.hold)
-        equal = _stack([c for c in problem.constraints if c.equality], tree)
+        equal = _stack([c for c in problem.constraints if c.equality and c.projected], tree)
         unequal = _stack(self._inequalities, tree)
         jacobian = ca.vertcat(ca.jacobian(equal, x) @ motion, held)
         self._equalities = _function([x], [ca.vertcat(equal, ca.SX(len(held), 1)), jacobian])
@@ -102,9 +105,14 @@ class ConstraintManifold:
     def distance_to_feasible(self, x: Array) -> Array:
         """Return the distance from the limits and inequalities to first order, shape (N,); zero where they hold."""
         outside = np.maximum(np.maximum(self.lower - x, x - self.upper), 0.0).max(axis=1, initial=0.0)
-        rows, jacobian = self.excess(x)
-        slopes = np.maximum(np.linalg.norm(jacobian, axis=2), 1e-9)
-        return np.asarray(np.maximum(outside, (np.abs(rows) / slopes).max(axis=1, initial=0.0)))
+        found = np.maximum(outside, _distance(*self.excess(x)))
+        numeric = Numeric(self.problem.robot.model) if self._others else None
+        for k, one in enumerate(x if numeric else ()):
+            numeric = numeric.at(self.to_q(one))
+            for constraint in self._others:
+                value, jacobian = constraint.evaluate(numeric)
+                found[k] = max(found[k], float(_distance(constraint.excess(value)[None], jacobian[None])[0]))
+        return np.asarray(found)
 
     def tangents(self, x: Array, dimension: int) -> Array:
         """Return an orthonormal basis of the tangent space of the manifold, shape (N, dimension, nv)."""
@@ -193,6 +201,12 @@ def _least_norm(jacobian: Array, value: Array) -> Array:
     step = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(gram, value[:, :, None]))[:, :, 0]
     length = np.linalg.norm(step, axis=1, keepdims=True)
     return np.asarray(step * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-300)))
+
+
+def _distance(excess: Array, jacobian: Array) -> Array:
+    """Return the largest distance at which a row would hold, to first order, shape (N,)."""
+    slopes = np.maximum(np.linalg.norm(jacobian, axis=2), 1e-9)
+    return np.asarray((np.abs(excess) / slopes).max(axis=1, initial=0.0))
 
 
 def _tangent_map(slots: Sequence[JointSlot], q: ca.SX, nx: int) -> ca.SX:

@@ -8,7 +8,7 @@ a start says little about the optimum that it leads to, so starts are not chosen
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -16,21 +16,19 @@ import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.errors import InputError, MetricError
-from impact_posture.posture.certificate import Certificate
+from impact_posture.errors import InputError, SolverFailed
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.constraint_manifold import ConstraintManifold
 from impact_posture.posture.missed_optima import estimated_optima, unseen_share
-from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp, one_blas_thread
+from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.posture.optimality_bound import OptimalityBound, bound_objective
 from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
 from impact_posture.posture.self_motion import SelfMotion, map_self_motion
-from impact_posture.posture.solve import PostureSolution, Progress, run_start
+from impact_posture.posture.solve import PostureSolution, Progress, solve
 from impact_posture.posture.starts import Projector, random_posture
-from impact_posture.processes import fork_map
 
-# Hops for each start of the multi-start search, and hops that leave from the same posture, side by side.
-HOPS_PER_START, _ROUND = 3, 4
+# Hops for each start of the multi-start search, and so rounds of as many hops as starts.
+HOPS_PER_START = 3
 # Shares of the joints that a hop draws anew.
 _REDRAWN = (0.1, 0.25, 0.5)
 # A value is better if it is lower by more than this share.
@@ -38,6 +36,8 @@ _BETTER = 1e-6
 # A start missed the best posture if it ended more than this share above.
 _MISSED = 1e-3
 _KEYS = ("redundancy", "improvement", "missed_rate", "unseen_share", "estimated_optima", "hops", "word", "line")
+# Attributes of a solution that tell of the multi-start search.
+_OF_THE_STARTS = ("optima", "starts", "feasible_starts", "certified_starts", "solve_time_s", "build_time_s")
 # Largest violation of a start on the constraints.
 _ON = 1e-8
 
@@ -181,91 +181,45 @@ def search_globally(
     """
     problem = solution.problem
     # A singular posture has more freedom than the manifold.
-    redundancy = min(_redundancy(problem, q) for q in (solution.initial, solution.q))
-    hops = HOPS_PER_START * solution.starts
-    nlp = build_nlp(problem, compile=compile, starts=hops)
+    numeric = Numeric(problem.robot.model)
+    ranks = [rank(equality_jacobian(problem, numeric.at(q))) for q in (solution.initial, solution.q)]
+    redundancy = problem.robot.nv - max(ranks)
+    solve_from = partial(_improved, seed=seed, jobs=jobs, compile=compile)
     if redundancy in (1, 2):
-        better, motion, bound = _mapped(solution, redundancy, nlp, seed, jobs)
-        drawn = _drawn(motion, solution, better)
-        return GlobalSolution(better, GlobalSearch(*_compared(solution, better), 0, motion, bound, drawn))
-    better = _hop(solution, nlp, hops, seed, jobs, progress)
-    return GlobalSolution(better, GlobalSearch(*_compared(solution, better), hops))
+        better, motion, bound, drawn = _mapped(solution, redundancy, seed, solve_from)
+        return GlobalSolution(better, GlobalSearch(redundancy, *_compared(solution, better), 0, motion, bound, drawn))
+    better, hops = solution, HOPS_PER_START * solution.starts
+    projector, rng = Projector(problem), np.random.default_rng([seed, 1])
+    for number in range(HOPS_PER_START):
+        better = solve_from(better, [_redrawn(projector, better.q, rng) for _ in range(solution.starts)])
+        if progress is not None:
+            progress((number + 1) * solution.starts, hops)
+    return GlobalSolution(better, GlobalSearch(redundancy, *_compared(solution, better), hops))
 
 
-def _compared(before: PostureSolution, after: PostureSolution) -> tuple[int, float, float, float, float]:
-    """Return the first five attributes of :class:`GlobalSearch`."""
+def _compared(before: PostureSolution, after: PostureSolution) -> tuple[float, float, float, float]:
+    """Return improvement, missed rate, unseen share and estimated number of optima."""
     value, hits = before.problem.objective.value, [optimum.hits for optimum in before.optima]
     best = value(after.q)
     near = sum(optimum.hits for optimum in before.optima if optimum.objective <= best * (1 + _MISSED))
-    improvement = max(0.0, 1 - best / value(before.q))
-    return after.redundancy, improvement, 1 - near / sum(hits), unseen_share(hits), estimated_optima(hits)
+    return max(0.0, 1 - best / value(before.q)), 1 - near / sum(hits), unseen_share(hits), estimated_optima(hits)
 
 
-def _ends(solution: PostureSolution) -> list[Array]:
-    return [optimum.q for optimum in solution.optima]
-
-
-# ---- one or two degrees of freedom ---------------------------------------------------------------------------
-
-
-def _mapped(
-    solution: PostureSolution, redundancy: int, nlp: PostureNLP, seed: int, jobs: int
-) -> tuple[PostureSolution, SelfMotion, OptimalityBound]:
-    """Map the manifold, polish the best node of each component, and bound what is left."""
-    manifold = ConstraintManifold(solution.problem)
-    known = np.array([manifold.chart.to_x(q) for q in (solution.initial, *_ends(solution))])
-    motion = map_self_motion(manifold, redundancy, known, seed=seed)
-    guesses = []
-    for component in motion.components:
-        feasible = manifold.distance_to_feasible(component.x) <= _ON
-        values = np.where(feasible, manifold.objective(component.x)[0], np.inf)
-        if np.isfinite(values).any():
-            guesses.append(manifold.to_q(component.x[int(np.nanargmin(values))]))
-    better = _better(solution, _solved(nlp, solution, guesses, jobs))
-    bound = bound_objective(motion, solution.problem.objective.value(better.q))
-    if bound.x is not None:
-        better = _better(better, _solved(nlp, solution, [manifold.to_q(bound.x)], jobs))
-        bound = replace(bound, best=min(bound.best, solution.problem.objective.value(better.q)))
-    return better, motion, bound
-
-
-def _drawn(motion: SelfMotion, before: PostureSolution, after: PostureSolution) -> SelfMotionMap:
-    from scipy.spatial import cKDTree
-
-    manifold, parts = motion.manifold, motion.components
-    x = np.concatenate([part.x for part in parts])
-    tree = cKDTree(manifold.embed(x))
-
-    def nearest(postures: Sequence[Array]) -> Array:
-        return np.asarray(tree.query(manifold.embed(np.array([manifold.chart.to_x(q) for q in postures])))[1])
-
-    return SelfMotionMap(
-        q=np.array([manifold.to_q(one) for one in x]),
-        component=np.repeat(np.arange(len(parts)), [len(part.x) for part in parts]),
-        s=np.concatenate([part.s for part in parts]),
-        objective=manifold.objective(x)[0],
-        feasible=manifold.distance_to_feasible(x) <= 1e-6,
-        start=nearest([before.initial]),
-        optimum=nearest([after.q]),
-        ends=nearest(_ends(before)),
-    )
-
-
-# ---- more degrees of freedom ---------------------------------------------------------------------------------
-
-
-def _hop(
-    solution: PostureSolution, nlp: PostureNLP, hops: int, seed: int, jobs: int, progress: Progress | None
+def _improved(
+    before: PostureSolution, guesses: Sequence[Array | None], *, seed: int, jobs: int, compile: CompileMode
 ) -> PostureSolution:
-    """Draw some joints of the best posture anew, solve, and keep the result if it is better."""
-    projector, rng = Projector(solution.problem), np.random.default_rng([seed, 1])
-    for done in range(0, hops, _ROUND):
-        drawn = [_redrawn(projector, solution.q, rng) for _ in range(min(_ROUND, hops - done))]
-        found = _solved(nlp, solution, [q for q in drawn if q is not None], jobs)
-        solution = _better(solution, found)
-        if progress is not None:
-            progress(done + len(drawn), hops)
-    return solution
+    """Solve from guesses, and return the better one of both solutions with the starts of the given one."""
+    known = [q for q in guesses if q is not None]
+    try:
+        found = solve(
+            before.problem, starts=1 + len(known), seed=seed, jobs=jobs, compile=compile, guesses=known
+        )  # fmt: skip
+    except SolverFailed:
+        return before
+    value = before.problem.objective.value
+    if not value(found.q) < value(before.q) * (1 - _BETTER):
+        return before
+    return replace(found, **{key: getattr(before, key) for key in _OF_THE_STARTS})
 
 
 def _redrawn(projector: Projector, q: Array, rng: np.random.Generator) -> Array | None:
@@ -280,41 +234,38 @@ def _redrawn(projector: Projector, q: Array, rng: np.random.Generator) -> Array 
     return found.q if found.violation <= _ON else None
 
 
-# ---- solves --------------------------------------------------------------------------------------------------
+def _mapped(
+    solution: PostureSolution, redundancy: int, seed: int, solve_from: Callable[..., PostureSolution]
+) -> tuple[PostureSolution, SelfMotion, OptimalityBound, SelfMotionMap]:
+    """Map the manifold, polish the best node of each component, and bound what is left."""
+    manifold = ConstraintManifold(solution.problem)
+    chart, ends = manifold.chart, [optimum.q for optimum in solution.optima]
+    known = np.array([chart.to_x(q) for q in (solution.initial, *ends)])
+    motion = map_self_motion(manifold, redundancy, known, seed=seed)
+    x = np.concatenate([component.x for component in motion.components])
+    component = np.repeat(np.arange(len(motion.components)), [len(part.x) for part in motion.components])
+    objective, feasible = manifold.objective(x)[0], manifold.distance_to_feasible(x) <= _ON
+    usable = feasible & np.isfinite(objective)
+    leading = [np.flatnonzero(usable & (component == k)) for k in range(len(motion.components))]
+    nodes = [places[objective[places].argmin()] for places in leading if places.size]
+    better = solve_from(solution, [manifold.to_q(x[node]) for node in nodes])
+    bound = bound_objective(motion, solution.problem.objective.value(better.q))
+    if bound.x is not None:
+        better = solve_from(better, [manifold.to_q(bound.x)])
+    points = manifold.embed(x)
 
-_Solved = tuple[float, SolveRecord, Certificate]
+    def nearest(*postures: Array) -> Array:
+        targets = manifold.embed(np.array([chart.to_x(q) for q in postures]))
+        return np.array([np.linalg.norm(points - target, axis=1).argmin() for target in targets])
 
-
-def _solved(nlp: PostureNLP, solution: PostureSolution, starts: Sequence[Array], jobs: int) -> list[_Solved]:
-    """Return objective, record and certificate of the starts that end at a certified posture, in their order."""
-    scale = nlp.problem.objective.value(solution.initial)
-    with fork_map(partial(_run, nlp, starts, scale), len(starts), jobs if len(starts) > 3 else 1) as results:
-        found = dict(results)
-    return [found[index] for index in range(len(starts)) if found[index][2].holds()]
-
-
-def _run(nlp: PostureNLP, starts: Sequence[Array], scale: float, index: int) -> _Solved:
-    record, certificate = run_start(nlp, starts[index], scale)
-    try:
-        return nlp.problem.objective.value(record.q), record, certificate
-    except MetricError:
-        return np.inf, record, certificate
-
-
-def _better(solution: PostureSolution, found: Sequence[_Solved]) -> PostureSolution:
-    """Return the solution at the best posture of all."""
-    if not found:
-        return solution
-    problem = solution.problem
-    objective, record, certificate = min(found, key=lambda one: one[0])
-    if not objective < problem.objective.value(solution.q) * (1 - _BETTER):
-        return solution
-    return replace(
-        solution, q=record.q, certificate=certificate, status=record.status, iterations=record.iterations,
-        redundancy=_redundancy(problem, record.q),
-    )  # fmt: skip
-
-
-def _redundancy(problem: PostureProblem, q: Array) -> int:
-    numeric = Numeric(problem.robot.model)
-    return problem.robot.nv - rank(equality_jacobian(problem, numeric.at(q)))
+    drawn = SelfMotionMap(
+        q=np.array([manifold.to_q(one) for one in x]),
+        component=component,
+        s=np.concatenate([part.s for part in motion.components]),
+        objective=objective,
+        feasible=feasible,
+        start=nearest(solution.initial),
+        optimum=nearest(better.q),
+        ends=nearest(*ends),
+    )
+    return better, motion, replace(bound, best=solution.problem.objective.value(better.q)), drawn

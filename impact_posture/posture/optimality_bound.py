@@ -87,20 +87,25 @@ def bound_objective(motion: SelfMotion, best: float, gap: float = 0.01) -> Optim
     active = _initial(motion)
     count, retired, found = len(active.x), np.inf, None
     while len(active.x):
+        retired, active = _retire(active, retired, best * (1 - gap))
+        # Feasibility takes longest, so only patches that may hold a better posture are asked.
         distance = manifold.distance_to_feasible(active.x)
         values = np.where((distance <= _FEASIBLE) & np.isfinite(active.value), active.value, np.inf)
         if values.size and np.exp(values.min()) < best * (1 - 1e-9):
             best, found = float(np.exp(values.min())), active.x[int(values.argmin())]
-        active = active.where(distance <= _BEYOND * active.radius)
-        open_ = active.lower < np.log(best * (1 - gap))
-        retired = min(retired, float(active.lower[~open_].min(initial=np.inf)))
-        active = active.where(open_)
+        retired, active = _retire(active.where(distance <= _BEYOND * active.radius), retired, best * (1 - gap))
         if not len(active.x) or count + len(active.x) * len(_PARTS[dimension]) > _MOST:
             break
         active = _split(manifold, dimension, active)
         count += len(active.x)
     lower = min(retired, float(active.lower.min(initial=np.inf)))
     return OptimalityBound(best, min(float(np.exp(lower)), best), found, count, not len(active.x))
+
+
+def _retire(active: _Patches, retired: float, threshold: float) -> tuple[float, _Patches]:
+    """Return the least bound on φ of all retired patches, and the patches that may lie below a threshold."""
+    open_ = active.lower < np.log(threshold)
+    return min(retired, float(active.lower[~open_].min(initial=np.inf))), active.where(open_)
 
 
 def _initial(motion: SelfMotion) -> _Patches:
