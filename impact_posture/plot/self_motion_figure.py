@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
@@ -19,7 +20,7 @@ from impact_posture.plot.view import ResultView, header_lines, objective_unit
 if TYPE_CHECKING:
     from impact_posture.posture.global_search import SelfMotionMap
 
-_CURVES = "Each curve is one component: a closed self-motion, or one from limit to limit."
+_CURVES = "Each curve is one component: it is closed, or runs from one limit to another."
 _SURFACES = "Each panel is one component, over the two joints that move most on it; sheets may lie over each other."
 _GRAY = "Gray: limits or inequalities are violated. Postures that differ by full turns count as one."
 # Largest number of surfaces, the largest first, and the gap between curves as a share of all lengths.
@@ -107,7 +108,7 @@ def _widest(chart: Chart, x: Array) -> tuple[int, int]:
     return joints[first], joints[second]
 
 
-def _mark(axes: Any, data: SelfMotionMap, x: Array, y: Array, mine: Array) -> None:
+def _mark(axes: Any, data: SelfMotionMap, x: Array, y: Array, mine: NDArray[np.bool_]) -> None:
     """Mark the start, the optimum and the optima of the multi-start search that lie on a component."""
     for name, look in _MARKS.items():
         places = getattr(data, name)

@@ -106,9 +106,9 @@ class ConstraintManifold:
         """Return the distance from the limits and inequalities to first order, shape (N,); zero where they hold."""
         outside = np.maximum(np.maximum(self.lower - x, x - self.upper), 0.0).max(axis=1, initial=0.0)
         found = np.maximum(outside, _distance(*self.excess(x)))
-        numeric = Numeric(self.problem.robot.model) if self._others else None
-        for k, one in enumerate(x if numeric else ()):
-            numeric = numeric.at(self.to_q(one))
+        numeric = Numeric(self.problem.robot.model)
+        for k, one in enumerate(x if self._others else ()):
+            numeric.at(self.to_q(one))
             for constraint in self._others:
                 value, jacobian = constraint.evaluate(numeric)
                 found[k] = max(found[k], float(_distance(constraint.excess(value)[None], jacobian[None])[0]))

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
@@ -58,13 +59,13 @@ class SelfMotionMap:
     """
 
     q: Array
-    component: Array
+    component: NDArray[np.int_]
     s: Array
     objective: Array
-    feasible: Array
-    start: Array
-    optimum: Array
-    ends: Array
+    feasible: NDArray[np.bool_]
+    start: NDArray[np.int_]
+    optimum: NDArray[np.int_]
+    ends: NDArray[np.int_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +255,7 @@ def _mapped(
         better = solve_from(better, [manifold.to_q(bound.x)])
     points = manifold.embed(x)
 
-    def nearest(*postures: Array) -> Array:
+    def nearest(*postures: Array) -> NDArray[np.int_]:
         targets = manifold.embed(np.array([chart.to_x(q) for q in postures]))
         return np.array([np.linalg.norm(points - target, axis=1).argmin() for target in targets])
 

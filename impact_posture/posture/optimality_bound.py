@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.posture.constraint_manifold import ConstraintManifold
@@ -71,7 +72,7 @@ class _Patches:
         found = self.value - slope * self.radius - self.curvature * self.radius**2 / 2
         return np.where(np.isfinite(found), found, -np.inf)
 
-    def where(self, mask: Array) -> _Patches:
+    def where(self, mask: NDArray[np.bool_]) -> _Patches:
         return _Patches(*(getattr(self, name)[mask] for name in ("x", "radius", "value", "gradient", "curvature")))
 
 

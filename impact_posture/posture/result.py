@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from importlib import metadata
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -92,10 +93,10 @@ def result_arrays(
     path: NullSpacePath,
     tradeoff: TradeOff | None = None,
     mapped: SelfMotionMap | None = None,
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, NDArray[Any]]:
     """Return the content of ``result.npz``: postures, ellipsoids, jumps, path, trade-off and self-motion map."""
     oracle = solution.problem.impact.oracle
-    arrays: dict[str, NDArray[np.float64]] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     for name, q in (("initial", solution.initial), ("optimal", solution.q)):
         found = oracle.quantities(q)
         arrays |= {

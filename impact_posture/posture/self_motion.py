@@ -178,9 +178,9 @@ def _curve(manifold: ConstraintManifold, x: Array) -> Component:
     if end != "closed":
         back, steps, end = _branch(manifold, x, -tangent)
         nodes, lengths, ends = [*back[:0:-1], *nodes], [*steps[::-1], *lengths], [end, *ends]
-    steps = np.array([0.0, *lengths])
-    reach = np.maximum(steps, np.append(steps[1:], 0.0))
-    return Component(np.array(nodes), np.cumsum(steps), reach, tuple(ends))
+    taken = np.array([0.0, *lengths])
+    reach = np.maximum(taken, np.append(taken[1:], 0.0))
+    return Component(np.array(nodes), np.cumsum(taken), reach, tuple(ends))
 
 
 def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple[list[Array], list[float], str]:
@@ -188,7 +188,8 @@ def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple
 
     Return the nodes from the start on, the lengths of the steps, and what ended it.
     """
-    nodes, lengths, x, direction, step = [start], [], start, tangent, _FIRST
+    nodes, x, direction, step = [start], start, tangent, _FIRST
+    lengths: list[float] = []
     home, first = manifold.embed(start[None])[0], tangent
     while len(nodes) < _NODES:
         moved = manifold.project(manifold.move(x[None], step * direction[None]), steps=6)
