@@ -18,7 +18,6 @@ from impact_posture.dynamics.chart import Chart, JointSlot
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree
-from impact_posture.posture.constraint import Constraint
 from impact_posture.posture.problem import PostureProblem, held_rows
 
 _CONVERGED = 1e-10
@@ -59,15 +58,19 @@ class ConstraintManifold:
         x, v = ca.SX.sym("x", self.chart.nx), ca.SX.sym("v", self.chart.nv)
         tree = Tree(model, self.chart.configuration(x), x)
         motion = _tangent_map(self.chart.slots, tree.q, self.chart.nx)
-        self._inequalities = [c for c in problem.constraints if not c.equality and c.projected]
-        # A constraint that only the program satisfies may have no expression in q alone.
-        self._others = [c for c in problem.constraints if not c.projected]
         held = held_rows(problem.robot, problem.requirements.hold)
-        equal = _stack([c for c in problem.constraints if c.equality and c.projected], tree)
-        unequal = _stack(self._inequalities, tree)
+        # A constraint that only the program satisfies may have no expression in q alone.
+        equal = ca.vertcat(
+            ca.SX(0, 1),
+            *[
+                c.symbolic(tree, ca.SX(ca.DM(c.parameters)))
+                for c in problem.constraints
+                if c.equality and c.projected
+            ],
+        )
+        self._inequalities = [c for c in problem.constraints if not (c.equality and c.projected)]
         jacobian = ca.vertcat(ca.jacobian(equal, x) @ motion, held)
         self._equalities = _function([x], [ca.vertcat(equal, ca.SX(len(held), 1)), jacobian])
-        self._bounded = _function([x], [unequal, ca.jacobian(unequal, x) @ motion])
         objective, normal = problem.impact.gradient_fun(), ca.DM(problem.impact.contact.normal)
         self._objective = _function([x], list(objective(tree.q, normal)))
         self._moved = _function([x, v], [_normalized(self.chart, x + motion @ v)])
@@ -80,10 +83,6 @@ class ConstraintManifold:
         limited = np.isfinite(self.lower) & np.isfinite(self.upper)
         self._middle = np.where(limited, self.lower, 0.0) / 2 + np.where(limited, self.upper, 0.0) / 2
         self.lower[self._turning], self.upper[self._turning] = -np.inf, np.inf
-        self._row_bounds = [
-            np.concatenate([np.zeros(0), *(getattr(c, side) for c in self._inequalities)])
-            for side in ("lower", "upper")
-        ]
 
     # ---- functions of many postures ---------------------------------------------------------------------------
 
@@ -97,22 +96,17 @@ class ConstraintManifold:
         value, gradient = _call(self._objective, x)
         return value[:, 0, 0], gradient[:, :, 0]
 
-    def excess(self, x: Array) -> tuple[Array, Array]:
-        """Return how far inequalities are violated, signed, shape (N, k), and the Jacobian of these rows."""
-        value, jacobian = _call(self._bounded, x)
-        return value[:, :, 0] - np.clip(value[:, :, 0], *self._row_bounds), jacobian
-
     def distance_to_feasible(self, x: Array) -> Array:
         """Return the distance from the limits and inequalities to first order, shape (N,); zero where they hold."""
         outside = np.maximum(np.maximum(self.lower - x, x - self.upper), 0.0).max(axis=1, initial=0.0)
-        found = np.maximum(outside, _distance(*self.excess(x)))
         numeric = Numeric(self.problem.robot.model)
-        for k, one in enumerate(x if self._others else ()):
+        for k, one in enumerate(x if self._inequalities else ()):
             numeric.at(self.to_q(one))
-            for constraint in self._others:
+            for constraint in self._inequalities:
                 value, jacobian = constraint.evaluate(numeric)
-                found[k] = max(found[k], float(_distance(constraint.excess(value)[None], jacobian[None])[0]))
-        return np.asarray(found)
+                slopes = np.maximum(np.linalg.norm(jacobian, axis=1), 1e-9)
+                outside[k] = max(outside[k], float((np.abs(constraint.excess(value)) / slopes).max()))
+        return np.asarray(outside)
 
     def tangents(self, x: Array, dimension: int) -> Array:
         """Return an orthonormal basis of the tangent space of the manifold, shape (N, dimension, nv)."""
@@ -132,7 +126,7 @@ class ConstraintManifold:
         Args:
             x: Postures, shape (N, nx).
             steps: Most steps.
-            within: Also satisfy limits and inequalities.
+            within: Also stay within the limits.
         """
         x, left = x.copy(), np.arange(len(x))
         converged = np.zeros(len(x), dtype=bool)
@@ -140,10 +134,6 @@ class ConstraintManifold:
             if within:
                 x[left] = np.clip(x[left], self.lower, self.upper)
             value, jacobian = self.equalities(x[left])
-            if within and self._inequalities:
-                excess, rows = self.excess(x[left])
-                value = np.concatenate([value, excess], axis=1)
-                jacobian = np.concatenate([jacobian, np.where((excess != 0)[:, :, None], rows, 0.0)], axis=1)
             there = np.abs(value).max(axis=1, initial=0.0) < _CONVERGED
             converged[left[there]] = True
             left, value, jacobian = left[~there], value[~there], jacobian[~there]
@@ -169,10 +159,6 @@ class ConstraintManifold:
     def to_q(self, x: Array) -> Array:
         """Return the configuration of one posture, shape (nq,)."""
         return self.chart.to_q(x)
-
-
-def _stack(constraints: Sequence[Constraint], tree: Tree) -> ca.SX:
-    return ca.vertcat(ca.SX(0, 1), *[c.symbolic(tree, ca.SX(ca.DM(c.parameters))) for c in constraints])
 
 
 def _function(inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
@@ -201,12 +187,6 @@ def _least_norm(jacobian: Array, value: Array) -> Array:
     step = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(gram, value[:, :, None]))[:, :, 0]
     length = np.linalg.norm(step, axis=1, keepdims=True)
     return np.asarray(step * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-300)))
-
-
-def _distance(excess: Array, jacobian: Array) -> Array:
-    """Return the largest distance at which a row would hold, to first order, shape (N,)."""
-    slopes = np.maximum(np.linalg.norm(jacobian, axis=2), 1e-9)
-    return np.asarray((np.abs(excess) / slopes).max(axis=1, initial=0.0))
 
 
 def _tangent_map(slots: Sequence[JointSlot], q: ca.SX, nx: int) -> ca.SX:

@@ -110,25 +110,11 @@ def _retire(active: _Patches, retired: float, threshold: float) -> tuple[float, 
 
 
 def _initial(motion: SelfMotion) -> _Patches:
-    """Patches that cover all components: segments between nodes, or discs around the nodes of surfaces."""
-    manifold, parts = motion.manifold, []
-    for component in motion.components:
-        x, radius = component.x, component.radius
-        if motion.dimension == 1:
-            step = np.diff(component.s)
-            tangents = manifold.tangents(x[:-1], 1)[:, 0]
-            ahead = manifold.embed(manifold.move(x[:-1], 1e-6 * tangents)) - manifold.embed(x[:-1])
-            sense = np.sign(np.sum(ahead * (manifold.embed(x[1:]) - manifold.embed(x[:-1])), axis=1))
-            middle = manifold.move(x[:-1], (sense * step / 2)[:, None] * tangents)
-            x, radius = manifold.project(middle).x, _HALF * step
-        value, gradient = _along(manifold, x, motion.dimension)
-        parts.append(_Patches(x, radius, value, gradient, _curvature(manifold, x, gradient)))
-    return _joined(parts)
-
-
-def _joined(parts: list[_Patches]) -> _Patches:
-    names = ("x", "radius", "value", "gradient", "curvature")
-    return _Patches(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    """Patches around the nodes of all components, which cover them."""
+    x = np.concatenate([component.x for component in motion.components])
+    value, gradient = _along(motion.manifold, x, motion.dimension)
+    radius = np.concatenate([component.radius for component in motion.components])
+    return _Patches(x, radius, value, gradient, _curvature(motion.manifold, x, gradient))
 
 
 def _curvature(manifold: ConstraintManifold, x: Array, gradient: Array) -> Array:

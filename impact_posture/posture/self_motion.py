@@ -23,6 +23,8 @@ _FIRST, _LONGEST, _SINGULAR = 0.02, 0.08, 1e-7
 _TURN, _STRAIGHT = 0.98, 0.995
 # A posture belongs to a node if it leaves the node's tangent space by at most this share of its distance.
 _FLAT = 0.2
+# The points of a curve are at most about half a step from a node: a little more, because the curve bends.
+_HALF = 0.52
 # Longest curve, in nodes, and largest surface.
 _NODES = 20_000
 # Step of a surface; new nodes keep this share of it from all others; number of directions of a step.
@@ -179,7 +181,7 @@ def _curve(manifold: ConstraintManifold, x: Array) -> Component:
         back, steps, end = _branch(manifold, x, -tangent)
         nodes, lengths, ends = [*back[:0:-1], *nodes], [*steps[::-1], *lengths], [end, *ends]
     taken = np.array([0.0, *lengths])
-    reach = np.maximum(taken, np.append(taken[1:], 0.0))
+    reach = _HALF * np.maximum(taken, np.append(taken[1:], 0.0))
     return Component(np.array(nodes), np.cumsum(taken), reach, tuple(ends))
 
 
