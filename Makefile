@@ -91,7 +91,7 @@ study-elastic: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks elastic --write
 
 study-global: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks global --write
+	$(BIN)/python -m tests.benchmarks global hops --write
 
 reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks reproduction --write

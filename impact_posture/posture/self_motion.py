@@ -42,7 +42,8 @@ class Component:
         x: Nodes in chart coordinates, along the curve for one degree of freedom, shape (N, nx).
         s: Path length to each node, rad mixed with m, shape (N,); zeros for a surface.
         radius: Each point of the component is within this distance of a node.
-        ends: What ends the curve: ``closed`` alone, or ``limit`` or ``singular`` for each of both ends; else empty.
+        ends: What ends the curve: ``closed`` alone, or ``limit``, ``singular`` or ``unfinished`` (too long) for each
+            of both ends; empty for a surface.
     """
 
     x: Array
@@ -80,7 +81,7 @@ class SelfMotion:
 
 
 def map_self_motion(
-    manifold: ConstraintManifold, dimension: int, known: Array, *, patience: int = 300, seed: int = 0
+    manifold: ConstraintManifold, dimension: int, known: Array, *, patience: int = 1000, seed: int = 0
 ) -> SelfMotion:
     """Follow every component that random starts reach, until ``patience`` starts in a row reach no new one.
 

@@ -38,17 +38,21 @@ _HOP = (
 )
 
 
-def lines(request: Request) -> Iterator[str]:
-    """The page: maps first, then searches at equal time."""
+def maps(request: Request) -> Iterator[str]:
+    """The page of maps: a row a case."""
+    yield from _machine(request)
+    yield from table(_MAP.split("|"), _maps(request))
+
+
+def hops(request: Request) -> Iterator[str]:
+    """The page of searches at equal time: a row a case."""
+    yield from _machine(request)
+    yield from table(_HOP.split("|"), _searches(request))
+
+
+def _machine(request: Request) -> Iterator[str]:
     yield f"{machine()}; {request.count} seeds, {_STARTS} starts a run, one process."
     yield ""
-    yield "### One or two degrees of freedom left"
-    yield ""
-    yield from table(_MAP.split("|"), _maps(request))
-    yield ""
-    yield "### More degrees of freedom, at equal processor time"
-    yield ""
-    yield from table(_HOP.split("|"), _searches(request))
 
 
 def _maps(request: Request) -> Iterator[list[str]]:
