@@ -107,8 +107,8 @@ class GlobalSearch:
         count = len(self.motion.components)
         pieces = "1 component" if count == 1 else f"{count} components"
         return (
-            f"self-motion followed on {pieces}: at most {100 * self.bound.gap:.2g} % above the best posture on them "
-            f"({self.word}); {missed} missed it; the last {self.motion.unsuccessful} of {self.motion.starts} random "
+            f"self-motion followed on {pieces}: no posture there is better by more than {100 * self.bound.gap:.2g} % "
+            f"({self.word}); {missed} missed this one; the last {self.motion.unsuccessful} of {self.motion.starts} random "
             "postures found no new component"
         )
 
@@ -212,9 +212,8 @@ def _improved(
     """Solve from guesses, and return the better one of both solutions with the starts of the given one."""
     known = [q for q in guesses if q is not None]
     try:
-        found = solve(
-            before.problem, starts=1 + len(known), seed=seed, jobs=jobs, compile=compile, guesses=known
-        )  # fmt: skip
+        count = 1 + len(known)
+        found = solve(before.problem, starts=count, seed=seed, jobs=jobs, compile=compile, guesses=known)
     except SolverFailed:
         return before
     value = before.problem.objective.value
@@ -269,4 +268,5 @@ def _mapped(
         optimum=nearest(better.q),
         ends=nearest(*ends),
     )
-    return better, motion, replace(bound, best=solution.problem.objective.value(better.q)), drawn
+    best = solution.problem.objective.value(better.q)
+    return better, motion, replace(bound, best=best, lower=min(bound.lower, best)), drawn
