@@ -25,11 +25,10 @@ _MAPPED = [
     for name, normal in (("down", DOWN), ("ahead", AHEAD))
 ]  # fmt: skip
 _HOPPED = [
-    Case("talos, aside", "talos", ASIDE),
     Case("g1", "g1", AHEAD),
     Case("anymal_kinova", "anymal_kinova", AHEAD),
-    Case("solo12", "solo12", AHEAD),
     Case("hextilt", "hextilt", AHEAD),
+    Case("talos, aside", "talos", ASIDE),
 ]
 _MAP = "case|degrees of freedom|components|objective|gap|word|patches|processor s|starts that missed it|runs that did"
 _HOP = (
