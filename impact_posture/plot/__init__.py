@@ -13,7 +13,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from impact_posture.errors import NameNotFound
-from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, path_figures
+from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, path_figures, self_motion_figure
 from impact_posture.plot.bars import Bar, bars_figure, draw_bars
 from impact_posture.plot.robot_drawing import postures_figure
 from impact_posture.plot.run_figures import (
@@ -26,7 +26,6 @@ from impact_posture.plot.run_figures import (
     metric_figure,
 )
 from impact_posture.plot.run_view import RunView, Span
-from impact_posture.plot.self_motion_figure import self_motion_figure
 from impact_posture.plot.snapshots import draw_snapshots, snapshots_figure
 from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save
 from impact_posture.plot.view import ResultView, TradeOffData
@@ -54,7 +53,6 @@ __all__ = [
     "metric_figure",
     "postures_figure",
     "save",
-    "self_motion_figure",
     "snapshots_figure",
 ]
 
@@ -65,7 +63,7 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "nullspace": path_figures.path_figure,
     "classical": classical_figure.classical_figure,
     "tradeoff": path_figures.tradeoff_figure,
-    "self_motion": self_motion_figure,
+    "self_motion": self_motion_figure.self_motion_figure,
 }
 
 # Figures that are drawn only if the view has this field.
