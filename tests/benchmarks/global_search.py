@@ -19,11 +19,15 @@ from tests.benchmarks.core import Request, machine, say, table
 _STARTS = 16
 # A run missed the best posture if it ended more than this share above it.
 _MISSED = 1e-3
+# The project asks for a gap of 1 % within a minute on these robots.
+_GOALS = ("tilthex_arm", "panda", "ur5", "xarm7")
 _MAPPED = [
     Case(f"{robot}, {name}", robot, normal)
-    for robot in ("tilthex_arm", "panda", "ur5", "xarm7", "z1", "kinova", "tiago", "borinot")
+    for robot in (*_GOALS, "z1", "kinova", "tiago", "borinot")
     for name, normal in (("down", DOWN), ("ahead", AHEAD))
-]  # fmt: skip
+    # An impact ahead leaves borinot three degrees of freedom.
+    if (robot, name) != ("borinot", "ahead")
+]
 _HOPPED = [
     Case("g1", "g1", AHEAD),
     Case("anymal_kinova", "anymal_kinova", AHEAD),
@@ -61,14 +65,12 @@ def _maps(request: Request) -> Iterator[list[str]]:
         began = time.process_time()
         found = search_globally(runs[0], jobs=1, compile="never")
         took = time.process_time() - began
-        best = found.search.bound.best if found.search.bound else float("nan")
-        if found.search.bound is None or found.search.motion is None:
-            request.missed.append(f"{case.name}: no map")
-            continue
+        assert found.search.bound is not None and found.search.motion is not None
+        best = found.search.bound.best
         hits = [(o.objective <= best * (1 + _MISSED), o.hits) for run in runs for o in run.optima]
         missed = sum(count for near, count in hits if not near) / sum(count for _, count in hits)
         failed = sum(run.optima[0].objective > best * (1 + _MISSED) for run in runs)
-        if took > 60 or found.search.bound.gap > 0.0101:
+        if case.robot in _GOALS and (took > 60 or found.search.bound.gap > 0.01):
             request.missed.append(f"{case.name}: gap {found.search.bound.gap:.3f} in {took:.0f} s")
         yield [
             case.name, str(found.search.redundancy), str(len(found.search.motion.components)), f"{best:.5g}",
