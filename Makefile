@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-robustness reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-robustness reproduction calibration regression
 .PHONY: pictures clean
 
 help:
@@ -19,6 +19,7 @@ help:
 	@echo "make coverage    branch coverage of both packages by the suite, for the documentation"
 	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
 	@echo "make study-elastic  which inertia arms with elastic joints meet a contact with, against MuJoCo"
+	@echo "make study-global   how complete the search global is, and basin hopping beside multi-start"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
 	@echo "make study-robustness  where each controller helps: 40 random variations of each experiment (an hour or two)"
 	@echo "make calibration    the simulated world's restitution, law by law"
@@ -88,6 +89,9 @@ study-impacts: $(VENV)/.installed-test
 
 study-elastic: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks elastic --write
+
+study-global: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks global hops --write
 
 reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks reproduction --write

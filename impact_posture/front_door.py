@@ -26,11 +26,12 @@ from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_su
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
+from impact_posture.posture.global_search import GlobalSearch, SelfMotionMap, check_searchable, search_globally
 from impact_posture.posture.pareto import pareto_front
 from impact_posture.posture.problem import PostureProblem as CoreProblem
 from impact_posture.posture.problem_settings import Prepared, prepare, requirements
 from impact_posture.posture.result import result_document
-from impact_posture.posture.robustness import Robustness, solve_robustly
+from impact_posture.posture.robustness import Robustness, compare_variants, solve_robustly
 from impact_posture.posture.search import Progress
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
@@ -47,6 +48,7 @@ from impact_posture.settings import (
     ObjectiveKind,
     ProblemSettings,
     RobotSettings,
+    Search,
 )
 from impact_posture.tables import validate
 
@@ -237,6 +239,7 @@ class PostureResult:
         robustness: Cost and gain of the model variants; ``None`` without model variants.
         tradeoff: The best objective within each distance from the start; ``None`` before :meth:`trade_off`.
         motion: The path from the start to the optimum; ``None`` before :meth:`path`.
+        global_search: Finding of the search ``global``; ``None`` without it.
     """
 
     def __init__(
@@ -246,9 +249,15 @@ class PostureResult:
         robustness: Robustness | None = None,
         tradeoff: TradeOff | None = None,
         motion: PosturePath | None = None,
+        global_search: GlobalSearch | None = None,
     ) -> None:
-        self.problem, self.solution = problem, solution
-        self.robustness, self.tradeoff, self.motion = robustness, tradeoff, motion
+        self.problem, self.solution, self.robustness = problem, solution, robustness
+        self.tradeoff, self.motion, self.global_search = tradeoff, motion, global_search
+
+    def _with(self, **found: Any) -> PostureResult:
+        """The same result with more found about it."""
+        kept = {key: getattr(self, key) for key in ("tradeoff", "motion", "global_search")}
+        return PostureResult(self.problem, self.solution, self.robustness, **kept | found)
 
     @property
     def q(self) -> Array:
@@ -278,7 +287,12 @@ class PostureResult:
             InputError: The objective is not that of an impact.
         """
         path = None if self.motion is None else self.motion.to_dict()
-        return result_document(self._prepared, self.solution, self.robustness, self.tradeoff, path)
+        extras = self.robustness, self.tradeoff, path, self.global_search
+        return result_document(self._prepared, self.solution, *extras)
+
+    @property
+    def _mapped(self) -> SelfMotionMap | None:
+        return None if self.global_search is None else self.global_search.map
 
     @property
     def _prepared(self) -> Prepared:
@@ -318,7 +332,7 @@ class PostureResult:
                 )
             force = impact.contact_stiffness, impact.speed
         curve = pareto_front(self.solution, points, force=force, compile=compile, progress=progress)
-        return PostureResult(self.problem, self.solution, self.robustness, curve, self.motion)
+        return self._with(tradeoff=curve)
 
     def path(self, *, seed: int = 0) -> PostureResult:
         """Return the same result with a path from the start to the optimum, timed within the robot's limits.
@@ -333,8 +347,7 @@ class PostureResult:
         """
         from impact_posture.path.posture_path import posture_path
 
-        motion = posture_path(self.solution, seed=seed)
-        return PostureResult(self.problem, self.solution, self.robustness, self.tradeoff, motion)
+        return self._with(motion=posture_path(self.solution, seed=seed))
 
     def save(
         self,
@@ -366,6 +379,7 @@ class PostureResult:
         """
         return write_result(
             self._prepared, self.solution, self.document, Path(out), tradeoff=self.tradeoff, motion=self.motion,
+            mapped=self._mapped,
             force=force, codegen=codegen, formats=formats, jobs=jobs, progress=progress, finish=finish,
         )  # fmt: skip
 
@@ -375,7 +389,7 @@ class PostureResult:
         """Draw the figures into a folder; return their paths."""
         from impact_posture.plot import draw_all
 
-        view = result_view(self._prepared, self.solution, self.document, self.motion)
+        view = result_view(self._prepared, self.solution, self.document, self.motion, self._mapped)
         return draw_all(view, Path(out), formats, only)
 
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
@@ -393,6 +407,7 @@ def optimize(
     seed: int = 0,
     jobs: int = 2,
     compile: CompileMode = "auto",
+    search: Search = "multistart",
     progress: Progress | None = None,
 ) -> PostureResult:
     """Find the posture with the least objective, from many starts, and certify it.
@@ -403,11 +418,22 @@ def optimize(
         seed: Seed of the random starts.
         jobs: Processes that search side by side.
         compile: Whether the program is compiled: ``auto`` (if it pays), ``always`` or ``never``.
+        search: ``multistart``, or ``global`` (:func:`~impact_posture.posture.global_search.search_globally`).
         progress: Called after each start with the numbers done and in all.
 
     Raises:
+        InputError: The problem is none for the search ``global``.
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
         SolverFailed: No run ended at a certified posture.
     """
+    _check_choice("search", search, get_args(Search))
+    if search == "global":
+        check_searchable(problem.problem)
     found = solve_robustly(problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress)
-    return PostureResult(problem, found.solution, found.robustness)
+    if search == "multistart":
+        return PostureResult(problem, found.solution, found.robustness)
+    best = search_globally(found.solution, seed=seed, jobs=jobs, compile=compile, progress=progress)
+    robustness = found.robustness and compare_variants(
+        best.solution, [variant.q for variant in found.robustness.model_variants], seed
+    )
+    return PostureResult(problem, best.solution, robustness, global_search=best.search)

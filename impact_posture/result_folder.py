@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ import numpy as np
 from impact_posture.errors import CompilerError, SpecError
 from impact_posture.escape import file_name
 from impact_posture.output_folder import whole_folder, write_record
+from impact_posture.posture.global_search import SelfMotionMap
 from impact_posture.posture.null_space_path import NullSpacePath, null_space_path
 from impact_posture.posture.problem_settings import Prepared, dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.result import result_arrays
@@ -32,7 +33,9 @@ if TYPE_CHECKING:
 
 FORMATS = ("png",)
 
-FinishRequest = tuple[Path, np.ndarray, np.ndarray, NullSpacePath, dict[str, Any], bool, Sequence[str], int]
+FinishRequest = tuple[
+    Path, np.ndarray, np.ndarray, NullSpacePath, SelfMotionMap | None, dict[str, Any], bool, Sequence[str], int
+]
 Finished = tuple[int, int, "tuple[Export, str] | None"]
 Finish = Callable[[FinishRequest], Iterator[Finished]]
 # Exceptions from reading a changed or incomplete result.
@@ -67,6 +70,7 @@ def write_result(
     *,
     tradeoff: TradeOff | None = None,
     motion: PosturePath | None = None,
+    mapped: SelfMotionMap | None = None,
     force: bool = False,
     codegen: bool = True,
     formats: Sequence[str] = FORMATS,
@@ -83,6 +87,7 @@ def write_result(
         out: The folder.
         tradeoff: The trade-off, if it was computed.
         motion: The path to the optimum, if it was searched.
+        mapped: The self-motion map, if it was computed.
         force: Replace an earlier result.
         codegen: Export, build and check the C code, too.
         formats: Formats of the figures.
@@ -98,14 +103,14 @@ def write_result(
     failure = ""
     with whole_folder(out, force=force, kind="result") as folder:
         _write_json(folder / "result.json", document)
-        np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff))  # type: ignore[arg-type]
+        np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff, mapped))  # type: ignore[arg-type]
         _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
         (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
         if motion is not None:
             from impact_posture.path.files import write_path
 
             write_path(folder, prepared.impact.robot, motion)
-        request = (folder, solution.initial, solution.q, path, document, codegen, formats, jobs)
+        request = (folder, solution.initial, solution.q, path, mapped, document, codegen, formats, jobs)
         for done, count, exported in (finish or partial(finish_result, prepared))(request):
             if exported is not None:
                 made, failure = exported
@@ -119,16 +124,17 @@ def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finish
 
     Args:
         prepared: The problem.
-        request: The folder, the postures before and after, the path between them, the content of ``result.json``,
-            whether to export, the formats of the figures, and the number of processes.  It can be sent to a process.
+        request: The folder, the postures before and after, the path between them, the self-motion map, the content of
+            ``result.json``, whether to export, the formats of the figures, and the number of processes.  It can be
+            sent to a process.
 
     Yields:
         The number of finished files, the number of all files, and what :func:`_export` returns if it has ended.
     """
-    folder, initial, optimal, path, document, codegen, formats, jobs = request
+    folder, initial, optimal, path, mapped, document, codegen, formats, jobs = request
     # The C code comes first, because it takes longest.
     tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
-    view = _view(prepared, initial, optimal, path, document, _motion(folder, document))
+    view = _view(prepared, initial, optimal, path, document, _motion(folder, document), mapped)
     tasks += _drawings(view, folder, formats)
     with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
         for done, (index, result) in enumerate(results, start=1):
@@ -172,11 +178,15 @@ def _motion(folder: Path, document: dict[str, Any]) -> PosturePath | None:
 
 
 def result_view(
-    prepared: Prepared, solution: PostureSolution, document: dict[str, Any], motion: PosturePath | None = None
+    prepared: Prepared,
+    solution: PostureSolution,
+    document: dict[str, Any],
+    motion: PosturePath | None = None,
+    mapped: SelfMotionMap | None = None,
 ) -> ResultView:
     """Return the view of a solution, from which its figures are drawn."""
     path = null_space_path(solution.problem, solution.initial, solution.q)
-    return _view(prepared, solution.initial, solution.q, path, document, motion)
+    return _view(prepared, solution.initial, solution.q, path, document, motion, mapped)
 
 
 def _view(
@@ -186,6 +196,7 @@ def _view(
     path: NullSpacePath,
     document: dict[str, Any],
     motion: PosturePath | None,
+    mapped: SelfMotionMap | None,
 ) -> ResultView:
     from impact_posture.plot import ResultView
 
@@ -201,6 +212,7 @@ def _view(
         tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
         collisions=_collisions(prepared, initial, optimal),
         motion=motion,
+        self_motion=mapped,
     )
 
 
@@ -248,6 +260,8 @@ def load_view(folder: Path) -> ResultView:
             path = NullSpacePath(
                 **{key: arrays[f"path_{key}"] for key in ("q", "s", "H", "G", "V", "S", "objective")}
             )
+            names = [field.name for field in fields(SelfMotionMap)] if "self_motion_q" in arrays else []
+            mapped = SelfMotionMap(**{name: arrays[f"self_motion_{name}"] for name in names}) if names else None
         robot, recorded = prepared.impact.robot, str(document["robot"]["model_sha256"])
         if recorded != robot.model_sha256:
             raise SpecError(
@@ -259,7 +273,7 @@ def load_view(folder: Path) -> ResultView:
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
             for key in ("initial", "optimal")
         )
-        return _view(prepared, initial, optimal, path, document, _motion(folder, document))
+        return _view(prepared, initial, optimal, path, document, _motion(folder, document), mapped)
     except _BROKEN as error:
         raise SpecError(
             f"is no whole result ({type(error).__name__}: {error})", where=str(folder), hint="run optimize again"

@@ -30,6 +30,7 @@ ContactPose = Literal["full", "position", "aligned", "free", "box"]
 BaseMode = Literal["free", "level", "fixed", "box"]
 SupportKind = Literal["point", "surface"]
 Against = Literal["distance", "force"]
+Search = Literal["multistart", "global"]
 JointModel = Literal["reflected", "link", "locked", "elastic"]
 TransmissionKind = Literal["rigid", "elastic", "locked"]
 
@@ -391,5 +392,12 @@ class ProblemSettings(ImpactSettings):
     path: Annotated[
         bool, Setting("Find a path from the start to the optimum on which all constraints hold, and time it.", TASK)
     ] = False
+    search: Annotated[
+        Search,
+        Setting(
+            "multistart, or global: all self-motions with 1 or 2 degrees of freedom left, else hops from the best.",
+            OUTPUT, "HOW",
+        ),
+    ] = "multistart"  # fmt: skip
     starts: Annotated[int, Setting("Number of starting points of the search.", OUTPUT, **demand.ONE_OR_MORE)] = 16
     seed: Annotated[int, Setting("Seed of the random starts.", OUTPUT, **demand.ZERO_OR_MORE)] = 0

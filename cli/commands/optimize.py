@@ -71,6 +71,7 @@ def optimize(
                 seed=settings.seed,
                 jobs=jobs,
                 compile=compile,
+                search=settings.search,
                 progress=advance,
             )
         if settings.tradeoff:
@@ -199,6 +200,8 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
         f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
         f"optima: {optima}{more}"
     )
+    if "global" in document:
+        page.line(document["global"]["line"])
     if "tradeoff" in document:
         _tradeoff(page, document, [n for n in document["notes"] if n.startswith("trade-off:")])
     if "path" in document:

@@ -13,7 +13,14 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from impact_posture.errors import NameNotFound
-from impact_posture.plot import classical_figure, ellipsoid_figure, jump_figure, motion_figure, path_figures
+from impact_posture.plot import (
+    classical_figure,
+    ellipsoid_figure,
+    jump_figure,
+    motion_figure,
+    path_figures,
+    self_motion_figure,
+)
 from impact_posture.plot.bars import Bar, bars_figure, draw_bars
 from impact_posture.plot.robot_drawing import postures_figure
 from impact_posture.plot.run_figures import (
@@ -64,16 +71,20 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "classical": classical_figure.classical_figure,
     "tradeoff": path_figures.tradeoff_figure,
     "path": motion_figure.motion_figure,
+    "self_motion": self_motion_figure.self_motion_figure,
 }
+
+# Figures that are drawn only if the view has this field.
+_NEEDED = {"nullspace": "path", "tradeoff": "tradeoff", "self_motion": "self_motion"}
 
 
 def drawable(view: ResultView) -> list[str]:
     """Return the names of the figures that the view has data for.
 
-    ``nullspace`` needs a path, ``tradeoff`` a trade-off, ``path`` a motion.
+    ``nullspace`` needs a path, ``tradeoff`` a trade-off, ``path`` a motion, and ``self_motion`` a map.
     """
-    still = view.motion is None or view.motion.use is None
-    lacking = {"nullspace": view.path is None, "tradeoff": view.tradeoff is None, "path": still}
+    lacking = {name: getattr(view, field) is None for name, field in _NEEDED.items()}
+    lacking["path"] = view.motion is None or view.motion.use is None
     return [name for name in FIGURES if not lacking.get(name)]
 
 

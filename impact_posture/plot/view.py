@@ -26,6 +26,7 @@ from impact_posture.settings import Against
 # Imported for its name alone, because the figures need no solver.
 if TYPE_CHECKING:
     from impact_posture.path.posture_path import PosturePath
+    from impact_posture.posture.global_search import SelfMotionMap
     from impact_posture.posture.null_space_path import NullSpacePath
 
 # Separator of the facts in a header line.
@@ -76,6 +77,7 @@ class ResultView:
         path: Quantities along the null-space path between them, if known.
         tradeoff: The trade-off of objective against distance, if it was computed.
         motion: The path to the optimum over time, if it was searched.
+        self_motion: The map of the self-motion manifold, if it was computed.
         title: First line of every figure; robot and contact frame if empty.
         collisions: Names of the shapes that collide, in pairs, before and after.
     """
@@ -89,6 +91,7 @@ class ResultView:
     path: NullSpacePath | None = None
     tradeoff: TradeOffData | None = None
     motion: PosturePath | None = None
+    self_motion: SelfMotionMap | None = None
     title: str = ""
     collisions: tuple[Sequence[tuple[str, str]], Sequence[tuple[str, str]]] = ((), ())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from importlib import metadata
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from impact_posture.impact.evaluation import Evaluation
 from impact_posture.posture.caveats import caveats
+from impact_posture.posture.global_search import GlobalSearch, SelfMotionMap
 from impact_posture.posture.null_space_path import NullSpacePath
 from impact_posture.posture.problem_settings import Prepared
 from impact_posture.posture.robustness import Robustness
@@ -42,8 +44,9 @@ def result_document(
     robustness: Robustness | None = None,
     tradeoff: TradeOff | None = None,
     path: dict[str, object] | None = None,
+    global_search: GlobalSearch | None = None,
 ) -> dict[str, object]:
-    """Return the content of ``result.json``; the last three arguments are keys only if they are given."""
+    """Return the content of ``result.json``; the last four arguments are keys only if they are given."""
     initial, optimal = evaluations(prepared, solution)
     impact, around = prepared.impact, prepared.problem.surroundings
     fault = [solution.compiler_fault] if solution.compiler_fault else []
@@ -68,6 +71,7 @@ def result_document(
             "seed": prepared.settings.seed,
             "optima": [json_block(optimum) for optimum in solution.optima],
         },
+        **({} if global_search is None else {"global": global_search.to_dict()}),
         **curve,
         **({} if path is None else {"path": path}),
         "notes": [*filter(None, [impact.choice]), *solution.notes, *(tradeoff.notes if tradeoff else ())],
@@ -88,11 +92,14 @@ def versions() -> dict[str, str]:
 
 
 def result_arrays(
-    solution: PostureSolution, path: NullSpacePath, tradeoff: TradeOff | None = None
-) -> dict[str, NDArray[np.float64]]:
-    """Return the content of ``result.npz``: postures, ellipsoids, jumps, the null-space path and the trade-off."""
+    solution: PostureSolution,
+    path: NullSpacePath,
+    tradeoff: TradeOff | None = None,
+    mapped: SelfMotionMap | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Return the content of ``result.npz``: postures, ellipsoids, jumps, path, trade-off and self-motion map."""
     oracle = solution.problem.impact.oracle
-    arrays: dict[str, NDArray[np.float64]] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     for name, q in (("initial", solution.initial), ("optimal", solution.q)):
         found = oracle.quantities(q)
         arrays |= {
@@ -103,4 +110,6 @@ def result_arrays(
             f"{name}_gradient": oracle.gradient_H(q),
         }
     arrays |= {f"path_{key}": getattr(path, key) for key in ("q", "s", "H", "G", "V", "S", "objective")}
+    if mapped is not None:
+        arrays |= {f"self_motion_{key}": value for key, value in vars(mapped).items()}
     return arrays if tradeoff is None else arrays | tradeoff.arrays()

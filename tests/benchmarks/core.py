@@ -69,6 +69,8 @@ STUDIES = {
         Study("restitution", "restitution", "rebound of each contact law", target="calibration"),
         Study("impacts", "impact.page", "objectives against impacts in MuJoCo; postures", 30, target="study-impacts"),
         Study("elastic", "elastic.study", "arms with elastic joints in MuJoCo; postures", 20, target="study-elastic"),
+        Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
+        Study("hops", "global_search:hops", "basin hopping beside multi-start; seeds", 10, target="study-global"),
         Study("robustness", "robustness.study", "where each controller helps; draws", 40, target="study-robustness"),
         Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
     )

@@ -31,6 +31,13 @@ def tilthex() -> ResultView:
 
 
 @pytest.fixture(scope="module")
+def surface(tilthex: ResultView) -> ResultView:
+    """A map of two degrees of freedom."""
+    assert tilthex.self_motion is not None
+    return dataclasses.replace(tilthex, self_motion=dataclasses.replace(tilthex.self_motion, s=np.zeros(24)))
+
+
+@pytest.fixture(scope="module")
 def talos() -> ResultView:
     return make_view("talos", (-1, 0, 0), path=False)
 

@@ -23,6 +23,7 @@ from impact_posture.plot.ellipsoid_figure import ellipsoid_figure
 from impact_posture.plot.jump_figure import groups_of, jump_figure
 from impact_posture.plot.path_figures import normalized, path_figure, tradeoff_figure
 from impact_posture.plot.robot_drawing import Surface, side_plane, surfaces_of
+from impact_posture.plot.self_motion_figure import self_motion_figure
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
     Plane,
@@ -184,6 +185,25 @@ def test_three_ellipsoids_share_panels_and_state_their_units(tilthex: ResultView
     limits = {axes.get_xlim() for axes in panels.flat} | {axes.get_ylim() for axes in panels.flat}
     assert len(limits) == 1
     assert all(len([c for c in axes.lines if len(c.get_xdata()) == 181]) == 3 for axes in panels.flat)
+
+
+def test_self_motion_draws_every_component_and_its_marks(tilthex: ResultView, surface: ResultView) -> None:
+    data = tilthex.self_motion
+    assert data is not None
+    (axes,) = self_motion_figure(tilthex).axes
+    solid = [line for line in axes.lines if line.get_linestyle() == "-" and len(line.get_xdata()) > 2]
+    curves = [np.array(line.get_xydata()) for line in solid]
+    for k, curve in enumerate(curves):
+        mine = data.component == k
+        np.testing.assert_allclose(np.diff(curve[:, 0]), np.diff(data.s[mine]), atol=1e-12)
+        np.testing.assert_allclose(curve[:, 1], np.where(data.feasible, data.objective, np.nan)[mine])
+    assert len(curves) == 2 and curves[0][-1, 0] < curves[1][0, 0]
+    marks = {line.get_label(): line for line in axes.lines}
+    assert marks["optimum"].get_ydata() == data.objective[data.optimum]
+    np.testing.assert_allclose(marks["optima of multi-start"].get_ydata(), data.objective[data.ends])
+    panels = [axes for axes in self_motion_figure(surface).axes if axes.get_xlabel()]
+    points = [panel.collections[0].get_offsets() for panel in panels]
+    assert [len(p) for p in points] == [data.feasible[data.component == k].sum() for k in (0, 1)]
 
 
 def test_tradeoff_marks_knee_and_what_did_not_certify(tilthex: ResultView) -> None:

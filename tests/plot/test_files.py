@@ -16,6 +16,7 @@ from impact_posture.plot.classical_figure import classical_figure
 from impact_posture.plot.ellipsoid_figure import ellipsoid_figure
 from impact_posture.plot.jump_figure import jump_figure
 from impact_posture.plot.path_figures import path_figure, tradeoff_figure
+from impact_posture.plot.self_motion_figure import self_motion_figure
 from impact_posture.plot.style import WIDTH
 from tests.plot.page import defects
 from tests.plot.views import PENDULUM, make_view, text_of
@@ -29,7 +30,8 @@ def test_figures_are_written_in_all_formats(tilthex: ResultView, tmp_path: Path)
     paths += draw_all(
         tilthex, tmp_path / "figures", ("svg", "svg"), only=["nullspace", "classical", "tradeoff", "path"]
     )
-    assert len(paths) == len(set(paths)) == 11
+    paths += draw_all(tilthex, tmp_path / "figures", only=["self_motion"])
+    assert len(paths) == len(set(paths)) == 12
     assert {p.stem for p in paths} == set(FIGURES)
     for path in paths:
         assert path.stat().st_size > 8_000, path
@@ -75,6 +77,8 @@ def test_the_same_view_gives_the_same_files(pendulum: ResultView, tmp_path: Path
         ("pendulum", classical_figure),
         ("tilthex", tradeoff_figure),
         ("pendulum", path_figure),
+        ("tilthex", self_motion_figure),
+        ("surface", self_motion_figure),
     ],
 )
 def test_pages_have_no_defects(name: str, figure: object, request: pytest.FixtureRequest) -> None:
@@ -159,6 +163,8 @@ def test_bad_input(pendulum: ResultView, panda: ResultView, tmp_path: Path) -> N
         draw_all(panda, tmp_path, only=["nullspace"])
     with pytest.raises(InputError, match=r"no trade-off to draw.*`tradeoff`"):
         draw_all(panda, tmp_path, only=["tradeoff"])
+    with pytest.raises(InputError, match=r"no map to draw.*search global"):
+        draw_all(panda, tmp_path, only=["self_motion"])
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="cannot be written"):
         draw_all(pendulum, tmp_path / "file", ("png",), only=["jump"])

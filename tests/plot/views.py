@@ -19,6 +19,7 @@ from impact_posture.plot import (
     ResultView,
     TradeOffData,
 )
+from impact_posture.posture.global_search import SelfMotionMap
 from impact_posture.posture.null_space_path import NullSpacePath
 from impact_posture.robot.robot_loader import load_robot
 
@@ -64,7 +65,24 @@ def make_view(
         path=sample_path(objective, way) if path else None,
         tradeoff=trade_of(objective, way) if path else None,
         motion=motion_of(objective, way, v) if path else None,
+        self_motion=map_of(objective, way) if path else None,
         **keys,  # type: ignore[arg-type]
+    )
+
+
+def map_of(objective: ImpactObjective, way: list[np.ndarray]) -> SelfMotionMap:
+    """Two components to draw, there and back; the end of the way back is infeasible."""
+    path = sample_path(objective, way)
+    count = len(way)
+    return SelfMotionMap(
+        q=np.concatenate([path.q, path.q[::-1]]),
+        component=np.repeat([0, 1], count),
+        s=np.tile(path.s, 2),
+        objective=np.concatenate([path.objective, path.objective[::-1]]),
+        feasible=np.arange(2 * count) < 2 * count - 4,
+        start=np.array([0]),
+        optimum=np.array([count - 1]),
+        ends=np.array([count - 1, count + 2]),
     )
 
 
