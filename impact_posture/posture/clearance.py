@@ -99,7 +99,8 @@ class Clearance(Constraint):
         at, values = self._placed(model)
         found = {}
         for k in map(int, np.flatnonzero(values < within)):
-            values[k], *found[k] = self._separators[k].distance_at(at[self._first[k]], at[self._second[k]])
+            values[k], normal, points = self._separators[k].distance_at(at[self._first[k]], at[self._second[k]])
+            found[k] = normal, points
         return values, found
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:

@@ -24,8 +24,9 @@ from impact_posture.posture.missed_optima import estimated_optima, unseen_share
 from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.posture.optimality_bound import OptimalityBound, bound_objective
 from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
+from impact_posture.posture.search import Progress
 from impact_posture.posture.self_motion import SelfMotion, map_self_motion
-from impact_posture.posture.solve import PostureSolution, Progress, solve
+from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.posture.starts import Projector, random_posture
 
 # Hops for each start of the multi-start search, and so rounds of as many hops as starts.

@@ -172,7 +172,8 @@ def _last_word(problem: PostureProblem, runs: list[Run]) -> tuple[list[Run], str
     """The runs at whose ends no original shapes touch, and two shapes that do at another end."""
     if problem.surroundings is None:
         return runs, ""
-    good, touching, known = [], "", []
+    good: list[Run] = []
+    touching, known = "", list[tuple[Array, list[tuple[str, str]]]]()
     for run in runs:
         assert run.record is not None  # noqa: S101 (narrows a type)
         q = run.record.q
