@@ -160,7 +160,7 @@ class ImpactSettings(RobotSettings):
         ),
     ] = None  # fmt: skip
     friction: Annotated[
-        float, Setting("Friction of the impact, and of the feet for --keep-contacts.", CONTACT, **demand.ZERO_OR_MORE)
+        float, Setting("Friction of the impact, and of the feet.", CONTACT, **demand.ZERO_OR_MORE)
     ] = FRICTION
     metric: Annotated[
         MetricKind,
@@ -321,6 +321,21 @@ class ProblemSettings(ImpactSettings):
         ),
     ] = None  # fmt: skip
     keep_contacts: Annotated[bool, Setting("The impact must neither lift nor slide a foot.", TASK)] = False
+    holdable: Annotated[
+        bool,
+        Setting(
+            "Keep joint torques, rotor thrusts and forces of the feet within their limits at rest, where the robot's "
+            "data say them.",
+            TASK, option="--holdable/--no-holdable",
+        ),
+    ] = True  # fmt: skip
+    hold_force: Annotated[
+        float,
+        Setting(
+            "Force along the normal that the robot also has to hold after the impact, N.", TASK, "N",
+            **demand.ZERO_OR_MORE,
+        ),
+    ] = 0.0  # fmt: skip
     max_force: Annotated[
         float | None,
         Setting(

@@ -7,9 +7,9 @@ from impact_posture.tables import validate
 
 
 def make_settings(values: dict[str, object]) -> ProblemSettings:
-    """Check values as those of options are checked; nothing keeps the robot from collisions unless they ask for it.
+    """Check values as those of options are checked; collisions and loads count only if the values ask for them.
 
-    What is tested with these settings is the impact and the program. Shapes would only make some of its normals
-    impossible (a wall through the robot).  ``tests/test_clearance.py`` and the commands have them.
+    What is tested with these settings is the impact and the program.  Shapes and motors would make some normals
+    impossible (a wall through the robot).  ``test_clearance.py``, ``test_holdable.py`` and the commands have them.
     """
-    return validate(ProblemSettings, {"collision": False, **values}, "options")
+    return validate(ProblemSettings, {"collision": False, "holdable": False, **values}, "options")

@@ -164,7 +164,7 @@ def test_no_redundancy_is_said(tmp_path: Path) -> None:
 
 
 def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
-    """Rotors that reach half of their speed leave the weight unbalanced; the optimum does not hide it."""
+    """Rotors that reach half of their speed cannot carry the weight; no optimum hides it."""
     from impact_posture_robots import DATA
 
     spec = (DATA / "tilthex_arm" / "robot.toml").read_text().replace("speed_max = 100.0", "speed_max = 50.0")
@@ -172,7 +172,9 @@ def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
     for name in ("tilthex_arm.urdf", "tilthex_arm.srdf"):
         shutil.copy(DATA / "tilthex_arm" / name, tmp_path)
     (tmp_path / "robot.toml").write_text(spec)
-    done = run("optimize", "tilthex_arm.urdf", "--normal", 0, 0, 1, "--json", *FAST, cwd=tmp_path)
+    asked = ("optimize", "tilthex_arm.urdf", "--normal", 0, 0, 1)
+    refused(run(*asked, *FAST, cwd=tmp_path), 3, "thrust of rotor_1 at rest")
+    done = run(*asked, "--no-holdable", "--json", *FAST, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert any("cannot hover" in warning for warning in json.loads(done.stdout)["warnings"])
 
@@ -273,3 +275,30 @@ def test_pictures_that_fail_after_the_answer_end_in_one_line(tmp_path: Path) -> 
     assert done.stderr.count("error:") == 1 and "Traceback" not in done.stderr
     assert not (tmp_path / "ur5-tool0").exists()
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+
+
+def test_what_holds_the_posture_is_told(tmp_path: Path) -> None:
+    """The three tightest actuators under each load, on the terminal and in the document."""
+    asked = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--hold-force", 3, *FAST)
+    done = run(*asked, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    table = done.stdout[done.stdout.index("share of the limits") :]
+    assert table.count("at rest") == table.count("while it pushes with 3 N") == 3
+    document = json.loads((tmp_path / "tilthex_arm-ee" / "result.json").read_text())
+    for block in (document["initial"]["holding"], document["optimal"]["holding"]):
+        (pushing,) = block["other_loads"]
+        assert block["feasible"] and pushing["feasible"] and block["unbalanced"] == 0
+        for load in (block, pushing):
+            shares = [one["share"] for one in load["actuators"].values()]
+            assert max(shares) == load["largest_share"] <= 1
+            assert all(one["low"] <= one["value"] <= one["high"] for one in load["actuators"].values())
+        thrusts = [sum(v["value"] for k, v in one["actuators"].items() if "rotor" in k) for one in (block, pushing)]
+        # The surface carries what the tool presses on it.
+        assert thrusts[1] < thrusts[0]
+    again = run("optimize", tmp_path / "tilthex_arm-ee" / "problem.toml", "--out", "again", "--json", cwd=tmp_path)
+    assert json.loads(again.stdout)["optimal"]["holding"]["other_loads"][0]["load"] == "while it pushes with 3 N"
+
+
+def test_a_force_that_cannot_be_held_is_named(tmp_path: Path) -> None:
+    asked = ("optimize", "panda", "--normal", 0, 0, 1, "--no-collision", *FAST, "--hold-force", 300)
+    refused(run(*asked, cwd=tmp_path), 3, "torque of panda_joint6 while it pushes with 300 N")

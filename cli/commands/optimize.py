@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from impact_posture.posture.solve import PostureSolution
     from impact_posture.result_folder import Written
 
+# Actuators in the table of what holding a posture takes.
+_TIGHTEST = 3
+
 RobotOrProblem = Annotated[
     str,
     typer.Argument(
@@ -122,6 +125,7 @@ def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
         ("tradeoff_against", bool(settings.tradeoff), "--tradeoff"),
         ("base_box", settings.base == "box", "--base box"),
         ("com_margin", settings.com is not False, "--com"),
+        ("hold_force", settings.holdable, "--holdable"),
     ):
         if name in given.values and not used:
             raise typer.BadParameter(f"does nothing without {hint}", param_hint=f"'--{name.replace('_', '-')}'")
@@ -177,6 +181,7 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     worst_tables(page, frames, blocks)
     page.gap()
     worst_lines(page, frames, blocks)
+    _holding(page, initial["holding"], optimal["holding"])
     page.line(f"reduction {percent(solution.reduction)}; {_redundancy(solution.redundancy)} left by the constraints")
     if "robustness" in document:
         page.line(document["robustness"]["line"])
@@ -224,6 +229,22 @@ def _impulse_and_force(
     if None not in forces:
         rows.append(("  force", number(forces[0]), number(forces[1]), "N", f"peak force {at}, no friction"))
     return rows
+
+
+def _holding(page: Page, before: dict[str, Any] | None, after: dict[str, Any] | None) -> None:
+    """Show the actuators that come nearest to their limits, under each load."""
+    if before is None or after is None:
+        return
+    rows = []
+    for one, other in zip((before, *before["other_loads"]), (after, *after["other_loads"]), strict=True):
+        shares = {name: (load["share"], other["actuators"][name]["share"]) for name, load in one["actuators"].items()}
+        for name in sorted(shares, key=lambda name: -max(shares[name]))[:_TIGHTEST]:
+            used = (f"{share:.0%}" for share in shares[name])
+            load = other["actuators"][name]
+            rows.append((f"  {name}", *used, f"{number(load['low'])} to {number(load['high'])}", one["load"]))
+    page.line("share of the limits that holding the posture uses (0% in the middle of the range)")
+    page.table(("", "before", "after", "range, N·m or N", ""), rows, right=(1, 2))
+    page.gap()
 
 
 def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:

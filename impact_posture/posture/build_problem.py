@@ -17,6 +17,7 @@ from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.constraint import Constraint
 from impact_posture.posture.impact_limits import ImpactLimits
 from impact_posture.posture.kept_feet import KeptFeet
+from impact_posture.posture.load_cases import LoadCases, load_cases
 from impact_posture.posture.pose_constraints import (
     AxisInCone,
     CenterOfMassOverFeet,
@@ -74,13 +75,16 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
         constraints += _limits(objective, bounds)
         constraints += _in_every_variant(objective, numeric, requirements.friction, bounds, constraints)
     lower, upper = _bounds(robot, chart, given, requirements)
+    held_up = load_cases(objective, given, requirements) if requirements.holdable else LoadCases()
+    decided += held_up.notes
+    loads = [constraint for case in held_up.cases for constraint in case.constraints()]
     more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
     clear, around = [], None
     if requirements.collision:
         around = _surroundings(objective, numeric, requirements, list(struck.values()))
         clear, notes = around.constraints(), [*notes, *around.notes]
     problem = PostureProblem(
-        robot, objective, requirements, given, (*constraints, *more, *clear), lower, upper,
+        robot, objective, requirements, given, (*constraints, *more, *clear, *loads), lower, upper,
         notes=(*decided, *notes), surroundings=around,
     )  # fmt: skip
     return regularize(problem)
@@ -119,6 +123,8 @@ def _check(robot: Robot, requirements: Requirements) -> None:
             raise InputError(f"is {value:g}", where=name, hint="give a number ≥ 0")
     if requirements.keep_contacts and not (np.isfinite(requirements.friction) and requirements.friction > 0):
         raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
+    if requirements.hold_force and not requirements.holdable:
+        raise InputError("does nothing without `holdable=True`", where="hold_force", hint="leave out one of them")
     quaternion = requirements.target_quaternion
     if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):
         raise InputError(

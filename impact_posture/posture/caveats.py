@@ -6,8 +6,8 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective, Objective
+from impact_posture.posture.holding import Holding
 from impact_posture.posture.problem_settings import Prepared
-from impact_posture.robot.actuation import hover
 
 # A contact counts as locked if its 1/mass falls below this share of the initial value.
 _LOCKED = 0.05
@@ -41,21 +41,22 @@ def notes_on_impacts(objective: Objective, initial: Array, q: Array) -> list[str
     return notes
 
 
-def caveats(prepared: Prepared, initial: Array, q: Array) -> list[str]:
-    """Return warnings about hovering, the surface and the ground, for the initial and the optimal posture."""
+def caveats(prepared: Prepared, initial: Array, q: Array, holding: Holding | None) -> list[str]:
+    """Return warnings about holding, the surface and the ground, for the initial and the optimal posture.
+
+    Args:
+        prepared: The problem.
+        initial: Initial posture, shape (nq,).
+        q: Optimal posture, shape (nq,).
+        holding: What holds the optimal posture, if it is known.
+    """
+    verb = "hold" if prepared.impact.robot.spec.propulsion is None else "hover in"
+    loads = holding.violations() if holding else []
+    held = [f"the robot cannot {verb} the optimal posture: {violation}" for violation in loads]
     around = prepared.problem.surroundings
     if around is not None and around.shapes.bodies:
-        return _hover_warnings(prepared, q)
-    return [*_hover_warnings(prepared, q), *_surface_warnings(prepared, initial, q), *_ground_warnings(prepared, q)]
-
-
-def _hover_warnings(prepared: Prepared, q: Array) -> list[str]:
-    """Reasons why an aerial robot cannot hover in the optimal posture."""
-    robot = prepared.impact.robot
-    if robot.spec.propulsion is None or not robot.floating:
-        return []
-    violations = hover(robot.model, robot.spec.propulsion, q).violations
-    return [f"the robot cannot hover in the optimal posture: {violation}" for violation in violations]
+        return held
+    return [*held, *_surface_warnings(prepared, initial, q), *_ground_warnings(prepared, q)]
 
 
 def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]:

@@ -82,7 +82,8 @@ class Constraint(ABC):
         lower: Lower bounds, shape (rows,).
         upper: Upper bounds, shape (rows,).
         projected: Whether starts are pulled onto it; else the program alone satisfies it.
-        grows: Whether :meth:`grown` may add parts to its program.
+        grows: Whether its program is likely to grow by :meth:`grown`.
+        price: Price of a violation of a row where constraints conflict; a cheap one gives way, and is named.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Constraint(ABC):
     upper: Array
     projected: bool = True
     grows: bool = False
+    price: float = 1.0
 
     @property
     def rows(self) -> int:

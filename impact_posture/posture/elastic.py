@@ -87,11 +87,12 @@ def _build(problem: PostureProblem, chart: Chart) -> ca.Function:
     lifted, targets = problem.lift(tree)
     k = lifted.rows.numel()
     up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
+    price = np.concatenate([np.full(len(problem.carried(i)), c.price) for i, c in enumerate(problem.constraints)])
     away = distance_squared(chart, tree.q, chart.configuration(reference))
     program = {
         "x": ca.vertcat(x, up, down, lifted.variables),
         "p": ca.vertcat(reference, *targets),
-        "f": ca.sum1(up + down) + lifted.slack + 1e-6 * away,
+        "f": ca.dot(price, up + down) + lifted.slack + 1e-6 * away,
         "g": ca.vertcat(chart.norms(x), lifted.rows + up - down),
     }
     return ca.nlpsol("elastic", "ipopt", program, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8})

@@ -41,7 +41,9 @@ class Requirements:
         com_asked: Whether the user set ``com_over_feet``; else it is dropped if the feet span no area.
         com_margin: Distance from the polygon's edges, meters.
         keep_contacts: The impact must neither lift nor slide a foot.
-        friction: Friction coefficient for ``keep_contacts``.
+        friction: Friction coefficient of the feet.
+        holdable: Thrusts, torques and forces of the feet that hold the posture stay within their limits.
+        hold_force: Force that each contact pushes back with after the impact, N, which has to be held as well.
         least_mobility: Least G of each contact, 1/kg, for the bound on the peak force; 0 for none.
         largest_jump: Largest jump of a joint per approach speed; infinite for no bound.
         collision: Keep the links clear of each other, the surface, the ground and the obstacles.
@@ -66,6 +68,8 @@ class Requirements:
     com_margin: float = 0.0
     keep_contacts: bool = False
     friction: float = 0.7
+    holdable: bool = False
+    hold_force: float = 0.0
     least_mobility: float = 0.0
     largest_jump: float = float("inf")
     collision: bool = False

@@ -26,7 +26,7 @@ _FILES = ("srdf", "config")
 # Settings that are requirements as they are.
 _AS_SET = (
     "target_position", "target_quaternion", "box", "base_box", "keep", "keep_contacts", "friction", "regularization",
-    "collision", "clearance", "surface", "obstacles",
+    "collision", "clearance", "surface", "obstacles", "holdable", "hold_force",
 )  # fmt: skip
 
 

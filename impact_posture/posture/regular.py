@@ -142,7 +142,8 @@ def _independent_rows(problem: PostureProblem, numeric: Numeric) -> tuple[tuple[
     held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
     equalities = [(index, c) for index, c in enumerate(problem.constraints) if c.equality]
     labels = [(index, row) for index, c in equalities for row in range(c.rows)]
-    stacked = np.vstack([c.evaluate(numeric)[1] for _, c in equalities])
+    # Of rows that repeat each other, those of the cheaper constraint are left out.
+    stacked = np.vstack([c.price * c.evaluate(numeric)[1] for _, c in equalities])
     stacked[:, held] = 0.0
     # SciPy takes long to import, and few problems come here.
     from scipy.linalg import qr

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from impact_posture.impact.evaluation import Evaluation
 from impact_posture.posture.caveats import caveats
 from impact_posture.posture.global_search import GlobalSearch, SelfMotionMap
+from impact_posture.posture.load_cases import load_cases
 from impact_posture.posture.null_space_path import NullSpacePath
 from impact_posture.posture.problem_settings import Prepared
 from impact_posture.posture.robustness import Robustness
@@ -49,8 +50,10 @@ def result_document(
     """Return the content of ``result.json``; the last four arguments are keys only if they are given."""
     initial, optimal = evaluations(prepared, solution)
     impact, around = prepared.impact, prepared.problem.surroundings
+    loads = load_cases(impact.objective, solution.initial, prepared.problem.requirements)
+    before, after = (loads.holding(q) for q in (solution.initial, solution.q))
     fault = [solution.compiler_fault] if solution.compiler_fault else []
-    found = caveats(prepared, solution.initial, solution.q)
+    found = caveats(prepared, solution.initial, solution.q, after)
     warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *found)
     curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list(), "tradeoff_against": tradeoff.against}
     return {
@@ -58,8 +61,13 @@ def result_document(
         "verdict": verdict(impact, initial, optimal).to_dict(),
         **impact.to_dict(solution.initial),
         "constraints": prepared.problem.describe(),
-        "initial": {"given_q": prepared.problem.given.tolist(), "moved": solution.moved, **initial.to_dict()},
-        "optimal": optimal.to_dict(),
+        "initial": {
+            "given_q": prepared.problem.given.tolist(),
+            "moved": solution.moved,
+            **initial.to_dict(),
+            "holding": before and before.to_dict(),
+        },
+        "optimal": {**optimal.to_dict(), "holding": after and after.to_dict()},
         "reduction": solution.reduction,
         **({} if robustness is None else {"robustness": robustness.to_dict()}),
         "redundancy": solution.redundancy,

@@ -116,8 +116,8 @@ class Search:
             ends = {k: record.q for k, record in records.items() if record is not None and record.converged}
             lacking = {k: q for k, q in ends.items() if self.problem.grown([q]) is not self.problem}
             # An end that lacks nothing and still violates something is a trap on the way from an earlier end.
-            trapped = {k for k, q in ends.items() if k not in lacking and not feasible(self.problem, q)}
-            trapped = {k for k in trapped if k in self._ends and k not in retried}
+            again = {k: q for k, q in ends.items() if k in self._ends and k not in lacking and k not in retried}
+            trapped = {k for k, q in again.items() if not feasible(self.problem, q)}
             retried |= trapped
             self._ends = {k: q for k, q in (self._ends | lacking).items() if k not in trapped}
             waiting = sorted({*lacking, *trapped, *later})

@@ -15,7 +15,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.errors import FrameNotFound, PostureError, SpecError
-from impact_posture.robot.model_joints import is_free_flyer, joint_range
+from impact_posture.robot.model_joints import finite_armature, is_free_flyer, joint_range
 from impact_posture.robot.spec import PropulsionSpec
 
 Array = NDArray[np.float64]
@@ -90,6 +90,17 @@ def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
         )
     c = propulsion.thrust_coefficient
     return c * propulsion.speed_min**2, c * propulsion.speed_max**2
+
+
+def torque_limits(model: pin.Model) -> Array:
+    """Return the largest torque of each velocity entry, N·m or N, shape (nv,); infinite where none is known.
+
+    A limit of zero is no data, nothing drives a floating base, and a brake holds a locked joint (infinite armature).
+    """
+    limits = np.array(model.effortLimit, dtype=float)
+    unknown = ~(np.isfinite(limits) & (limits > 0)) | finite_armature(model)[1]
+    unknown[: 6 if is_free_flyer(model) else 0] = True
+    return np.where(unknown, np.inf, limits)
 
 
 def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:

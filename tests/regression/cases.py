@@ -42,7 +42,9 @@ class Case:
     def settings(self) -> ProblemSettings:
         """The same as settings."""
         robot = str(ROOT / self.robot) if self.robot.endswith(".urdf") else self.robot
-        return make_settings({"robot": robot, "frame": self.frame, "normal": self.normal, "collision": True})
+        return make_settings(
+            {"robot": robot, "frame": self.frame, "normal": self.normal, "collision": True, "holdable": True}
+        )
 
     def solve(self) -> tuple[Prepared, PostureSolution]:
         """Solve with the command's defaults."""

@@ -1,0 +1,188 @@
+"""Distribution of the forces that hold a robot at rest, with the least share of its limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.arrays import Array
+from impact_posture.posture.static_load import ForceSource, StaticLoad, StaticTorque
+
+# The default of HiGHS, 1e-7, is coarser than what a certificate accepts.
+_EXACT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+# Shares closer to the largest than this are as large.
+_TIED = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Distribution:
+    """Forces and torques that hold one posture.
+
+    Attributes:
+        forces: ``z`` of rotors and feet, shape (k,).
+        shares: Signed share of its limit that each actuator uses, 0 in the middle of its range, shape (actuators,).
+        unbalanced: Sum of the absolute entries of the wrench on the base that nothing bears, in weights (moments
+            over one meter); zero if the posture can be balanced.
+        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  Where the
+            forces are not unique, it is that of the largest share or of ``unbalanced``, and other rows are zero.
+    """
+
+    forces: Array
+    shares: Array
+    unbalanced: float
+    jacobian: Array
+
+    @property
+    def largest(self) -> float:
+        """The largest share."""
+        return float(np.abs(self.shares).max(initial=0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Thrusts:
+    """Thrusts that the wrench on the base determines alone, ``u = P τ_base``.
+
+    Attributes:
+        names: Name of each rotor.
+        matrix: ``P``, N per N and N·m, shape (k, 6).
+        lower: Least thrusts, N, shape (k,).
+        upper: Largest thrusts, N, shape (k,).
+    """
+
+    names: tuple[str, ...] = ()
+    matrix: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    lower: Array = field(default_factory=lambda: np.zeros(0))
+    upper: Array = field(default_factory=lambda: np.zeros(0))
+
+
+class Equilibrium:
+    """A robot at rest: rows ``R τ(q, z) + r``, first the balance of the base (= 0), then shares of limits.
+
+    A share is 0 in the middle of the range of an actuator, and ±1 at its limits.
+
+    Args:
+        model: The robot, with gravity.
+        sources: Wrenches of rotors and feet in weights, and of what pushes on it, N.
+        weight: The weight of the robot, N.
+        limits: Largest torques, infinite where unknown, shape (nv,).
+        balance: Combinations of the base wrench that the sources balance, shape (b, 6); none on a fixed base.
+        thrusts: Thrusts that are not among the sources.
+        names: Names of the entries of ``ν``.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        sources: Sequence[ForceSource],
+        weight: float,
+        limits: Array,
+        balance: Array,
+        thrusts: Thrusts,
+        names: Sequence[str],
+    ) -> None:
+        self.load, self.weight, self.balanced = StaticLoad(model, sources), weight, len(balance)
+        bounded = [k for k, limit in enumerate(limits) if np.isfinite(limit)]
+        # An entry of z with two limits is a thrust; feet can push as hard as it takes.
+        self._free = np.flatnonzero(np.isfinite(self.load.upper))
+        half, middle = (thrusts.upper - thrusts.lower) / 2, (thrusts.upper + thrusts.lower) / 2
+        base = np.vstack([balance / weight, thrusts.matrix / half[:, None]])
+        torque = np.diag(1 / limits)[bounded]
+        self.rows = np.vstack([np.zeros((len(base), model.nv)), torque])
+        self.rows[: len(base), :6] = base[:, : model.nv]
+        self.offset = np.zeros(len(self.rows))
+        self.offset[self.balanced : len(base)] = -middle / half
+        free = [self.load.names[k] for k in self._free]
+        self.kinds = ("thrust",) * len(half) + ("torque",) * len(bounded) + ("thrust",) * len(free)
+        self.actuators = (*thrusts.names, *(names[k] for k in bounded), *free)
+        ends = [
+            (np.append(thrusts.lower, -limits[bounded]), np.append(thrusts.upper, limits[bounded])),
+            (weight * self.load.lower[self._free], weight * self.load.upper[self._free]),
+        ]
+        self.lower, self.upper = (np.concatenate(parts) for parts in zip(*ends, strict=True))
+
+    def _affine(self, still: StaticTorque) -> tuple[Array, Array, Array, Array]:
+        """``A, b, S, c`` of the balance ``A z + b`` and the shares ``S z + c``, from the torque at ``z = 0``."""
+        every, start = self.rows @ still.by_force, self.rows @ still.value + self.offset
+        half = (self.load.upper - self.load.lower)[self._free, None] / 2
+        middle = (self.load.upper + self.load.lower)[self._free] / 2
+        S = np.vstack([every[self.balanced :], np.eye(self.load.count)[self._free] / half])
+        return (
+            every[: self.balanced],
+            start[: self.balanced],
+            S,
+            np.append(start[self.balanced :], -middle / half[:, 0]),
+        )
+
+    def spares(self, q: Array, room: float) -> bool:
+        """Return whether forces near even ones balance the base and keep ``room`` from every limit.
+
+        This proves without a linear program that the posture can be held.  It says nothing if they do not.
+        """
+        A, b, S, c = self._affine(self.load.torque(q, np.zeros(self.load.count)))
+        lower, upper = self.load.lower, self.load.upper
+        pushing = np.isfinite(lower) & np.isinf(upper)
+        even = np.where(pushing, 1 / max(pushing.sum(), 1), 0.0)
+        even[self._free] = (lower + upper)[self._free] / 2
+        z = even - np.linalg.pinv(A) @ (A @ even + b) if len(A) else even
+        balanced = np.abs(A @ z + b).max(initial=0.0) < _TIED and (z[pushing] >= 0).all()
+        return bool(balanced and np.abs(S @ z + c).max(initial=0.0) <= 1 - room)
+
+    def distribute(self, q: Array) -> Distribution:
+        """Return the forces that balance the base with the least largest share, or with the least imbalance."""
+        count = self.load.count
+        still = self.load.torque(q, np.zeros(count))
+        A, b, S, c = self._affine(still)
+        jacobian = np.zeros((1 + c.size, self.load.model.nv))
+        if not count:
+            jacobian[1:] = np.sign(c)[:, None] * (self.rows @ still.by_posture)
+            return Distribution(np.zeros(0), c, 0.0, jacobian)
+        z, unbalanced, duals = self._least_share(A, b, S, c) or self._least_imbalance(A, b)
+        shares = S @ z + c
+        # The value moves with R τ at fixed z, by the multipliers of its rows.
+        gradient = duals @ self.rows @ self.load.torque(q, z).by_posture
+        worst = np.abs(shares) > np.abs(shares).max(initial=0.0) - _TIED
+        jacobian[np.append(unbalanced > 0, worst & (unbalanced == 0))] = gradient
+        return Distribution(z, shares, unbalanced, jacobian)
+
+    def _least_share(self, A: Array, b: Array, S: Array, c: Array) -> tuple[Array, float, Array] | None:
+        """``min s`` with ``A z + b = 0`` and ``|S z + c| ≤ s``; ``None`` if the feet cannot balance the robot."""
+        # Imported here, because SciPy takes long to import and not every robot needs it.
+        from scipy.optimize import linprog
+
+        count = self.load.count
+        bounds = np.column_stack([self.load.lower, self.load.upper])
+        # A thrust beyond its limits shows as a share above one.
+        bounds[self._free] = -np.inf, np.inf
+        found = linprog(
+            np.append(np.zeros(count), 1.0),
+            A_ub=np.block([[S, -np.ones((len(S), 1))], [-S, -np.ones((len(S), 1))]]),
+            b_ub=np.concatenate([-c, c]),
+            A_eq=np.column_stack([A, np.zeros(len(A))]),
+            b_eq=-b,
+            bounds=[*bounds, (0.0, np.inf)],
+            options=_EXACT,
+        )
+        if found.status != 0:
+            return None
+        above, below = np.split(found.ineqlin.marginals, 2)
+        duals = -np.concatenate([found.eqlin.marginals, above - below])
+        return found.x[:count], 0.0, duals[: len(self.rows)]
+
+    def _least_imbalance(self, A: Array, b: Array) -> tuple[Array, float, Array]:
+        """``min Σ|A z + b|`` within the limits of thrusts and feet."""
+        from scipy.optimize import linprog
+
+        one = np.eye(len(A))
+        found = linprog(
+            np.concatenate([np.zeros(self.load.count), np.ones(2 * len(A))]),
+            A_eq=np.hstack([A, -one, one]),
+            b_eq=-b,
+            bounds=[*np.column_stack([self.load.lower, self.load.upper]), *[(0.0, np.inf)] * (2 * len(A))],
+            options=_EXACT,
+        )
+        duals = np.zeros(len(self.rows))
+        duals[: len(A)] = -found.eqlin.marginals
+        return found.x[: self.load.count], float(found.fun), duals
