@@ -119,6 +119,7 @@ def test_degenerate_robot_draws(pendulum: ResultView) -> None:
         "jump": "Diamonds: with friction 0.7 the contact point",
         "nullspace": "S is undefined along the path",
         "postures": "seen along −x",
+        "self_motion": "runs from one limit to another",
         "tradeoff": "S is undefined at these postures",
     }
     for name, build in FIGURES.items():
