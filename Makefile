@@ -91,7 +91,8 @@ study-elastic: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks elastic --write
 
 study-global: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks global hops --write
+	$(BIN)/python -m tests.benchmarks global --write
+	$(BIN)/python -m tests.benchmarks hops --write
 
 reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks reproduction --write

@@ -122,6 +122,7 @@ def test_degenerate_robot_draws(pendulum: ResultView) -> None:
         "nullspace": "S is undefined along the path",
         "path": "Note: a reason.",
         "postures": "seen along −x",
+        "self_motion": "runs from one limit to another",
         "tradeoff": "S is undefined at these postures",
     }
     for name, build in FIGURES.items():
