@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-robustness reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-robustness reproduction calibration regression
 .PHONY: pictures clean
 
 help:
@@ -21,6 +21,7 @@ help:
 	@echo "make study-elastic  which inertia arms with elastic joints meet a contact with, against MuJoCo"
 	@echo "make study-global   how complete the search global is, and basin hopping beside multi-start"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
+	@echo "make study-feasible  what it costs to be clear of collisions and held by the motors, over the catalogue"
 	@echo "make study-robustness  where each controller helps: 40 random variations of each experiment (an hour or two)"
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
@@ -93,6 +94,9 @@ study-elastic: $(VENV)/.installed-test
 study-global: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks global --write
 	$(BIN)/python -m tests.benchmarks hops --write
+
+study-feasible: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks feasible --write
 
 reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks reproduction --write

@@ -57,7 +57,8 @@ class PostureSolution:
         optima: Distinct optima, best first.
         starts: Number of starts.
         feasible_starts: Starts that reached the constraints.
-        certified_starts: Starts that ended at a certified posture.
+        certified_starts: Starts that ended at a certified posture at which no original shapes touch.
+        colliding_starts: Starts that ended at another certified posture.
         status: Return status of IPOPT for the best run.
         iterations: Iterations of the best run.
         solve_time_s: Wall time of all runs together.
@@ -77,6 +78,7 @@ class PostureSolution:
     starts: int
     feasible_starts: int
     certified_starts: int
+    colliding_starts: int
     status: str
     iterations: int
     solve_time_s: float
@@ -158,6 +160,7 @@ def solve(
         starts=starts,
         feasible_starts=sum(r.start is not None for r in runs),
         certified_starts=len(good),
+        colliding_starts=len(certified) - len(good),
         status=best.record.status,
         iterations=best.record.iterations,
         solve_time_s=time.perf_counter() - began - search.build_time_s,

@@ -1,0 +1,87 @@
+"""What feasibility costs: the optimum without demands, clear of collisions, and also held by the motors."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from impact_posture.errors import ImpactPostureError
+from impact_posture.posture.problem_settings import prepare
+from impact_posture.posture.solve import PostureSolution, solve
+from impact_posture.posture.surroundings import Surroundings
+from impact_posture.robot.robot_loader import known_robots
+from tests.benchmarks.cases import BACK, DOWN
+from tests.benchmarks.core import Request, machine, say, table
+from tests.settings import make_settings
+
+_HEAD = ("robot", "normal", "free: objective", "certified", "collide", "s", "clear: loss", "certified", "time",
+         "all: loss", "certified", "left out", "time")  # fmt: skip
+_NORMALS = {"down": DOWN, "ahead": BACK}
+_STARTS = 16
+
+
+def lines(request: Request) -> Iterator[str]:
+    """A row for each robot and normal."""
+    yield "Each robot of the catalogue at its own contact frame, striking a floor (*down*) and a wall (*ahead*), from"
+    yield f"{_STARTS} starts: *free* of these demands, *clear* of collisions, and with *all*, also held by the motors."
+    yield "*collide*: of the distinct optima of the free problem, those at which shapes touch each other, the surface or"
+    yield "the ground. *loss*: how much the objective of the best posture rises. *left out*: certified ends that the"
+    yield "check on the original shapes refused. *time*: processor time of the search against that of the free one, in"
+    yield "the same run. A dash: no posture meets the demands, and the last column says what conflicts."
+    yield machine()
+    yield ""
+    ends: list[int] = []
+    cases = [(robot, name) for robot in known_robots() if request.only in robot for name in _NORMALS]
+    yield from table((*_HEAD, "conflict"), (_row(robot, name, request, ends) for robot, name in cases))
+    yield ""
+    yield f"Certified ends with all demands, none of which collides by its original shapes: {sum(ends)}."
+
+
+def _row(robot: str, name: str, request: Request, ends: list[int]) -> list[str]:
+    say(f"{robot} {name}")
+    asked = {"robot": robot, "normal": _NORMALS[name], "seed": request.seed}
+    clear, everything = {"collision": True}, {"collision": True, "holdable": True}
+    free, seconds = _solve(asked)
+    around = _surroundings(asked | clear)
+    if not isinstance(free, PostureSolution):
+        return [robot, name, *["–"] * (len(_HEAD) - 2), free]
+    collide = sum(bool(around.collisions(optimum.q)) for optimum in free.optima)
+    best = free.optima[0].objective
+    cells = [
+        robot,
+        name,
+        f"{best:.4g}",
+        f"{free.certified_starts}",
+        f"{collide} of {len(free.optima)}",
+        f"{seconds:.2f}",
+    ]
+    conflict = ""
+    for demands in (clear, everything):
+        found, took = _solve(asked | demands)
+        if not isinstance(found, PostureSolution):
+            cells += ["–"] * (3 if demands is clear else 4)
+            conflict = found
+            continue
+        cells += [f"{100 * (found.optima[0].objective / best - 1):.1f} %", f"{found.certified_starts}"]
+        if demands is everything:
+            cells.append(f"{found.colliding_starts}")
+            ends.append(found.certified_starts)
+        cells.append(f"{took / seconds:.1f}×")
+    return [*cells, conflict]
+
+
+def _solve(asked: dict[str, object]) -> tuple[PostureSolution | str, float]:
+    """The solution, or why there is none, and the processor time of the search."""
+    try:
+        problem = prepare(make_settings(asked)).problem
+        began = time.process_time()
+        solution = solve(problem, starts=_STARTS, seed=int(str(asked["seed"])), jobs=1, compile="never")
+        return solution, time.process_time() - began
+    except ImpactPostureError as error:
+        return error.what, 0.0
+
+
+def _surroundings(asked: dict[str, object]) -> Surroundings:
+    around = prepare(make_settings(asked)).problem.surroundings
+    assert around is not None
+    return around
