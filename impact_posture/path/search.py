@@ -13,7 +13,7 @@ from impact_posture.path.path_space import PathSpace
 from impact_posture.posture.starts import random_posture
 
 # Postures that the search may pull onto the constraints for a target.
-EFFORT = 20_000
+EFFORT = 5000
 # A path is shortened if it exceeds the straight distance of its ends by more than a share: by an elastic band, and
 # before it by shortcuts, whose walks cost more.
 _BENT, _DETOUR = 0.02, 0.2
