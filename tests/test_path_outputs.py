@@ -30,7 +30,7 @@ LIMITS = {"velocity", "velocity_of", "torque", "torque_of", "thrust", "thrust_of
 
 def found(**settings: object) -> tuple[Robot, PosturePath]:
     solution = solve(prepare(make_settings({"normal": (0, 0, 1), **settings})).problem, starts=2, jobs=1)
-    return solution.problem.robot, posture_path(solution, samples=100)
+    return solution.problem.robot, posture_path(solution, effort=500)
 
 
 @pytest.mark.parametrize(

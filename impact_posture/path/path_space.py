@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from copy import copy
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,14 +10,13 @@ import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
-from impact_posture.posture.constraint import Constraint
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import Projector
 
 # Largest violation of equalities and of inequalities at a valid posture (m, rad, or the unit of the constraint).
 EQUALITY, INEQUALITY = 1e-6, 1e-8
 # No frame of the robot moves farther between two postures that are checked, m.
-CHECK_DISTANCE = 1e-2
+CHECK_DISTANCE = 2e-2
 # Tangent length of a step along the constraints, rad mixed with m.
 STEP = 0.05
 # A step that comes nearer to its target by less than this share of its length counts as stuck.
@@ -35,12 +32,15 @@ class PathSpace:
 
     Args:
         problem: The posture problem, whose constraints and joint limits hold along a path.
+
+    Attributes:
+        pulls: Number of postures pulled onto the constraints so far, the measure of effort.
     """
 
     def __init__(self, problem: PostureProblem) -> None:
         self.problem, self.model = problem, problem.robot.model
-        # Starts need not be pulled onto every constraint, but a walk slides along what it meets.
-        self.projector = Projector(replace(problem, constraints=tuple(map(_projected, problem.constraints))))
+        self.projector = Projector(problem)
+        self.pulls = 0
         self._inequalities = any(not c.equality for c in problem.constraints)
         self._reach = lever_arms(self.projector.chart, self.model)
 
@@ -75,6 +75,7 @@ class PathSpace:
 
     def pulled(self, q: Array, step: Array | None = None) -> Array | None:
         """Return ``q ⊕ step`` pulled onto the constraints, or ``None`` if it does not reach them."""
+        self.pulls += 1
         found = self.projector.project(q if step is None else np.asarray(pin.integrate(self.model, q, step))).q
         return found if self.valid(found) else None
 
@@ -151,12 +152,6 @@ class PathSpace:
     def length(self, postures: Iterable[Array]) -> float:
         """Return the tangent length of a path, rad mixed with m."""
         return sum(self.distance(a, b) for a, b in pairwise(postures))
-
-
-def _projected(constraint: Constraint) -> Constraint:
-    made = copy(constraint)
-    made.projected = True
-    return made
 
 
 def lever_arms(chart: Chart, model: pin.Model) -> Array:

@@ -13,7 +13,7 @@ from impact_posture.impact.objective import Objective
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import fitted_curve
 from impact_posture.path.path_space import PathSpace
-from impact_posture.path.search import SAMPLES, Connection, connect, shortened
+from impact_posture.path.search import EFFORT, Connection, connect, shortened
 from impact_posture.path.timing import LimitUse, limit_use, timed
 from impact_posture.posture.solve import PostureSolution
 
@@ -95,7 +95,7 @@ def check_package() -> None:
         )
 
 
-def posture_path(solution: PostureSolution, *, seed: int = 0, samples: int = SAMPLES) -> PosturePath:
+def posture_path(solution: PostureSolution, *, seed: int = 0, effort: int = EFFORT) -> PosturePath:
     """Find a path from ``solution.initial`` to ``solution.q`` along which all constraints hold, and time it.
 
     If the optimum is not reached, the next certified optima are tried, best first, then the best posture on the way.
@@ -103,7 +103,7 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, samples: int = SAM
     Args:
         solution: A solved posture problem.
         seed: Seed of the samples.
-        samples: Postures and attempts that the search may take for each optimum.
+        effort: Postures that the search may pull onto the constraints for each optimum.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed.
@@ -113,7 +113,7 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, samples: int = SAM
     violated = [name for name, size, tolerance in space.violations(start) if size > tolerance]
     if violated:
         return _still(space, objective, start, f"the start violates: {', '.join(violated)}")
-    found, failure = _reached(solution, space, seed, samples)
+    found, failure = _reached(solution, space, seed, effort)
     postures = found.path or [start]
     if len(postures) == 1:
         return _still(space, objective, start, failure)
@@ -150,7 +150,7 @@ def _still(space: PathSpace, objective: Objective, q: Array, reason: str) -> Pos
     return PosturePath(not reason, reason, "", "", value, np.zeros(1), q[None], rest, rest, 0.0, space.worst(q))
 
 
-def _reached(solution: PostureSolution, space: PathSpace, seed: int, samples: int) -> tuple[Connection, str]:
+def _reached(solution: PostureSolution, space: PathSpace, seed: int, effort: int) -> tuple[Connection, str]:
     """Return the path to the optimum, or to the best posture that is reached and why it ends there."""
     start, objective = solution.initial, solution.problem.objective
     others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
@@ -160,7 +160,7 @@ def _reached(solution: PostureSolution, space: PathSpace, seed: int, samples: in
         target = space.pulled(space.unwound(start, q))
         if target is None or (k and objective.value(target) >= objective.value(start)):
             continue
-        found = connect(space, start, target, seed, samples)
+        found = connect(space, start, target, seed, effort)
         visited += found.reached
         if found.path is not None:
             if k == 0:
@@ -170,7 +170,7 @@ def _reached(solution: PostureSolution, space: PathSpace, seed: int, samples: in
     best = objective.value(found.path[-1] if found.path else start) * (1 - _NO_GAIN)
     lowest = min(visited[:: max(1, len(visited) // _MOST_VISITED)], key=objective.value)
     if objective.value(lowest) < best:
-        found, end = connect(space, start, lowest, seed, samples), "posture that was reached"
+        found, end = connect(space, start, lowest, seed, effort), "posture that was reached"
     return (found if found.path else stay), (
         "no path to the optimum was found at this contact pose, which does not prove that there is none"
         + (f"; the path ends at the best {end}" if found.path else "; nothing better than the start was reached")

@@ -12,8 +12,8 @@ from impact_posture.arrays import Array
 from impact_posture.path.path_space import PathSpace
 from impact_posture.posture.starts import random_posture
 
-# Postures and attempts that the search may take for a target.
-SAMPLES = 2000
+# Postures that the search may pull onto the constraints for a target.
+EFFORT = 5000
 # A path is shortened if it exceeds the straight distance of its ends by more than a share: by an elastic band, and
 # before it by shortcuts, whose walks cost more.
 _BENT, _DETOUR = 0.02, 0.2
@@ -66,7 +66,7 @@ class _Tree:
         return found[::-1]
 
 
-def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, samples: int = SAMPLES) -> Connection:
+def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, effort: int = EFFORT) -> Connection:
     """Search a path: walk from both ends towards each other, then grow trees of walks towards random postures, too.
 
     The trees are CBiRRT's (Berenson et al. 2009).  OMPL 2.0 has planners on projected state spaces, which stop at
@@ -78,12 +78,12 @@ def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, sample
         start: First posture, shape (nq,), valid.
         target: Last posture, shape (nq,), valid.
         seed: Seed of the random postures.
-        samples: Number of postures in both trees and of attempts to extend them at which the search ends.
+        effort: Number of postures pulled onto the constraints after which the search ends.
     """
     rng, chart = np.random.default_rng(seed), space.projector.chart
     ours, theirs = _Tree(space, start), _Tree(space, target)
-    growing, other, attempt = ours, theirs, 0
-    while len(ours.postures) + len(theirs.postures) + attempt <= samples:
+    growing, other, attempt, begun = ours, theirs, 0, space.pulls
+    while space.pulls - begun <= effort:
         near = attempt % 4 < 2
         aim = random_posture(space.problem, chart, rng, near=near) if attempt else target
         end = growing.extend(aim)
