@@ -181,16 +181,26 @@ def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
 
 def test_surface_and_locking_are_warned_about(tmp_path: Path) -> None:
     """A normal that points into the surface puts the whole robot behind it."""
-    done = run("optimize", "tilthex_arm", "--normal", 0, 0, -1, "--json", *FAST, cwd=tmp_path)
+    wrong = ("optimize", "tilthex_arm", "--normal", 0, 0, -1, "--json", *FAST)
+    done = run(*wrong, "--no-collision", cwd=tmp_path)
     assert any("check its sign" in w for w in json.loads(done.stdout)["warnings"])
+    done = run(*wrong, cwd=tmp_path)
+    assert done.returncode == 3
+    assert "surface at ee" in done.stderr and "check the sign" in done.stderr
     done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--out", "right", "--json", *FAST, cwd=tmp_path)
     assert not any("surface" in w for w in json.loads(done.stdout)["warnings"])
 
 
 def test_knees_below_the_ground_and_a_growing_jump_are_said(tmp_path: Path) -> None:
     """The best posture of this quadruped folds two knees under its feet, and V rises while H falls."""
-    done = run("optimize", "anymal_c", "--normal", 0, 1, 0, "--json", "--no-codegen", "--format", "png", cwd=tmp_path)
+    command = ("optimize", "anymal_c", "--normal", 0, 1, 0, "--json", "--no-codegen", "--format", "png")
+    done = run(*command, "--out", "clear", cwd=tmp_path)
+    clear = json.loads(done.stdout)
+    assert not any("below the lowest foot" in warning for warning in clear["warnings"])
+    assert clear["collision"]["optimal"]["distance"] > 0.0009
+    done = run(*command, "--no-collision", cwd=tmp_path)
     document = json.loads(done.stdout)
+    assert document["optimal"]["objective"] < clear["optimal"]["objective"]
     assert document["optimal"]["V"] > document["initial"]["V"]
     told = document["verdict"]
     assert told["outcome"] == "worse" or any("without friction the jump grows" in line for line in told["advice"])

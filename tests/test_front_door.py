@@ -95,7 +95,18 @@ def test_objects_check_themselves() -> None:
 def test_defaults_are_those_of_the_command_line(
     robot: str, frame: str, settings: dict[str, object], objective: dict[str, Any]
 ) -> None:
-    theirs = prepare(make_settings({"robot": robot, "frame": frame, "normal": (0.1, 0.2, 1.0), **settings}))
+    theirs = prepare(
+        make_settings(
+            {
+                "robot": robot,
+                "frame": frame,
+                "normal": (0.1, 0.2, 1.0),
+                "collision": True,
+                "holdable": True,
+                **settings,
+            }
+        )
+    )
     made = ip.ImpactObjective(ip.load_robot(robot), ip.ImpactContact(frame, (0.1, 0.2, 1.0)), **objective)
     ours = ip.PostureProblem(made)
     assert ours.prepared is not None

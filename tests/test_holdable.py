@@ -42,7 +42,7 @@ PUSHED = {name: {"hold_force": 2.0} for name in ("tilthex_arm", "talos", "panda"
 @functools.cache
 def problem(name: str, **more: object) -> PostureProblem:
     """Without what else a robot may touch, which has tests of its own."""
-    values = {"robot": name, "normal": (0.3, -0.2, 1.0), "collision": False, **more}
+    values = {"robot": name, "normal": (0.3, -0.2, 1.0), "holdable": True, **more}
     return prepare(make_settings(values)).problem
 
 

@@ -98,9 +98,10 @@ def _surroundings(
 ) -> Surroundings:
     """What the links stay clear of; a push (a free contact pose) has no surface."""
     found = Surroundings(objective.robot, numeric, requirements.hold, requirements.clearance)
-    found.add_ground(objective.supports)
-    for contact, mode in struck:
-        if mode != "free" and requirements.surface != "none":
+    touching = [(contact, mode) for contact, mode in struck if mode != "free"]
+    found.add_ground(objective.supports, [contact for contact, _ in touching])
+    for contact, _ in touching:
+        if requirements.surface != "none":
             width = float("inf") if requirements.surface == "plane" else requirements.surface
             found.add_surface(contact, width if width is None else float(width))
     found.add_obstacles(requirements.obstacles)

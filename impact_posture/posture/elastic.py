@@ -18,6 +18,8 @@ from impact_posture.posture.starts import random_posture
 
 # A constraint with a violation below this (m, rad) is satisfied.
 _KEPT = 1e-6
+# Price of a meter of slack beside that of a violated row: where bodies are in the way of a pose, they are the reason.
+_SLACK_PRICE = 0.03
 # Most times that the program grows for one start.
 _ROUNDS = 20
 
@@ -92,7 +94,7 @@ def _build(problem: PostureProblem, chart: Chart) -> ca.Function:
     program = {
         "x": ca.vertcat(x, up, down, lifted.variables),
         "p": ca.vertcat(reference, *targets),
-        "f": ca.dot(price, up + down) + lifted.slack + 1e-6 * away,
+        "f": ca.dot(price, up + down) + _SLACK_PRICE * lifted.slack + 1e-6 * away,
         "g": ca.vertcat(chart.norms(x), lifted.rows + up - down),
     }
     return ca.nlpsol("elastic", "ipopt", program, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8})

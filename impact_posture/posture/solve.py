@@ -206,8 +206,11 @@ def _initial(problem: PostureProblem, seed: int) -> tuple[PostureProblem, Array]
     answer = elastic(problem if start is None else replace(problem, given=start), seed)
     if answer.conflicts:
         limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
+        sign = "; check the sign of the normal, which points towards the robot"
+        struck = sign if any(" / surface at " in name for name in answer.conflicts) else ""
         raise Infeasible(
-            answer.conflicts, hint=f"relax one of them, move the target, or start from another `posture`{limits}"
+            answer.conflicts,
+            hint=f"relax one of them, move the target, or start from another `posture`{struck}{limits}",
         )
     found = Projector(problem).project(answer.q)
     if found.violation > 1e-8:

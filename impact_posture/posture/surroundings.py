@@ -77,14 +77,15 @@ class Surroundings:
 
     # ---- what is there ----------------------------------------------------------------------------------------
 
-    def add_ground(self, supports: Sequence[Support]) -> None:
-        """Put level ground under the lowest foot; the feet may touch it."""
+    def add_ground(self, supports: Sequence[Support], struck: Sequence[ImpactContact]) -> None:
+        """Put level ground under the lowest foot; the feet and the links that are struck may touch it."""
         if not supports:
             return
         feet = [point_on(self.robot, s.frame, s.offset) for s in supports]
         height = min(float(self._numeric.placement(foot).translation[2]) for foot in feet)
-        exempt = self._rigid([0, *(foot.joint for foot in feet)])
-        self._still |= exempt
+        self._still |= self._rigid(foot.joint for foot in feet)
+        touching = [foot.joint for foot in feet] + [point_on(self.robot, c.frame).joint for c in struck]
+        exempt = self._rigid([0, *touching])
         up = np.array([0.0, 0.0, 1.0])
         body = Body("ground", None, PointOnLink(0, np.array([0.0, 0.0, height]), np.eye(3)), normal=up)
         self._walls.append(_Wall(body, exempt))

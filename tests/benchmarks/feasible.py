@@ -23,7 +23,7 @@ _STARTS = 16
 def lines(request: Request) -> Iterator[str]:
     """A row for each robot and normal."""
     yield "Each robot of the catalogue at its own contact frame, striking a floor (*down*) and a wall (*ahead*),"
-    yield f"from {_STARTS} starts: *free* of these demands, *clear* of collisions, and *all*, also held by the motors."
+    yield f"from {_STARTS} starts: *free* of demands, *clear* of collisions, and with *all*, also held by the motors."
     yield "*collide*: of the distinct optima of the free problem, those at which shapes touch each other, the surface"
     yield "or the ground. *loss*: how much the objective of the best posture rises. *left out*: certified ends that"
     yield "the check on the original shapes refused. *time*: processor time of the search against that of the free"

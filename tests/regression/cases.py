@@ -55,10 +55,10 @@ class Case:
 
 CASES = (
     Case("tilthex_arm, floor", "tilthex_arm", "ee", (0, 0, 1)),
-    Case("tilthex_arm, wall", "tilthex_arm", "ee", (1, 0, 0)),
+    Case("tilthex_arm, wall", "tilthex_arm", "ee", (-1, 0, 0)),
     Case("solo8, push at the base", "solo8", "base_link", (1, 0, 0)),
     Case("talos, push at the torso", "talos", "torso_2_link", (1, 0, 0)),
-    Case("talos, right hand", "talos", "gripper_right_base_link", (1, 0, 0)),
+    Case("talos, right hand", "talos", "gripper_right_base_link", (-1, 0, 0)),
     Case("panda, hand", "panda", "panda_hand_tcp", (0, 0, 1)),
     Case("hextilt, gripper", "hextilt", "flying_arm_5__gripper", (0, 0, 1)),
     Case("rail_arm, your own URDF", "docs/examples/rail_arm/rail_arm.urdf", "tool", (0, 0, 1)),
