@@ -184,7 +184,7 @@ def test_surface_and_locking_are_warned_about(tmp_path: Path) -> None:
     wrong = ("optimize", "tilthex_arm", "--normal", 0, 0, -1, "--json", *FAST)
     done = run(*wrong, "--no-collision", cwd=tmp_path)
     assert any("check its sign" in w for w in json.loads(done.stdout)["warnings"])
-    done = run(*wrong, cwd=tmp_path)
+    done = run(*wrong, "--out", "wrong", cwd=tmp_path)
     assert done.returncode == 3
     assert "surface at ee" in done.stderr and "check the sign" in done.stderr
     done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--out", "right", "--json", *FAST, cwd=tmp_path)

@@ -103,7 +103,10 @@ def _surroundings(
     for contact, _ in touching:
         if requirements.surface != "none":
             width = float("inf") if requirements.surface == "plane" else requirements.surface
-            found.add_surface(contact, width if width is None else float(width))
+            points = [
+                point_on(objective.robot, c.frame, c.offset) for c in (*objective.supports, *objective.contacts)
+            ]
+            found.add_surface(contact, width if width is None else float(width), points)
     found.add_obstacles(requirements.obstacles)
     return found
 

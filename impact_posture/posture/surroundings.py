@@ -21,6 +21,8 @@ from impact_posture.posture.separator import Body, Separator
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import PATCH, Obstacle
 
+# A contact point this near (m) to a plane lies in it.
+_BESIDE = 0.03
 # A body that cannot move and lies this far (m) behind the plane of the surface shows that the surface ends before it.
 _BEHIND = 1e-3
 
@@ -90,16 +92,18 @@ class Surroundings:
         body = Body("ground", None, PointOnLink(0, np.array([0.0, 0.0, height]), np.eye(3)), normal=up)
         self._walls.append(_Wall(body, exempt))
 
-    def add_surface(self, contact: ImpactContact, width: float | None) -> None:
+    def add_surface(self, contact: ImpactContact, width: float | None, touching: Sequence[PointOnLink] = ()) -> None:
         """Put the surface behind a contact: the whole plane, or a square patch of it.
 
         The plane passes through the contact point, or behind the link of the contact (with what held joints fix to
-        it) if that reaches farther at the given posture.  This link may touch it.  The surface is a patch as well if
-        a foot or a fixed base lies behind the plane, because then it ends before it reaches there.
+        it) if that reaches farther at the given posture.  This link may touch it, and so may a link whose own contact
+        lies in the plane, such as a foot beside the one that is struck.  The surface is a patch as well if a foot or
+        a fixed base lies behind the plane, because then it ends before it reaches there.
 
         Args:
             contact: The contact.
             width: Edge length of the patch, m; infinite for the plane, ``None`` to decide.
+            touching: Contact points of feet and of other impacts.
         """
         point = point_on(self.robot, contact.frame, contact.offset)
         turns = contact.normal_frame == "contact"
@@ -110,6 +114,8 @@ class Surroundings:
         plane = Body(name, None, point, turns, n)
         depth = max([0.0, *[-self._height(body, plane) for body in own]])
         plane = replace(plane, offset=-depth)
+        beside = [p.joint for p in touching if abs(self._above(p, plane)) < _BESIDE]
+        exempt |= self._rigid(beside)
         behind = self._stands_behind(plane, exempt)
         if width is None and behind:
             width = PATCH
@@ -200,6 +206,11 @@ class Surroundings:
 
     def _is_still(self, body: Body) -> bool:
         return self._is_fixed(body) or body.point.joint in self._still
+
+    def _above(self, point: PointOnLink, plane: Body) -> float:
+        """Height of a point above a plane."""
+        hull = SweptHull("", "", point.joint, np.array([point.position]), 0.0)
+        return self._height(Body.of_link(hull), plane)
 
     def _height(self, body: Body, plane: Body) -> float:
         return Separator(body, plane, 0.0).distance(self._numeric)[0]
