@@ -27,11 +27,11 @@ class Fit(NamedTuple):
     radius: float
 
 
-def fit_hull(points: Array) -> Fit:
+def fit_hull(points: Array, tolerance: float = _TOLERANCE) -> Fit:
     """Fit a sphere-swept convex hull that holds the convex hull of points, shape (n, 3), m.
 
-    The corner farthest from the hull of those chosen is added, until all are within 4 mm of it or 40 are chosen.
-    The sweep radius is the largest distance of a point from the hull, so every point is held.
+    The corner farthest from the hull of those chosen is added, until all are within the tolerance (m) of it or 40 are
+    chosen.  The sweep radius is the largest distance of a point from the hull, so every point is held.
     """
     corners = hull_corners(points)
     candidates = corners[:: -(-len(corners) // _MOST_CANDIDATES)]
@@ -49,7 +49,7 @@ def fit_hull(points: Array) -> Fit:
             k = queue[0][1]
             seen.add(k)
             heapreplace(queue, (-distance_from_hull(candidates[k], hull), k))
-        if len(chosen) >= min(MOST_VERTICES, len(candidates)) or -queue[0][0] <= _TOLERANCE:
+        if len(chosen) >= min(MOST_VERTICES, len(candidates)) or -queue[0][0] <= tolerance:
             break
         chosen.append(queue[0][1])
     return Fit(vertices, max((distance_from_hull(p, hull) for p in _outside(points, hull)), default=0.0) + _ROUNDING)

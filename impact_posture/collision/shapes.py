@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from itertools import product
 
 import coal
 import numpy as np
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 
 from impact_posture.collision.bodies import Body, merged_bodies
 from impact_posture.collision.geometry import Geometry, geometry_key, load_geometry
+from impact_posture.collision.hollows import open_hollows
 from impact_posture.collision.hull_fit import Fit, fit_hull
 from impact_posture.collision.pairs import Pair, hindered, mostly_touching, pairs_of, touch_of
+from impact_posture.collision.parts import triangles_of
 from impact_posture.collision.shape_cache import StoredHull, StoredShapes, read_shapes, write_shapes
 from impact_posture.collision.swept_hull import SweptHull
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
@@ -31,8 +34,8 @@ class RobotShapes:
         pairs: Bodies that have to keep apart, as indices into ``bodies``, shape (k, 2).
         always_touching: Names of shapes that touch at the default posture and at most others, so that they overlap by
             design and need not keep apart.
-        hulls_touching: Names of bodies whose hulls touch at most of the postures at which their shapes do not.  They
-            are in no pair of hulls, and only the check on the shapes finds their collisions.
+        hulls_touching: Names of bodies whose hulls touch at most of the postures at which their shapes do not, however
+            they are cut.  They are in no pair of hulls, and only the check on the shapes finds their collisions.
         warnings: Shapes that are left out, and what a robot without shapes means; one line each.
         robot: The robot, for the shapes themselves.
     """
@@ -89,14 +92,14 @@ def _shapes(source: _Source) -> RobotShapes:
 
 
 def fit_shapes(robot: Robot, described: list[UrdfShape]) -> StoredShapes:
-    """Load the shapes, fit their hulls, and find the pairs."""
+    """Load the shapes, fit their hulls, find the pairs, and cut bodies in each other's hollows into parts."""
     loaded = load_geometry(robot, described)
     shapes, apart = loaded.model.geometryObjects, loaded.apart
     touching = mostly_touching(robot, shapes, pairs_of(apart))
     for i, j in touching:
         apart[i, j] = apart[j, i] = False
     merged = merged_bodies(shapes, apart)
-    bodies = tuple(_stored(body, loaded) for body in merged)
+    hulls = [_fitted(body, loaded) for body in merged]
     # The shapes of a body have to keep apart from the same shapes.
     first = [body.shapes[0] for body in merged]
     pairs = pairs_of(apart[np.ix_(first, first)])
@@ -106,17 +109,21 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> StoredShapes:
         a, b = (merged[k].shapes for k in pair)
         return any(touch((i, j), data) for i in a for j in b)
 
-    out = set(hindered(robot, [_hull(body) for body in bodies], pairs, bodies_touch))
+    hollows = hindered(robot, hulls, pairs, bodies_touch)
+    opened = open_hollows(hulls, hollows, lambda k: triangles_of(shapes[n] for n in merged[k].shapes))
+    bodies = [hull for parts in opened.parts for hull in parts]
+    index = {hull: k for k, hull in enumerate(bodies)}
+    finer = [two for i, j in pairs for two in product(opened.parts[i], opened.parts[j])]
     return StoredShapes(
-        bodies=bodies,
-        pairs=tuple(pair for pair in pairs if pair not in out),
+        bodies=tuple(_stored(hull) for hull in bodies),
+        pairs=tuple((index[a], index[b]) for a, b in finer if (a, b) not in opened.hindered),
         always_touching=tuple((shapes[i].name, shapes[j].name) for i, j in touching),
-        hulls_touching=tuple((bodies[i].name, bodies[j].name) for i, j in sorted(out)),
+        hulls_touching=tuple((a.name, b.name) for a, b in finer if (a, b) in opened.hindered),
         warnings=loaded.warnings,
     )
 
 
-def _stored(body: Body, loaded: Geometry) -> StoredHull:
+def _fitted(body: Body, loaded: Geometry) -> SweptHull:
     """Fit the hull of a body; that of a single ball or capsule is exact."""
     shape = loaded.model.geometryObjects[body.shapes[0]]
     alone, solid, at = len(body.shapes) == 1, shape.geometry, shape.placement
@@ -127,9 +134,13 @@ def _stored(body: Body, loaded: Geometry) -> StoredHull:
         fit = Fit(np.array(ends), float(solid.radius))
     else:
         fit = fit_hull(np.vstack(body.corners))
-    vertices = tuple((float(x), float(y), float(z)) for x, y, z in fit.vertices)
     link = loaded.links[body.shapes[0]]
-    return StoredHull(shape.name, link, int(shape.parentJoint), vertices, fit.radius)
+    return SweptHull(shape.name, link, int(shape.parentJoint), fit.vertices, fit.radius)
+
+
+def _stored(hull: SweptHull) -> StoredHull:
+    vertices = tuple((float(x), float(y), float(z)) for x, y, z in hull.vertices)
+    return StoredHull(hull.name, hull.link, hull.joint, vertices, hull.radius)
 
 
 def _hull(stored: StoredHull) -> SweptHull:

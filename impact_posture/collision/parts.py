@@ -1,0 +1,104 @@
+"""Parts of a body with a hollow: its triangles, cut by planes so that the hulls of the parts leave the hollow free."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import product
+from typing import Any, NamedTuple
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.arrays import Array
+from impact_posture.collision.shape_points import shape_points
+from impact_posture.collision.swept_hull import SweptHull, hull_corners, separation
+
+TOLERANCE = 0.001
+"""Tolerance (m) of the hulls of parts, finer than that of others, because bodies in hollows have little room."""
+
+# A cut is sought across each axis, at so many places that divide the extent evenly.
+_PLACES = 9
+# The best cut is sought with so many triangles at most, and is made through all.
+_MOST_TRIANGLES = 500
+
+
+class Cut(NamedTuple):
+    """A cut of a part.
+
+    Attributes:
+        sides: Triangles of each side, shape (n, 3, 3) each, m.
+        depth: Sum of the depths (m) to which the other body is in the hulls of the sides.
+    """
+
+    sides: tuple[Array, Array]
+    depth: float
+
+
+def triangles_of(shapes: Iterable[pin.GeometryObject]) -> Array:
+    """Return the triangles around shapes in the axes of their joint, shape (n, 3, 3), m.
+
+    They are those of a mesh, or of the hull around a primitive shape.
+    """
+    found = []
+    for shape in shapes:
+        solid: Any = shape.geometry
+        points = shape_points(solid)
+        if isinstance(solid, coal.BVHModelBase):
+            corners = (solid.tri_indices(k) for k in range(solid.num_tris))
+            faces = np.array([(triangle[0], triangle[1], triangle[2]) for triangle in corners])
+        else:
+            points = hull_corners(points)
+            faces = SweptHull("", "", 0, points, 0.0).faces
+        found.append((points @ shape.placement.rotation.T + shape.placement.translation)[faces])
+    return np.concatenate(found)
+
+
+def best_cut(triangles: Array, other: SweptHull, placements: Sequence[pin.SE3]) -> Cut:
+    """Cut triangles by the plane across an axis that leaves another body least deep in the hulls of the two sides.
+
+    Triangles across the plane are divided, so that the sides together hold every point of all triangles.
+
+    Args:
+        triangles: The triangles, shape (n, 3, 3), m.
+        other: The other body.
+        placements: Placements of the other body in the axes of the triangles.
+    """
+    some = triangles[:: -(-len(triangles) // _MOST_TRIANGLES)]
+    low, high = some.min(axis=(0, 1)), some.max(axis=(0, 1))
+    shares = np.arange(1, _PLACES + 1) / (_PLACES + 1)
+    extent = high - low
+    axes = np.flatnonzero(extent >= min(TOLERANCE, extent.max()))
+    planes = [(int(axis), float(low[axis] + share * extent[axis])) for axis, share in product(axes, shares)]
+    depths = [depth([_hull(side) for side in divide(some, *plane)], other, placements) for plane in planes]
+    best = int(np.argmin(depths))
+    return Cut(divide(triangles, *planes[best]), depths[best])
+
+
+def depth(parts: Sequence[SweptHull], other: SweptHull, placements: Sequence[pin.SE3]) -> float:
+    """Return the sum over placements of the depth (m) to which a body is in hulls, that of the deepest hull each."""
+    here = pin.SE3.Identity()
+    return sum(-min(0.0, *(separation(part, here, other, at).distance for part in parts)) for at in placements)
+
+
+def divide(triangles: Array, axis: int, height: float) -> tuple[Array, Array]:
+    """Return the triangles below and above a plane across an axis; those across it are divided into three."""
+    above = triangles[:, :, axis] > height
+    count = above.sum(axis=1)
+    sides = [triangles[count == 0], triangles[count == 3]]
+    # Triangles with one corner above, then those with one corner below.  That corner comes first.
+    for own, alone in ((1, above & (count == 1)[:, None]), (0, ~above & (count == 2)[:, None])):
+        across, first = np.nonzero(alone)
+        a, b, c = (triangles[across, (first + k) % 3] for k in range(3))
+        on_b, on_c = (
+            a + ((height - a[:, axis]) / (end[:, axis] - a[:, axis]))[:, None] * (end - a) for end in (b, c)
+        )
+        tip, rest = np.stack([a, on_b, on_c], axis=1), np.stack([on_b, b, c, on_b, c, on_c], axis=1)
+        sides[own] = np.concatenate([sides[own], tip])
+        sides[1 - own] = np.concatenate([sides[1 - own], rest.reshape(-1, 3, 3)])
+    return sides[0], sides[1]
+
+
+def _hull(triangles: Array) -> SweptHull:
+    """Return about the hull that would be fitted to triangles."""
+    return SweptHull("", "", 0, hull_corners(triangles.reshape(-1, 3)), TOLERANCE)
