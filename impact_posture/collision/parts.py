@@ -65,11 +65,12 @@ def best_cut(triangles: Array, other: SweptHull, placements: Sequence[pin.SE3]) 
         placements: Placements of the other body in the axes of the triangles.
     """
     some = triangles[:: -(-len(triangles) // _MOST_TRIANGLES)]
-    low, high = some.min(axis=(0, 1)), some.max(axis=(0, 1))
     shares = np.arange(1, _PLACES + 1) / (_PLACES + 1)
-    extent = high - low
-    axes = np.flatnonzero(extent >= min(TOLERANCE, extent.max()))
-    planes = [(int(axis), float(low[axis] + share * extent[axis])) for axis, share in product(axes, shares)]
+    planes = []
+    for axis in _axes(triangles):
+        low, high = np.min(some @ axis), np.max(some @ axis)
+        if high - low > TOLERANCE:
+            planes += [(axis, float(low + share * (high - low))) for share in shares]
     depths = [depth([_hull(side) for side in divide(some, *plane)], other, placements) for plane in planes]
     best = int(np.argmin(depths))
     return Cut(divide(triangles, *planes[best]), depths[best])
@@ -81,18 +82,25 @@ def depth(parts: Sequence[SweptHull], other: SweptHull, placements: Sequence[pin
     return sum(-min(0.0, *(separation(part, here, other, at).distance for part in parts)) for at in placements)
 
 
-def divide(triangles: Array, axis: int, height: float) -> tuple[Array, Array]:
-    """Return the triangles below and above a plane across an axis; those across it are divided into three."""
-    above = triangles[:, :, axis] > height
+def _axes(triangles: Array) -> Array:
+    """Return the principal axes of the normals, weighted by area, as rows: those of a box are its edges."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    weights = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(np.linalg.eigh(normals.T @ (normals / np.maximum(weights, np.finfo(float).tiny)))[1].T)
+
+
+def divide(triangles: Array, axis: Array, height: float) -> tuple[Array, Array]:
+    """Return the triangles below and above the plane ``axis·x = height``; those across it are divided into three."""
+    heights = triangles @ axis
+    above = heights > height
     count = above.sum(axis=1)
     sides = [triangles[count == 0], triangles[count == 3]]
     # Triangles with one corner above, then those with one corner below.  That corner comes first.
     for own, alone in ((1, above & (count == 1)[:, None]), (0, ~above & (count == 2)[:, None])):
         across, first = np.nonzero(alone)
         a, b, c = (triangles[across, (first + k) % 3] for k in range(3))
-        on_b, on_c = (
-            a + ((height - a[:, axis]) / (end[:, axis] - a[:, axis]))[:, None] * (end - a) for end in (b, c)
-        )
+        of_a, of_b, of_c = (heights[across, (first + k) % 3, None] for k in range(3))
+        on_b, on_c = a + (height - of_a) / (of_b - of_a) * (b - a), a + (height - of_a) / (of_c - of_a) * (c - a)
         tip, rest = np.stack([a, on_b, on_c], axis=1), np.stack([on_b, b, c, on_b, c, on_c], axis=1)
         sides[own] = np.concatenate([sides[own], tip])
         sides[1 - own] = np.concatenate([sides[1 - own], rest.reshape(-1, 3, 3)])
