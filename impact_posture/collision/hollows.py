@@ -17,6 +17,8 @@ from impact_posture.collision.swept_hull import SweptHull, separation
 
 # A body gets so many parts at most.
 _MOST_PARTS = 8
+# Hulls may forbid this share of the postures that the shapes allow, if so many parts are enough for that.
+_GOAL = 0.25
 # A cut is made if it leaves less than this share of the depth, measured at so many placements.
 _LEFT = 0.98
 _TRIED = 10
@@ -61,10 +63,11 @@ def open_hollows(
     parts = {k: [_Part(triangles(k), bodies[k])] for k in sorted({k for pair in hollows for k in pair})}
     for pair, hindrance in hollows.items():
         before = {k: parts[k] for k in pair}
-        while hindrance.by(_count(touching := _touching(parts, pair, hindrance))):
+        while (count := _count(touching := _touching(parts, pair, hindrance))) > _GOAL * hindrance.free:
             if not _cut(parts, pair, touching, hindrance):
-                parts.update(before)
                 break
+        if hindrance.by(count):
+            parts.update(before)
     named = {part: hull for k, found in parts.items() for part, hull in _named(bodies[k].name, found)}
     hindered: set[tuple[SweptHull, SweptHull]] = set()
     for pair, hindrance in hollows.items():
