@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -40,20 +39,22 @@ def area(triangles: Array) -> Array:
     return np.asarray(np.linalg.norm(np.cross(*np.diff(triangles, axis=1).transpose(1, 0, 2)), axis=1) / 2)
 
 
-@given(seed=st.integers(0, 2**32 - 1), axis=st.integers(0, 2), height=st.floats(-1.5, 1.5))
-def test_a_cut_loses_no_point(seed: int, axis: int, height: float) -> None:
+@given(seed=st.integers(0, 2**32 - 1), height=st.floats(-1.5, 1.5), upright=st.booleans())
+def test_a_cut_loses_no_point(seed: int, height: float, upright: bool) -> None:
     random = np.random.default_rng(seed)
-    # Corners on a grid, so that some of them lie in the plane.
+    # Corners on a grid, so that some of them lie in an upright plane.
     triangles = random.integers(-4, 5, (60, 3, 3)) / 3
-    height = round(3 * height) / 3 if seed % 2 else height
+    height = round(3 * height) / 3 if upright else height
+    axis = np.eye(3)[seed % 3] if upright else random.normal(size=3)
+    axis /= np.linalg.norm(axis)
     below, above = divide(triangles, axis, height)
-    assert below[..., axis].max(initial=-9) <= height + 1e-12
-    assert above[..., axis].min(initial=9) >= height - 1e-12
+    assert (below @ axis).max(initial=-9) <= height + 1e-12
+    assert (above @ axis).min(initial=9) >= height - 1e-12
     assert area(below).sum() + area(above).sum() == pytest.approx(area(triangles).sum(), abs=1e-12)
     # A random point of each triangle is a sum of the corners of a triangle of its side.
     shares = random.dirichlet(np.ones(3), len(triangles))
     for point in np.einsum("nk,nkj->nj", shares, triangles):
-        side = below if point[axis] <= height else above
+        side = below if point @ axis <= height else above
         rows = np.concatenate([side.transpose(0, 2, 1), np.ones((len(side), 1, 3))], axis=1)
         found = np.linalg.pinv(rows) @ np.r_[point, 1]
         apart = np.linalg.norm(np.einsum("nij,nj->ni", rows, found) - np.r_[point, 1], axis=1)
@@ -79,7 +80,10 @@ def rod_in_channel(folder: Path, turn: Array) -> tuple[Robot, RobotShapes]:
     stl(folder / "channel.stl", channel @ turn.T)
     text = f'<robot name="channel">{link("frame", mesh("channel.stl"))}{link("slide")}'
     rpy = " ".join(map(str, pin.rpy.matrixToRpy(turn)))
-    for parent, child, origin, axis in (("frame", "slide", turn @ [0, 0, 0.15], "y"), ("slide", "rod", (0, 0, 0), "z")):
+    for parent, child, origin, axis in (
+        ("frame", "slide", turn @ [0, 0, 0.15], "y"),
+        ("slide", "rod", (0, 0, 0), "z"),
+    ):
         xyz = " ".join(map(str, origin))
         text += (
             f'<joint name="{axis}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>'
@@ -117,11 +121,11 @@ def test_a_rod_may_be_in_a_channel_and_not_in_its_walls(
         assert distance <= max(gap, 0) + 1e-6
         assert bool(mesh_collisions(robot, shapes, q)) is (gap < 0)
         if np.array_equal(turn, np.eye(3)):
-            # The walls lie along the axes, so that their parts are as they are, but for the sweep radius.
-            assert distance > gap - 0.003 or gap < 0
+            # Parts are cut beside the walls, and take in so much of the channel.
+            assert distance > gap - 0.03 or gap < 0
         free, allowed = free + (gap > 0), allowed + (distance > 0)
     assert 100 < free < 190
-    assert allowed > free / 2
+    assert allowed > 0.7 * free
 
 
 def test_a_rod_that_fills_its_bore_stays_out_of_the_pairs(tmp_path: Path) -> None:
@@ -137,7 +141,7 @@ def test_a_rod_that_fills_its_bore_stays_out_of_the_pairs(tmp_path: Path) -> Non
 # ---- robots -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["hyq", "solo12", "hextilt"])
+@pytest.mark.parametrize("name", ["hyq", "hextilt"])
 def test_bodies_of_robots_have_no_hollows_left(name: str) -> None:
     shapes = load_shapes(load_robot(name))
     assert shapes.hulls_touching == ()
@@ -148,7 +152,7 @@ def test_bodies_of_robots_have_no_hollows_left(name: str) -> None:
         assert len([body for body in parts if body.link == link_name]) <= 8
 
 
-@pytest.mark.parametrize("name", ["hyq", "solo12", "hextilt"])
+@pytest.mark.parametrize("name", ["hyq", "hextilt"])
 def test_parts_hold_their_shapes(name: str) -> None:
     shapes, random = load_shapes(load_robot(name)), np.random.default_rng(0)
     cut = {body.link for body in shapes.bodies if "/" in body.name}
@@ -171,9 +175,8 @@ def _far(body: SweptHull, points: Array) -> Array:
     return np.asarray(~near)
 
 
-@cache
-def pelvis_and_hip() -> tuple[Robot, list[SweptHull], list[pin.GeometryObject]]:
-    """The two bodies of g1 that collide at most of its optima, alone: the others take long."""
+def test_pelvis_and_hip_are_kept_apart() -> None:
+    """The two bodies of g1 that collide at many of its optima, alone, because its other bodies take long."""
     robot = load_robot("g1")
     described = [shape for shape in read_urdf_shapes(robot)[0] if shape.link in ("pelvis", "right_hip_roll_link")]
     shapes = list(load_geometry(robot, described).model.geometryObjects)
@@ -181,11 +184,6 @@ def pelvis_and_hip() -> tuple[Robot, list[SweptHull], list[pin.GeometryObject]]:
     for shape in shapes:
         points = shape_points(shape.geometry) @ shape.placement.rotation.T + shape.placement.translation
         hulls.append(SweptHull(shape.name, shape.name, shape.parentJoint, *fit_hull(points)))
-    return robot, hulls, shapes
-
-
-def test_pelvis_and_hip_are_kept_apart() -> None:
-    robot, hulls, shapes = pelvis_and_hip()
     touch = touch_of(shapes)
     hollows = hindered(robot, hulls, [(0, 1)], touch)
     assert set(hollows) == {(0, 1)}
@@ -201,5 +199,5 @@ def test_pelvis_and_hip_are_kept_apart() -> None:
         touching = touch((0, 1), data)
         assert not (apart and touching)
         free, allowed = free + (not touching), allowed + apart
-    # Before, the hulls of the whole bodies allowed a quarter of them.
-    assert free > 200 and allowed > 0.45 * free
+    # The hulls of the whole bodies allow less than half of them.
+    assert free > 200 and allowed > 0.7 * free

@@ -17,7 +17,7 @@ from impact_posture.collision.swept_hull import SweptHull, separation
 
 # A body gets so many parts at most.
 _MOST_PARTS = 8
-# Hulls may forbid this share of the postures that the shapes allow, if so many parts are enough for that.
+# Bodies are cut until their hulls forbid less than this share of the postures that the shapes allow.
 _GOAL = 0.25
 # A cut is made if it leaves less than this share of the depth, measured at so many placements.
 _LEFT = 0.98
@@ -53,7 +53,8 @@ def open_hollows(
 ) -> Opened:
     """Cut bodies until their hulls allow most of the postures that their shapes allow.
 
-    Two bodies stay as they are if that takes more than 8 parts of each, as a shaft that fills its bore.
+    A cut is made where it lets the two bodies least deep into each other.  Two bodies stay as they are if 8 parts of
+    each are not enough, as for a shaft that fills its bore.
 
     Args:
         bodies: The swept hulls.
@@ -81,7 +82,7 @@ def open_hollows(
 
 
 def _cut(parts: dict[int, list[_Part]], pair: Pair, touching: _Touching, hindrance: Hindrance) -> bool:
-    """Cut the one part of a pair of bodies where that helps, those first that touch most; tell whether any does."""
+    """Cut one part of two bodies, of those that touch most if that helps; tell whether any cut helps."""
     for (a, b), indices in sorted(touching.items(), key=lambda item: -len(item[1])):
         some = indices[:: -(-len(indices) // _TRIED) or 1]
         placements = [hindrance.placements[n] for n in some]
@@ -108,9 +109,7 @@ def _fitted(triangles: Array, whole: SweptHull) -> SweptHull:
 def _touching(parts: Mapping[int, list[_Part]], pair: Pair, hindrance: Hindrance) -> _Touching:
     here = pin.SE3.Identity()
     return {
-        (a, b): [
-            n for n, at in enumerate(hindrance.placements) if separation(a.hull, here, b.hull, at).distance <= 0
-        ]
+        (a, b): [n for n, at in enumerate(hindrance.placements) if separation(a.hull, here, b.hull, at).distance <= 0]
         for a, b in product(parts[pair[0]], parts[pair[1]])
     }
 

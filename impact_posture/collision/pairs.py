@@ -111,7 +111,9 @@ def hindered(
                 apart[k] += 1
             elif not touch(pairs[k], data):
                 placements[k].append(data.oMi[a.joint].actInv(data.oMi[b.joint]))
-    found = {pair: Hindrance(at, len(at) + int(count)) for pair, at, count in zip(pairs, placements, apart, strict=True)}
+    found = {
+        pair: Hindrance(at, len(at) + int(count)) for pair, at, count in zip(pairs, placements, apart, strict=True)
+    }
     return {pair: one for pair, one in found.items() if one.by(len(one.placements))}
 
 

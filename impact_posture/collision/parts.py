@@ -1,9 +1,8 @@
-"""Parts of a body with a hollow: its triangles, cut by planes so that the hulls of the parts leave the hollow free."""
+"""Parts of a body with a hollow: its triangles, cut so that the hulls of the parts leave the hollow free."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import product
 from typing import Any, NamedTuple
 
 import coal
@@ -55,9 +54,10 @@ def triangles_of(shapes: Iterable[pin.GeometryObject]) -> Array:
 
 
 def best_cut(triangles: Array, other: SweptHull, placements: Sequence[pin.SE3]) -> Cut:
-    """Cut triangles by the plane across an axis that leaves another body least deep in the hulls of the two sides.
+    """Cut triangles by the plane that leaves another body least deep in the hulls of the two sides.
 
-    Triangles across the plane are divided, so that the sides together hold every point of all triangles.
+    Triangles across the plane are divided, so that the sides together hold every point of all triangles.  What is
+    smaller than the tolerance is not cut; its depth is infinite.
 
     Args:
         triangles: The triangles, shape (n, 3, 3), m.
@@ -71,6 +71,8 @@ def best_cut(triangles: Array, other: SweptHull, placements: Sequence[pin.SE3]) 
         low, high = np.min(some @ axis), np.max(some @ axis)
         if high - low > TOLERANCE:
             planes += [(axis, float(low + share * (high - low))) for share in shares]
+    if not planes:
+        return Cut((triangles, triangles), np.inf)
     depths = [depth([_hull(side) for side in divide(some, *plane)], other, placements) for plane in planes]
     best = int(np.argmin(depths))
     return Cut(divide(triangles, *planes[best]), depths[best])

@@ -34,8 +34,8 @@ class RobotShapes:
         pairs: Bodies that have to keep apart, as indices into ``bodies``, shape (k, 2).
         always_touching: Names of shapes that touch at the default posture and at most others, so that they overlap by
             design and need not keep apart.
-        hulls_touching: Names of bodies whose hulls touch at most of the postures at which their shapes do not, however
-            they are cut.  They are in no pair of hulls, and only the check on the shapes finds their collisions.
+        hulls_touching: Names of bodies whose hulls touch at most of the postures at which their shapes do not, even
+            if they are cut.  They are in no pair, and only the check on the shapes finds their collisions.
         warnings: Shapes that are left out, and what a robot without shapes means; one line each.
         robot: The robot, for the shapes themselves.
     """

@@ -25,7 +25,7 @@ class SweptHull:
     """The points within ``radius`` of a convex hull that moves with a joint.
 
     Attributes:
-        name: Unique name in messages: the link, with ``[k]`` if the link has several shapes.
+        name: Unique name in messages: the link, with ``[k]`` if the link has several shapes, and ``/k`` for a part.
         link: Name of the link.
         joint: Index of the joint in the model; 0 is the world.
         vertices: Corners of the hull in the axes of the joint, shape (k, 3) with k ≤ 40, m.
