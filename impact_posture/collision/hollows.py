@@ -29,11 +29,11 @@ class Opened(NamedTuple):
 
     Attributes:
         parts: Hulls of each body: those of its parts, or its own.
-        hindered: Pairs of these hulls that still touch at most of the postures at which the shapes do not.
+        hindered: Pairs of bodies, by their indices, that are still in each other's hollows.
     """
 
     parts: list[list[SweptHull]]
-    hindered: set[tuple[SweptHull, SweptHull]]
+    hindered: set[Pair]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +62,7 @@ def open_hollows(
         triangles: The triangles around a body, by its index, in the axes of its joint, shape (n, 3, 3), m.
     """
     parts = {k: [_Part(triangles(k), bodies[k])] for k in sorted({k for pair in hollows for k in pair})}
+    hindered = set()
     for pair, hindrance in hollows.items():
         before = {k: parts[k] for k in pair}
         while (count := _count(touching := _touching(parts, pair, hindrance))) > _GOAL * hindrance.free:
@@ -69,15 +70,10 @@ def open_hollows(
                 break
         if hindrance.by(count):
             parts.update(before)
-    named = {part: hull for k, found in parts.items() for part, hull in _named(bodies[k].name, found)}
-    hindered: set[tuple[SweptHull, SweptHull]] = set()
-    for pair, hindrance in hollows.items():
-        touching = _touching(parts, pair, hindrance)
-        while touching and hindrance.by(_count(touching)):
-            a, b = most = max(touching, key=lambda found: len(touching[found]))
-            hindered.add((named[a], named[b]))
-            del touching[most]
-    hulls = [[named[part] for part in parts[k]] if k in parts else [hull] for k, hull in enumerate(bodies)]
+            hindered.add(pair)
+    hulls = [
+        _named(hull.name, [part.hull for part in parts[k]]) if k in parts else [hull] for k, hull in enumerate(bodies)
+    ]
     return Opened(hulls, hindered)
 
 
@@ -119,8 +115,6 @@ def _count(touching: _Touching) -> int:
     return len({n for indices in touching.values() for n in indices})
 
 
-def _named(name: str, parts: Sequence[_Part]) -> list[tuple[_Part, SweptHull]]:
-    """Give each part of a body its own name: that of the body, with ``/1`` and so on if there are several."""
-    if len(parts) == 1:
-        return [(parts[0], parts[0].hull)]
-    return [(part, replace(part.hull, name=f"{name}/{n}")) for n, part in enumerate(parts, 1)]
+def _named(name: str, parts: list[SweptHull]) -> list[SweptHull]:
+    """Give each of several parts of a body a name of its own: that of the body, with ``/1`` and so on."""
+    return [replace(part, name=f"{name}/{n}") for n, part in enumerate(parts, 1)] if len(parts) > 1 else parts

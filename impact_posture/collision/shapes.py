@@ -113,12 +113,12 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> StoredShapes:
     opened = open_hollows(hulls, hollows, lambda k: triangles_of(shapes[n] for n in merged[k].shapes))
     bodies = [hull for parts in opened.parts for hull in parts]
     index = {hull: k for k, hull in enumerate(bodies)}
-    finer = [two for i, j in pairs for two in product(opened.parts[i], opened.parts[j])]
+    kept = [pair for pair in pairs if pair not in opened.hindered]
     return StoredShapes(
         bodies=tuple(_stored(hull) for hull in bodies),
-        pairs=tuple((index[a], index[b]) for a, b in finer if (a, b) not in opened.hindered),
+        pairs=tuple((index[a], index[b]) for i, j in kept for a, b in product(opened.parts[i], opened.parts[j])),
         always_touching=tuple((shapes[i].name, shapes[j].name) for i, j in touching),
-        hulls_touching=tuple((a.name, b.name) for a, b in finer if (a, b) in opened.hindered),
+        hulls_touching=tuple((hulls[i].name, hulls[j].name) for i, j in sorted(opened.hindered)),
         warnings=loaded.warnings,
     )
 
