@@ -129,5 +129,6 @@ def test_the_command_says_it_first(tmp_path: Path) -> None:
     assert document["metric"]["objective"] == "coulomb" and document["notes"][0].startswith("objective coulomb")
     told = np.array([document[name]["jump"]["coulomb"]["norm"] for name in ("initial", "optimal")])
     assert document["verdict"]["jump"] == pytest.approx(told[1] / told[0] - 1)
-    paper = run("optimize", "talos", "--normal", -1, 0, 0, "--starts", 2, "--no-codegen", "--out", tmp_path / "talos")
+    free = ("--starts", 2, "--no-collision", "--no-holdable", "--no-codegen", "--out", tmp_path / "talos")
+    paper = run("optimize", "talos", "--normal", -1, 0, 0, *free)
     assert "verdict: worse." in paper.stdout and "--objective coulomb minimizes this jump" in paper.stdout

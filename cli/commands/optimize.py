@@ -60,13 +60,14 @@ def optimize(
             from impact_posture.path.posture_path import check_package
 
             check_package()
-        page = Page(quiet=quiet or json)
-        prepared = prepare(settings)
+        page, shown = Page(quiet=quiet or json), not (quiet or json)
+        # The shapes of a large robot are fitted once, which can take some seconds.
+        with progress("preparing", "", shown=shown):
+            prepared = prepare(settings)
         folder = Path(out) if out else default_out(prepared)
         check_output(folder, force=force, kind="result")
         if not json:
             _announce(page, prepared)
-        shown = not (quiet or json)
         with progress("solving", "starts", shown=shown, first="building the expressions") as advance:
             result = solve(
                 PostureProblem.of(prepared),

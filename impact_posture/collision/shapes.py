@@ -20,6 +20,7 @@ from impact_posture.collision.parts import triangles_of
 from impact_posture.collision.shape_cache import StoredHull, StoredShapes, read_shapes, write_shapes
 from impact_posture.collision.swept_hull import SweptHull
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.progress import tell
 from impact_posture.robot.robot import Robot
 
 NO_SHAPES = "the robot has no shapes, so collisions are checked by joint origins only"
@@ -93,6 +94,7 @@ def _shapes(source: _Source) -> RobotShapes:
 
 def fit_shapes(robot: Robot, described: list[UrdfShape]) -> StoredShapes:
     """Load the shapes, fit their hulls, find the pairs, and cut bodies in each other's hollows into parts."""
+    tell("fitting collision shapes")
     loaded = load_geometry(robot, described)
     shapes, apart = loaded.model.geometryObjects, loaded.apart
     touching = mostly_touching(robot, shapes, pairs_of(apart))

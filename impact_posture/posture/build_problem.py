@@ -103,9 +103,8 @@ def _surroundings(
     for contact, _ in touching:
         if requirements.surface != "none":
             width = float("inf") if requirements.surface == "plane" else requirements.surface
-            points = [
-                point_on(objective.robot, c.frame, c.offset) for c in (*objective.supports, *objective.contacts)
-            ]
+            points = [point_on(objective.robot, foot.frame, foot.offset) for foot in objective.supports]
+            points += [point_on(objective.robot, other.frame, other.offset) for other in objective.contacts]
             found.add_surface(contact, width if width is None else float(width), points)
     found.add_obstacles(requirements.obstacles)
     return found
