@@ -198,6 +198,10 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:12]}…"
 
 
+# Conflicts that one line names, the largest first.
+_MOST_NAMED = 6
+
+
 class Infeasible(ImpactPostureError):
     """No posture satisfies the constraints; carries the conflicting ones."""
 
@@ -205,7 +209,10 @@ class Infeasible(ImpactPostureError):
 
     def __init__(self, conflicts: dict[str, float], *, where: str = "problem", hint: str = "") -> None:
         self.conflicts = dict(conflicts)
-        named = ", ".join(f"{name} (off by {value:.3g})" for name, value in self.conflicts.items())
+        worst = sorted(self.conflicts.items(), key=lambda conflict: -conflict[1])
+        named = ", ".join(f"{name} (off by {value:.3g})" for name, value in worst[:_MOST_NAMED])
+        if len(worst) > _MOST_NAMED:
+            named += f" and {len(worst) - _MOST_NAMED} more"
         super().__init__(
             f"the constraints conflict: {named}",
             where=where,

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
     from impact_posture.path.posture_path import PosturePath
     from impact_posture.plot import ResultView, TradeOffData
+    from impact_posture.robot.robot import Robot
 
 FORMATS = ("png",)
 
@@ -134,7 +135,7 @@ def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finish
     folder, initial, optimal, path, mapped, document, codegen, formats, jobs = request
     # The C code comes first, because it takes longest.
     tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
-    view = _view(prepared, initial, optimal, path, document, _motion(folder, document), mapped)
+    view = _view(prepared, initial, optimal, path, document, _motion(folder, document, prepared.impact.robot), mapped)
     tasks += _drawings(view, folder, formats)
     with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
         for done, (index, result) in enumerate(results, start=1):
@@ -168,13 +169,13 @@ def _drawings(view: ResultView, folder: Path, formats: Sequence[str]) -> list[Ca
     return [partial(draw_all, view, folder, formats, [name]) for name in drawable(view)]
 
 
-def _motion(folder: Path, document: dict[str, Any]) -> PosturePath | None:
+def _motion(folder: Path, document: dict[str, Any], robot: Robot) -> PosturePath | None:
     """Read the path of a result folder, if it has one."""
     if "path" not in document:
         return None
     from impact_posture.path.files import read_path
 
-    return read_path(folder, document["path"])
+    return read_path(folder, document["path"], robot)
 
 
 def result_view(
@@ -273,7 +274,9 @@ def load_view(folder: Path) -> ResultView:
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
             for key in ("initial", "optimal")
         )
-        return _view(prepared, initial, optimal, path, document, _motion(folder, document), mapped)
+        return _view(
+            prepared, initial, optimal, path, document, _motion(folder, document, prepared.impact.robot), mapped
+        )
     except _BROKEN as error:
         raise SpecError(
             f"is no whole result ({type(error).__name__}: {error})", where=str(folder), hint="run optimize again"

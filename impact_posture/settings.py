@@ -38,6 +38,8 @@ TransmissionKind = Literal["rigid", "elastic", "locked"]
 # Mechanics of Materials, 5th ed. (steel; oak in bending; rubber; concrete).
 MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0.48), "ground": (24e9, 0.15)}
 
+# Most characters of the name of an obstacle, which errors print.
+_LONGEST_NAME = 60
 # Least distance (m) of links that stay apart, and edge length (m) of a surface that ends before the robot's stand.
 CLEARANCE, PATCH = 0.001, 0.3
 # Coulomb coefficient of an ordinary surface.
@@ -252,10 +254,13 @@ class Obstacle(Checked):
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
+        if not self.name.strip() or len(self.name) > _LONGEST_NAME:
+            what = "has no name" if not self.name.strip() else f"has a name of {len(self.name)} characters"
+            raise InputError(what, where="obstacles", hint=f"give each a name of up to {_LONGEST_NAME} characters")
         where = f"obstacle '{self.name}'"
         if (self.box is None) == (self.sphere is None):
-            what = "neither `box` nor `sphere`" if self.box is None else "both `box` and `sphere`"
-            raise InputError(f"has {what}", where=where, hint="give one of them")
+            what = "neither edge lengths nor a radius" if self.box is None else "edge lengths and a radius"
+            raise InputError(f"has {what}", where=where, hint="give one of the keys box and sphere")
         norm = math.hypot(*self.quaternion)
         if abs(norm - 1) > 1e-3:
             raise InputError(
@@ -333,7 +338,7 @@ class ProblemSettings(ImpactSettings):
         float,
         Setting(
             "Force along the normal that the robot also has to hold after the impact, N.", TASK, "N",
-            **demand.ZERO_OR_MORE,
+            **demand.between(0.0, 1e6, "N"),
         ),
     ] = 0.0  # fmt: skip
     max_force: Annotated[

@@ -322,8 +322,8 @@ def test_a_box_stands_where_it_is_put(seed: int) -> None:
 
 
 @pytest.mark.parametrize("values, words", [
-    ({}, "neither `box` nor `sphere`"),
-    ({"box": (1.0, 1.0, 1.0), "sphere": 1.0}, "both `box` and `sphere`"),
+    ({}, "neither edge lengths nor a radius"),
+    ({"box": (1.0, 1.0, 1.0), "sphere": 1.0}, "edge lengths and a radius"),
     ({"sphere": 0.0}, "above zero"),
     ({"sphere": float("nan")}, "above zero"),
     ({"box": (1.0, -1.0, 1.0)}, "above zero"),

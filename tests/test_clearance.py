@@ -15,7 +15,7 @@ from impact_posture.collision.swept_hull import SweptHull
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
-from impact_posture.errors import Infeasible
+from impact_posture.errors import Infeasible, InputError
 from impact_posture.posture.clearance import Clearance
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.search import feasible
@@ -176,6 +176,25 @@ def test_a_body_in_the_way_of_the_optimum() -> None:
     assert touched and all(active.multiplier > 0 for active in touched)
     objective = found.problem.objective
     assert objective.value(free.q) < objective.value(found.q)
+
+
+@pytest.mark.parametrize("names", [("a", "a"), ("base_link[0]",), ("surface at ee",)])
+def test_obstacles_that_messages_could_not_tell_apart_are_refused(names: tuple[str, ...]) -> None:
+    balls = tuple(Obstacle(name=name, sphere=0.01, position=(5.0, 0.0, 0.0)) for name in names)
+    with pytest.raises(InputError, match="is the name of another body"):
+        prepare(_problem(obstacles=balls))
+
+
+@pytest.mark.parametrize("name", ["", "  ", "x" * 100])
+def test_an_obstacle_without_a_name_to_print_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match="name"):
+        Obstacle(name=name, sphere=1.0)
+
+
+def test_obstacles_need_collisions() -> None:
+    ball = Obstacle(name="ball", sphere=0.01, position=(5.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="obstacles"):
+        prepare(_problem(obstacles=(ball,), collision=False))
 
 
 def test_what_is_impossible_is_named() -> None:

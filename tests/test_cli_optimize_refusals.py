@@ -222,7 +222,15 @@ def test_interrupt_in_mid_solve_leaves_nothing(jobs: int, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "arguments", [("--box", 1, 1, 1), ("--base-box", 1, 1, 1), ("--no-com", "--com-margin", 0.1)]
+    "arguments",
+    [
+        ("--box", 1, 1, 1),
+        ("--base-box", 1, 1, 1),
+        ("--no-com", "--com-margin", 0.1),
+        ("--no-collision", "--clearance", 0.1),
+        ("--no-collision", "--surface", "plane"),
+        ("--no-holdable", "--hold-force", 10),
+    ],
 )
 def test_options_that_would_do_nothing_are_refused(arguments: tuple[object, ...], tmp_path: Path) -> None:
     done = run("optimize", "solo12", "--normal", 1, 0, 0, *arguments, *FAST, cwd=tmp_path)

@@ -80,7 +80,7 @@ def test_csv_npz_and_yaml_agree(settings: dict[str, object], tmp_path: Path) -> 
     for key in (*(BLOCK - {"limits"}), *(f"limits.{key}" for key in LIMITS)):
         assert f"`path.{key}`" in page, key
     assert set(block) == BLOCK and set(block["limits"]) == LIMITS
-    again = read_path(tmp_path, block)
+    again = read_path(tmp_path, block, loaded)
     assert again.to_dict() == path.to_dict()
     assert np.array_equal(again.objectives, path.objectives)
     assert again.use is not None and path.use is not None and np.array_equal(again.use.velocity, path.use.velocity)
@@ -142,6 +142,25 @@ def test_solved_again_from_its_problem_the_path_is_the_same(folder: Path, tmp_pa
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["path"] == json.loads((folder / "result.json").read_text())["path"]
     assert (tmp_path / "again" / "path.csv").read_bytes() == (folder / "path.csv").read_bytes()
+
+
+TAMPERED = {
+    "fewer postures": lambda arrays: {**arrays, "q": arrays["q"][1:]},
+    "columns": lambda arrays: {**arrays, "q": arrays["q"][:, :3]},
+    "no numbers": lambda arrays: {**arrays, "v": np.full_like(arrays["v"], np.nan)},
+    "huge": lambda arrays: {**arrays, "q": arrays["q"] * 1e300},
+    "times": lambda arrays: {**arrays, "t": 0 * arrays["t"]},
+    "shares": lambda arrays: {**arrays, "share_at": np.array(1.0)},
+}
+
+
+@pytest.mark.parametrize("how", TAMPERED)
+def test_a_damaged_path_is_refused(how: str, folder: Path, tmp_path: Path) -> None:
+    loaded, block = robot("tilthex_arm"), json.loads((folder / "result.json").read_text())["path"]
+    with np.load(folder / "path.npz") as file:
+        np.savez(tmp_path / "path.npz", **TAMPERED[how](dict(file)))
+    with pytest.raises(ValueError, match=r"path\.npz"):
+        read_path(tmp_path, block, loaded)
 
 
 def test_plot_draws_the_path_of_a_folder(folder: Path, tmp_path: Path) -> None:

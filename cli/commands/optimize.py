@@ -127,6 +127,8 @@ def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
         ("base_box", settings.base == "box", "--base box"),
         ("com_margin", settings.com is not False, "--com"),
         ("hold_force", settings.holdable, "--holdable"),
+        ("clearance", settings.collision, "--collision"),
+        ("surface", settings.collision, "--collision"),
     ):
         if name in given.values and not used:
             raise typer.BadParameter(f"does nothing without {hint}", param_hint=f"'--{name.replace('_', '-')}'")

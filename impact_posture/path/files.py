@@ -44,16 +44,38 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
     (folder / "path.yaml").write_text(_trajectory(robot, path, angles), encoding="utf-8")
 
 
-def read_path(folder: Path, block: Mapping[str, Any]) -> PosturePath:
-    """Read a path from ``path.npz`` and the block ``path`` of ``result.json``."""
-    with np.load(folder / "path.npz") as arrays:
-        shares = {key.removeprefix("share_"): arrays[key] for key in arrays.files if key.startswith("share_")}
-        return PosturePath(
-            **{key: block[key] for key in _BLOCK},
-            **{key: arrays[key] for key in ("t", "q", "v", "a")},
-            use=LimitUse(**shares, largest=block["limits"]) if shares else None,
-            objectives=arrays["objective"],
-        )
+# Numbers above this are none of a path.
+_HUGE = 1e9
+
+
+def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePath:
+    """Read a path of a robot from ``path.npz`` and the block ``path`` of ``result.json``.
+
+    Raises:
+        ValueError: The arrays do not fit each other or the robot.
+    """
+    try:
+        with np.load(folder / "path.npz") as file:
+            arrays = {key: np.asarray(file[key], dtype=float) for key in file.files}
+    except MemoryError:
+        # A header may state any size.
+        raise ValueError("path.npz states more numbers than it has") from None
+    shares = {key.removeprefix("share_"): found for key, found in arrays.items() if key.startswith("share_")}
+    count, samples = arrays["t"].size, arrays["objective"].size
+    wanted = {"t": (count,), "q": (count, robot.nq), "v": (count, robot.nv), "a": (count, robot.nv)}
+    wanted |= {"objective": (samples,), **{f"share_{name}": (samples,) for name in shares}}
+    for key, shape in wanted.items():
+        known = key in ("share_torque", "share_thrust") or np.isfinite(arrays[key]).all()
+        if arrays[key].shape != shape or not known or (np.abs(arrays[key]) > _HUGE).any():
+            raise ValueError(f"'{key}' of path.npz does not fit the path of {robot.name}")
+    if count == 0 or (np.diff(arrays["t"]) <= 0).any():
+        raise ValueError("the times of path.npz do not rise")
+    return PosturePath(
+        **{key: block[key] for key in _BLOCK},
+        t=arrays["t"], q=arrays["q"], v=arrays["v"], a=arrays["a"],
+        use=LimitUse(**shares, largest=block["limits"]) if shares else None,
+        objectives=arrays["objective"],
+    )  # fmt: skip
 
 
 def positions(robot: Robot, q: Array) -> tuple[list[str], Array]:

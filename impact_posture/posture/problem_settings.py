@@ -105,6 +105,8 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     free = tuple(j for j in spec.hold if j not in robot.locked)
     base: BaseMode = "level" if spec.level_base and robot.floating else "free"
     com = spec.com_over_feet and bool(objective.supports) if settings.com is None else settings.com
+    if settings.obstacles and not settings.collision:
+        raise InputError("do nothing without `collision`", where="obstacles", hint="leave one of them out")
     if com and not objective.supports:
         raise InputError(
             "there are no feet to keep the center of mass over", where="com", hint="add `support` or `com=False`"

@@ -15,6 +15,7 @@ from impact_posture.collision.shapes import load_shapes
 from impact_posture.collision.swept_hull import SweptHull
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.posture.clearance import Clearance
 from impact_posture.posture.separator import Body, Separator
@@ -131,8 +132,18 @@ class Surroundings:
         self._walls.append(_Wall(Body(name, hull, point, turns), exempt))
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Add bodies that stand in the world."""
+        """Add bodies that stand in the world; links that cannot move either may touch them.
+
+        Raises:
+            InputError: Two bodies have one name, which messages could not tell apart.
+        """
+        taken = {body.name for body in self._bodies} | {wall.body.name for wall in self._walls}
         for obstacle in obstacles:
+            if obstacle.name in taken:
+                raise InputError(
+                    f"'{obstacle.name}' is the name of another body", where="obstacles", hint="give it another name"
+                )
+            taken.add(obstacle.name)
             self._walls.append(_Wall(Body.of_link(obstacle_hull(obstacle)), self._rigid([0])))
 
     # ---- what follows -----------------------------------------------------------------------------------------
