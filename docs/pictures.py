@@ -16,7 +16,7 @@ PICTURES = [
         {name: name for name in ("ellipsoid", "postures", "jump", "nullspace", "classical")},
     ),
     ("anymal_c --normal 0 1 0 --normal-cone 20", {"ellipsoid": "cone"}),
-    ("panda --normal 1 0 0 --search global", {"self_motion": "self_motion"}),
+    ("panda --normal -1 0 0 --search global", {"self_motion": "self_motion"}),
     ("talos --frame gripper_right_base_link --normal -1 0 0 --tradeoff", {"tradeoff": "tradeoff"}),
     ("tilthex_arm --frame ee --normal 0 0 1 --path", {"path": "path"}),
 ]
