@@ -64,12 +64,13 @@ def _end(number: int, frame: object) -> None:
 
     A second signal skips the cleaning.
     """
-    library = sys.modules.get("impact_posture.processes")
+    # A signal may come while the module is imported; then nothing has begun that would need cleaning.
+    end_early = getattr(sys.modules.get("impact_posture.processes"), "end_early", None)
     leave = partial(_leave, number)
-    if library is None or _SEEN:
+    if end_early is None or _SEEN:
         leave()
     _SEEN.append(number)
-    library.end_early(leave)  # type: ignore[union-attr]
+    end_early(leave)
 
 
 def _leave(number: int) -> None:

@@ -119,3 +119,16 @@ def test_many_signals(tmp_path: Path, hostile_full: bool) -> None:
         folder = tmp_path / f"{name}-{k}"
         folder.mkdir()
         send(name, k, number, folder)
+
+
+def test_a_signal_during_an_import_ends_the_process() -> None:
+    """The module that cleans up may be there without its functions yet."""
+    code = (
+        "import os, signal, sys, types\n"
+        "from impact_posture_cli.process import prepare\n"
+        "prepare()\n"
+        "sys.modules['impact_posture.processes'] = types.ModuleType('impact_posture.processes')\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 128 + signal.SIGTERM and done.stderr == "error: terminated\n"
