@@ -69,6 +69,7 @@ def _end(number: int, frame: object) -> None:
     leave = partial(_leave, number)
     if end_early is None or _SEEN:
         leave()
+        return
     _SEEN.append(number)
     end_early(leave)
 
