@@ -13,7 +13,7 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.impact.contact import point_on
-from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.constraint import ExpressionConstraint
 from impact_posture.posture.pose_constraints import (
     CenterOfMassOverFeet,
     HeldOrientation,
@@ -25,7 +25,7 @@ from impact_posture.posture.pose_constraints import (
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 
-Factory = Callable[[PointOnLink, pin.SE3], Constraint]
+Factory = Callable[[PointOnLink, pin.SE3], ExpressionConstraint]
 
 AXIS = np.array([0.3, -0.5, 0.8]) / np.linalg.norm([0.3, -0.5, 0.8])
 SQUARE = np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])

@@ -29,7 +29,7 @@ from impact_posture.impact.lifted import Guess, Lifted
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.worst_case import Subgradients
 from impact_posture.posture.build_problem import build_problem
-from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.constraint import ExpressionConstraint
 from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.solve import solve
@@ -81,7 +81,7 @@ class JointDistance:
         return np.zeros((0, 6))
 
 
-class Coupled(Constraint):
+class Coupled(ExpressionConstraint):
     """The first two joints' angles add up to a value."""
 
     def __init__(self, total: float) -> None:

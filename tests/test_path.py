@@ -23,7 +23,7 @@ from impact_posture.path.path_space import CHECK_DISTANCE, PathSpace
 from impact_posture.path.posture_path import posture_path
 from impact_posture.path.search import connect, shortened
 from impact_posture.posture.build_problem import build_problem
-from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.constraint import ExpressionConstraint
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import PostureSolution, solve
@@ -33,7 +33,7 @@ from tests.helpers import rng, robot
 from tests.settings import make_settings
 
 
-class OutsideDisc(Constraint):
+class OutsideDisc(ExpressionConstraint):
     """A frame of a planar arm stays outside a disc: ``|p(q) − c|² ≥ r²``."""
 
     def __init__(self, problem: PostureProblem, frame: str, center: Array, radius: float) -> None:

@@ -1,8 +1,8 @@
 """Constraints on a posture, each as an expression and in Pinocchio's numbers.
 
-To add a constraint, derive from :class:`Constraint` and implement ``evaluate``, and ``symbolic`` or, with auxiliary
-unknowns, ``lift``, ``guess`` and ``linearize``.  The program, the search for feasible starts, the certificate and the
-elastic diagnosis need nothing else.
+To add a constraint, derive from :class:`ExpressionConstraint` and implement ``symbolic`` and ``evaluate``; with
+unknowns of its own, from :class:`Constraint` and implement ``lift``, ``guess``, ``linearize`` and ``evaluate``.  The
+program, the search for feasible starts, the certificate and the elastic diagnosis need nothing else.
 """
 
 from __future__ import annotations
@@ -109,10 +109,6 @@ class Constraint(ABC):
         """Text that distinguishes it apart from parameters and bounds; part of the key of the compile cache."""
         return f"{type(self).__name__}:{self.name}:{self.rows}"
 
-    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """Return ``c(q)`` as an expression, shape (rows, 1), of a ``tree`` that was built with ``chart_x``."""
-        raise NotImplementedError(f"{type(self).__name__} has a lifted form only")
-
     @abstractmethod
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """Return ``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``model.q``."""
@@ -123,9 +119,9 @@ class Constraint(ABC):
 
     # ---- lifted form, by default without auxiliaries ----------------------------------------------------------
 
+    @abstractmethod
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """Return the rows of the program, with their auxiliaries."""
-        return LiftedRows(self.symbolic(tree, parameters))
+        """Return the rows of the program with their auxiliaries, of a ``tree`` that was built with ``chart_x``."""
 
     @property
     def lifted_bounds(self) -> tuple[Array, Array]:
@@ -172,3 +168,15 @@ class Constraint(ABC):
     def pose_error(self, model: Numeric) -> tuple[float, float]:
         """Return the error of a held pose in meters and radians; zeros for other constraints."""
         return 0.0, 0.0
+
+
+class ExpressionConstraint(Constraint):
+    """Abstract base of constraints that are an expression of the posture alone."""
+
+    @abstractmethod
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        """Return ``c(q)`` as an expression, shape (rows, 1), of a ``tree`` that was built with ``chart_x``."""
+
+    def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
+        """See :class:`Constraint`."""
+        return LiftedRows(self.symbolic(tree, parameters))

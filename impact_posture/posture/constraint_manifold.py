@@ -18,6 +18,7 @@ from impact_posture.dynamics.chart import Chart, JointSlot
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree
+from impact_posture.posture.constraint import ExpressionConstraint
 from impact_posture.posture.problem import PostureProblem, held_rows
 
 _CONVERGED = 1e-10
@@ -60,15 +61,11 @@ class ConstraintManifold:
         motion = _tangent_map(self.chart.slots, tree.q, self.chart.nx)
         held = held_rows(problem.robot, problem.requirements.hold)
         # A constraint that only the program satisfies may have no expression in q alone.
-        equal = ca.vertcat(
-            ca.SX(0, 1),
-            *[
-                c.symbolic(tree, ca.SX(ca.DM(c.parameters)))
-                for c in problem.constraints
-                if c.equality and c.projected
-            ],
-        )
-        self._inequalities = [c for c in problem.constraints if not (c.equality and c.projected)]
+        followed = [
+            c for c in problem.constraints if isinstance(c, ExpressionConstraint) and c.equality and c.projected
+        ]
+        equal = ca.vertcat(ca.SX(0, 1), *[c.symbolic(tree, ca.SX(ca.DM(c.parameters))) for c in followed])
+        self._inequalities = [c for c in problem.constraints if c not in followed]
         jacobian = ca.vertcat(ca.jacobian(equal, x) @ motion, held)
         self._equalities = _function([x], [ca.vertcat(equal, ca.SX(len(held), 1)), jacobian])
         objective, normal = problem.impact.gradient_fun(), ca.DM(problem.impact.contact.normal)

@@ -12,7 +12,7 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.lifted import Guess
-from impact_posture.posture.constraint import Constraint, LiftedRows, Linearization
+from impact_posture.posture.constraint import Constraint, ExpressionConstraint, LiftedRows, Linearization
 from impact_posture.posture.equilibrium import Equilibrium
 from impact_posture.posture.static_load import StaticLoad
 
@@ -138,7 +138,7 @@ class Holdable(Constraint):
         )
 
 
-class ReachableWrench(Constraint):
+class ReachableWrench(ExpressionConstraint):
     """The wrench on the base is one that the rotors can make: ``R h(q) = 0`` for what they cannot.
 
     Rotors in one plane make no side force, so the robot has to be level to hold its weight.

@@ -19,10 +19,10 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.contact import support_inertia
 from impact_posture.impact.lifted import impact_at
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.constraint import ExpressionConstraint
 
 
-class ImpactLimits(Constraint):
+class ImpactLimits(ExpressionConstraint):
     """``G(q) ≥ G_min`` and ``|a_i(q)|/G(q) ≤ b`` at every joint.
 
     The bounds are bounds of the rows, so one program serves all of them.

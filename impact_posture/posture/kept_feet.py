@@ -14,10 +14,10 @@ from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.contact import point_on, support_inertia
 from impact_posture.impact.contact_stability import FrictionCones
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.constraint import ExpressionConstraint
 
 
-class KeptFeet(Constraint):
+class KeptFeet(ExpressionConstraint):
     """Support impulses ``f = −J_s a/ε`` stay in the friction cones: ``A f(q) ≤ 0`` per unit impulse, 1 at the start.
 
     These are the impulses of feet at compliance ε, one member of the set of

@@ -12,10 +12,10 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.spatial import quaternion_product
 from impact_posture.dynamics.tree import PointOnLink, Tree
-from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.constraint import ExpressionConstraint
 
 
-class HeldPosition(Constraint):
+class HeldPosition(ExpressionConstraint):
     """The point stays at ``p*``: ``p(q) − p* = 0``, world axes, meters."""
 
     def __init__(self, name: str, point: PointOnLink, target: Array) -> None:
@@ -58,7 +58,7 @@ class PositionBox(HeldPosition):
         return float(np.linalg.norm(outside)), 0.0
 
 
-class HeldOrientation(Constraint):
+class HeldOrientation(ExpressionConstraint):
     """The frame keeps its orientation, or the direction of one of its axes.
 
     ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)`` is the vector part of the error quaternion, polynomial in half angles.  It is
@@ -111,12 +111,12 @@ class HeldOrientation(Constraint):
         return 0.0, float(np.arctan2(np.linalg.norm(np.cross(now, wanted)), now @ wanted))
 
 
-class HeldPose(Constraint):
+class HeldPose(ExpressionConstraint):
     """The frame keeps position and orientation: six rows, or five with a free spin."""
 
     def __init__(self, name: str, point: PointOnLink, target: pin.SE3, axis: Array | None = None) -> None:
         self.name = name
-        self._parts: tuple[Constraint, ...] = (
+        self._parts: tuple[ExpressionConstraint, ...] = (
             HeldPosition(name, point, target.translation),
             HeldOrientation(name, point, target.rotation, axis),
         )
@@ -143,7 +143,7 @@ class HeldPose(Constraint):
         return position.pose_error(model)[0], orientation.pose_error(model)[1]
 
 
-class AxisInCone(Constraint):
+class AxisInCone(ExpressionConstraint):
     """An axis of the frame stays within a cone: ``−dᵀR(q)c ≤ −cos α``; the frame may turn about the axis.
 
     Args:
@@ -174,7 +174,7 @@ class AxisInCone(Constraint):
         return -np.array([now @ direction]), (model.jacobian(self.point)[3:].T @ np.cross(direction, now))[None, :]
 
 
-class HeldTurn(Constraint):
+class HeldTurn(ExpressionConstraint):
     """The base does not turn about one of its axes: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
 
     Args:
@@ -201,7 +201,7 @@ class HeldTurn(Constraint):
         return np.array([self._axis @ value]), (self._axis @ jacobian)[None, :]
 
 
-class CenterOfMassOverFeet(Constraint):
+class CenterOfMassOverFeet(ExpressionConstraint):
     """The center of mass stays above the feet: ``A xy − b ≤ −margin``, meters.
 
     Args:

@@ -12,7 +12,7 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.posture.constraint import Constraint
+from impact_posture.posture.constraint import ExpressionConstraint
 
 
 def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
@@ -60,7 +60,7 @@ def distance_gradient(chart: Chart, q: Array, reference: Array) -> Array:
     return gradient
 
 
-class WithinDistance(Constraint):
+class WithinDistance(ExpressionConstraint):
     """The posture stays in a ball: ``distance_squared(q, reference) ≤ radius²``.
 
     The radius is a bound and the reference a parameter, so one program serves all radii.

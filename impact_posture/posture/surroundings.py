@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -148,6 +149,7 @@ class Surroundings:
 
     # ---- what follows -----------------------------------------------------------------------------------------
 
+    @cached_property
     def constraints(self) -> list[Clearance]:
         """Return one constraint for the links among themselves, and one for each wall."""
         near = f"at least {1e3 * self._clearance:g} mm apart"
@@ -166,7 +168,7 @@ class Surroundings:
     def closest(self, q: Array) -> dict[str, object]:
         """Return the bodies that are closest at ``q``, and their distance, m."""
         numeric = Numeric(self.robot.model).at(q)
-        name, value = min((c.closest(numeric) for c in self.constraints()), key=lambda pair: pair[1])
+        name, value = min((c.closest(numeric) for c in self.constraints), key=lambda pair: pair[1])
         return {"closest": name, "distance": value + self._clearance}
 
     def to_dict(self, initial: Array, optimal: Array) -> dict[str, object]:

@@ -55,7 +55,7 @@ def _reduced(nlp: PostureNLP) -> ca.Function:
     tree = Tree(problem.robot.model, q, x)
     rows = [chart.norms(x)]
     for index, constraint in enumerate(problem.constraints):
-        rows.append(constraint.symbolic(tree, ca.SX(constraint.parameters))[problem.carried(index)])
+        rows.append(constraint.lift(tree, ca.SX(constraint.parameters)).rows[problem.carried(index)])
     program = {"x": x, "p": scale, "f": objective.scale * kernel.H / scale, "g": ca.vertcat(*rows)}
     return ca.nlpsol("reduced", "ipopt", program, IPOPT_OPTIONS)
 
