@@ -201,7 +201,7 @@ def _view(
 ) -> ResultView:
     from impact_posture.plot import ResultView
 
-    impact = prepared.impact
+    impact, around = prepared.impact, prepared.problem.surroundings
     return ResultView(
         robot=impact.robot,
         objective=impact.objective,
@@ -212,6 +212,7 @@ def _view(
         path=path,
         tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
         collisions=_collisions(prepared, initial, optimal),
+        depths=() if around is None else tuple(around.depth(c) for c in impact.objective.contacts),
         motion=motion,
         self_motion=mapped,
     )

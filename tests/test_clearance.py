@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import product
 
 import casadi as ca
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -16,6 +17,7 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.errors import Infeasible, InputError
+from impact_posture.impact.contact import point_on
 from impact_posture.posture.clearance import Clearance
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.search import feasible
@@ -24,6 +26,7 @@ from impact_posture.posture.solve import solve
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import Obstacle, ProblemSettings
+from impact_posture.tables import validate
 
 BOX = np.array(list(product((-0.04, 0.05), (-0.03, 0.06), (-0.05, 0.07))))
 ROBOTS = ("tilthex_arm", "talos", "panda", "kinova")
@@ -207,3 +210,35 @@ def test_what_is_impossible_is_named() -> None:
         solve(prepare(_problem(obstacles=(around,), contact_pose="full", base="fixed")).problem, jobs=1)
     assert "block" in str(caught.value)
     assert caught.value.exit_code == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "normal"), [("z1", (-1.0, 0.0, 0.0)), ("panda", (1.0, 0.0, 0.0)), ("kinova", (0.0, 1.0, 0.0))]
+)
+def test_a_surface_lies_where_the_link_of_the_contact_reaches(name: str, normal: tuple[float, float, float]) -> None:
+    problem = prepare(validate(ProblemSettings, {"robot": name, "normal": normal}, "options")).problem
+    around, contact, robot = problem.surroundings, problem.objective.contact, problem.robot
+    assert around is not None
+    point = point_on(robot, contact.frame, contact.offset)
+    height = float(np.array(normal) @ Numeric(robot.model).at(problem.given).placement(point).translation)
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, problem.given)
+    own = [shape for shape in around.shapes.geometry.geometryObjects if shape.parentJoint == point.joint]
+
+    def touched(above: float) -> bool:
+        """Whether coal finds a mesh of the link in the half-space so far above the surface, m."""
+        half = coal.Halfspace(np.array(normal), height - around.depth(contact) + above)
+        request = coal.CollisionRequest()
+        at = [data.oMi[point.joint] * shape.placement for shape in own]
+        return any(
+            coal.collide(
+                half, coal.Transform3s(), shape.geometry, coal.Transform3s(p.rotation, p.translation), request,
+                coal.CollisionResult(),
+            )
+            for shape, p in zip(own, at, strict=True)
+        )  # fmt: skip
+
+    assert around.depth(contact) > 0
+    assert not touched(-1e-6)
+    # A swept hull is a few millimeters larger than the mesh inside.
+    assert touched(0.015)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,7 @@ STICKS = "Sticks join joint origins."
 _NO_SHAPES = "They do not show the shapes of the links."
 _ENDS = "The last stick of a chain ends at the last frame of its link, or at the center of mass of the link."
 _NORMAL = "n points out of the surface, towards the robot."
+_BEHIND = "The surface lies behind the link of the contact where that reaches behind the contact point."
 _BODY = "The body is the box between the hips, of no true height."
 HATCH = "/////"
 # 3-D axes number the areas from 3 up, whatever their order.
@@ -75,10 +77,11 @@ def postures_figure(view: ResultView) -> Figure:
         for q, collisions in zip((view.q_initial, view.q_optimal), view.collisions, strict=True)
     )
     points = np.vstack([first.points, second.points])
-    surfaces = surfaces_of(first, second, contact_letters(view), 0.3 * max(float(np.ptp(points, axis=0).max()), 1e-3))
+    side = 0.3 * max(float(np.ptp(points, axis=0).max()), 1e-3)
+    surfaces = surfaces_of(first, second, contact_letters(view), side, view.depths)
     plane = side_plane(first, second)
     states = ((first, BEFORE), (second, AFTER))
-    notes = [*stick_notes(first), _ENDS, _NORMAL]
+    notes = [*stick_notes(first), _ENDS, _NORMAL, *([_BEHIND] if any(view.depths) else [])]
     low, high = _window([first, second], plane, surfaces)
     # As high as the view from the side needs, within the limits of a page.
     height = float(np.clip(3.1 * (high - low)[1] / (high - low)[0], 2.3, 3.6)) + 1.0
@@ -124,20 +127,24 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
     return max(candidates, key=shown)
 
 
-def surfaces_of(first: Skeleton, second: Skeleton, letters: list[str], side: float) -> list[Surface]:
-    """Return the planes of each contact; both where the plane moves along n or turns."""
+def surfaces_of(
+    first: Skeleton, second: Skeleton, letters: list[str], side: float, depths: Sequence[float] = ()
+) -> list[Surface]:
+    """Return the planes of each contact, at their depths; both where the plane moves along n or turns."""
     found = []
-    pairs = zip(first.contacts, second.contacts, first.normals, second.normals, letters, strict=True)
-    for before, after, n_before, n_after, letter in pairs:
+    depths = depths or [0.0] * len(letters)
+    pairs = zip(first.contacts, second.contacts, first.normals, second.normals, letters, depths, strict=True)
+    for before, after, n_before, n_after, letter, depth in pairs:
+        below, above = before - depth * n_before, after - depth * n_after
         way, turned = after - before, float(np.linalg.norm(n_before - n_after)) > 0.01
         if not turned and abs(float(way @ n_after)) < 0.03 * side:
             # The same surface, touched at another place, is wide enough for both places.
             wide = side + float(np.linalg.norm(way))
-            found.append(Surface((before + after) / 2, n_after, wide, after, 0.8 * side, f"n{letter}", GRAY))
+            found.append(Surface((below + above) / 2, n_after, wide, after, 0.8 * side, f"n{letter}", GRAY))
             continue
         names = (f"n₀{letter}", f"n₁{letter}")
-        found.append(Surface(before, n_before, side, before, 0.8 * side, names[0], VERMILLION))
-        found.append(Surface(after, n_after, side, after, 0.8 * side, names[1], BLUE))
+        found.append(Surface(below, n_before, side, before, 0.8 * side, names[0], VERMILLION))
+        found.append(Surface(above, n_after, side, after, 0.8 * side, names[1], BLUE))
     return found
 
 

@@ -80,6 +80,7 @@ class ResultView:
         self_motion: The map of the self-motion manifold, if it was computed.
         title: First line of every figure; robot and contact frame if empty.
         collisions: Names of the shapes that collide, in pairs, before and after.
+        depths: How far behind its contact point each surface lies, m; empty for none.
     """
 
     robot: Robot
@@ -94,6 +95,7 @@ class ResultView:
     self_motion: SelfMotionMap | None = None
     title: str = ""
     collisions: tuple[Sequence[tuple[str, str]], Sequence[tuple[str, str]]] = ((), ())
+    depths: tuple[float, ...] = ()
 
     @cached_property
     def before(self) -> ImpactQuantities:

@@ -71,6 +71,7 @@ class Surroundings:
         self._group = _rigid_groups(robot, held)
         self._walls: list[_Wall] = []
         self._still = {0}
+        self._depths: dict[ImpactContact, float] = {}
         self.notes: list[str] = list(self.shapes.warnings)
         if touching := self.shapes.always_touching:
             self.notes.append(
@@ -115,6 +116,7 @@ class Surroundings:
         own = [b for b in self._bodies if b.point.joint in exempt]
         plane = Body(name, None, point, turns, n)
         depth = max([0.0, *[-self._height(body, plane) for body in own]])
+        self._depths[contact] = depth
         plane = replace(plane, offset=-depth)
         beside = [p.joint for p in touching if abs(self._above(p, plane)) < _BESIDE]
         exempt |= self._rigid(beside)
@@ -146,6 +148,10 @@ class Surroundings:
                 )
             taken.add(obstacle.name)
             self._walls.append(_Wall(Body.of_link(obstacle_hull(obstacle)), self._rigid([0])))
+
+    def depth(self, contact: ImpactContact) -> float:
+        """Return how far behind the contact point the surface lies, m; zero where a contact has no surface."""
+        return self._depths.get(contact, 0.0)
 
     # ---- what follows -----------------------------------------------------------------------------------------
 

@@ -281,6 +281,17 @@ def surfaces(view: ResultView) -> list[Surface]:
     return surfaces_of(first, second, contact_letters(view), 0.1)
 
 
+def test_a_surface_is_drawn_at_its_depth(tilthex: ResultView, solo8: ResultView) -> None:
+    for view in (tilthex, solo8):
+        first, second = (skeleton(view, q) for q in (view.q_initial, view.q_optimal))
+        letters = contact_letters(view)
+        for there, moved in zip(
+            surfaces_of(first, second, letters, 0.1), surfaces_of(first, second, letters, 0.1, [0.07]), strict=True
+        ):
+            np.testing.assert_allclose(there.point - moved.point, 0.07 * there.normal, atol=1e-12)
+            np.testing.assert_array_equal(there.contact, moved.contact)
+
+
 def test_each_contact_has_its_planes(
     tilthex: ResultView, turned: ResultView, two_hands: ResultView, solo8: ResultView
 ) -> None:
