@@ -120,6 +120,10 @@ def pendulum(effort: float, *, gravity: float = 0.0) -> PathSpace:
     return PathSpace(build_problem(made, objective, made.posture(), Requirements(contact_pose="free")))
 
 
+def limits_of(space: PathSpace) -> ActuatorLimits:
+    return ActuatorLimits(space.problem.objective, space.problem.given, space.problem.requirements)
+
+
 def curve_of(space: PathSpace, angle: float) -> PathCurve:
     return PathCurve(space, [space.problem.given + x for x in np.linspace(0, angle, 6)[:, None]])
 
@@ -129,7 +133,7 @@ def test_a_pendulum_takes_the_time_of_bang_bang(effort: float, angle: float) -> 
     """T = 2 √(I Δ/τ); with the smooth law the largest acceleration is 10/√3 Δ/T²."""
     space = pendulum(effort)
     inertia = float(pin.crba(space.model, space.model.createData(), space.problem.given)[0, 0])
-    limits = ActuatorLimits(space.problem.robot, (), 0.7)
+    limits = limits_of(space)
     assert not limits.missing
     fastest = timing.timed(space, curve_of(space, angle), limits)
     assert fastest.method == "time-optimal" and not fastest.notes
@@ -140,9 +144,11 @@ def test_a_pendulum_takes_the_time_of_bang_bang(effort: float, angle: float) -> 
 
 def test_without_a_torque_limit_velocities_count_and_this_is_said() -> None:
     space = pendulum(0.0)
-    limits = ActuatorLimits(space.problem.robot, (), 0.7)
+    limits = limits_of(space)
     motion = timing.timed(space, curve_of(space, 1.0), limits)
-    assert motion.method == "scaled" and motion.notes == ("no torque limits are known: timed by velocities alone",)
+    assert motion.method == "scaled" and motion.notes == (
+        "no effort limit of a joint is known: timed by velocities alone",
+    )
     # The joint may turn at 10 rad/s, and the smooth law is fastest in its middle: 15/8 Δ/T.
     assert np.abs(motion.v).max() == pytest.approx(10.0, rel=1e-3)
     assert motion.t[-1] == pytest.approx(15 / 8 / 10.0, rel=1e-3)
@@ -150,7 +156,7 @@ def test_without_a_torque_limit_velocities_count_and_this_is_said() -> None:
 
 def test_a_posture_that_the_motor_cannot_hold_is_named() -> None:
     space = pendulum(0.2, gravity=9.81)
-    limits = ActuatorLimits(space.problem.robot, (), 0.7)
+    limits = limits_of(space)
     motion = timing.timed(space, curve_of(space, 0.3), limits)
     held = 0.2 * 9.81 * 0.25 / 0.2
     assert motion.notes == (f"joint_0 would need {held:.3g} times its limit at rest on the path: "
@@ -159,8 +165,10 @@ def test_a_posture_that_the_motor_cannot_hold_is_named() -> None:
 
 def test_a_floating_base_without_rotors_or_feet_is_said() -> None:
     made = yaw_and_pitches()
-    limits = ActuatorLimits(Robot(**{**vars_of(made), "spec": type(made.spec)()}), (), 0.7)
-    assert limits.missing == "neither rotors nor feet on the ground are known"
+    loose = Robot(**{**vars_of(made), "spec": type(made.spec)()})
+    objective = ImpactObjective(loose, ImpactContact(TIP, (0, 0, 1)))
+    limits = ActuatorLimits(objective, loose.posture(), Requirements())
+    assert limits.missing == "there are neither rotors nor feet that could hold it up"
 
 
 def vars_of(made: Robot) -> dict[str, object]:
@@ -172,15 +180,16 @@ def test_a_light_standing_robot_rests_and_a_slippery_one_does_not(name: str) -> 
     """Level ground needs no friction at rest in a symmetric stance, but some for a push sideways."""
     loaded = robot(name)
     supports = tuple(Support.from_spec(s) for s in loaded.spec.supports)
+    objective = ImpactObjective(loaded, ImpactContact(loaded.spec.contact.frame, (1, 0, 0)), supports=supports)
     q, zero = loaded.posture(), np.zeros(loaded.nv)
-    limits = ActuatorLimits(loaded, supports, 0.7)
+    limits = ActuatorLimits(objective, q, Requirements(friction=0.7))
     rest = limits.load(q, zero, zero)
     sideways = limits.load(q, zero, np.eye(loaded.nv)[1]) - rest
     shares = limits.shares(q, rest)
-    assert shares is not None and shares.max() < 1
+    assert shares is not None and np.abs(shares).max() < 1
     rate = limits.largest_rate(q, rest, sideways)
     assert rate is not None
     # μ g bounds the acceleration of the mass center, whatever the motors can do.
     assert 0 < rate < 0.7 * 9.81 * 1.5
-    slippery = ActuatorLimits(loaded, supports, 0.07).largest_rate(q, rest, sideways)
+    slippery = ActuatorLimits(objective, q, Requirements(friction=0.07)).largest_rate(q, rest, sideways)
     assert slippery is None or slippery < 0.3 * rate

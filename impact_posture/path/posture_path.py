@@ -120,8 +120,7 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, effort: int = EFFO
     curve = fitted_curve(space, shortened(space, postures, seed)) or fitted_curve(space, postures)
     if curve is None:
         return _still(space, objective, start, "no smooth curve through the path satisfies the constraints")
-    requirements = solution.problem.requirements
-    limits = ActuatorLimits(solution.problem.robot, objective.supports, requirements.friction)
+    limits = ActuatorLimits(objective, start, solution.problem.requirements)
     motion = timed(space, curve, limits)
     q = np.array([space.projector.project(curve.at(z)).q for z in motion.z])
     use = limit_use(space, motion, q, limits)

@@ -61,17 +61,20 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
     from toppra.algorithm import TOPPRA
     from toppra.constraint import DiscretizationType, JointTorqueConstraint, JointVelocityConstraint
 
-    speed, effort = velocity_limits(space), limits.effort
+    speed = velocity_limits(space)
     # Joints without a limit get a bound that nothing reaches; the solver takes no infinities.
     bound = np.where(np.isfinite(speed), speed, 1e6)
 
     def used(z: Array, v: Array, a: Array) -> Array:
-        return limits.load(curve.at(z), v, a) / effort
+        q = curve.at(z)
+        found = limits.shares(q, limits.load(q, v, a))
+        assert found is not None  # noqa: S101 (a fixed base balances every load)
+        return found
 
     constraints = [
         JointVelocityConstraint(np.column_stack([-bound, bound])),
         JointTorqueConstraint(
-            used, np.tile([-1.0, 1.0], (len(effort), 1)), np.zeros(len(effort)),
+            used, np.tile([-1.0, 1.0], (len(limits.names), 1)), np.zeros(len(limits.names)),
             discretization_scheme=DiscretizationType.Interpolation,
         ),
     ]  # fmt: skip
@@ -134,7 +137,7 @@ def _cannot_move(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple
     held = [share for share in shares if share is not None]
     if len(held) < len(shares):
         return "rotors or friction cannot hold all postures of the path at rest"
-    worst = np.max(held, axis=0)
+    worst = np.abs(held).max(axis=0)
     if worst.max() <= 1:
         return "rotors or friction cannot accelerate the robot along the path at any speed"
     return f"{limits.names[int(worst.argmax())]} would need {worst.max():.3g} times its limit at rest on the path"
@@ -181,12 +184,10 @@ def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: Act
     for row, k in enumerate([] if limits.missing else every):
         found = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
         shares[row] = np.nan if found is None else found
-    joints = len(limits.effort)
-    groups = {
-        "velocity": (np.abs(motion.v[every]) / velocity_limits(space), robot.tangent_names),
-        "torque": (shares[:, :joints], limits.names[:joints]),
-        "thrust": (shares[:, joints:], limits.names[joints:]),
-    }
+    groups = {"velocity": (np.abs(motion.v[every]) / velocity_limits(space), robot.tangent_names)}
+    for kind in ("torque", "thrust"):
+        own = [k for k, other in enumerate(limits.kinds) if other == kind]
+        groups[kind] = np.abs(shares[:, own]), [limits.names[k] for k in own]
     largest: dict[str, object] = {}
     sizes: dict[str, float] = {}
     for name, (used, names) in groups.items():

@@ -9,12 +9,14 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.posture.static_load import ForceSource, StaticLoad, StaticTorque
+from impact_posture.posture.static_load import ForceSource, StaticLoad
 
 # The default of HiGHS, 1e-7, is coarser than what a certificate accepts.
 _EXACT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 # Shares closer to the largest than this are as large.
 _TIED = 1e-9
+# Rate above which a load meets no limit.
+_MOST = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +105,9 @@ class Equilibrium:
         ]
         self.lower, self.upper = (np.concatenate(parts) for parts in zip(*ends, strict=True))
 
-    def _affine(self, still: StaticTorque) -> tuple[Array, Array, Array, Array]:
-        """``A, b, S, c`` of the balance ``A z + b`` and the shares ``S z + c``, from the torque at ``z = 0``."""
-        every, start = self.rows @ still.by_force, self.rows @ still.value + self.offset
+    def _affine(self, load: Array, by_force: Array) -> tuple[Array, Array, Array, Array]:
+        """``A, b, S, c`` of the balance ``A z + b`` and the shares ``S z + c``, from the load at ``z = 0``."""
+        every, start = self.rows @ by_force, self.rows @ load + self.offset
         half = (self.load.upper - self.load.lower)[self._free, None] / 2
         middle = (self.load.upper + self.load.lower)[self._free] / 2
         S = np.vstack([every[self.balanced :], np.eye(self.load.count)[self._free] / half])
@@ -121,7 +123,8 @@ class Equilibrium:
 
         This proves without a linear program that the posture can be held.  It says nothing if they do not.
         """
-        A, b, S, c = self._affine(self.load.torque(q, np.zeros(self.load.count)))
+        still = self.load.torque(q, np.zeros(self.load.count))
+        A, b, S, c = self._affine(still.value, still.by_force)
         lower, upper = self.load.lower, self.load.upper
         pushing = np.isfinite(lower) & np.isinf(upper)
         even = np.where(pushing, 1 / max(pushing.sum(), 1), 0.0)
@@ -134,7 +137,7 @@ class Equilibrium:
         """Return the forces that balance the base with the least largest share, or with the least imbalance."""
         count = self.load.count
         still = self.load.torque(q, np.zeros(count))
-        A, b, S, c = self._affine(still)
+        A, b, S, c = self._affine(still.value, still.by_force)
         jacobian = np.zeros((1 + c.size, self.load.model.nv))
         if not count:
             jacobian[1:] = np.sign(c)[:, None] * (self.rows @ still.by_posture)
@@ -146,6 +149,42 @@ class Equilibrium:
         worst = np.abs(shares) > np.abs(shares).max(initial=0.0) - _TIED
         jacobian[np.append(unbalanced > 0, worst & (unbalanced == 0))] = gradient
         return Distribution(z, shares, unbalanced, jacobian)
+
+    def shares(self, q: Array, load: Array) -> Array | None:
+        """Return the signed shares for another load than that of rest, such as ``M ν̇ + h``, shape (actuators,).
+
+        The largest is as small as possible.  ``None`` if the feet cannot balance the load.
+        """
+        A, b, S, c = self._affine(load, self._by_force(q))
+        if not self.load.count:
+            return c
+        found = self._least_share(A, b, S, c)
+        return None if found is None else S @ found[0] + c
+
+    def largest_rate(self, q: Array, rest: Array, dynamic: Array) -> float | None:
+        """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``; infinite if all do.
+
+        ``None`` if they do not even allow ``rest``.
+        """
+        from scipy.optimize import linprog
+
+        A, b, S, c = self._affine(rest, self._by_force(q))
+        rate = self.rows @ dynamic
+        into = np.append(rate[self.balanced :], np.zeros(len(self._free)))
+        found = linprog(
+            np.append(np.zeros(self.load.count), -1.0),
+            A_ub=np.block([[S, into[:, None]], [-S, -into[:, None]]]),
+            b_ub=np.concatenate([1 - c, 1 + c]),
+            A_eq=np.column_stack([A, rate[: self.balanced]]),
+            b_eq=-b,
+            bounds=[*np.column_stack([self.load.lower, self.load.upper]), (0.0, _MOST)],
+        )
+        if found.status != 0:
+            return None
+        return float("inf") if found.x[-1] > _MOST * (1 - 1e-9) else float(found.x[-1])
+
+    def _by_force(self, q: Array) -> Array:
+        return self.load.torque(q, np.zeros(self.load.count)).by_force
 
     def _least_share(self, A: Array, b: Array, S: Array, c: Array) -> tuple[Array, float, Array] | None:
         """``min s`` with ``A z + b = 0`` and ``|S z + c| ≤ s``; ``None`` if the feet cannot balance the robot."""

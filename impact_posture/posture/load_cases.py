@@ -57,10 +57,17 @@ class LoadCase:
 
 @dataclass(frozen=True, eq=False)
 class LoadCases:
-    """The load cases of a problem, and notes for the user about what is not known."""
+    """The load cases of a problem.
+
+    Attributes:
+        cases: The load cases; none where the data of the robot do not allow a statement.
+        notes: Notes for the user about what is not known.
+        unknown: Why there are no load cases; empty if there are.
+    """
 
     cases: tuple[LoadCase, ...] = ()
     notes: tuple[str, ...] = ()
+    unknown: str = ""
 
     def holding(self, q: Array) -> Holding | None:
         """Return what holds ``q``, at rest and in the other cases; ``None`` if the data do not say."""
@@ -100,7 +107,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
     if unknown and force:
         raise InputError(f"{force:g} N cannot be checked: {unknown}", where="hold_force", hint="leave it out")
     if unknown:
-        return LoadCases(notes=(f"whether the robot can hold the posture is not checked: {unknown}",))
+        return LoadCases((), (f"whether the robot can hold the posture is not checked: {unknown}",), unknown)
     free = [s.frame for s in objective.supports if feet and s.kind == "surface" and not s.has_sole]
     notes = [f"the moments that {', '.join(free)} can bear are not checked: the sole has no size"] if free else []
     kinds = ["joint torques", *["rotor thrusts"] * bool(rotors), *["forces of the feet"] * bool(feet)]
