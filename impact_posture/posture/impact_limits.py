@@ -23,7 +23,7 @@ from impact_posture.posture.constraint import ExpressionConstraint
 
 
 class ImpactLimits(ExpressionConstraint):
-    """``G(q) ≥ G_min`` and ``|a_i(q)|/G(q) ≤ b`` at every joint.
+    """``1/G(q) ≤ 1/G_min`` and ``|a_i(q)|/G(q) ≤ b`` at every joint.
 
     The bounds are bounds of the rows, so one program serves all of them.
 
@@ -43,9 +43,10 @@ class ImpactLimits(ExpressionConstraint):
         self._joints = np.flatnonzero(moving) if np.isfinite(jump) else np.zeros(0, dtype=int)
         self._least, self._jump = least_mobility, jump
         self.parameters = np.array(objective.contact.normal)
-        force = [least_mobility] if least_mobility > 0 else []
-        self.lower = np.array([*force, *[-jump] * len(self._joints)])
-        self.upper = np.array([*[np.inf] * len(force), *[jump] * len(self._joints)])
+        # Effective masses, because a bound on G can be large beside any G.
+        force = [1 / least_mobility] if least_mobility > 0 else []
+        self.lower = np.array([*[-np.inf] * len(force), *[-jump] * len(self._joints)])
+        self.upper = np.array([*force, *[jump] * len(self._joints)])
 
     def describe(self) -> str:
         """See :class:`Constraint`."""
@@ -68,7 +69,7 @@ class ImpactLimits(ExpressionConstraint):
         impact = impact_at(case, parameters)
         found = heavy.respond(wrenches=[impact])
         G = ca.dot(heavy.link_force(impact), found.velocities[impact.point.joint])
-        rows = [G] if self._least > 0 else []
+        rows = [1 / G] if self._least > 0 else []
         return ca.densify(ca.vertcat(*rows, *[found.a[int(k)] / G for k in self._joints]))
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
@@ -77,8 +78,8 @@ class ImpactLimits(ExpressionConstraint):
         found, slope = oracle.quantities(model.q), oracle.gradient_G(model.q)
         values, gradients = [], []
         if self._least > 0:
-            values.append(found.G)
-            gradients.append(slope)
+            values.append(1 / found.G)
+            gradients.append(-slope / found.G**2)
         if len(self._joints):
             jumps = oracle.jump_gradient(model.q)
             for k in self._joints:
