@@ -19,10 +19,12 @@ from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.contact import point_on
 from impact_posture.posture.clearance import Clearance
+from impact_posture.posture.nlp import build_nlp
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.search import feasible
-from impact_posture.posture.separator import Body, Separator
+from impact_posture.posture.separator import EQUATIONS, Body, Separator
 from impact_posture.posture.solve import solve
+from impact_posture.posture.starts import Projector, random_posture
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import Obstacle, ProblemSettings
@@ -80,14 +82,15 @@ def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str) -> None:
         separator, q = _separator(robot, kind), _random(robot, rng)
         distance = separator.distance(numeric.at(q))[0]
         corners = separator.corners(numeric)
-        lifted = separator.lift(tree, "", corners)
-        rows = ca.Function("rows", [x, lifted.variables], [lifted.rows])
+        lifted = separator.lift(tree, "")
+        sides = separator.sides(lifted.variables, corners)
+        rows = ca.Function("rows", [x, lifted.variables], [ca.vertcat(lifted.rows, sides)])
         guess = separator.guess(numeric).values.copy()
         assert len(guess) == separator.count
         # Without the slack.
         guess[-1] = 0.0
         value = np.array(rows(chart.to_x(q), guess)).ravel()
-        lower, upper = separator.bounds(corners)
+        lower, upper = (np.append(np.zeros(EQUATIONS), side) for side in separator.bounds(corners))
         outside = np.maximum(lower - value, value - upper)
         # The guess of the normal is 2 % short, so a gap of a few millimeters may not show.
         if abs(distance) > 0.03:
@@ -242,3 +245,25 @@ def test_a_surface_lies_where_the_link_of_the_contact_reaches(name: str, normal:
     assert not touched(-1e-6)
     # A swept hull is a few millimeters larger than the mesh inside.
     assert touched(0.015)
+
+
+@pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo12"])
+def test_derivatives_of_a_program_that_grew_are_those_of_casadi(name: str) -> None:
+    asked = {"robot": name, "normal": (0.0, 0.0, 1.0), "contact_pose": "position"}
+    problem = prepare(validate(ProblemSettings, asked, "options")).problem
+    rng, projector = np.random.default_rng(3), Projector(problem)
+    first = nlp = build_nlp(problem, compile="never")
+    for _ in range(3):
+        # Postures anywhere bring in pairs and corners, as the ends of runs do.
+        ends = [random_posture(problem, projector.chart, rng, near=False) for _ in range(3)]
+        problem = problem.grown(ends)
+        nlp = nlp.grown(problem, compile="never")
+    assert nlp.solver.size1_in("lbg") > first.solver.size1_in("lbg") + 50
+    symbols, _ = nlp.program.symbols(problem)
+    plain = ca.nlpsol("plain", "ipopt", symbols, {"print_time": False, "ipopt.print_level": 0})
+    numbers = [rng.normal(size=nlp.solver.get_function("nlp_hess_l").size1_in(k)) for k in range(4)]
+    for function, count in (("nlp_jac_g", 2), ("nlp_hess_l", 4)):
+        ours, theirs = (solver.get_function(function)(*numbers[:count]) for solver in (nlp.solver, plain))
+        pairs = zip(ours, theirs, strict=True) if count == 2 else [(ours, theirs)]
+        for one, other in pairs:
+            np.testing.assert_allclose(ca.DM(one).full(), ca.DM(other).full(), rtol=1e-9, atol=1e-9)

@@ -187,7 +187,7 @@ def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: Act
     groups = {"velocity": (np.abs(motion.v[every]) / velocity_limits(space), robot.tangent_names)}
     for kind in ("torque", "thrust"):
         own = [k for k, other in enumerate(limits.kinds) if other == kind]
-        groups[kind] = np.abs(shares[:, own]), [limits.names[k] for k in own]
+        groups[kind] = np.abs(shares[:, own]), tuple(limits.names[k] for k in own)
     largest: dict[str, object] = {}
     sizes: dict[str, float] = {}
     for name, (used, names) in groups.items():

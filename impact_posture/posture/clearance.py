@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Self
 
 import casadi as ca
@@ -15,7 +16,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.lifted import Guess
 from impact_posture.posture.constraint import Constraint, LiftedRows, Linearization
-from impact_posture.posture.separator import Body, Corners, Separator
+from impact_posture.posture.separator import EQUATIONS, Body, Corners, Separator
 
 # Pairs closer than this (m) beyond their clearance are computed exactly; a bound is enough for the others.
 _NEAR = 0.01
@@ -37,16 +38,23 @@ class Clearance(Constraint):
         separators: The pairs.
         words: Description in one line.
         active: Pairs in the program, by index, with the corners that have rows there.
+        lifted: Equations of pairs by index and tree, which all constraints share that one grows into.
     """
 
     projected = False
     grows = True
 
     def __init__(
-        self, name: str, separators: Sequence[Separator], words: str, active: Mapping[int, Corners] | None = None
+        self,
+        name: str,
+        separators: Sequence[Separator],
+        words: str,
+        active: Mapping[int, Corners] | None = None,
+        lifted: dict[tuple[int, int], tuple[Tree, LiftedRows]] | None = None,
     ) -> None:
         self.name, self._separators, self._words = name, tuple(separators), words
         self.active: Mapping[int, Corners] = active or {}
+        self._lifted = {} if lifted is None else lifted
         self.parameters = np.zeros(0)
         self.lower, self.upper = np.zeros(len(self._separators)), np.full(len(self._separators), np.inf)
         bodies: dict[int, Body] = {}
@@ -138,7 +146,7 @@ class Clearance(Constraint):
             if not (new.a <= old.a and new.b <= old.b):
                 active[int(k)] = Corners(old.a | new.a, old.b | new.b)
                 added += 1
-        return type(self)(self.name, self._separators, self._words, active) if added else self
+        return type(self)(self.name, self._separators, self._words, active, self._lifted) if added else self
 
     # ---- lifted form ------------------------------------------------------------------------------------------
 
@@ -147,20 +155,24 @@ class Clearance(Constraint):
         return [(k, self._separators[k], corners) for k, corners in self.active.items()]
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """See :class:`Constraint`."""
-        parts = [one.lift(tree, f"{self.name}{k}", corners) for k, one, corners in self._program]
-        rows, variables = (
-            ca.vertcat(ca.SX(0, 1), *[getattr(part, key) for part in parts]) for key in ("rows", "variables")
-        )
-        return LiftedRows(rows, variables, sum((part.slack for part in parts), ca.SX(0)))
+        """See :class:`Constraint`; a pair keeps its equations while others, and more corners, come in."""
+        pieces = []
+        for k, one, corners in self._program:
+            if (k, id(tree)) not in self._lifted:
+                self._lifted[k, id(tree)] = tree, one.lift(tree, f"{self.name}{k}")
+            pair = self._lifted[k, id(tree)][1]
+            pieces.append(replace(pair, sides=one.sides(pair.variables, corners)))
+        return LiftedRows.joined(pieces)
 
     @property
     def lifted_bounds(self) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
+        equations = np.zeros(EQUATIONS * len(self.active))
         lower, upper = (
-            [np.zeros(0), *[one.bounds(corners)[side] for _, one, corners in self._program]] for side in (0, 1)
+            np.concatenate([equations, *[one.bounds(corners)[side] for _, one, corners in self._program]])
+            for side in (0, 1)
         )
-        return np.concatenate(lower), np.concatenate(upper)
+        return lower, upper
 
     def guess(self, model: Numeric) -> Guess:
         """See :class:`Constraint`."""

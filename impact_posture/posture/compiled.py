@@ -8,6 +8,7 @@ compiles once.
 from __future__ import annotations
 
 import platform
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -39,9 +40,22 @@ class BuiltSolver(NamedTuple):
 
 
 def compiled_solver(
-    problem: PostureProblem, symbols: dict[str, ca.SX], options: dict[str, Any], mode: CompileMode, starts: int
+    problem: PostureProblem,
+    symbols: dict[str, ca.SX],
+    options: dict[str, Any],
+    mode: CompileMode,
+    starts: int,
+    derivatives: Mapping[str, ca.Function],
 ) -> BuiltSolver:
     """Build ``nlpsol`` on the expressions, compiled or interpreted.
+
+    Args:
+        problem: The problem.
+        symbols: The expressions ``x``, ``p``, ``f`` and ``g``.
+        options: Options of IPOPT.
+        mode: Whether to compile.
+        starts: Number of runs that compiling has to pay for.
+        derivatives: Options of ``nlpsol`` with the derivatives that are known.
 
     Raises:
         CompilerError: The mode is ``always``, and there is no compiler or it fails.
@@ -51,7 +65,7 @@ def compiled_solver(
     try:
         if mode != "never" and (found := _cached(problem, options)) is not None:
             return BuiltSolver(found, True)
-        interpreted = ca.nlpsol("posture", "ipopt", symbols, options)
+        interpreted = ca.nlpsol("posture", "ipopt", symbols, {**options, **derivatives})
         compiler = find_compiler()
         if mode == "always" and compiler is None:
             raise no_compiler("compile")
@@ -65,7 +79,7 @@ def compiled_solver(
         if mode == "always":
             raise
         if interpreted is None:
-            interpreted = ca.nlpsol("posture", "ipopt", symbols, options)
+            interpreted = ca.nlpsol("posture", "ipopt", symbols, {**options, **derivatives})
         return BuiltSolver(interpreted, False, f"interpreted, not compiled: {error.line}")
 
 

@@ -29,11 +29,25 @@ class LiftedRows:
         rows: ``g(q, z)``, shape (m, 1).
         variables: ``z``, shape (k, 1).
         slack: Sum of those auxiliaries that relax rows, meters; the program drives it to zero.
+        sides: More rows, which see only ``z``.
+        pieces: The pieces of a constraint that grows.  The expressions of a piece's ``rows`` stay the same object.
     """
 
     rows: ca.SX
     variables: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
     slack: ca.SX = field(default_factory=lambda: ca.SX(1, 1))
+    sides: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
+    pieces: tuple[LiftedRows, ...] = ()
+
+    @staticmethod
+    def joined(pieces: Sequence[LiftedRows]) -> LiftedRows:
+        """Return pieces as one: the rows of all, then the sides of all."""
+        rows, sides, variables = (
+            ca.vertcat(ca.SX(0, 1), *[getattr(piece, key) for piece in pieces])
+            for key in ("rows", "sides", "variables")
+        )
+        slack = sum((piece.slack for piece in pieces), ca.SX(0))
+        return LiftedRows(ca.vertcat(rows, sides), variables, slack, pieces=tuple(pieces))
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.nlp import IPOPT_OPTIONS, run_solver
 from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.program_rows import Derivatives, ProgramRows, joined
 from impact_posture.posture.starts import random_posture
 
 # A constraint with a violation below this (m, rad) is satisfied.
@@ -45,7 +46,8 @@ def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAn
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures."""
     chart = Chart(problem.robot.model)
     rng = np.random.default_rng(seed)
-    solver = _build(problem, chart)
+    program = _Elastic(problem, chart)
+    solver = program.solver(problem)
     best: ElasticAnswer | None = None
     for attempt in range(tries):
         start = problem.given if attempt == 0 else random_posture(problem, chart, rng, near=attempt % 2 == 1)
@@ -54,7 +56,7 @@ def elastic(problem: PostureProblem, seed: int = 0, tries: int = 6) -> ElasticAn
             if found.problem is problem:
                 break
             problem = found.problem
-            solver = _build(problem, chart)
+            solver = program.solver(problem)
         if best is None or sum(found.conflicts.values()) < sum(best.conflicts.values()):
             best = found
         if not best.conflicts:
@@ -83,21 +85,46 @@ def _relax(problem: PostureProblem, chart: Chart, solver: ca.Function, start: Ar
     return _judge(problem.grown([q]), chart, q)
 
 
-def _build(problem: PostureProblem, chart: Chart) -> ca.Function:
-    x, reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
-    tree = Tree(problem.robot.model, chart.configuration(x), x)
-    lifted, targets = problem.lift(tree)
-    k = lifted.rows.numel()
-    up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
-    price = np.concatenate([np.full(len(problem.carried(i)), c.price) for i, c in enumerate(problem.constraints)])
-    away = distance_squared(chart, tree.q, chart.configuration(reference))
-    program = {
-        "x": ca.vertcat(x, up, down, lifted.variables),
-        "p": ca.vertcat(reference, *targets),
-        "f": ca.dot(price, up + down) + _SLACK_PRICE * lifted.slack + 1e-6 * away,
-        "g": ca.vertcat(chart.norms(x), lifted.rows + up - down),
-    }
-    return ca.nlpsol("elastic", "ipopt", program, {**IPOPT_OPTIONS, "ipopt.tol": 1e-8})
+class _Elastic:
+    """The elastic program, most of whose expressions stay while the problem grows."""
+
+    def __init__(self, problem: PostureProblem, chart: Chart) -> None:
+        self._x, self._reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
+        tree = Tree(problem.robot.model, chart.configuration(self._x), self._x)
+        self._rows = ProgramRows(self._x, tree, problem)
+        self._away = 1e-6 * distance_squared(chart, tree.q, chart.configuration(self._reference))
+        self._norms = chart.norms(self._x)
+        self._own = Derivatives.of(ca.vertcat(self._away, self._norms), self._x)
+
+    def solver(self, problem: PostureProblem) -> ca.Function:
+        """Return ``nlpsol`` for a problem that grew out of the first."""
+        lifted = self._rows.lift(problem)
+        k, z, nx = lifted.rows.numel(), lifted.variables.numel(), self._x.numel()
+        up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
+        price = np.concatenate([np.full(len(problem.carried(i)), c.price) for i, c in enumerate(problem.constraints)])
+        x, p = ca.vertcat(self._x, up, down, lifted.variables), ca.vertcat(self._reference, *self._rows.parameters)
+        g = ca.vertcat(self._norms, lifted.rows + up - down)
+        f = ca.dot(price, up + down) + _SLACK_PRICE * lifted.slack + self._away
+        known = self._rows.derivatives(lifted)
+        slacks = ca.horzcat(ca.SX.eye(k), -ca.SX.eye(k))
+        relaxed = Derivatives(
+            known.multipliers,
+            ca.horzcat(known.jacobian[:, :nx], slacks, known.jacobian[:, nx:]),
+            _widened(known.hessian, nx, 2 * k, z),
+        )
+        found = joined(self._own, relaxed, nx)
+        order = [*range(1, found.multipliers.numel())]
+        placed = Derivatives(found.multipliers[order], found.jacobian[order, :], found.hessian)
+        options = {**IPOPT_OPTIONS, "ipopt.tol": 1e-8, **placed.options(x, p, found.multipliers[0], g)}
+        return ca.nlpsol("elastic", "ipopt", {"x": x, "p": p, "f": f, "g": g}, options)
+
+
+def _widened(hessian: ca.SX, before: int, width: int, after: int) -> ca.SX:
+    """Return a Hessian with unknowns that it does not depend on, between the first ones and the last."""
+    place = [*range(before), *range(before + width, before + width + after)]
+    wide = ca.SX(before + width + after, before + width + after)
+    wide[place, place] = hessian
+    return wide
 
 
 def _judge(problem: PostureProblem, chart: Chart, q: Array) -> ElasticAnswer:

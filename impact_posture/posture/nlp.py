@@ -23,7 +23,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import casadi as ca
@@ -37,6 +37,7 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.compiled import CompileMode, compiled_solver
 from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.program_rows import Derivatives, ProgramRows, joined
 
 IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.print_level": 0,
@@ -96,21 +97,28 @@ class PostureNLP:
 
     Attributes:
         problem: The posture problem.
-        chart: Coordinates of the robot.
+        program: Its expressions.
         solver: ``nlpsol`` of CasADi.
-        bounded: Number of last rows that are inequalities ``≤ 0`` of the objective.
         build_time_s: Time to build and compile the program.
         compiled: Whether its functions run as machine code.
         compiler_fault: Reason why a compilation failed; empty else.
     """
 
     problem: PostureProblem
-    chart: Chart
+    program: Program
     solver: ca.Function
-    bounded: int
     build_time_s: float
     compiled: bool
     compiler_fault: str = ""
+
+    @property
+    def chart(self) -> Chart:
+        """Coordinates of the robot."""
+        return self.program.chart
+
+    def grown(self, problem: PostureProblem, *, compile: CompileMode = "auto") -> PostureNLP:
+        """Build the program of a problem that this one grew into."""
+        return build_nlp(problem, compile=compile, program=self.program)
 
     def solve(self, start: Array, *, scale: float | None = None, attempt: int = 0) -> SolveRecord:
         """Solve from ``start``.
@@ -199,35 +207,79 @@ def _noticing_interrupts() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def build_nlp(problem: PostureProblem, *, compile: CompileMode = "auto", starts: int = 1) -> PostureNLP:
-    """Build the program; the number of ``starts`` decides whether compiling pays."""
+class Program:
+    """The expressions of a program, most of which stay while the problem grows.
+
+    Args:
+        problem: The problem before it grows.
+
+    Attributes:
+        chart: Coordinates of the robot.
+        bounded: Number of last rows that are inequalities ``≤ 0`` of the objective.
+    """
+
+    def __init__(self, problem: PostureProblem) -> None:
+        self.chart = chart = Chart(problem.robot.model)
+        self._x = x = ca.SX.sym("x", chart.nx)
+        own = ca.SX.sym("own", len(problem.objective.parameters))
+        scale, weight = ca.SX.sym("scale"), ca.SX.sym("weight")
+        reference = ca.SX.sym("reference", chart.nx)
+        tree = Tree(problem.robot.model, chart.configuration(x), x)
+        self._lifted = lifted = problem.objective.lift(tree, own, scale)
+        self.bounded = int(lifted.inequalities.numel())
+        self._value = lifted.value / scale + weight * distance_squared(chart, tree.q, chart.configuration(reference))
+        self._norms = chart.norms(x)
+        self._rows = ProgramRows(x, tree, problem)
+        self._p = ca.vertcat(own, scale, weight, reference, *self._rows.parameters)
+
+    def symbols(self, problem: PostureProblem) -> tuple[dict[str, ca.SX], dict[str, ca.Function]]:
+        """Return the expressions of a problem, and the derivatives of one that grows as options of ``nlpsol``.
+
+        The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.
+        """
+        rows, objective = self._rows.lift(problem), self._lifted
+        x = ca.vertcat(self._x, objective.variables, rows.variables)
+        g = ca.vertcat(self._norms, rows.rows, objective.residual, objective.inequalities)
+        symbols = {"x": x, "p": self._p, "f": self._value + SLACK_PRICE * rows.slack, "g": g}
+        if not problem.grows:
+            return symbols, {}
+        found = joined(self._own, self._rows.derivatives(rows), self.chart.nx)
+        # Own rows are the value, the norms and the rows of the objective, with the constraints between the latter.
+        norms, count, own = self._norms.numel(), rows.rows.numel(), self._own.multipliers.numel()
+        order = [*range(1, 1 + norms), *range(own, own + count), *range(1 + norms, own)]
+        placed = Derivatives(found.multipliers[order], found.jacobian[order, :], found.hessian)
+        return symbols, placed.options(x, self._p, found.multipliers[0], g)
+
+    @cached_property
+    def _own(self) -> Derivatives:
+        """Derivatives of the value and of all rows but those of constraints."""
+        objective = self._lifted
+        rows = ca.vertcat(self._value, self._norms, objective.residual, objective.inequalities)
+        return Derivatives.of(rows, ca.vertcat(self._x, objective.variables))
+
+
+def build_nlp(
+    problem: PostureProblem, *, compile: CompileMode = "auto", starts: int = 1, program: Program | None = None
+) -> PostureNLP:
+    """Build the program; the number of ``starts`` decides whether compiling pays.
+
+    Args:
+        problem: The posture problem.
+        compile: Whether to compile.
+        starts: Number of runs.
+        program: The expressions of a problem that grew into this one.
+
+    Raises:
+        CompilerError, OutputError: As :func:`impact_posture.posture.compiled.compiled_solver`.
+    """
     began = time.perf_counter()
-    chart = Chart(problem.robot.model)
-    symbols, bounded = program(problem, chart)
+    program = program or Program(problem)
+    symbols, derivatives = program.symbols(problem)
     options = IPOPT_OPTIONS | (_WORST_OPTIONS if problem.objective.attempts > 1 else {})
     # A program that grows is soon another one, so it is not worth compiling.
-    built = compiled_solver(problem, symbols, options, compile, 1 if problem.grows else starts)
+    built = compiled_solver(problem, symbols, options, compile, 1 if problem.grows else starts, derivatives)
     took = time.perf_counter() - began
-    return PostureNLP(problem, chart, built.solver, bounded, took, built.compiled, built.fault)
-
-
-def program(problem: PostureProblem, chart: Chart) -> tuple[dict[str, ca.SX], int]:
-    """Return ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``, and the number of last rows that are ``≤ 0``."""
-    x = ca.SX.sym("x", chart.nx)
-    own = ca.SX.sym("own", len(problem.objective.parameters))
-    scale, weight = ca.SX.sym("scale"), ca.SX.sym("weight")
-    reference = ca.SX.sym("reference", chart.nx)
-    tree = Tree(problem.robot.model, chart.configuration(x), x)
-    lifted = problem.objective.lift(tree, own, scale)
-    constraints, targets = problem.lift(tree)
-    value = lifted.value / scale + weight * distance_squared(chart, tree.q, chart.configuration(reference))
-    symbols = {
-        "x": ca.vertcat(x, lifted.variables, constraints.variables),
-        "p": ca.vertcat(own, scale, weight, reference, *targets),
-        "f": value + SLACK_PRICE * constraints.slack,
-        "g": ca.vertcat(chart.norms(x), constraints.rows, lifted.residual, lifted.inequalities),
-    }
-    return symbols, int(lifted.inequalities.numel())
+    return PostureNLP(problem, program, built.solver, took, built.compiled, built.fault)
 
 
 def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Array:
@@ -248,5 +300,5 @@ def _row_bounds(problem: PostureProblem, nlp: PostureNLP) -> dict[str, Array]:
     # The other rows belong to the objective: first equations, then inequalities that bound it from below.
     lifted = np.zeros(nlp.solver.size1_in("lbg") - len(lower))
     below = lifted.copy()
-    below[lifted.size - nlp.bounded :] = -np.inf
+    below[lifted.size - nlp.program.bounded :] = -np.inf
     return {"lbg": np.concatenate([lower, below]), "ubg": np.concatenate([upper, lifted])}

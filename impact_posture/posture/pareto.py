@@ -201,7 +201,8 @@ class _Curve:
                 grown = self._problem.grown([record.q])
                 if grown is self._problem:
                     break
-                self._problem, self._nlp, start = grown, build_nlp(grown, compile=self._compile), record.q
+                self._problem, self._nlp = grown, self._nlp.grown(grown, compile=self._compile)
+                start = record.q
             self._take(k, path, record.q, certificate)
         except MetricError:
             # This path led to a posture where the objective does not exist.

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import casadi as ca
 import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
 from impact_posture.impact.lifted import Guess
 from impact_posture.impact.objective import ImpactObjective, Objective
-from impact_posture.posture.constraint import Constraint, LiftedRows
+from impact_posture.posture.constraint import Constraint
 from impact_posture.posture.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import CLEARANCE, BaseMode, Obstacle, Vector3
@@ -136,16 +134,6 @@ class PostureProblem:
             np.concatenate([empty, *[lower[rows] for lower, _, rows in carried]]),
             np.concatenate([empty, *[upper[rows] for _, upper, rows in carried]]),
         )
-
-    def lift(self, tree: Tree) -> tuple[LiftedRows, list[ca.SX]]:
-        """Return the rows that the program carries with all auxiliaries, and the symbols of their parameters."""
-        symbols = [ca.SX.sym(f"p{index}", len(c.parameters)) for index, c in enumerate(self.constraints)]
-        lifted = [c.lift(tree, p) for c, p in zip(self.constraints, symbols, strict=True)]
-        rows = [part.rows[self.carried(index)] for index, part in enumerate(lifted)]
-        slack = sum((part.slack for part in lifted), ca.SX(0))
-        empty = ca.SX(0, 1)
-        variables = ca.vertcat(empty, *[part.variables for part in lifted])
-        return LiftedRows(ca.vertcat(empty, *rows), variables, slack), symbols
 
     def guess(self, numeric: Numeric) -> Guess:
         """Return the auxiliaries of all constraints to start from at ``numeric.q``, with their bounds."""

@@ -123,7 +123,7 @@ class Search:
             waiting = sorted({*lacking, *trapped, *later})
             if lacking:
                 self.problem = self.problem.grown(list(lacking.values()))
-                self.nlp = build_nlp(self.problem, compile=self._compile)
+                self.nlp = self.nlp.grown(self.problem, compile=self._compile)
                 self.build_time_s += self.nlp.build_time_s
             if not waiting:
                 break

@@ -28,6 +28,8 @@ from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.impact.lifted import Guess
 from impact_posture.posture.constraint import LiftedRows, Linearization
 
+# Number of equations of a pair.
+EQUATIONS = 4
 # Least n·n.  Without it a normal could shrink to zero where bodies penetrate each other, which leaves no way out.
 _SHORT = 0.8
 # A slack starts so far (m) above the penetration, and a normal at this length, inside their bounds.
@@ -120,12 +122,10 @@ class Separator:
         return self.b.normal is not None
 
     def bounds(self, corners: Corners) -> tuple[Array, Array]:
-        """Return the bounds of the rows of :meth:`lift`."""
+        """Return the bounds of the :meth:`sides`; the rows of :meth:`lift` are :data:`EQUATIONS`."""
         first, second, own = len(corners.a), len(corners.b), 0 if self.known else 1
-        lower = np.concatenate(
-            [np.zeros(4), np.full(first, self.gap), np.full(second, -np.inf), np.full(own, _SHORT)]
-        )
-        upper = np.concatenate([np.zeros(4), np.full(first, np.inf), np.zeros(second), np.ones(own)])
+        lower = np.concatenate([np.full(first, self.gap), np.full(second, -np.inf), np.full(own, _SHORT)])
+        upper = np.concatenate([np.full(first, np.inf), np.zeros(second), np.ones(own)])
         return lower, upper
 
     def content(self, corners: Corners) -> str:
@@ -135,8 +135,8 @@ class Separator:
         points = self._x[sorted(corners.a)].tolist(), self._y[sorted(corners.b)].tolist()
         return repr((bodies, self.b.turns, normal, self.b.offset, points))
 
-    def lift(self, tree: Tree, label: str, corners: Corners) -> LiftedRows:
-        """Return the rows, the unknowns ``n, c, m, d, s`` (``m, d, s`` for a half-space), and the slack."""
+    def lift(self, tree: Tree, label: str) -> LiftedRows:
+        """Return the equations, the unknowns ``n, c, m, d, s`` (``m, d, s`` for a half-space), and the slack."""
         plane = ca.SX(0, 1) if self.known else ca.SX.sym(f"plane{label}", 4)
         m, d, s = ca.SX.sym(f"m{label}", 3), ca.SX.sym(f"d{label}"), ca.SX.sym(f"s{label}")
         if self.b.normal is None:
@@ -144,10 +144,16 @@ class Separator:
         else:
             n, c = ca.SX(self.b.normal), ca.SX(self.b.offset)
         Q, t = self._relative(tree)
-        rows = [m - Q.T @ n, d - (ca.dot(n, t) - c), ca.SX(self._x[sorted(corners.a)]) @ m + d + s]
+        return LiftedRows(ca.vertcat(m - Q.T @ n, d - (ca.dot(n, t) - c)), ca.vertcat(plane, m, d, s), s)
+
+    def sides(self, variables: ca.SX, corners: Corners) -> ca.SX:
+        """Return the rows of corners, over the unknowns of :meth:`lift`."""
+        m, d, s = variables[-5:-2], variables[-2], variables[-1]
+        rows = [ca.SX(self._x[sorted(corners.a)]) @ m + d + s]
         if not self.known:
+            n, c = variables[:3], variables[3]
             rows += [ca.SX(self._y[sorted(corners.b)]) @ n - c, ca.dot(n, n)]
-        return LiftedRows(ca.vertcat(*rows), ca.vertcat(plane, m, d, s), s)
+        return ca.vertcat(*rows)
 
     def corners(self, model: Numeric) -> Corners:
         """Return the corners that a plane between the closest points meets first, as it is and tilted a little."""

@@ -1,0 +1,144 @@
+"""The rows of all constraints in a program that grows, with derivatives that are computed once for each piece.
+
+Most of the time to build a program goes into its first and second derivatives.  When a program grows, all but a few
+of its pieces stay as they were, and so do their derivatives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.dynamics.tree import Tree
+from impact_posture.posture.constraint import Constraint, LiftedRows
+from impact_posture.posture.problem import PostureProblem
+
+
+@dataclass(frozen=True, eq=False)
+class Derivatives:
+    """Derivatives of rows ``g(x, z)``.
+
+    Attributes:
+        multipliers: Symbols ``λ``, shape (m, 1).
+        jacobian: ``∂g/∂(x, z)``, shape (m, nx + k).
+        hessian: Second derivatives of ``λᵀg``, shape (nx + k, nx + k).
+    """
+
+    multipliers: ca.SX
+    jacobian: ca.SX
+    hessian: ca.SX
+
+    @staticmethod
+    def of(rows: ca.SX, unknowns: ca.SX) -> Derivatives:
+        """Differentiate rows."""
+        multipliers = ca.SX.sym("multipliers", rows.numel())
+        return Derivatives(
+            multipliers, ca.jacobian(rows, unknowns), ca.hessian(ca.dot(multipliers, rows), unknowns)[0]
+        )
+
+    def options(self, x: ca.SX, p: ca.SX, price: ca.SX, g: ca.SX) -> dict[str, ca.Function]:
+        """Return the options of ``nlpsol`` for ``g`` with these derivatives; ``price`` is the multiplier of f."""
+        return {
+            "jac_g": ca.Function("nlp_jac_g", [x, p], [g, self.jacobian]),
+            "hess_lag": ca.Function("nlp_hess_l", [x, p, price, self.multipliers], [ca.triu(self.hessian)]),
+        }
+
+
+class ProgramRows:
+    """Lifts the constraints of a problem, and those of all problems that it grows into.
+
+    Args:
+        x: Chart coordinates, shape (nx, 1).
+        tree: The dynamics at ``x``.
+        problem: The problem before it grows.
+
+    Attributes:
+        parameters: Symbols of the parameters of each constraint.
+    """
+
+    def __init__(self, x: ca.SX, tree: Tree, problem: PostureProblem) -> None:
+        self._x, self._tree = x, tree
+        self.parameters = [ca.SX.sym(f"p{k}", len(c.parameters)) for k, c in enumerate(problem.constraints)]
+        # Kept with the constraints, because an identity may later be that of another object.
+        self._lifted: dict[int, tuple[Constraint, LiftedRows]] = {}
+        self._blocks: list[tuple[Derivatives, list[LiftedRows]]] = []
+
+    def lift(self, problem: PostureProblem) -> LiftedRows:
+        """Return the rows that the program of a problem carries, by constraint."""
+        found = []
+        for index, constraint in enumerate(problem.constraints):
+            if id(constraint) not in self._lifted:
+                lifted = constraint.lift(self._tree, self.parameters[index])
+                if not lifted.pieces:
+                    lifted = LiftedRows(lifted.rows[problem.carried(index)], lifted.variables, lifted.slack)
+                self._lifted[id(constraint)] = constraint, lifted
+            found.append(self._lifted[id(constraint)][1])
+        return LiftedRows.joined(found)
+
+    def derivatives(self, lifted: LiftedRows) -> Derivatives:
+        """Return the derivatives of the rows of :meth:`lift` over ``(x, z)``."""
+        nx, row, column = self._x.numel(), 0, 0
+        rows, sides, columns = dict[int, range](), dict[int, range](), dict[int, range]()
+        pieces: dict[int, LiftedRows] = {}
+        for whole in lifted.pieces:
+            own = whole.pieces or (whole,)
+            for kind, places in (("rows", rows), ("sides", sides)):
+                for piece in own:
+                    size = getattr(piece, kind).numel()
+                    places[id(piece.rows)] = range(row, row + size)
+                    row += size
+            for piece in own:
+                if piece.rows.numel():
+                    pieces[id(piece.rows)] = piece
+                columns[id(piece.rows)] = range(column, column + piece.variables.numel())
+                column += piece.variables.numel()
+        self._differentiate(list(pieces.values()))
+        parts, order = list[Derivatives](), list[int]()
+        at = [k for _, block in self._blocks for piece in block for k in columns[id(piece.rows)]]
+        for found, block in self._blocks:
+            present = [pieces[id(piece.rows)] for piece in block]
+            below = [Derivatives.of(piece.sides, piece.variables) for piece in present]
+            parts.append(_with_sides(found, below, nx))
+            order += [k for places in (rows, sides) for piece in present for k in places[id(piece.rows)]]
+        J, H = _stacked(parts, nx)
+        new_columns = [*range(nx), *(nx + np.argsort(at)).tolist()]
+        multipliers = ca.vertcat(*[part.multipliers for part in parts])
+        new_rows = np.argsort(order).tolist()
+        return Derivatives(multipliers[new_rows], J[new_rows, new_columns], H[new_columns, new_columns])
+
+    def _differentiate(self, pieces: list[LiftedRows]) -> None:
+        """Differentiate the pieces that are new, together, because they share expressions."""
+        known = {id(piece.rows) for _, block in self._blocks for piece in block}
+        new = [piece for piece in pieces if id(piece.rows) not in known]
+        if new:
+            unknowns = ca.vertcat(self._x, *[piece.variables for piece in new])
+            self._blocks.append((Derivatives.of(ca.vertcat(*[piece.rows for piece in new]), unknowns), new))
+
+
+def _with_sides(found: Derivatives, below: list[Derivatives], nx: int) -> Derivatives:
+    """Add rows that see only the auxiliaries of one piece each."""
+    jacobian = ca.diagcat(*[part.jacobian for part in below])
+    hessian = ca.diagcat(ca.SX(nx, nx), *[part.hessian for part in below])
+    return Derivatives(
+        ca.vertcat(found.multipliers, *[part.multipliers for part in below]),
+        ca.vertcat(found.jacobian, ca.horzcat(ca.SX(jacobian.shape[0], nx), jacobian)),
+        found.hessian + hessian,
+    )
+
+
+def _stacked(parts: list[Derivatives], nx: int) -> tuple[ca.SX, ca.SX]:
+    """Return the Jacobian and the Hessian of parts with the same x and auxiliaries of their own."""
+    J = ca.horzcat(ca.vertcat(*[p.jacobian[:, :nx] for p in parts]), ca.diagcat(*[p.jacobian[:, nx:] for p in parts]))
+    both = ca.horzcat(*[p.hessian[:nx, nx:] for p in parts])
+    H = ca.vertcat(
+        ca.horzcat(sum((p.hessian[:nx, :nx] for p in parts), ca.SX(nx, nx)), both),
+        ca.horzcat(both.T, ca.diagcat(*[p.hessian[nx:, nx:] for p in parts])),
+    )
+    return J, H
+
+
+def joined(one: Derivatives, other: Derivatives, nx: int) -> Derivatives:
+    """Return the derivatives of the rows of both, which share x alone."""
+    return Derivatives(ca.vertcat(one.multipliers, other.multipliers), *_stacked([one, other], nx))
