@@ -120,13 +120,16 @@ class PostureNLP:
         """Build the program of a problem that this one grew into."""
         return build_nlp(problem, compile=compile, program=self.program)
 
-    def solve(self, start: Array, *, scale: float | None = None, attempt: int = 0) -> SolveRecord:
+    def solve(
+        self, start: Array, *, scale: float | None = None, attempt: int = 0, price: float = SLACK_PRICE
+    ) -> SolveRecord:
         """Solve from ``start``.
 
         Args:
             start: Configuration, shape (nq,).
             scale: Divisor of the objective; by default its value at ``start``.
             attempt: Index of the guess of the objective.
+            price: Price of a meter of slack.
         """
         problem, nx = self.problem, self.chart.nx
         x = np.clip(self.chart.to_x(start), problem.lower, problem.upper)
@@ -136,7 +139,7 @@ class PostureNLP:
         lower = np.concatenate([problem.lower, guess.lower, own.lower])
         upper = np.concatenate([problem.upper, np.full(guess.values.size, np.inf), own.upper])
         began, busy = time.perf_counter(), time.process_time()
-        p = parameters(problem, self.chart, scale)
+        p = parameters(problem, self.chart, scale, price)
         x0 = np.concatenate([x, guess.values, own.values])
         answer = run_solver(self.solver, x0=x0, lbx=lower, ubx=upper, p=p, **_row_bounds(problem, self))
         elapsed, busy = time.perf_counter() - began, time.process_time() - busy
@@ -222,7 +225,7 @@ class Program:
         self.chart = chart = Chart(problem.robot.model)
         self._x = x = ca.SX.sym("x", chart.nx)
         own = ca.SX.sym("own", len(problem.objective.parameters))
-        scale, weight = ca.SX.sym("scale"), ca.SX.sym("weight")
+        scale, weight, self._price = ca.SX.sym("scale"), ca.SX.sym("weight"), ca.SX.sym("price")
         reference = ca.SX.sym("reference", chart.nx)
         tree = Tree(problem.robot.model, chart.configuration(x), x)
         self._lifted = lifted = problem.objective.lift(tree, own, scale)
@@ -230,7 +233,7 @@ class Program:
         self._value = lifted.value / scale + weight * distance_squared(chart, tree.q, chart.configuration(reference))
         self._norms = chart.norms(x)
         self._rows = ProgramRows(x, tree, problem)
-        self._p = ca.vertcat(own, scale, weight, reference, *self._rows.parameters)
+        self._p = ca.vertcat(own, scale, weight, self._price, reference, *self._rows.parameters)
 
     def symbols(self, problem: PostureProblem) -> tuple[dict[str, ca.SX], dict[str, ca.Function]]:
         """Return the expressions of a problem, and the derivatives of one that grows as options of ``nlpsol``.
@@ -240,7 +243,7 @@ class Program:
         rows, objective = self._rows.lift(problem), self._lifted
         x = ca.vertcat(self._x, objective.variables, rows.variables)
         g = ca.vertcat(self._norms, rows.rows, objective.residual, objective.inequalities)
-        symbols = {"x": x, "p": self._p, "f": self._value + SLACK_PRICE * rows.slack, "g": g}
+        symbols = {"x": x, "p": self._p, "f": self._value + self._price * rows.slack, "g": g}
         if not problem.grows:
             return symbols, {}
         found = joined(self._own, self._rows.derivatives(rows), self.chart.nx)
@@ -282,12 +285,12 @@ def build_nlp(
     return PostureNLP(problem, program, built.solver, took, built.compiled, built.fault)
 
 
-def parameters(problem: PostureProblem, chart: Chart, scale: float) -> Array:
+def parameters(problem: PostureProblem, chart: Chart, scale: float, price: float) -> Array:
     """Return the values of the parameters of the program."""
     return np.concatenate(
         [
             problem.objective.parameters,
-            [scale, problem.requirements.regularization],
+            [scale, problem.requirements.regularization, price],
             chart.to_x(problem.given),
             *[c.parameters for c in problem.constraints],
         ]

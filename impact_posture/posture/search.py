@@ -12,7 +12,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import MetricError
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.nlp import PostureNLP, SolveRecord, build_nlp, one_blas_thread
+from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, SolveRecord, build_nlp, one_blas_thread
 from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import feasible_start
@@ -24,6 +24,8 @@ Progress = Callable[[int, int], None]
 FEASIBLE = 1e-8
 # Starts that run before the others, and most rounds in which the program grows.
 _FIRST, _ROUNDS = 2, 8
+# Price of a meter of slack for runs that ended in a trap.
+_HIGH_PRICE = 20 * SLACK_PRICE
 
 
 @dataclass(frozen=True)
@@ -51,14 +53,16 @@ class Run:
 
 
 @one_blas_thread()
-def run_start(nlp: PostureNLP, start: Array, scale: float) -> tuple[SolveRecord, Certificate]:
+def run_start(
+    nlp: PostureNLP, start: Array, scale: float, price: float = SLACK_PRICE
+) -> tuple[SolveRecord, Certificate]:
     """Solve from a feasible start and certify the end; try the other guesses of the objective if it fails."""
-    record = nlp.solve(start, scale=scale)
+    record = nlp.solve(start, scale=scale, price=price)
     certificate = certify(nlp.problem, record.q, scale, record.auxiliaries)
     for attempt in range(1, nlp.problem.objective.attempts):
         if certificate.holds():
             break
-        again = nlp.solve(start, scale=scale, attempt=attempt)
+        again = nlp.solve(start, scale=scale, attempt=attempt, price=price)
         certificate = certify(nlp.problem, again.q, scale, again.auxiliaries)
         record = replace(
             again,
@@ -97,6 +101,7 @@ class Search:
         self.build_time_s = self.nlp.build_time_s
         # A run goes on from where it ended without what the program lacked.
         self._ends: dict[int, Array] = {}
+        self._trapped: set[int] = set()
 
     def run(self, jobs: int, progress: Progress | None) -> list[Run]:
         """Run all starts; those whose ends the program did not keep feasible run again with what it lacked."""
@@ -106,7 +111,6 @@ class Search:
         waiting, later = list(range(starts)), []
         if self.problem.grows and starts > _FIRST:
             waiting, later = waiting[:_FIRST], waiting[_FIRST:]
-        retried: set[int] = set()
         for _ in range(_ROUNDS):
             for index, run in self._round(waiting, jobs):
                 runs[index] = run
@@ -115,11 +119,11 @@ class Search:
             records = {k: runs[k].record for k in waiting}
             ends = {k: record.q for k, record in records.items() if record is not None and record.converged}
             lacking = {k: q for k, q in ends.items() if self.problem.grown([q]) is not self.problem}
-            # An end that lacks nothing and still violates something is a trap on the way from an earlier end.
-            again = {k: q for k, q in ends.items() if k in self._ends and k not in lacking and k not in retried}
+            # An end that lacks nothing and still violates something is a trap, and a higher price may lead out of it.
+            again = {k: q for k, q in ends.items() if k not in lacking and k not in self._trapped}
             trapped = {k for k, q in again.items() if not feasible(self.problem, q)}
-            retried |= trapped
-            self._ends = {k: q for k, q in (self._ends | lacking).items() if k not in trapped}
+            self._trapped |= trapped
+            self._ends |= lacking | {k: ends[k] for k in trapped}
             waiting = sorted({*lacking, *trapped, *later})
             if lacking:
                 self.problem = self.problem.grown(list(lacking.values()))
@@ -144,7 +148,7 @@ class Search:
         if start is None:
             return Run()
         try:
-            record, certificate = run_start(nlp, start, scale)
+            record, certificate = run_start(nlp, start, scale, _HIGH_PRICE if index in self._trapped else SLACK_PRICE)
             objective = problem.objective.value(record.q)
         except MetricError:
             # This start led to a posture where the objective does not exist.  The other starts go on.

@@ -30,14 +30,15 @@ def lines(request: Request) -> Iterator[str]:
     yield "one, in the same run. A dash: no posture meets the demands, and the last column says what conflicts."
     yield machine()
     yield ""
-    ends: list[int] = []
+    ends, left = list[int](), list[int]()
     cases = [(robot, name) for robot in known_robots() if request.only in robot for name in _NORMALS]
-    yield from table((*_HEAD, "conflict"), (_row(robot, name, request, ends) for robot, name in cases))
+    yield from table((*_HEAD, "conflict"), (_row(robot, name, request, ends, left) for robot, name in cases))
     yield ""
-    yield f"Certified ends with all demands, none of which collides by its original shapes: {sum(ends)}."
+    yield f"Certified ends with all demands, from two seeds: {sum(ends)}.  At {sum(left)} of them original shapes"
+    yield "touch, and these were left out."
 
 
-def _row(robot: str, name: str, request: Request, ends: list[int]) -> list[str]:
+def _row(robot: str, name: str, request: Request, ends: list[int], left: list[int]) -> list[str]:
     say(f"{robot} {name}")
     asked = {"robot": robot, "normal": _NORMALS[name], "seed": request.seed}
     clear, everything = {"collision": True}, {"collision": True, "holdable": True}
@@ -65,7 +66,11 @@ def _row(robot: str, name: str, request: Request, ends: list[int]) -> list[str]:
         cells += [f"{100 * (found.optima[0].objective / best - 1):.1f} %", f"{found.certified_starts}"]
         if demands is everything:
             cells.append(f"{found.colliding_starts}")
-            ends.append(found.certified_starts)
+            # Another seed gives more ends for the check on the original shapes.
+            again, _ = _solve(asked | demands | {"seed": request.seed + 1})
+            more = [found, *([again] if isinstance(again, PostureSolution) else [])]
+            ends += [one.certified_starts + one.colliding_starts for one in more]
+            left += [one.colliding_starts for one in more]
         cells.append(f"{took / seconds:.1f}×")
     return [*cells, conflict]
 
