@@ -89,6 +89,10 @@ class FlowDirection:
         missing = curvature - self.B @ z
         outer = np.outer(missing, z)
         self.B += outer + outer.T - (z @ missing) * np.outer(z, z)
+        self.follow(z, slope)
+
+    def follow(self, z: Array, slope: Array) -> None:
+        """Take over ``T z = slope`` for a unit vector ``z``."""
         self.T += np.outer(slope - self.T @ z, z)
 
     def limit(self, state: State, rooms: Array, shares: Array) -> None:

@@ -127,22 +127,24 @@ class ReferenceFlow:
         """
         options, state = self.options, self._state
         self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
-        self._first = self.q.copy()
-        self._wanted, self._flow = np.zeros((2, self.velocity.size))
+        self._first, self._before = self.q.copy(), self.q.copy()
+        self._wanted, self._flow, self._still = np.zeros((3, self.velocity.size))
         self._phase, self._next, self._elapsed, self._clock = 0, 0, 0.0, 0.0
-        self._deadline, self._track = np.inf, 1.0
+        self._deadline = np.inf
         self.on, self.resting, self.failed = False, False, False
         state.update(q, self.velocity)
         kinds = {3: FramePosition, 6: FramePose}
         held: list[Task] = [kinds[c.size](c.point) for c in self._contacts]
-        for task in held:
-            task.reset(state)
         self._held = [*held, *self._tasks]
+        for task, rows in zip(self._held, self._places, strict=True):
+            task.reset(state)
+            self._J[rows] = task.jacobian(state)
+        self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
         normals, self._offsets = polygon_edges(state, self._contacts)
         self._edges = normals
         limits = {"rho": options.rho, "mu": options.mu, "margin": options.joint_margin}
         self.direction = FlowDirection(self._robot, normals, self._static.limited.size, **limits)
-        self.start = 1.0
+        self.start, self.shares = 1.0, np.zeros(self._static.limited.size)
         self.value, _ = self._evaluate(self.q)
         if not (np.isfinite(self.value) and self.value != 0):
             raise MetricError("the objective vanishes or does not exist", where="reset", hint="start elsewhere")
@@ -154,11 +156,11 @@ class ReferenceFlow:
             self._probe(-1.0)
         self._next = 0
 
-    def advance(self, dt: float, error: float = 0.0) -> None:
-        """Advance by ``dt`` seconds, where ``error`` is the largest error of the joints that follow, rad (m)."""
+    def advance(self, dt: float, measured: Array) -> None:
+        """Advance by ``dt`` seconds; ``measured`` is the configuration of the robot that follows, shape (nq,)."""
         self._clock += dt
         self._elapsed += dt
-        self._track = min(max(1.0 - error / self.options.tracking, 0.0), 1.0)
+        self._measured = measured
         phase, self._phase = self._phase, (self._phase + 1) % len(PHASES)
         PHASES[phase](self)
         self.velocity += dt * self.acceleration
@@ -187,7 +189,12 @@ class ReferenceFlow:
         rooms = self._offsets
         if rooms.size:
             rooms = -rooms - self.options.com_margin - self._edges @ state.center_of_mass()[0][:2]
-        self.shares = self._static.shares(state, self._J)
+        before, self.shares = self.shares, self._static.shares(state, self._J)
+        way = pin.difference(self._model, self._before, self.q)
+        far = float(np.linalg.norm(way))
+        if far > _STEP:
+            direction.follow(way / far, (self.shares - before) / far)
+            self._before[:] = self.q
         direction.limit(state, rooms, self.shares)
 
     def _probe(self, sign: float) -> None:
@@ -228,7 +235,8 @@ class ReferenceFlow:
         """Limit speed and acceleration, and return to contacts and tasks."""
         options, Z = self.options, self._space.basis
         period, self._elapsed = self._elapsed, 0.0
-        fastest = options.speed * self._track
+        error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
+        fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         fastest = min(fastest, options.acceleration * max(self._deadline - self._clock, 0.0))
         wanted = self._wanted * (options.acceleration / options.speed)
         if not self.on or self.resting:
@@ -249,9 +257,9 @@ class ReferenceFlow:
 
     def _place(self, q: Array) -> None:
         """Evaluate the Jacobian of the constraints at a posture."""
-        state = self._state.update(q, np.zeros(self.velocity.size))
-        for task, rows in zip(self._held, self._places, strict=True):
-            self._J[rows] = task.jacobian(state)
+        state = self._state.update(q, self._still)
+        for task, J in self._turning:
+            J[:] = task.jacobian(state)
 
     def _evaluate(self, q: Array) -> tuple[float, Array]:
         """Return ``H`` and a copy of ``∇H/H₀``, zero where they do not exist."""

@@ -53,9 +53,8 @@ class ReferenceFlowPosture(JointPosture):
         super().__init__(robot, name=name, **gains)
         self._function = gradient if callable(gradient) else gradient_of(gradient)
         self.options = options or FlowOptions()
-        self._base = 6 if robot.floating else 0
         self._data = robot.model.createData()
-        slowest = float(self.kp[self._base :].min(initial=np.inf))
+        slowest = float(self.kp[6 if robot.floating else 0 :].min(initial=np.inf))
         self.settle = 4.0 / np.sqrt(slowest) if 0 < slowest < np.inf else 0.0
 
     def brace(self, t_impact: float | None = None) -> None:
@@ -97,8 +96,7 @@ class ReferenceFlowPosture(JointPosture):
         flow = self.flow
         if not flow.moves:
             return
-        error = pin.difference(self._model, state.q, flow.q)[self._base :]
-        flow.advance(dt, float(np.abs(error).max(initial=0.0)))
+        flow.advance(dt, state.q)
         self.value = flow.value
         self._target[:], self._velocity[:], self._acceleration[:] = flow.q, flow.velocity, flow.acceleration
         if flow.led:

@@ -14,6 +14,8 @@ from impact_posture.tsid.state import State
 
 # Weight of a moment (N·m) relative to that of a force (N) in the choice of contact wrenches.
 _MOMENT = 100.0
+# Share of the trace that makes the balance of the base solvable where the feet cannot carry it.
+_TINY = 1e-12
 
 
 class StaticControls:
@@ -47,8 +49,10 @@ class StaticControls:
             J = J[: self._count]
             A = J[:, : self._base].T
             eased = A * self._ease
-            f = eased.T @ np.linalg.lstsq(eased @ A.T, force[: self._base], rcond=1e-9)[0]
-            force -= J.T @ f
+            square = eased @ A.T
+            # Feet on a line carry no moment about it.
+            square.flat[:: self._base + 1] += _TINY * square.trace()
+            force -= J.T @ (eased.T @ np.linalg.solve(square, force[: self._base]))
         u = self._actuators.solve(force, self._spare)
         return np.asarray((u[self.limited] - self._middle) / self._half)
 
