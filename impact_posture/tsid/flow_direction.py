@@ -44,13 +44,14 @@ class FlowDirection:
 
     ``y`` minimizes ``½ yᵀ|B_Z| y + (Zᵀ∇Φ)ᵀ y``.  ``|B_Z|`` has the eigenvectors of the curvature and
     ``max(|λᵢ|, μ)`` for its eigenvalues (saddle-free Newton, Dauphin et al. 2014), so that the step leaves saddles.
-    The curvature ``B`` is learned from secants by Powell's symmetric Broyden update, the slope ``T`` of the static
-    controls by Broyden's.  Rows keep joints, center of mass and static controls within their limits.  A limit that
+    The curvature ``B`` is learned from secants by Powell's symmetric Broyden update, the slope ``T`` of what contacts
+    add to the static controls by Broyden's.  Rows keep joints, center of mass and static controls within their limits.  A limit that
     does not hold at ``q_r`` is not crossed further.
 
     Attributes:
         B: Curvature of ``H/H₀`` on the constraints, shape (nv, nv).
-        T: Slope of the static controls (:class:`StaticControls`), shape (controls, nv).
+        T: Slope of the static controls (:class:`StaticControls`) less that of gravity, shape (controls, nv).
+        gravity: Slope of the static controls by gravity alone, shape (controls, nv).
         gain: Decrease of ``Φ`` that the last step predicts.
     """
 
@@ -74,6 +75,7 @@ class FlowDirection:
         self._pulled = np.ones(nv)
         self._pulled[: 6 if robot.floating else 0] = 0.0
         self.B, self.T, self.gain = np.zeros((nv, nv)), np.zeros((controls, nv)), 0.0
+        self.gravity = np.zeros((controls, nv))
         # The sizes never change.  Directions that the constraints take keep columns of zeros.
         self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + controls)
         self._solver = DaqpSolver(nv, self._qp.m)
@@ -85,15 +87,15 @@ class FlowDirection:
         self.B[:] = self.T[:] = self.gain = 0.0
 
     def learn(self, z: Array, curvature: Array, slope: Array) -> None:
-        """Take over ``B z = curvature`` and ``T z = slope`` for a unit vector ``z``, shape (nv,)."""
+        """Take over ``B z = curvature`` and ``(T + gravity) z = slope`` for a unit vector ``z``, shape (nv,)."""
         missing = curvature - self.B @ z
         outer = np.outer(missing, z)
         self.B += outer + outer.T - (z @ missing) * np.outer(z, z)
         self.follow(z, slope)
 
     def follow(self, z: Array, slope: Array) -> None:
-        """Take over ``T z = slope`` for a unit vector ``z``."""
-        self.T += np.outer(slope - self.T @ z, z)
+        """Take over ``(T + gravity) z = slope`` for a unit vector ``z``."""
+        self.T += np.outer(slope - (self.T + self.gravity) @ z, z)
 
     def limit(self, state: State, rooms: Array, shares: Array) -> None:
         """Set the rows for a state at ``ν = 0``.
@@ -110,7 +112,7 @@ class FlowDirection:
         if k:
             np.matmul(self._edges, state.center_of_mass()[1][:2], out=self._rows[count : count + k])
             upper[count : count + k] = np.maximum(rooms, 0.0)
-        self._rows[count + k :] = self.T
+        np.add(self.T, self.gravity, out=self._rows[count + k :])
         upper[count + k :] = np.maximum(1.0 - shares, 0.0)
         lower[count + k :] = np.minimum(-1.0 - shares, 0.0)
 

@@ -104,7 +104,7 @@ class ReferenceFlow:
             options: Parameters.
         """
         self._model, self._gradient, self.options = robot.model, gradient, options
-        self._contacts = formulation.contacts
+        self._contacts, self._data = formulation.contacts, robot.model.createData()
         self._state = State(robot, formulation.points)
         weighted = [t for t in formulation.weighted if not isinstance(t, CenterOfMass | BaseOrientation)]
         self.led = tuple(t for t in formulation.weighted if t not in weighted)
@@ -127,7 +127,7 @@ class ReferenceFlow:
         """
         options, state = self.options, self._state
         self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
-        self._first, self._before = self.q.copy(), self.q.copy()
+        self._first = self.q.copy()
         self._wanted, self._flow, self._still = np.zeros((3, self.velocity.size))
         self._phase, self._next, self._elapsed, self._clock = 0, 0, 0.0, 0.0
         self._deadline = np.inf
@@ -144,12 +144,13 @@ class ReferenceFlow:
         self._edges = normals
         limits = {"rho": options.rho, "mu": options.mu, "margin": options.joint_margin}
         self.direction = FlowDirection(self._robot, normals, self._static.limited.size, **limits)
-        self.start, self.shares = 1.0, np.zeros(self._static.limited.size)
+        self.start, self._before = 1.0, (self._first, np.zeros(0))
         self.value, _ = self._evaluate(self.q)
         if not (np.isfinite(self.value) and self.value != 0):
             raise MetricError("the objective vanishes or does not exist", where="reset", hint="start elsewhere")
         self.start = abs(self.value)
         self._look()
+        self._before = self._first, self.shares
         for k in range(self._space.basis.shape[1]):
             self._next = k
             self._probe(1.0)
@@ -189,12 +190,13 @@ class ReferenceFlow:
         rooms = self._offsets
         if rooms.size:
             rooms = -rooms - self.options.com_margin - self._edges @ state.center_of_mass()[0][:2]
-        before, self.shares = self.shares, self._static.shares(state, self._J)
-        way = pin.difference(self._model, self._before, self.q)
+        self.shares = self._static.shares(state, self._J)
+        direction.gravity[:] = self._static.slope(self._model, self._data, self.q)
+        way = pin.difference(self._model, self._before[0], self.q)
         far = float(np.linalg.norm(way))
         if far > _STEP:
-            direction.follow(way / far, (self.shares - before) / far)
-            self._before[:] = self.q
+            direction.follow(way / far, (self.shares - self._before[1]) / far)
+        self._before = self.q.copy(), self.shares
         direction.limit(state, rooms, self.shares)
 
     def _probe(self, sign: float) -> None:
@@ -203,7 +205,8 @@ class ReferenceFlow:
         if self.failed or not Z.shape[1]:
             return
         z = Z[:, self._next % Z.shape[1]]
-        q = pin.integrate(self._model, self.q, sign * _STEP * z)
+        # Both sides of the posture of the last look, because the flow has moved on since.
+        q = pin.integrate(self._model, self._before[0], sign * _STEP * z)
         _, slope = self._evaluate(q)
         self._place(q)
         found = slope - self._J.T @ self._multipliers, self._static.shares(self._state, self._J)

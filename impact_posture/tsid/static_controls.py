@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
+import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.tsid.actuators import Actuators
@@ -29,13 +30,18 @@ class StaticControls:
 
     def __init__(self, actuators: Actuators, contacts: Sequence[SupportContact], share: float) -> None:
         """Set the share of the limits that rest may take, 0 to 1."""
-        self._actuators, base = actuators, actuators.base
+        base = actuators.base
         self.limited = np.flatnonzero(np.isfinite(actuators.upper) & np.isfinite(actuators.lower))
         lower, upper = actuators.lower[self.limited], actuators.upper[self.limited]
         self._middle, self._half = (upper + lower) / 2, share * (upper - lower) / 2
         wrench = np.array([1.0] * 3 + [_MOMENT] * 3)
         self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
-        self._count, self._base, self._spare = self._ease.size, base, np.zeros(actuators.spare.shape[1])
+        self._count, self._base = self._ease.size, base
+        # u = inverse · force for everything but the contacts.
+        self._inverse = np.zeros((actuators.controls, actuators.G.shape[0]))
+        self._inverse[: actuators.rotors, :base] = actuators.inverse
+        self._inverse[actuators.rotors :, base:] = np.eye(actuators.controls - actuators.rotors)
+        self._inverse = self._inverse[self.limited] / self._half[:, None]
 
     def shares(self, state: State, J: Array) -> Array:
         """Return the shares at a state with ``ν = 0``, shape (m,); within ±1 the posture can be held.
@@ -53,8 +59,11 @@ class StaticControls:
             # Feet on a line carry no moment about it.
             square.flat[:: self._base + 1] += _TINY * square.trace()
             force -= J.T @ (eased.T @ np.linalg.solve(square, force[: self._base]))
-        u = self._actuators.solve(force, self._spare)
-        return np.asarray((u[self.limited] - self._middle) / self._half)
+        return np.asarray(self._inverse @ force - self._middle / self._half)
+
+    def slope(self, model: pin.Model, data: pin.Data, q: Array) -> Array:
+        """Return the derivative of the shares at contact wrenches of zero along ν, shape (m, nv)."""
+        return np.asarray(self._inverse @ pin.computeGeneralizedGravityDerivatives(model, data, q))
 
 
 def polygon_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:
