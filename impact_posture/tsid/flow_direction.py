@@ -13,30 +13,39 @@ from impact_posture.tsid.qp import QP
 from impact_posture.tsid.ranges import JointRanges
 from impact_posture.tsid.state import State
 
-# Singular value of the constraints, relative to the largest, below which a direction counts as free.
-_RANK = 1e-3
+# Singular value of the constraints, relative to the largest, below which they are springs.  The rows of points on one
+# body can depend on each other almost: held exactly in one posture, free in the next, a flow would never rest.
+_SOFT = 2e-2
+# Stiffness of those springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
+_STIFFNESS = 3e4
 
 
 @dataclass(frozen=True)
 class Redundancy:
-    """Null space and pseudo-inverse of the constraints.
+    """Directions that the constraints leave, ``J = U S Vᵀ``, and a pseudo-inverse of those that they hold.
 
     Attributes:
         basis: ``Z``, orthonormal, shape (nv, r).
-        inverse: ``J⁺``, shape (nv, rows).
+        inverse: ``J⁺`` of the held directions, shape (nv, rows).
+        springs: Slope of the error of nearly dependent constraints along ``Z``, shape (rows, r).
     """
 
     basis: Array
     inverse: Array
+    springs: Array
 
     @classmethod
     def of(cls, J: Array) -> Redundancy:
         """Decompose ``J``, shape (rows, nv)."""
-        if not J.shape[0]:
-            return cls(np.eye(J.shape[1]), np.zeros((J.shape[1], 0)))
+        rows, nv = J.shape
+        if not rows:
+            return cls(np.eye(nv), np.zeros((nv, 0)), np.zeros((0, nv)))
         U, s, Vt = np.linalg.svd(J)
-        rank = int(np.count_nonzero(s > _RANK * s[0]))
-        return cls(Vt[rank:].T, (Vt[:rank].T / s[:rank]) @ U[:, :rank].T)
+        rank = int(np.count_nonzero(s > _SOFT * s[0]))
+        Z = Vt[rank:].T
+        springs = np.zeros((rows, Z.shape[1]))
+        springs[:, : s.size - rank] = U[:, rank : s.size] * s[rank:]
+        return cls(Z, (Vt[:rank].T / s[:rank]) @ U[:, :rank].T, springs)
 
 
 class FlowDirection:
@@ -44,14 +53,13 @@ class FlowDirection:
 
     ``y`` minimizes ``½ yᵀ|B_Z| y + (Zᵀ∇Φ)ᵀ y``.  ``|B_Z|`` has the eigenvectors of the curvature and
     ``max(|λᵢ|, μ)`` for its eigenvalues (saddle-free Newton, Dauphin et al. 2014), so that the step leaves saddles.
-    The curvature ``B`` is learned from secants by Powell's symmetric Broyden update, the slope ``T`` of what contacts
-    add to the static controls by Broyden's.  Rows keep joints, center of mass and static controls within their limits.  A limit that
+    The curvature ``B`` is learned from secants by Powell's symmetric Broyden update, the slope ``T`` of the static
+    controls by Broyden's.  Rows keep joints, center of mass and static controls within their limits.  A limit that
     does not hold at ``q_r`` is not crossed further.
 
     Attributes:
         B: Curvature of ``H/H₀`` on the constraints, shape (nv, nv).
-        T: Slope of the static controls (:class:`StaticControls`) less that of gravity, shape (controls, nv).
-        gravity: Slope of the static controls by gravity alone, shape (controls, nv).
+        T: Slope of the static controls (:class:`StaticControls`), shape (controls, nv).
         gain: Decrease of ``Φ`` that the last step predicts.
     """
 
@@ -75,7 +83,6 @@ class FlowDirection:
         self._pulled = np.ones(nv)
         self._pulled[: 6 if robot.floating else 0] = 0.0
         self.B, self.T, self.gain = np.zeros((nv, nv)), np.zeros((controls, nv)), 0.0
-        self.gravity = np.zeros((controls, nv))
         # The sizes never change.  Directions that the constraints take keep columns of zeros.
         self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + controls)
         self._solver = DaqpSolver(nv, self._qp.m)
@@ -87,15 +94,11 @@ class FlowDirection:
         self.B[:] = self.T[:] = self.gain = 0.0
 
     def learn(self, z: Array, curvature: Array, slope: Array) -> None:
-        """Take over ``B z = curvature`` and ``(T + gravity) z = slope`` for a unit vector ``z``, shape (nv,)."""
+        """Take over ``B z = curvature`` and ``T z = slope`` for a unit vector ``z``, shape (nv,)."""
         missing = curvature - self.B @ z
         outer = np.outer(missing, z)
         self.B += outer + outer.T - (z @ missing) * np.outer(z, z)
-        self.follow(z, slope)
-
-    def follow(self, z: Array, slope: Array) -> None:
-        """Take over ``(T + gravity) z = slope`` for a unit vector ``z``."""
-        self.T += np.outer(slope - (self.T + self.gravity) @ z, z)
+        self.T += np.outer(slope - self.T @ z, z)
 
     def limit(self, state: State, rooms: Array, shares: Array) -> None:
         """Set the rows for a state at ``ν = 0``.
@@ -112,20 +115,22 @@ class FlowDirection:
         if k:
             np.matmul(self._edges, state.center_of_mass()[1][:2], out=self._rows[count : count + k])
             upper[count : count + k] = np.maximum(rooms, 0.0)
-        np.add(self.T, self.gravity, out=self._rows[count + k :])
+        self._rows[count + k :] = self.T
         upper[count + k :] = np.maximum(1.0 - shares, 0.0)
         lower[count + k :] = np.minimum(-1.0 - shares, 0.0)
 
-    def newton(self, Z: Array, gradient: Array, offset: Array) -> Array:
+    def newton(self, space: Redundancy, gradient: Array, offset: Array, error: Array) -> Array:
         """Return the step δ, shape (nv,).
 
         Args:
-            Z: Basis of the redundancy, shape (nv, r).
+            space: The redundancy.
             gradient: ``∇H/H₀``, shape (nv,).
             offset: ``q_r ⊖ q₀``, shape (nv,).
+            error: Error of the constraints, shape (rows,).
         """
-        slope = Z.T @ (gradient + self._rho * self._pulled * offset)
-        curvature = Z.T @ self.B @ Z + self._rho * (Z.T * self._pulled) @ Z
+        Z, springs = space.basis, space.springs
+        slope = Z.T @ (gradient + self._rho * self._pulled * offset) - _STIFFNESS * (springs.T @ error)
+        curvature = Z.T @ self.B @ Z + self._rho * (Z.T * self._pulled) @ Z + _STIFFNESS * springs.T @ springs
         values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
         way = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
         return self._solve(way, way.T @ (Z @ slope))

@@ -27,6 +27,8 @@ Gradient = Callable[[Array], tuple[float, Array]]
 _STEP = 1e-4
 # Time constant with which the reference comes back to contacts and tasks, s.
 _RETURN = 0.1
+# Speed below which a flow that is off stands still, rad/s (m/s).
+_STILL = 1e-5
 # Pull to zero of the base's share in a motion that the joints do not determine.
 _IDLE = 1e-9
 
@@ -71,8 +73,8 @@ class ReferenceFlow:
     impact itself do not enter.  An update takes :data:`PHASES` ticks, one part each.  All memory is in arrays whose
     sizes do not change, except for the basis of the redundancy.
 
-    Held are: contacts at their places, tasks of the strict levels, and weighted tasks at their targets.  ``led`` tasks
-    (center of mass, base orientation) follow the flow instead.  Joints that ``robot.toml`` holds do not move.
+    Contacts stay at their places, and tasks of the strict levels and weighted tasks at their targets.  Only the
+    ``led`` tasks (center of mass, base orientation) follow the flow.  Joints that ``robot.toml`` holds do not move.
 
     Attributes:
         q: ``q_r``, shape (nq,).
@@ -104,7 +106,7 @@ class ReferenceFlow:
             options: Parameters.
         """
         self._model, self._gradient, self.options = robot.model, gradient, options
-        self._contacts, self._data = formulation.contacts, robot.model.createData()
+        self._contacts = formulation.contacts
         self._state = State(robot, formulation.points)
         weighted = [t for t in formulation.weighted if not isinstance(t, CenterOfMass | BaseOrientation)]
         self.led = tuple(t for t in formulation.weighted if t not in weighted)
@@ -127,7 +129,7 @@ class ReferenceFlow:
         """
         options, state = self.options, self._state
         self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
-        self._first = self.q.copy()
+        self._first, self._here = self.q.copy(), self.q.copy()
         self._wanted, self._flow, self._still = np.zeros((3, self.velocity.size))
         self._phase, self._next, self._elapsed, self._clock = 0, 0, 0.0, 0.0
         self._deadline = np.inf
@@ -144,13 +146,12 @@ class ReferenceFlow:
         self._edges = normals
         limits = {"rho": options.rho, "mu": options.mu, "margin": options.joint_margin}
         self.direction = FlowDirection(self._robot, normals, self._static.limited.size, **limits)
-        self.start, self._before = 1.0, (self._first, np.zeros(0))
+        self.start = 1.0
         self.value, _ = self._evaluate(self.q)
         if not (np.isfinite(self.value) and self.value != 0):
             raise MetricError("the objective vanishes or does not exist", where="reset", hint="start elsewhere")
         self.start = abs(self.value)
         self._look()
-        self._before = self._first, self.shares
         for k in range(self._space.basis.shape[1]):
             self._next = k
             self._probe(1.0)
@@ -174,7 +175,7 @@ class ReferenceFlow:
     @property
     def moves(self) -> bool:
         """Whether :meth:`advance` has anything to do."""
-        return self.on or bool(self.velocity.any())
+        return self.on or bool(np.abs(self.velocity).max() > _STILL)
 
     # ---- the parts of an update, one a tick -----------------------------------------------------------------------
 
@@ -182,6 +183,7 @@ class ReferenceFlow:
         """Evaluate objective, constraints and limits at ``q_r``."""
         state, direction = self._state, self.direction
         self._place(self.q)
+        self._here[:] = self.q
         for task, rows in zip(self._held, self._places, strict=True):
             self._e[rows] = task.error(state)
         self.value, self._slope = self._evaluate(self.q)
@@ -191,12 +193,6 @@ class ReferenceFlow:
         if rooms.size:
             rooms = -rooms - self.options.com_margin - self._edges @ state.center_of_mass()[0][:2]
         self.shares = self._static.shares(state, self._J)
-        direction.gravity[:] = self._static.slope(self._model, self._data, self.q)
-        way = pin.difference(self._model, self._before[0], self.q)
-        far = float(np.linalg.norm(way))
-        if far > _STEP:
-            direction.follow(way / far, (self.shares - self._before[1]) / far)
-        self._before = self.q.copy(), self.shares
         direction.limit(state, rooms, self.shares)
 
     def _probe(self, sign: float) -> None:
@@ -206,7 +202,7 @@ class ReferenceFlow:
             return
         z = Z[:, self._next % Z.shape[1]]
         # Both sides of the posture of the last look, because the flow has moved on since.
-        q = pin.integrate(self._model, self._before[0], sign * _STEP * z)
+        q = pin.integrate(self._model, self._here, sign * _STEP * z)
         _, slope = self._evaluate(q)
         self._place(q)
         found = slope - self._J.T @ self._multipliers, self._static.shares(self._state, self._J)
@@ -230,7 +226,7 @@ class ReferenceFlow:
         self._wanted[:] = 0.0
         if self.failed:
             return
-        self._wanted[:] = self.direction.newton(self._space.basis, self._slope, offset)
+        self._wanted[:] = self.direction.newton(self._space, self._slope, offset, self._e)
         gain, least = self.direction.gain, self.options.epsilon
         self.resting = gain < (4 * least if self.resting else least)
 

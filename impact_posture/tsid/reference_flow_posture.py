@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
@@ -21,16 +23,13 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 class ReferenceFlowPosture(JointPosture):
     """``ν̇* = K_p (q_r ⊖ q) + K_d (u − ν) + u̇``, where ``q_r`` follows the reference flow.
 
-    There is no gain for ``∇H``: :class:`~impact_posture.tsid.reference_flow.ReferenceFlow` has a speed, an
-    acceleration and a rule when to rest, which are the same for every robot.  Center of mass and base orientation of a
-    standing robot follow ``q_r`` too.
+    There is no gain for ``∇H``.  :class:`~impact_posture.tsid.reference_flow.ReferenceFlow` has a speed, an
+    acceleration and a rule when to rest, which are the same for every robot.  Center of mass and base orientation of
+    a standing robot follow ``q_r`` too.
 
     Attributes:
-        flow: The flow; there is none before the first reset of a controller.
         settle: Time at rest before a known impact, s: four time constants ``1/√K_p``.
     """
-
-    flow: ReferenceFlow
 
     def __init__(
         self,
@@ -53,16 +52,34 @@ class ReferenceFlowPosture(JointPosture):
         super().__init__(robot, name=name, **gains)
         self._function = gradient if callable(gradient) else gradient_of(gradient)
         self.options = options or FlowOptions()
+        self._flow: ReferenceFlow | None = None
         self._data = robot.model.createData()
         slowest = float(self.kp[6 if robot.floating else 0 :].min(initial=np.inf))
         self.settle = 4.0 / np.sqrt(slowest) if 0 < slowest < np.inf else 0.0
+
+    @property
+    def flow(self) -> ReferenceFlow:
+        """The flow.
+
+        Raises:
+            InputError: No controller with this task has been reset.
+        """
+        if self._flow is None:
+            raise InputError("has no posture to flow from", where=self.name, hint="reset the controller first")
+        return self._flow
 
     def brace(self, t_impact: float | None = None) -> None:
         """Let the flow go, because an impact is coming.
 
         Args:
-            t_impact: Time until the impact, s.  The flow then rests :attr:`settle` earlier and stays.
+            t_impact: Time until the impact, s.  The flow then rests :attr:`settle` earlier and stays, as far as its
+                acceleration permits.
+
+        Raises:
+            InputError: The time is not finite, or no controller with this task has been reset.
         """
+        if t_impact is not None and not math.isfinite(t_impact):
+            raise InputError("the time is not finite", where=f"{self.name}: t_impact", hint="give seconds from now")
         self.flow.on = True
         self.flow.rest_at(np.inf if t_impact is None else t_impact - self.settle)
 
@@ -77,7 +94,7 @@ class ReferenceFlowPosture(JointPosture):
     @property
     def level(self) -> float:
         """Whether the flow may move: 0 or 1."""
-        return float(self.flow.on)
+        return 0.0 if self._flow is None else float(self._flow.on)
 
     def begin(self, state: State, formulation: TaskFormulation, actuators: Actuators) -> None:
         """Start the flow at a state; the controller calls this at ``reset``.
@@ -85,9 +102,9 @@ class ReferenceFlowPosture(JointPosture):
         Raises:
             MetricError: The gradient does not exist there, or ``H`` vanishes.
         """
-        self.flow = ReferenceFlow(self._robot, self._function, formulation, actuators, self.options)
-        self.flow.reset(state.q)
-        self.value = self.flow.value
+        flow = ReferenceFlow(self._robot, self._function, formulation, actuators, self.options)
+        flow.reset(state.q)
+        self._flow, self.value = flow, flow.value
         self._velocity[:] = self._acceleration[:] = 0.0
 
     def advance(self, state: State, dt: float) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
-import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.tsid.actuators import Actuators
@@ -60,10 +59,6 @@ class StaticControls:
             square.flat[:: self._base + 1] += _TINY * square.trace()
             force -= J.T @ (eased.T @ np.linalg.solve(square, force[: self._base]))
         return np.asarray(self._inverse @ force - self._middle / self._half)
-
-    def slope(self, model: pin.Model, data: pin.Data, q: Array) -> Array:
-        """Return the derivative of the shares at contact wrenches of zero along ν, shape (m, nv)."""
-        return np.asarray(self._inverse @ pin.computeGeneralizedGravityDerivatives(model, data, q))
 
 
 def polygon_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:

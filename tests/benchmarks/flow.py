@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 
-from impact_posture.codegen.export import export
-from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.posture.build_problem import build_problem
-from impact_posture.posture.nlp import PostureNLP, build_nlp
 from impact_posture.posture.problem import PostureProblem, Requirements
-from impact_posture.posture.search import run_start
-from impact_posture.posture.starts import feasible_start
-from impact_posture.processes import fork_map
-from impact_posture.tsid.actuators import Actuators
-from impact_posture.tsid.impact_robust import Gradient, gradient_of
+from impact_posture.robot.robot import Robot
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.reference_flow import FlowOptions, ReferenceFlow
 from impact_posture.tsid.task_formulation import (
@@ -29,7 +18,7 @@ from impact_posture.tsid.task_formulation import (
     legged_formulation,
 )
 from tests.benchmarks.cases import AHEAD, DOWN, Case
-from tests.benchmarks.core import Request, Vector, machine, say, table
+from tests.benchmarks.core import Vector
 
 DT = 1e-3
 # Times in which the flow is to rest, and in which a flow with a finer rule does, s.
@@ -66,11 +55,10 @@ class Course:
     room: float
 
 
-def formulation_of(problem: PostureProblem) -> TaskFormulation:
+def formulation_for(robot: Robot, posture: JointPosture) -> TaskFormulation:
     """The formulation that suits the robot."""
-    robot = problem.robot
     builders = {"aerial": aerial_formulation, "arm": arm_formulation}
-    return builders.get(robot.spec.kind, legged_formulation)(robot, JointPosture(robot))
+    return builders.get(robot.spec.kind, legged_formulation)(robot, posture)
 
 
 def problem_of(case: Case) -> PostureProblem:
@@ -104,5 +92,3 @@ def course(flow: ReferenceFlow, q: Vector, longest: float) -> Course:
                 break
     rested = (k + 1) * DT if flow.resting else np.inf
     return Course(flow.q.copy(), np.array(values) / flow.start, rested, missed / 10, share, room)
-
-
