@@ -27,25 +27,28 @@ class Redundancy:
     Attributes:
         basis: ``Z``, orthonormal, shape (nv, r).
         inverse: ``J⁺`` of the held directions, shape (nv, rows).
-        springs: Slope of the error of nearly dependent constraints along ``Z``, shape (rows, r).
+        springs: ``k JZ`` of nearly dependent constraints, shape (rows, r).
+        stiffness: Their stiffness ``k s²`` along each column of ``Z``, shape (r,).
     """
 
     basis: Array
     inverse: Array
     springs: Array
+    stiffness: Array
 
     @classmethod
     def of(cls, J: Array) -> Redundancy:
         """Decompose ``J``, shape (rows, nv)."""
         rows, nv = J.shape
         if not rows:
-            return cls(np.eye(nv), np.zeros((nv, 0)), np.zeros((0, nv)))
+            return cls(np.eye(nv), np.zeros((nv, 0)), np.zeros((0, nv)), np.zeros(nv))
         U, s, Vt = np.linalg.svd(J)
         rank = int(np.count_nonzero(s > _SOFT * s[0]))
         Z = Vt[rank:].T
-        springs = np.zeros((rows, Z.shape[1]))
-        springs[:, : s.size - rank] = U[:, rank : s.size] * s[rank:]
-        return cls(Z, (Vt[:rank].T / s[:rank]) @ U[:, :rank].T, springs)
+        springs, stiffness = np.zeros((rows, Z.shape[1])), np.zeros(Z.shape[1])
+        springs[:, : s.size - rank] = U[:, rank : s.size] * (_STIFFNESS * s[rank:])
+        stiffness[: s.size - rank] = _STIFFNESS * s[rank:] ** 2
+        return cls(Z, (Vt[:rank].T / s[:rank]) @ U[:, :rank].T, springs, stiffness)
 
 
 class FlowDirection:
@@ -58,7 +61,7 @@ class FlowDirection:
     does not hold at ``q_r`` is not crossed further.
 
     Attributes:
-        B: Curvature of ``H/H₀`` on the constraints, shape (nv, nv).
+        B: Curvature of ``Φ`` on the constraints, shape (nv, nv).
         T: Slope of the static controls (:class:`StaticControls`), shape (controls, nv).
         gain: Decrease of ``Φ`` that the last step predicts.
     """
@@ -78,10 +81,10 @@ class FlowDirection:
         self._joints = np.flatnonzero(np.isfinite(ranges.lower) & np.isfinite(ranges.upper))
         width = (ranges.upper - ranges.lower)[self._joints]
         self._margin = np.minimum(margin, width / 8)
-        self._edges, self._rho, self._mu = edges, rho, mu
+        self._edges, self._mu = edges, mu
         # The pull towards the start acts on joints.  Others lead the base.
-        self._pulled = np.ones(nv)
-        self._pulled[: 6 if robot.floating else 0] = 0.0
+        self._pull = np.full(nv, rho)
+        self._pull[: 6 if robot.floating else 0] = 0.0
         self.B, self.T, self.gain = np.zeros((nv, nv)), np.zeros((controls, nv)), 0.0
         # The sizes never change.  Directions that the constraints take keep columns of zeros.
         self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + controls)
@@ -89,15 +92,13 @@ class FlowDirection:
         self._rows = np.zeros((self._qp.m, nv))
         self._rows[np.arange(self._joints.size), self._joints] = 1.0
 
-    def reset(self) -> None:
-        """Forget what was learned."""
-        self.B[:] = self.T[:] = self.gain = 0.0
-
     def learn(self, z: Array, curvature: Array, slope: Array) -> None:
-        """Take over ``B z = curvature`` and ``T z = slope`` for a unit vector ``z``, shape (nv,)."""
-        missing = curvature - self.B @ z
+        """Learn the curvature of ``H/H₀`` and the slope of the static controls along a unit vector, shape (nv,)."""
+        missing = curvature + self._pull * z - self.B @ z
+        missing -= z @ missing / 2 * z
         outer = np.outer(missing, z)
-        self.B += outer + outer.T - (z @ missing) * np.outer(z, z)
+        self.B += outer
+        self.B += outer.T
         self.T += np.outer(slope - self.T @ z, z)
 
     def limit(self, state: State, rooms: Array, shares: Array) -> None:
@@ -128,10 +129,11 @@ class FlowDirection:
             offset: ``q_r ⊖ q₀``, shape (nv,).
             error: Error of the constraints, shape (rows,).
         """
-        Z, springs = space.basis, space.springs
-        slope = Z.T @ (gradient + self._rho * self._pulled * offset) - _STIFFNESS * (springs.T @ error)
-        curvature = Z.T @ self.B @ Z + self._rho * (Z.T * self._pulled) @ Z + _STIFFNESS * springs.T @ springs
-        values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
+        Z = space.basis
+        slope = Z.T @ (gradient + self._pull * offset) - space.springs.T @ error
+        curvature = Z.T @ self.B @ Z
+        curvature.flat[:: slope.size + 1] += space.stiffness
+        values, vectors = np.linalg.eigh(curvature)
         way = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
         return self._solve(way, way.T @ (Z @ slope))
 
