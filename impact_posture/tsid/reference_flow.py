@@ -77,6 +77,7 @@ class ReferenceFlow:
     ``led`` tasks (center of mass, base orientation) follow the flow.  Joints that ``robot.toml`` holds do not move.
 
     Attributes:
+        robot: The robot.
         q: ``q_r``, shape (nq,).
         velocity: ``u`` with ``q̇_r = u``, rad/s (m/s), shape (nv,).
         acceleration: ``u̇``, shape (nv,).
@@ -86,6 +87,8 @@ class ReferenceFlow:
         resting: Whether no step promises a decrease of more than ε.
         failed: Whether the last evaluation raised or was not finite.  The flow then brakes.
         led: Tasks that follow the flow.
+        error: Distance from contacts and tasks at the last update, m and rad, and zeros for held joints.
+        shares: Static controls there, within ±1 where the posture can be held (:class:`StaticControls`).
     """
 
     def __init__(
@@ -115,11 +118,11 @@ class ReferenceFlow:
         fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
         sizes = [c.size for c in self._contacts] + [t.size for t in self._tasks]
         self._places, self._count = stacked_rows(sizes)
-        self._J, self._e = np.zeros((self._count + len(fixed), nv)), np.zeros(self._count + len(fixed))
+        self._J, self.error = np.zeros((self._count + len(fixed), nv)), np.zeros(self._count + len(fixed))
         self._J[np.arange(self._count, self._J.shape[0]), fixed] = 1.0
         self._static = StaticControls(actuators, self._contacts, options.share)
         self.q, self.velocity, self.acceleration = robot.posture(), np.zeros(nv), np.zeros(nv)
-        self._robot = robot
+        self.robot = robot
 
     def reset(self, q: Array) -> None:
         """Begin at rest at a posture, shape (nq,), and measure the curvature there.
@@ -131,7 +134,7 @@ class ReferenceFlow:
         self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
         self._first, self._here = self.q.copy(), self.q.copy()
         self._wanted, self._flow, self._still = np.zeros((3, self.velocity.size))
-        self._phase, self._next, self._elapsed, self._clock = 0, 0, 0.0, 0.0
+        self._phase, self._next, self.errorlapsed, self._clock = 0, 0, 0.0, 0.0
         self._deadline = np.inf
         self.on, self.resting, self.failed = False, False, False
         state.update(q, self.velocity)
@@ -143,9 +146,9 @@ class ReferenceFlow:
             self._J[rows] = task.jacobian(state)
         self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
         normals, self._offsets = polygon_edges(state, self._contacts)
-        self._edges = normals
+        self.errordges = normals
         limits = {"rho": options.rho, "mu": options.mu, "margin": options.joint_margin}
-        self.direction = FlowDirection(self._robot, normals, self._static.limited.size, **limits)
+        self.direction = FlowDirection(self.robot, normals, self._static.limited.size, **limits)
         self.start = 1.0
         self.value, _ = self._evaluate(self.q)
         if not (np.isfinite(self.value) and self.value != 0):
@@ -161,7 +164,7 @@ class ReferenceFlow:
     def advance(self, dt: float, measured: Array) -> None:
         """Advance by ``dt`` seconds; ``measured`` is the configuration of the robot that follows, shape (nq,)."""
         self._clock += dt
-        self._elapsed += dt
+        self.errorlapsed += dt
         self._measured = measured
         phase, self._phase = self._phase, (self._phase + 1) % len(PHASES)
         PHASES[phase](self)
@@ -185,13 +188,13 @@ class ReferenceFlow:
         self._place(self.q)
         self._here[:] = self.q
         for task, rows in zip(self._held, self._places, strict=True):
-            self._e[rows] = task.error(state)
+            self.error[rows] = task.error(state)
         self.value, self._slope = self._evaluate(self.q)
         self._space = space = Redundancy.of(self._J)
         self._multipliers = space.inverse.T @ self._slope
         rooms = self._offsets
         if rooms.size:
-            rooms = -rooms - self.options.com_margin - self._edges @ state.center_of_mass()[0][:2]
+            rooms = -rooms - self.options.com_margin - self.errordges @ state.center_of_mass()[0][:2]
         self.shares = self._static.shares(state, self._J)
         direction.limit(state, rooms, self.shares)
 
@@ -226,14 +229,14 @@ class ReferenceFlow:
         self._wanted[:] = 0.0
         if self.failed:
             return
-        self._wanted[:] = self.direction.newton(self._space, self._slope, offset, self._e)
+        self._wanted[:] = self.direction.newton(self._space, self._slope, offset, self.error)
         gain, least = self.direction.gain, self.options.epsilon
         self.resting = gain < (4 * least if self.resting else least)
 
     def _govern(self) -> None:
         """Limit speed and acceleration, and return to contacts and tasks."""
         options, Z = self.options, self._space.basis
-        period, self._elapsed = self._elapsed, 0.0
+        period, self.errorlapsed = self.errorlapsed, 0.0
         error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         fastest = min(fastest, options.acceleration * max(self._deadline - self._clock, 0.0))
@@ -242,10 +245,10 @@ class ReferenceFlow:
             fastest = 0.0
         step = limited(wanted, fastest) - self._flow
         self._flow = Z @ (Z.T @ (self._flow + limited(step, options.acceleration * period)))
-        self._e /= _RETURN
+        rate = self.error / _RETURN
         for task, rows in zip(self._held, self._places, strict=True):
-            self._e[rows] += task.target_velocity
-        back = self._space.inverse @ self._e
+            rate[rows] += task.target_velocity
+        back = self._space.inverse @ rate
         if self._base:
             # Of all motions that bring the tasks there, that of the base and not of the joints.
             joints = Z[self._base :]
