@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,8 @@ Gradient = Callable[[Array], tuple[float, Array]]
 _STEP = 1e-4
 # Time constant with which the reference comes back to contacts and tasks, s.
 _RETURN = 0.1
+# Step below which a posture on the way is reached, or as near as the limits permit, rad (m).
+_REACHED = 0.02
 # Speed below which a flow that is off stands still, rad/s (m/s).
 _STILL = 1e-5
 # Pull to zero of the base's share in a motion that the joints do not determine.
@@ -98,6 +100,7 @@ class ReferenceFlow:
         formulation: TaskFormulation,
         actuators: Actuators,
         options: FlowOptions,
+        path: Sequence[Array] = (),
     ) -> None:
         """Size the buffers.
 
@@ -107,6 +110,7 @@ class ReferenceFlow:
             formulation: Tasks and contacts.
             actuators: Rotors and motors.
             options: Parameters.
+            path: Postures to visit first, each of shape (nq,); the last may be an optimum that was found offline.
         """
         self._model, self._gradient, self.options = robot.model, gradient, options
         self._contacts = formulation.contacts
@@ -122,7 +126,7 @@ class ReferenceFlow:
         self._J[np.arange(self._count, self._J.shape[0]), fixed] = 1.0
         self._static = StaticControls(actuators, self._contacts, options.share)
         self.q, self.velocity, self.acceleration = robot.posture(), np.zeros(nv), np.zeros(nv)
-        self.robot = robot
+        self.robot, self._path = robot, tuple(path)
 
     def reset(self, q: Array) -> None:
         """Begin at rest at a posture, shape (nq,), and measure the curvature there.
@@ -228,6 +232,11 @@ class ReferenceFlow:
         offset = pin.difference(self._model, self._first, self.q)
         self._wanted[:] = 0.0
         if self.failed:
+            return
+        if self._visited < len(self._path):
+            way = pin.difference(self._model, self.q, self._path[self._visited])
+            self._wanted[:] = self.direction.towards(self._space.basis, way)
+            self._visited += int(np.abs(self._wanted).max() < _REACHED)
             return
         self._wanted[:] = self.direction.newton(self._space, self._slope, offset, self.error)
         gain, least = self.direction.gain, self.options.epsilon

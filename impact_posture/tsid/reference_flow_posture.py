@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError
@@ -37,6 +38,7 @@ class ReferenceFlowPosture(JointPosture):
         gradient: Gradient | ImpactGradient,
         *,
         options: FlowOptions | None = None,
+        path: ArrayLike | None = None,
         name: str = "flow posture",
         **gains: Any,
     ) -> None:
@@ -46,12 +48,19 @@ class ReferenceFlowPosture(JointPosture):
             robot: The robot.
             gradient: ``q → (H, ∇H)``, or a compiled export, whose own objective is then used.
             options: Parameters of the flow.
+            path: Posture to visit first, shape (nq,), or several, shape (k, nq).  The flow walks to an optimum that
+                was found offline, or along its path, and goes on from there.
             name: Name in reports.
             gains: As of :class:`~impact_posture.tsid.posture_tasks.JointPosture`.
+
+        Raises:
+            PostureError: A posture of the path is no configuration of the robot.
         """
         super().__init__(robot, name=name, **gains)
         self._function = gradient if callable(gradient) else gradient_of(gradient)
         self.options = options or FlowOptions()
+        visited = np.zeros((0, robot.nq)) if path is None else np.atleast_2d(np.asarray(path, dtype=float))
+        self._path = [robot.check_posture(q, limits=False) for q in visited]
         self._flow: ReferenceFlow | None = None
         self._data = robot.model.createData()
         slowest = float(self.kp[6 if robot.floating else 0 :].min(initial=np.inf))
@@ -102,7 +111,7 @@ class ReferenceFlowPosture(JointPosture):
         Raises:
             MetricError: The gradient does not exist there, or ``H`` vanishes.
         """
-        flow = ReferenceFlow(self._robot, self._function, formulation, actuators, self.options)
+        flow = ReferenceFlow(self._robot, self._function, formulation, actuators, self.options, self._path)
         flow.reset(state.q)
         self._flow, self.value = flow, flow.value
         self._velocity[:] = self._acceleration[:] = 0.0
