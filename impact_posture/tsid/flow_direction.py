@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,18 +53,19 @@ class Redundancy:
 
 
 class FlowDirection:
-    """Newton step ``δ = Z y`` of ``Φ = H/H₀ + ρ/2 ‖q_r ⊖ q₀‖²`` on the constraints.
+    """Newton step ``δ = Z y`` of ``Φ = 2√(H/H₀) + ρ/2 ‖q_r ⊖ q₀‖²`` on the constraints.
 
-    ``y`` minimizes ``½ yᵀ|B_Z| y + (Zᵀ∇Φ)ᵀ y``.  ``|B_Z|`` has the eigenvectors of the curvature and
-    ``max(|λᵢ|, μ)`` for its eigenvalues (saddle-free Newton, Dauphin et al. 2014), so that the step leaves saddles.
-    The curvature ``B`` is learned from secants by Powell's symmetric Broyden update, the slope ``T`` of the static
-    controls by Broyden's.  Rows keep joints, center of mass and static controls within their limits.  A limit that
-    does not hold at ``q_r`` is not crossed further.
+    The root counts, because the velocity jump grows with it: low in a valley, the pull towards the start is weak.
+    ``y`` minimizes ``½ yᵀ|B_Z| y + (Zᵀ∇Φ)ᵀ y``, where ``B_Z`` is the curvature of ``H/H₀`` times ``√(H₀/H)``, and
+    that of the pull.  ``|B_Z|`` has its eigenvectors and ``max(|λᵢ|, μ)`` for its eigenvalues (saddle-free Newton,
+    Dauphin et al. 2014), so that the step leaves saddles.  The curvature ``B`` is learned from secants by Powell's
+    symmetric Broyden update, the slope ``T`` of the static controls by Broyden's.  Rows keep joints, center of mass
+    and static controls within their limits.  A limit that does not hold at ``q_r`` is not crossed further.
 
     Attributes:
-        B: Curvature of ``Φ`` on the constraints, shape (nv, nv).
+        B: Curvature of ``H/H₀`` on the constraints, shape (nv, nv).
         T: Slope of the static controls (:class:`StaticControls`), shape (controls, nv).
-        gain: Decrease of ``Φ`` that the last step predicts.
+        gain: Decrease of ``H/H₀`` that the last step predicts.
     """
 
     def __init__(self, robot: Robot, edges: Array, controls: int, *, rho: float, mu: float, margin: float) -> None:
@@ -94,48 +96,55 @@ class FlowDirection:
 
     def learn(self, z: Array, curvature: Array, slope: Array) -> None:
         """Learn the curvature of ``H/H₀`` and the slope of the static controls along a unit vector, shape (nv,)."""
-        missing = curvature + self._pull * z - self.B @ z
+        missing = curvature - self.B @ z
         missing -= z @ missing / 2 * z
         outer = np.outer(missing, z)
         self.B += outer
         self.B += outer.T
         self.T += np.outer(slope - self.T @ z, z)
 
-    def limit(self, state: State, rooms: Array, shares: Array) -> None:
-        """Set the rows for a state at ``ν = 0``.
+    def limit(self, state: State, rooms: Array, shares: Array, coasting: Array) -> None:
+        """Set the rows for a state at ``ν = 0``, less what the flow needs to brake.
 
         Args:
             state: The state.
             rooms: Distance of the center of mass to each edge of the polygon, less its margin, m, shape (k,).
             shares: Static controls, shape (controls,).
+            coasting: Way on which the present flow brakes, shape (nv,).
         """
         upper, lower = self._qp.upper[self._qp.n :], self._qp.lower[self._qp.n :]
         count, k = self._joints.size, self._edges.shape[0]
-        room = np.maximum(state.room[:, self._joints] - self._margin, 0.0)
+        room = state.room[:, self._joints] - self._margin
         upper[:count], lower[:count] = room[0], -room[1]
         if k:
             np.matmul(self._edges, state.center_of_mass()[1][:2], out=self._rows[count : count + k])
-            upper[count : count + k] = np.maximum(rooms, 0.0)
+            upper[count : count + k] = rooms
         self._rows[count + k :] = self.T
-        upper[count + k :] = np.maximum(1.0 - shares, 0.0)
-        lower[count + k :] = np.minimum(-1.0 - shares, 0.0)
+        upper[count + k :] = 1.0 - shares
+        lower[count + k :] = -1.0 - shares
+        ahead = self._rows @ coasting
+        np.maximum(upper - np.maximum(ahead, 0.0), 0.0, out=upper)
+        np.minimum(lower - np.minimum(ahead, 0.0), 0.0, out=lower)
 
-    def newton(self, space: Redundancy, gradient: Array, offset: Array, error: Array) -> Array:
+    def newton(self, space: Redundancy, gradient: Array, value: float, offset: Array, error: Array) -> Array:
         """Return the step δ, shape (nv,).
 
         Args:
             space: The redundancy.
             gradient: ``∇H/H₀``, shape (nv,).
+            value: ``H/H₀``.
             offset: ``q_r ⊖ q₀``, shape (nv,).
             error: Error of the constraints, shape (rows,).
         """
-        Z = space.basis
-        slope = Z.T @ (gradient + self._pull * offset) - space.springs.T @ error
-        curvature = Z.T @ self.B @ Z
+        Z, root = space.basis, math.sqrt(abs(value))
+        slope = Z.T @ (gradient / root + self._pull * offset) - space.springs.T @ error
+        curvature = Z.T @ (self.B / root) @ Z + (Z.T * self._pull) @ Z
         curvature.flat[:: slope.size + 1] += space.stiffness
         values, vectors = np.linalg.eigh(curvature)
         way = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
-        return self._solve(way, way.T @ (Z @ slope))
+        step = self._solve(way, way.T @ (Z @ slope))
+        self.gain *= root
+        return step
 
     def towards(self, Z: Array, way: Array) -> Array:
         """Return the step nearest to ``way``, shape (nv,), on the constraints and within the limits."""

@@ -138,7 +138,7 @@ class ReferenceFlow:
         self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
         self._first, self._here = self.q.copy(), self.q.copy()
         self._wanted, self._flow, self._still = np.zeros((3, self.velocity.size))
-        self._phase, self._next, self.errorlapsed, self._clock = 0, 0, 0.0, 0.0
+        self._phase, self._next, self._visited, self._elapsed, self._clock = 0, 0, 0, 0.0, 0.0
         self._deadline = np.inf
         self.on, self.resting, self.failed = False, False, False
         state.update(q, self.velocity)
@@ -149,10 +149,9 @@ class ReferenceFlow:
             task.reset(state)
             self._J[rows] = task.jacobian(state)
         self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
-        normals, self._offsets = polygon_edges(state, self._contacts)
-        self.errordges = normals
+        self._edges, self._offsets = polygon_edges(state, self._contacts)
         limits = {"rho": options.rho, "mu": options.mu, "margin": options.joint_margin}
-        self.direction = FlowDirection(self.robot, normals, self._static.limited.size, **limits)
+        self.direction = FlowDirection(self.robot, self._edges, self._static.limited.size, **limits)
         self.start = 1.0
         self.value, _ = self._evaluate(self.q)
         if not (np.isfinite(self.value) and self.value != 0):
@@ -168,7 +167,7 @@ class ReferenceFlow:
     def advance(self, dt: float, measured: Array) -> None:
         """Advance by ``dt`` seconds; ``measured`` is the configuration of the robot that follows, shape (nq,)."""
         self._clock += dt
-        self.errorlapsed += dt
+        self._elapsed += dt
         self._measured = measured
         phase, self._phase = self._phase, (self._phase + 1) % len(PHASES)
         PHASES[phase](self)
@@ -198,9 +197,10 @@ class ReferenceFlow:
         self._multipliers = space.inverse.T @ self._slope
         rooms = self._offsets
         if rooms.size:
-            rooms = -rooms - self.options.com_margin - self.errordges @ state.center_of_mass()[0][:2]
+            rooms = -rooms - self.options.com_margin - self._edges @ state.center_of_mass()[0][:2]
         self.shares = self._static.shares(state, self._J)
-        direction.limit(state, rooms, self.shares)
+        coasting = self._flow * (self.options.speed / self.options.acceleration / 2)
+        direction.limit(state, rooms, self.shares, coasting)
 
     def _probe(self, sign: float) -> None:
         """Evaluate the reduced gradient and the static controls beside ``q_r``, and learn from both sides."""
@@ -238,22 +238,24 @@ class ReferenceFlow:
             self._wanted[:] = self.direction.towards(self._space.basis, way)
             self._visited += int(np.abs(self._wanted).max() < _REACHED)
             return
-        self._wanted[:] = self.direction.newton(self._space, self._slope, offset, self.error)
+        self._wanted[:] = self.direction.newton(self._space, self._slope, self.value / self.start, offset, self.error)
         gain, least = self.direction.gain, self.options.epsilon
         self.resting = gain < (4 * least if self.resting else least)
 
     def _govern(self) -> None:
         """Limit speed and acceleration, and return to contacts and tasks."""
         options, Z = self.options, self._space.basis
-        period, self.errorlapsed = self.errorlapsed, 0.0
+        period, self._elapsed = self._elapsed, 0.0
         error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         fastest = min(fastest, options.acceleration * max(self._deadline - self._clock, 0.0))
         wanted = self._wanted * (options.acceleration / options.speed)
         if not self.on or self.resting:
             fastest = 0.0
-        step = limited(wanted, fastest) - self._flow
-        self._flow = Z @ (Z.T @ (self._flow + limited(step, options.acceleration * period)))
+        most = options.acceleration * period
+        # Each joint brakes as fast as it can, and then all stay on the constraints.
+        step = np.clip(limited(wanted, fastest) - self._flow, -most, most)
+        self._flow = Z @ (Z.T @ (self._flow + limited(Z @ (Z.T @ step), most)))
         rate = self.error / _RETURN
         for task, rows in zip(self._held, self._places, strict=True):
             rate[rows] += task.target_velocity

@@ -35,7 +35,9 @@ from tests.benchmarks.core import Request, Vector, machine, say, table
 
 DT = 1e-3
 # The time in which a flow is to rest, the longest that one may take, and that of a fine one, s.
-REST, LONGEST, FINE = 8.0, 16.0, 25.0
+REST, LONGEST, FINE = 8.0, 16.0, 5.0
+# The most flows that are sent to the best optimum first.
+SENT = 30
 # Share of the start's H that counts: as distance from an optimum, and between basins.
 CLOSE = 0.01
 CASES = (
@@ -47,8 +49,9 @@ CASES = (
     Case("g1", "g1", AHEAD),
 )
 _HEAD = (
-    "robot|starts|H rises, of H₀|at rest, s: median|95 %|within 8 s|within 1 % of H₀ of its basin's optimum|"
-    "H above that, median|another basin|largest static share|least room of a joint beyond its margin, rad|off contacts and tasks, mm"
+    "robot|starts|H rises, of H₀: worst|median|at rest, s: median|95 %|within 8 s|"
+    "within 1 % of H₀ of its basin's optimum|H above that, median|another basin|of these, sent to the best|"
+    "largest static share|least room of a joint beyond its margin, rad|off contacts and tasks, mm"
 )
 
 
@@ -131,12 +134,14 @@ class Outcome:
         course: The course.
         start: ``H₀``.
         optimum: ``H`` at the optimum of the basin, under the same rows.
+        q: That optimum.
         program: Whether the offline program from the end of the flow gave it, and not a finer flow.
     """
 
     course: Course
     start: float
     optimum: float
+    q: Vector
     program: bool
 
     @property
@@ -150,11 +155,12 @@ def lines(request: Request) -> Iterator[str]:
     each = max(1, request.count // len(CASES))
     yield machine("daqp")
     yield ""
-    yield f"{each} random feasible starts for each robot, all on the same contacts and tool pose, at rest; starts that"
-    yield "need more than 80 % of what the actuators can give are drawn again. The optimum of the basin is what the offline"
-    yield "program (IPOPT) finds from the end of the flow under the same rows; where that lies elsewhere or needs more torque,"
-    yield "it is the end of a finer flow (ρ = 0, ε = 10⁻⁷). Another basin: that optimum lies more than 1 % of H₀ above the"
-    yield "best that any start has found. Shares of the static limits count from a start within them."
+    yield f"{each} random feasible starts for each robot, all on the same contacts and tool pose. Starts that need more"
+    yield "than 80 % of what the actuators can give are drawn again. The robot follows exactly (no physics). The optimum"
+    yield "of a basin is what the offline program (IPOPT) finds from the end of the flow under the same rows. Where that"
+    yield "lies elsewhere or needs more torque, it is the end of a finer flow (ρ = 0, ε = 10⁻⁷, 5 s more). Another basin:"
+    yield "that optimum lies more than 1 % of H₀ above the best that any start has found. *Sent to the best*: of up to"
+    yield f"{SENT} of these, which visit that best posture first, those that end within 1 % of H₀ of it."
     yield ""
     yield from table(_HEAD.split("|"), (_row(case, each, request) for case in CASES if request.only in case.name))
 
@@ -165,12 +171,12 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         export(problem.impact, Path(folder), check=False)
         library = ImpactGradient.load(folder, robot=robot)
-        flow, fine = (
-            ReferenceFlow(
-                robot, gradient_of(library), formulation_for(robot, JointPosture(robot)), Actuators(robot), o
-            )
-            for o in (FlowOptions(), FlowOptions(rho=0.0, mu=0.005, epsilon=1e-7))
-        )
+        formulation, actuators = formulation_for(robot, JointPosture(robot)), Actuators(robot)
+
+        def flow_of(options: FlowOptions, path: Sequence[Vector] = ()) -> ReferenceFlow:
+            return ReferenceFlow(robot, gradient_of(library), formulation, actuators, options, path)
+
+        flow, fine = flow_of(FlowOptions()), flow_of(FlowOptions(rho=0.0, mu=0.005, epsilon=1e-7))
         nlp = build_nlp(problem, compile="never")
         starts = starts_of(problem, flow, count, request.seed)
 
@@ -184,35 +190,47 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
             away = np.abs(pin.difference(robot.model, found.q, record.q)[6 if robot.floating else 0 :]).max()
             optimum = problem.objective.value(record.q)
             if fits and away < 0.5 and optimum < end + 1e-6 * start:
-                return Outcome(found, start, optimum, True)
+                return Outcome(found, start, optimum, record.q, True)
             finer = course(fine, found.q, FINE)
-            return Outcome(found, start, end * float(finer.values[-1]), False)
+            return Outcome(found, start, end * float(finer.values[-1]), finer.q, False)
 
-        outcomes = []
+        outcomes: dict[int, Outcome] = {}
         with fork_map(one, len(starts), request.jobs) as results:
-            for number, (_, outcome) in enumerate(results, 1):
-                outcomes.append(outcome)
-                say(f"\r{case.name}: {number} of {len(starts)}", end="")
+            for index, outcome in results:
+                outcomes[index] = outcome
+                say(f"\r{case.name}: {len(outcomes)} of {len(starts)}", end="")
         say("")
-    return _cells(case.name, outcomes)
+        best = min(outcomes.values(), key=lambda o: o.optimum)
+        apart = [i for i, o in outcomes.items() if o.optimum - best.optimum > CLOSE * o.start][:SENT]
+        warm = flow_of(FlowOptions(), [best.q])
+
+        def again(k: int) -> bool:
+            found, start = course(warm, starts[apart[k]], LONGEST), outcomes[apart[k]].start
+            return bool(found.values[-1] * start - best.optimum <= CLOSE * start)
+
+        with fork_map(again, len(apart), request.jobs) as results:
+            mended = [good for _, good in results]
+    return _cells(case.name, list(outcomes.values()), best.optimum, mended)
 
 
-def _cells(name: str, outcomes: Sequence[Outcome]) -> list[str]:
+def _cells(name: str, outcomes: Sequence[Outcome], best: float, mended: Sequence[bool]) -> list[str]:
     rest = np.array([o.course.rested for o in outcomes])
     start, end, optimum = (np.array([getattr(o, key) for o in outcomes]) for key in ("start", "end", "optimum"))
-    best = min(optimum.min(), end.min())
+    rises = [float((o.course.values - np.minimum.accumulate(o.course.values)).max()) for o in outcomes]
     program = np.mean([o.program for o in outcomes])
     near = np.mean(end - optimum <= CLOSE * start)
     return [
         name,
         str(len(outcomes)),
-        f"{max(float(np.diff(o.course.values).max()) for o in outcomes):.0e}",
+        f"{max(rises):.0e}",
+        f"{np.median(rises):.0e}",
         f"{np.median(rest):.1f}",
         f"{np.percentile(rest, 95):.1f}",
         f"{100 * np.mean(rest <= REST):.1f} %",
         f"{100 * near:.1f} % ({100 * program:.0f} % by the program)",
         f"{100 * np.median(end / optimum - 1):.1f} %",
         f"{100 * np.mean(optimum - best > CLOSE * start):.0f} %",
+        f"{sum(mended)} of {len(mended)}",
         f"{max(o.course.share for o in outcomes) * FlowOptions().share:.3f}",
         f"{min(o.course.room for o in outcomes):.3f}",
         f"{1e3 * max(o.course.missed for o in outcomes):.2f}",
