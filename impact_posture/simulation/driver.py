@@ -73,7 +73,7 @@ class Driver:
     @property
     def level(self) -> float:
         """Level of the term that prepares for the impact, 0 to 1."""
-        return 0.0
+        return self.posture.level
 
     def _follow(self, reference: ReferencePoint) -> None:
         task, home = self._end_effector, self._home
@@ -137,11 +137,6 @@ class FlowDriver(Driver):
         """Rest early enough before an impact at a time, s."""
         if self.posture.flow.on:
             self.posture.brace(t - self._now)
-
-    @property
-    def level(self) -> float:
-        """Whether the posture may flow: 0 or 1."""
-        return self.posture.level
 
 
 class PostureDriver(Driver):

@@ -17,6 +17,8 @@ from impact_posture.tsid.state import State
 # Singular value of the constraints, relative to the largest, below which they are springs.  The rows of points on one
 # body can depend on each other almost: held exactly in one posture, free in the next, a flow would never rest.
 _SOFT = 2e-2
+# Least ``H/H₀`` whose root counts.
+_LEAST = 1e-8
 # Stiffness of those springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
 _STIFFNESS = 3e4
 
@@ -136,7 +138,7 @@ class FlowDirection:
             offset: ``q_r ⊖ q₀``, shape (nv,).
             error: Error of the constraints, shape (rows,).
         """
-        Z, root = space.basis, math.sqrt(abs(value))
+        Z, root = space.basis, math.sqrt(max(abs(value), _LEAST))
         slope = Z.T @ (gradient / root + self._pull * offset) - space.springs.T @ error
         curvature = Z.T @ (self.B / root) @ Z + (Z.T * self._pull) @ Z
         curvature.flat[:: slope.size + 1] += space.stiffness

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -120,10 +121,9 @@ class ReferenceFlow:
         self._tasks = [task for level in formulation.levels for task in level] + weighted
         self._base, nv = actuators.base, robot.nv
         fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
-        sizes = [c.size for c in self._contacts] + [t.size for t in self._tasks]
-        self._places, self._count = stacked_rows(sizes)
-        self._J, self.error = np.zeros((self._count + len(fixed), nv)), np.zeros(self._count + len(fixed))
-        self._J[np.arange(self._count, self._J.shape[0]), fixed] = 1.0
+        self._places, count = stacked_rows([c.size for c in self._contacts] + [t.size for t in self._tasks])
+        self._J, self.error = np.zeros((count + len(fixed), nv)), np.zeros(count + len(fixed))
+        self._J[np.arange(count, count + len(fixed)), fixed] = 1.0
         self._static = StaticControls(actuators, self._contacts, options.share)
         self.q, self.velocity, self.acceleration = robot.posture(), np.zeros(nv), np.zeros(nv)
         self.robot, self._path = robot, tuple(path)
@@ -143,15 +143,16 @@ class ReferenceFlow:
         self.on, self.resting, self.failed = False, False, False
         state.update(q, self.velocity)
         kinds = {3: FramePosition, 6: FramePose}
-        held: list[Task] = [kinds[c.size](c.point) for c in self._contacts]
-        self._held = [*held, *self._tasks]
+        self._held: list[Task] = [*(kinds[c.size](c.point) for c in self._contacts), *self._tasks]
         for task, rows in zip(self._held, self._places, strict=True):
             task.reset(state)
             self._J[rows] = task.jacobian(state)
         self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
         self._edges, self._offsets = polygon_edges(state, self._contacts)
-        limits = {"rho": options.rho, "mu": options.mu, "margin": options.joint_margin}
-        self.direction = FlowDirection(self.robot, self._edges, self._static.limited.size, **limits)
+        self.direction = FlowDirection(
+            self.robot, self._edges, self._static.limited.size,
+            rho=options.rho, mu=options.mu, margin=options.joint_margin,
+        )  # fmt: skip
         self.start = 1.0
         self.value, _ = self._evaluate(self.q)
         if not (np.isfinite(self.value) and self.value != 0):
@@ -221,15 +222,8 @@ class ReferenceFlow:
             self.direction.learn(z, curvature, controls)
             self._next += 1
 
-    def _probe_ahead(self) -> None:
-        self._probe(1.0)
-
-    def _probe_behind(self) -> None:
-        self._probe(-1.0)
-
     def _direct(self) -> None:
         """Find the step, and whether it is worth moving."""
-        offset = pin.difference(self._model, self._first, self.q)
         self._wanted[:] = 0.0
         if self.failed:
             return
@@ -238,6 +232,7 @@ class ReferenceFlow:
             self._wanted[:] = self.direction.towards(self._space.basis, way)
             self._visited += int(np.abs(self._wanted).max() < _REACHED)
             return
+        offset = pin.difference(self._model, self._first, self.q)
         self._wanted[:] = self.direction.newton(self._space, self._slope, self.value / self.start, offset, self.error)
         gain, least = self.direction.gain, self.options.epsilon
         self.resting = gain < (4 * least if self.resting else least)
@@ -286,10 +281,10 @@ class ReferenceFlow:
         return (np.nan, np.zeros(self.velocity.size)) if self.failed else (float(value), found)
 
 
-PHASES = (
+PHASES: tuple[Callable[[ReferenceFlow], None], ...] = (
     ReferenceFlow._look,
-    ReferenceFlow._probe_ahead,
-    ReferenceFlow._probe_behind,
+    partial(ReferenceFlow._probe, sign=1.0),
+    partial(ReferenceFlow._probe, sign=-1.0),
     ReferenceFlow._direct,
     ReferenceFlow._govern,
 )

@@ -155,12 +155,12 @@ def lines(request: Request) -> Iterator[str]:
     each = max(1, request.count // len(CASES))
     yield machine("daqp")
     yield ""
-    yield f"{each} random feasible starts for each robot, all on the same contacts and tool pose. Starts that need more"
-    yield "than 80 % of what the actuators can give are drawn again. The robot follows exactly (no physics). The optimum"
-    yield "of a basin is what the offline program (IPOPT) finds from the end of the flow under the same rows. Where that"
-    yield "lies elsewhere or needs more torque, it is the end of a finer flow (ρ = 0, ε = 10⁻⁷, 5 s more). Another basin:"
-    yield "that optimum lies more than 1 % of H₀ above the best that any start has found. *Sent to the best*: of up to"
-    yield f"{SENT} of these, which visit that best posture first, those that end within 1 % of H₀ of it."
+    yield f"{each} random feasible starts for each robot, all on the same contacts and tool pose. Starts that need"
+    yield "more than 80 % of what the actuators can give are drawn again. The robot follows exactly (no physics). The"
+    yield "optimum of a basin is what the offline program (IPOPT) finds from the end of the flow under the same rows."
+    yield "Where that lies elsewhere or needs more torque, it is the end of a finer flow (ρ = 0, ε = 10⁻⁷, 5 s more)."
+    yield "Another basin: that optimum lies more than 1 % of H₀ above the best that any start has found. *Sent to the"
+    yield f"best*: of up to {SENT} of these, which visit that posture first, those that end within 1 % of H₀ of it."
     yield ""
     yield from table(_HEAD.split("|"), (_row(case, each, request) for case in CASES if request.only in case.name))
 
