@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-robustness reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness reproduction calibration regression
 .PHONY: pictures clean
 
 help:
@@ -22,6 +22,7 @@ help:
 	@echo "make study-global   how complete the search global is, and basin hopping beside multi-start"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
 	@echo "make study-feasible  what it costs to be clear of collisions and held by the motors, over the catalogue"
+	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts (an hour)"
 	@echo "make study-robustness  where each controller helps: 40 random variations of each experiment (an hour or two)"
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
@@ -97,6 +98,9 @@ study-global: $(VENV)/.installed-test
 
 study-feasible: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks feasible --write
+
+study-flow: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks flow --jobs $(JOBS) --write
 
 reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks reproduction --write

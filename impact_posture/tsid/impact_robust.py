@@ -53,9 +53,10 @@ class ImpactRobustPosture(JointPosture):
     """``ν̇* = K_p (q_des ⊖ q) − K_d ν − α K s(q) ∇H(q)/λ`` (Afifi et al. 2026, impact-robust posture).
 
     - ``λ`` is the largest curvature of ``H`` along the redundancy at ``reset`` (:meth:`normalize`).  ``K`` is then a
-      stiffness like ``K_p``, in 1/s², on every robot: near an optimum the term is a spring of at most ``K``.  ``H``
-      itself scales like 1/armature².
-    - ``K_d = 2√(K_p + K)`` by default, critical for both springs together.
+      stiffness like ``K_p``, in 1/s², on every robot, while ``H`` itself scales like 1/armature².  But ``λ`` is the
+      curvature at the start, where ``H`` may even be concave.  Near an optimum with the curvature ``λ*``, the term is
+      a spring ``K λ*/λ``, which can be several times as stiff as ``K``.
+    - ``K_d = 2√(K_p + K)`` by default, critical for both springs together where ``λ* = λ``.
     - The length of the term is at most ``K·reach``, like a spring ``K`` stretched by ``reach``.  A bound below
       ``K_p|q_des ⊖ q|`` would stall the flow on its way.
     - ``s(q)`` fades out the part of each joint that pushes into a position limit, from ``fade[1]`` rad before the
@@ -158,6 +159,11 @@ class ImpactRobustPosture(JointPosture):
         was_on = self.activation.goal > 0
         self.activation.enter(Phase.RELEASE)
         self._hold = self._hold or was_on
+
+    @property
+    def level(self) -> float:
+        """Level ``α`` of the activation, 0 to 1."""
+        return self.activation.level
 
     # ---- the task -------------------------------------------------------------------------------------------------
 

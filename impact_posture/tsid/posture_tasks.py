@@ -21,9 +21,13 @@ class JointPosture(Task):
     lead the base, give its six entries no weight (``base_weight = 0``).
 
     A new ``q_des`` is faded in (:meth:`move_to`), hence ``ν̇*`` does not jump.
+
+    Attributes:
+        value: Objective at the last evaluation, if the task has one; else NaN.
     """
 
     constant = True
+    value = float("nan")
 
     def __init__(
         self,
@@ -64,6 +68,11 @@ class JointPosture(Task):
     def target(self) -> Array:
         """``q_des``, shape (nq,); during a fade, the new one.  Change it by :meth:`move_to`."""
         return self._next if self._blend < 1 else self._target
+
+    @property
+    def level(self) -> float:
+        """Level at which the task prepares for an impact, 0 to 1; this one does not."""
+        return 0.0
 
     def reset(self, state: State) -> None:
         """Take the target of the constructor, or the present posture if there is none."""

@@ -72,6 +72,7 @@ STUDIES = {
         Study("elastic", "elastic.study", "arms with elastic joints in MuJoCo; postures", 20, target="study-elastic"),
         Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
         Study("hops", "global_search:hops", "basin hopping beside multi-start; seeds", 10, target="study-global"),
+        Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
         Study("robustness", "robustness.study", "where each controller helps; draws", 40, target="study-robustness"),
         Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
     )
