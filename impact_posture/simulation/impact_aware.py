@@ -18,7 +18,7 @@ from impact_posture.tsid.posture_tasks import JointPosture
 class ImpactAwareDriver(Driver):
     """Nominal controller with limits of post-impact rates and impulsive torques (Wang et al. 2020).
 
-    From the begin of an approach until ``AFTER`` (s) behind the expected impact, each tick obeys
+    From the begin of an approach until the way back, each tick obeys
     :class:`~impact_posture.tsid.impact_limits.ImpactLimits`, as if the impact came at the next tick.  It approaches
     only as fast as the limits of the robot allow.  Where they allow the speed of the scenario, this is the nominal
     controller.
@@ -27,8 +27,6 @@ class ImpactAwareDriver(Driver):
     them.  The paper also keeps the zero-moment point and the friction of standing feet through the impact.  Here, the
     feet react without limit.
     """
-
-    AFTER = 0.1
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
         """Add the limits to the tasks of the scenario."""
@@ -41,14 +39,15 @@ class ImpactAwareDriver(Driver):
 
     def reset(self, q: Array) -> Command:
         """Begin at rest, without an expected impact."""
-        self._until, self.limits.active = -1.0, False
+        self.limits.active = False
         return super().reset(q)
 
     def expect(self, t: float) -> None:
-        """Expect an impact at a time, s."""
-        self._until = t + self.AFTER
+        """Expect an impact at a time, s, and limit what it may do from now on."""
+        self.limits.active = True
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command, limited while an impact may come."""
-        self.limits.active = reading.t < self._until
+        """Return the command, limited until the end effector goes back."""
+        if reference is not None and reference.speed < 0:
+            self.limits.active = False
         return super().tick(reading, reference)
