@@ -39,6 +39,7 @@ MEANING: dict[str, str] = {
     "walker": "the gradient's flow as reference of the posture task",
 }
 CONTROLLERS = tuple(MEANING)
+# A controller with this at the end of its name is also as stiff as the term is in its posture.
 _STIFF = "-stiff"
 _PLAIN = {
     "nominal": Driver,
@@ -112,7 +113,7 @@ class ControllerFactory:
         modes = get_args(Mode)
         if mode not in modes:
             raise InputError(f"there is no mode '{mode}'", where="--mode", hint=f"one of: {', '.join(modes)}")
-        if name not in CONTROLLERS:
+        if name.removesuffix(_STIFF) not in CONTROLLERS:
             return self._driver_from_outside(name, mode, gain)
         if mode == "held" and not (name.startswith("robust") or name == "walker"):
             raise InputError(f"'{name}' has no term to hold", where="--mode", hint="only robust… and walker have one")
