@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts reproduction calibration regression
 .PHONY: pictures clean
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo "make study-feasible  what it costs to be clear of collisions and held by the motors, over the catalogue"
 	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts (an hour)"
 	@echo "make study-robustness  where each controller helps: 40 random variations of each experiment (an hour or two)"
+	@echo "make study-real-impacts  balls, strikes, taps: what the rigid model predicts, and what MuJoCo finds (some minutes)"
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make pictures    draw the pictures that the documentation shows"
@@ -107,6 +108,9 @@ reproduction: $(VENV)/.installed-test
 
 study-robustness: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks robustness --jobs $(JOBS) --write
+
+study-real-impacts: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks real-impacts --jobs $(JOBS) --write
 
 calibration: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks restitution --write

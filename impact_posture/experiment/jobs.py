@@ -88,7 +88,7 @@ def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
     """
     factory = controller_factory(job.scenario, job.free)
     scenario = factory.setup.scenario
-    if job.sign is not None and not (scenario.push and job.sign in scenario.push.signs):
+    if job.sign is not None and job.sign not in scenario.signs:
         raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, hint="leave --sign out")
     runs = run(factory, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
     metrics = [measure(factory.setup, one) for one in runs]

@@ -44,7 +44,7 @@ class ContactLog:
 
     def __init__(self, model: Any, geoms: tuple[str, ...], frames: tuple[str, ...]) -> None:
         self._frames, count = frames, len(frames)
-        # MuJoCo names the plane of a contact first, so the contact pushes the second geom.
+        # MuJoCo names the plane of a contact first, so the contact pushes the second geom.  A ball may be either.
         self._shape_of = np.full(model.ngeom, -1)
         for k, name in enumerate(geoms):
             self._shape_of[model.geom(name).id] = k
@@ -69,7 +69,8 @@ class ContactLog:
         contact = data.contact
         # A contact just outside the surface does not push and has no address.
         pushing = contact.efc_address >= 0
-        first, shapes = contact.efc_address[pushing], self._shape_of[contact.geom[pushing, 1]]
+        first, (one, other) = contact.efc_address[pushing], self._shape_of[contact.geom[pushing]].T
+        shapes, side = np.maximum(one, other), np.where(other >= 0, 1.0, -1.0)
         local = np.zeros((first.size, 3))
         local[:, 0] = data.efc_force[first]
         # A contact has one number without friction, else three.
@@ -78,7 +79,7 @@ class ContactLog:
         local[rough, 2] = data.efc_force[first[rough] + 2]
         # The rows of a contact frame are its axes, the normal first.
         frames = contact.frame[pushing].reshape(-1, 3, 3)
-        np.add.at(self.forces, shapes, (local[:, None, :] @ frames)[:, 0])
+        np.add.at(self.forces, shapes, side[:, None] * (local[:, None, :] @ frames)[:, 0])
         np.add.at(self._normal, shapes, local[:, 0])
         self._impulses += self._step * self.forces
         np.maximum(self._peaks, self._normal, out=self._peaks)
@@ -108,11 +109,12 @@ class ContactLog:
         slips = np.zeros(len(self._frames))
         if not (data.ncon and self._normal.any()):
             return slips
-        contact, geoms = data.contact, data.contact.geom[:, 1]
+        # A ball is no place to slide on.
+        contact, grounds = data.contact, self._body_of[data.contact.geom[:, 0]] == 0
+        geoms, places, normals = contact.geom[grounds, 1], contact.pos[grounds], contact.frame[grounds, :3]
         bodies = self._body_of[geoms]
-        twists, arms = data.cvel[bodies], contact.pos - data.subtree_com[self._root_of[bodies]]
+        twists, arms = data.cvel[bodies], places - data.subtree_com[self._root_of[bodies]]
         velocities = twists[:, 3:] + np.cross(twists[:, :3], arms)
-        normals = contact.frame[:, :3]
         velocities -= np.sum(normals * velocities, axis=1, keepdims=True) * normals
         np.maximum.at(slips, self._shape_of[geoms], np.linalg.norm(velocities, axis=1))
         slips[self._normal <= 0] = 0.0

@@ -64,11 +64,13 @@ class StanceGains(Checked):
         friction: Coulomb coefficient that the controller assumes.
         least: Least normal force of a contact (for a sole, of the whole sole), N.
         force_weight: Weight of contact forces in the cost, 1/N².
+        lifted: Frames of supports that do not stand, for example the foot that hits the ground.
     """
 
     friction: Positive = 0.5
     least: Positive = 1.0
     force_weight: Positive = 1e-5
+    lifted: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -138,12 +138,12 @@ def before(series: Series, window: Window) -> int:
 
 def jump(setup: Setup, series: Series, window: Window) -> float:
     """Return the largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP` of the begin, or for pushes ``‖ν‖`` in the window."""
-    return _peak(setup, series, window, window.begin + JUMP if setup.scenario.contacts else window.end)
+    return _peak(setup, series, window, window.end if setup.scenario.push else window.begin + JUMP)
 
 
 def _peak(setup: Setup, series: Series, window: Window, end: float) -> float:
     """Return the largest ``‖ν(t) − ν⁻‖`` from the begin of a window until ``end``, or for pushes ``‖ν‖``."""
     after = series.v[series.slice(window.begin, end)]
-    if setup.scenario.contacts:
+    if not setup.scenario.push:
         after = after - series.v[before(series, window)]
     return float(np.linalg.norm(after, axis=1).max(initial=0.0))

@@ -13,6 +13,7 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.simulation.metrics import before, jump
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.throw import thrown_jumps
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,8 @@ class Prediction:
         G: 1/kg.
         V: ``H/G²``.
         S: Squared jump per squared approach speed if the contact sticks, or ``None`` where it is undefined.
-        approach: Speed into the surface just before the impact, m/s.  For pushes, the impulse of the push, N·s.
+        approach: Speed of robot and surface (or ball) towards each other just before the impact, m/s.  For pushes,
+            the impulse of the push, N·s.
         frictionless: Jump without friction and rebound, ``v √V``.  For pushes, ``√H`` times the impulse, which is the
             velocity at the end of the push of a robot without controller.
         sticking: Jump if the contact sticks, ``v √S`` (for an approach along the normal), or ``None`` for pushes.
@@ -61,6 +63,9 @@ def predict(setup: Setup, objective: ImpactObjective, run: Run) -> tuple[Predict
         if scenario.push:
             approach = float(np.linalg.norm(scenario.push.force)) * scenario.push.duration
             smooth, sticking, coulomb = approach * float(np.sqrt(here.H)), None, None
+        elif scenario.throw:
+            approach = scenario.throw.speed - float(scenario.normal @ numeric.at(q).jacobian(point)[:3] @ v)
+            smooth, sticking, coulomb = thrown_jumps(objective.oracle, q, scenario.throw, approach)
         else:
             approach = float(-scenario.normal @ numeric.at(q).jacobian(point)[:3] @ v)
             smooth = approach * float(np.sqrt(here.V))

@@ -22,9 +22,9 @@ def feet_of(setup: Setup) -> tuple[str, ...]:
     scenario, robot = setup.scenario, setup.robot
     if scenario.control.footing is None:
         return ()
-    held = {point_on(robot, support.frame).joint for support in robot.spec.supports}
-    hits = None if scenario.contacts is None else scenario.contacts.frame
-    return tuple(s.frame for s in scenario.shapes if s.frame != hits and point_on(robot, s.frame).joint in held)
+    lifted = (*scenario.control.footing.lifted, "" if scenario.contacts is None else scenario.contacts.frame)
+    held = {point_on(robot, s.frame).joint for s in robot.spec.supports if s.frame not in lifted}
+    return tuple(s.frame for s in scenario.shapes if s.frame not in lifted and point_on(robot, s.frame).joint in held)
 
 
 class Recorder:
@@ -37,9 +37,9 @@ class Recorder:
 
     def __init__(self, setup: Setup, metric: Gradient) -> None:
         self._setup, self._metric = setup, metric
-        robot, contacts = setup.robot, setup.scenario.contacts
+        robot, scenario = setup.robot, setup.scenario
         shapes = [s.frame for s in setup.scenario.shapes]
-        self._shape = None if contacts is None else shapes.index(contacts.frame)
+        self._shape = None if scenario.push else shapes.index(scenario.task.frame)
         feet = feet_of(setup)
         self._feet = [k for k, frame in enumerate(shapes) if frame in feet]
         self._joints = {name: k for k, name in enumerate(robot.tangent_names)}

@@ -19,6 +19,7 @@ from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush
 from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.simulation.series import RECOVERY, Series, Window
+from impact_posture.simulation.throw import FLIGHT, Throw
 
 # Time when controllers begin to prepare, after the first reaction of sensors and motors, s.
 _BRACE = 0.1
@@ -75,9 +76,9 @@ def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mod
         return (_contacts(_Loop(factory, driver, seed), scenario.contacts, mode),)
     if only not in (None, 1, -1):
         raise InputError(f"{only} is no sign of a push", where=scenario.source, hint="give 1 or -1")
-    assert scenario.push is not None  # noqa: S101 (a scenario has contacts or a push)
-    signs = scenario.push.signs if only is None else (only,)
-    return _pushes(_Loop(factory, driver, seed), scenario.push, signs, mode)
+    task = scenario.task
+    assert not isinstance(task, RepeatedContacts)  # noqa: S101 (those have returned)
+    return _pushes(_Loop(factory, driver, seed), task, task.signs if only is None else (only,), mode)
 
 
 class _Loop:
@@ -151,7 +152,7 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     return Run(loop.recorder.series(), tuple(windows), away=loop.away)
 
 
-def _pushes(loop: _Loop, task: SinglePush, signs: Sequence[int], mode: Mode) -> tuple[Run, ...]:
+def _pushes(loop: _Loop, task: SinglePush | Throw, signs: Sequence[int], mode: Mode) -> tuple[Run, ...]:
     """Settle once and push with each sign from there, the other signs in forked processes."""
     # All controllers begin to prepare before a push, whatever the patience of the scenario is.
     rested = _settle(loop, task, max(task.settle, _BRACE + loop.period), [loop.driver.brace])
@@ -167,21 +168,27 @@ def _pushes(loop: _Loop, task: SinglePush, signs: Sequence[int], mode: Mode) -> 
         return (first(), *(collect() for collect in waiting))
 
 
-def _push(loop: _Loop, task: SinglePush, sign: int, rested: bool) -> Run:
-    begin = loop.t
-    loop.driver.expect(begin)
-    push = task.push(sign)
-    loop.world.push(push)
-    loop.recorder.pushed(np.array(push.force), begin, begin + task.duration)
-    for _ in range(round((task.duration + task.after) / loop.period)):
+def _push(loop: _Loop, task: SinglePush | Throw, sign: int, rested: bool) -> Run:
+    begin = expected = loop.t
+    if isinstance(task, Throw):
+        expected, length = begin + FLIGHT, task.window
+        loop.world.throw(sign)
+    else:
+        push, length = task.push(sign), task.duration
+        loop.world.push(push)
+        loop.recorder.pushed(np.array(push.force), begin, begin + length)
+    loop.driver.expect(expected)
+    for _ in range(round((expected - begin + length + task.after) / loop.period)):
         if not loop.tick():
             break
-    ends = {"impact": task.duration, "recovery": min(RECOVERY, task.duration + task.after)}
-    windows = tuple(Window(kind, 0, begin, begin + length, True) for kind, length in ends.items())
-    return Run(loop.recorder.series(), windows, sign, begin, rested, loop.away)
+    touch = loop.recorder.first_touch(begin, np.inf) if isinstance(task, Throw) else begin
+    hit = expected if touch is None else touch
+    ends = {"impact": length, "recovery": min(RECOVERY, length + task.after)}
+    windows = tuple(Window(kind, 0, hit, hit + end, touch is not None) for kind, end in ends.items())
+    return Run(loop.recorder.series(), windows, sign, hit, rested, loop.away)
 
 
-def _settle(loop: _Loop, task: SinglePush, least: float, brace: list[Callable[[], None]]) -> bool:
+def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Callable[[], None]]) -> bool:
     """Go on until ``least`` and until the robot has been quiet for long enough.  Return whether it has."""
     still, end = 0.0, max(least, loop.t) + task.patience
     while loop.t < least - 1e-9 or still < task.still - 1e-9:

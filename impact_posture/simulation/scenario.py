@@ -17,10 +17,11 @@ from impact_posture.robot.postures import read_posture, set_joints
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.spec import NonNegative, Positive
-from impact_posture.settings import RobotSettings, Vector3
+from impact_posture.settings import FRICTION, RobotSettings, Vector3
 from impact_posture.simulation.actuator_command import Push
 from impact_posture.simulation.control import Control
 from impact_posture.simulation.scene import Finite, FiniteVector, Scene, Shape, Surface
+from impact_posture.simulation.throw import Settling, Throw
 from impact_posture.simulation.world import World, build_world
 from impact_posture.tables import Checked
 
@@ -60,30 +61,18 @@ class RepeatedContacts(Checked):
 
 
 @dataclass(frozen=True)
-class SinglePush(Checked):
+class SinglePush(Settling):
     """A standing robot is pushed after it has come to rest.
 
     Attributes:
         frame: Frame that is pushed.
         force: Force of a push with sign 1, world, N.
         duration: Duration of the push and of its impact window, s.
-        signs: Signs of the pushes, one run each.
-        settle: Least time before the push, s.
-        quiet: ``‖ν‖`` below which the push may begin (mixes m/s and rad/s, as the metric of the paper does).
-        still: Time for which ``‖ν‖`` must have been below ``quiet``, s.
-        patience: Time beyond ``settle`` after which a robot that still moves is pushed anyway, s.
-        after: Time that the run goes on after the push, s.
     """
 
     frame: str
     force: FiniteVector
     duration: Positive = 0.4
-    signs: Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)] = (1, -1)
-    settle: NonNegative = 1.0
-    quiet: Positive = 0.005
-    still: NonNegative = 0.2
-    patience: Positive = 20.0
-    after: NonNegative = 1.0
 
     def __post_init__(self) -> None:
         """Refuse a push without force."""
@@ -129,8 +118,9 @@ class ScenarioTable(Scene, RobotSettings):
         description: One line.
         posture: Name or file of the start posture.  ``None`` takes the default posture of the robot.
         joints: Values that replace those of the start posture, by joint, rad or m.
-        contacts: The contacts, or ``None`` if the robot is pushed.
-        push: The push, or ``None`` if the robot makes contacts.
+        contacts: The contacts that the robot makes, or ``None``.
+        push: The push, or ``None``.
+        throw: The body that is thrown at the robot, or ``None``.  There is one of the three.
         control: The gains.
         bounds: Bounds that a run must keep to count.
     """
@@ -142,25 +132,34 @@ class ScenarioTable(Scene, RobotSettings):
     joints: Mapping[str, float] = field(default_factory=dict)
     contacts: RepeatedContacts | None = None
     push: SinglePush | None = None
+    throw: Throw | None = None
     control: Control
     bounds: Bounds = Bounds()
 
+    @property
+    def laws(self) -> tuple[tuple[str, tuple[float, float]], ...]:
+        """Name and ``solref`` of all contact laws, with that of a ball."""
+        return super().laws if self.throw is None else (*super().laws, ("throw", self.throw.solref))
+
     def __post_init__(self) -> None:
-        """Refuse no task, two tasks, and contacts of an unknown shape or surface."""
+        """Refuse no task, two tasks, and a task with an unknown shape or surface."""
         super().__post_init__()
-        if (self.contacts is None) == (self.push is None):
-            what = "neither [contacts] nor [push]" if self.push is None else "both [contacts] and [push]"
+        tasks = {key: getattr(self, key) for key in ("contacts", "push", "throw") if getattr(self, key) is not None}
+        if len(tasks) != 1:
+            both = "both " + " and ".join(f"[{key}]" for key in tasks)
+            what = both if tasks else "neither [contacts], [push] nor [throw]"
             raise InputError(f"has {what}", hint="have one of them")
-        if self.contacts is None:
-            return
-        for key, name, known in (
-            ("surface", self.contacts.surface, [s.name for s in self.surfaces]),
-            ("frame", self.contacts.frame, [s.frame for s in self.shapes]),
-        ):
+        (task, content), shapes = tasks.popitem(), [s.frame for s in self.shapes]
+        names = [] if self.contacts is None else [("surface", self.contacts.surface, [s.name for s in self.surfaces])]
+        for key, name, known in (*names, *([] if self.push else [("frame", content.frame, shapes)])):
             if name not in known:
                 table = "surfaces" if key == "surface" else "shapes"
                 hint = f"one of: {', '.join(known)}" if known else f"add it to [[{table}]]"
-                raise InputError(f"key 'contacts.{key}': there is no '{name}'", hint=hint)
+                raise InputError(f"key '{task}.{key}': there is no '{name}'", hint=hint)
+        for shape in self.shapes if self.throw else ():
+            if shape.frame == content.frame and (shape.kind != "sphere" or shape.center is None):
+                what = f"a ball is thrown at the {shape.kind} at '{shape.frame}'"
+                raise InputError(what, hint="make it a sphere and give its center, at which the ball flies")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -174,17 +173,27 @@ class Scenario(ScenarioTable):
     source: str = ""
 
     @property
-    def task(self) -> RepeatedContacts | SinglePush:
-        """The contacts or the push."""
-        task = self.contacts or self.push
+    def task(self) -> RepeatedContacts | SinglePush | Throw:
+        """The contacts, the push or the throw."""
+        task = self.contacts or self.push or self.throw
         assert task is not None  # noqa: S101 (__post_init__ has checked it)
         return task
 
     @property
+    def signs(self) -> tuple[int, ...]:
+        """Signs of the pushes or throws, one run each; none for contacts."""
+        return () if isinstance(self.task, RepeatedContacts) else self.task.signs
+
+    @property
     def normal(self) -> Array:
-        """Unit normal of the impact, shape (3,): that of the surface, or the direction of the push."""
-        n = np.array(self.push.force if self.push else self.surface.normal, dtype=float)
-        return np.asarray(n / np.linalg.norm(n))
+        """Unit normal of the impact, shape (3,): that of the surface, or the direction of the push or throw."""
+        given = self.push.force if self.push else self.throw.direction if self.throw else self.surface.normal
+        return np.asarray(np.array(given, dtype=float) / np.linalg.norm(given))
+
+    @property
+    def friction(self) -> float:
+        """Coulomb coefficient of the impact."""
+        return FRICTION if self.push else self.throw.friction if self.throw else self.surface.friction
 
     @property
     def surface(self) -> Surface:
@@ -197,16 +206,19 @@ class Scenario(ScenarioTable):
 
     @property
     def shape(self) -> Shape:
-        """The shape that hits the surface.
+        """The shape that hits the surface, or that is hit.
 
         Raises:
             InputError: The robot is pushed instead.
         """
-        return next(s for s in self.shapes if s.frame == self._contacts("shape that hits").frame)
+        frame = self._contacts("shape that hits").frame if self.throw is None else self.throw.frame
+        return next(s for s in self.shapes if s.frame == frame)
 
     @property
     def offset(self) -> Vector3:
-        """Contact point of the shape that hits, or of the pushed frame, in the frame, m."""
+        """Contact point of the shape that hits, center of the one that is hit, or pushed frame, in the frame, m."""
+        if self.throw:
+            return self.shape.center or (0.0, 0.0, 0.0)
         return self.shape.offset if self.contacts else (0.0, 0.0, 0.0)
 
     def _contacts(self, what: str) -> RepeatedContacts:
@@ -253,7 +265,7 @@ def set_up(scenario: Scenario) -> Setup:
     q = set_joints(robot, read_posture(robot, scenario.posture, where="posture"), scenario.joints, scenario.source)
     q = robot.check_posture(q, where=scenario.source)
     robot.frame_id(scenario.task.frame)
-    return Setup(scenario, robot, q, build_world(robot, scenario, q))
+    return Setup(scenario, robot, q, build_world(robot, scenario, q, scenario.throw))
 
 
 def _check_base(robot: Robot, scenario: Scenario) -> None:

@@ -21,7 +21,7 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.supports import resolve_supports
 from impact_posture.libraries import cache_folder, is_cached, library_path, source_key
 from impact_posture.progress import tell
-from impact_posture.settings import FRICTION, ObjectiveKind
+from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.scenario import Setup
 from impact_posture.toolchain import find_compiler, no_compiler
 
@@ -38,9 +38,10 @@ def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: b
     """
     scenario, robot = setup.scenario, setup.robot
     x, y, z = (float(value) for value in scenario.normal)
-    friction = FRICTION if scenario.push else scenario.surface.friction
-    contact = ImpactContact(scenario.task.frame, (x, y, z), scenario.offset, friction=friction)
-    supports = () if free or scenario.control.footing is None else resolve_supports(robot, None)
+    contact = ImpactContact(scenario.task.frame, (x, y, z), scenario.offset, friction=scenario.friction)
+    footing = scenario.control.footing
+    supports = () if free or footing is None else resolve_supports(robot, None)
+    supports = tuple(s for s in supports if footing is None or s.frame not in footing.lifted)
     return ImpactObjective(robot, contact, Metric(), kind, supports)
 
 

@@ -180,6 +180,11 @@ class Scene(Checked):
     physics: Physics = Physics()
     sensors: Sensors = Sensors()
 
+    @property
+    def laws(self) -> tuple[tuple[str, tuple[float, float]], ...]:
+        """Name and ``solref`` of all contact laws."""
+        return (("stops", self.physics.stop_solref), *((s.name, s.solref) for s in self.surfaces))
+
     def __post_init__(self) -> None:
         """Refuse a name that is used twice, a law that is too fast for the time step, and an unknown force sensor."""
         super().__post_init__()
@@ -191,8 +196,7 @@ class Scene(Checked):
             if twice:
                 raise InputError(f"two {words} '{twice[0]}'", where="scene", hint="have one of each")
         step = self.physics.timestep
-        laws = [("stops", self.physics.stop_solref), *((s.name, s.solref) for s in self.surfaces)]
-        for name, (a, b) in laws:
+        for name, (a, b) in self.laws:
             # MuJoCo silently applies the first two rules (refsafe).  A spring whose 1/√k is below the time step
             # gives more energy than it took (measured, docs/generated/restitution.md).
             slow = (("the time constant", a, 2), ("its product with the damping ratio", a * b, 1))

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.errors import SpecError
+from impact_posture.errors import FrameNotFound, SpecError
 from impact_posture.impact.contact import point_on
+from impact_posture.simulation.control import StanceGains
 from impact_posture.simulation.scenario import Setup
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
 from impact_posture.tsid.contacts import SupportContact, support_contacts
@@ -27,11 +28,10 @@ def end_effector_task(setup: Setup) -> EndEffector | None:
         SpecError: A push has gains for an end effector, or contacts have none.
     """
     scenario, gains = setup.scenario, setup.scenario.control.end_effector
-    if scenario.push and gains is not None:
-        raise SpecError(
-            "has [control.end_effector], but a push", where=scenario.source, hint="remove [control.end_effector]"
-        )
-    if scenario.push:
+    if scenario.contacts is None and gains is not None:
+        hint = "remove [control.end_effector]"
+        raise SpecError("has [control.end_effector], but no [contacts]", where=scenario.source, hint=hint)
+    if scenario.contacts is None:
         return None
     if gains is None:
         raise SpecError(
@@ -72,7 +72,7 @@ def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffe
         for task, gains in ((CenterOfMass, control.center_of_mass), (BaseOrientation, control.base))
         if gains is not None
     ]
-    contacts, cost = _contacts(setup, control.footing.friction, control.footing.least), control.footing.force_weight
+    contacts, cost = _contacts(setup, control.footing), control.footing.force_weight
     return TaskFormulation((), (*weighted, *tasks), posture, contacts, force_point=felt, force_weight=cost)
 
 
@@ -105,12 +105,16 @@ def _check_gains(setup: Setup) -> None:
             raise SpecError(f"has [control.{key}], but {why}", where=source, hint=f"remove [control.{key}]")
 
 
-def _contacts(setup: Setup, friction: float, least: float) -> tuple[SupportContact, ...]:
-    contacts = support_contacts(setup.robot, friction=friction)
+def _contacts(setup: Setup, footing: StanceGains) -> tuple[SupportContact, ...]:
+    contacts = support_contacts(setup.robot, friction=footing.friction)
+    for name in footing.lifted:
+        if name not in [c.point.frame for c in contacts]:
+            raise FrameNotFound(name, [c.point.frame for c in contacts], where="control.footing.lifted")
+    contacts = tuple(c for c in contacts if c.point.frame not in footing.lifted)
     if not contacts:
         raise SpecError(
             "has [control.footing], but the robot has no supports",
             where=setup.scenario.source,
             hint="name [[supports]] in robot.toml",
         )
-    return tuple(replace(contact, least=least) for contact in contacts)
+    return tuple(replace(contact, least=footing.least) for contact in contacts)

@@ -21,6 +21,7 @@ from impact_posture.simulation.contact_forces import ContactLog
 from impact_posture.simulation.rotors import Rotors, Vibration
 from impact_posture.simulation.scene import Scene
 from impact_posture.simulation.sensor_noise import Reading, SensorNoise
+from impact_posture.simulation.throw import Ball, Throw
 from impact_posture.simulation.world_builder import BuiltScene, build_scene
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.state import checked_velocity
@@ -81,6 +82,7 @@ class World:
         self._model = built.mjcf.compile()
         self._data = self._mujoco.MjData(self._model)
         frames, sensors, propulsion = tuple(s.frame for s in scene.shapes), scene.sensors, robot.spec.propulsion
+        self.ball = None if built.throw is None else Ball(self._model, built.throw)
         self._log = ContactLog(self._model, built.shape_geoms, frames)
         self._noise = SensorNoise(robot, sensors)
         self._rotors = None if propulsion is None else Rotors(propulsion, self.timestep)
@@ -121,8 +123,8 @@ class World:
         q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False, where="reset")
         v = checked_velocity(self.robot, np.zeros(self.robot.nv) if v is None else v)
         self._mujoco.mj_resetData(self._model, self._data)
-        self._data.qpos[:] = self._layout.qpos(q)
-        self._data.qvel[:] = self._layout.qvel(q, v)
+        self._data.qpos[: self._layout.nqpos] = self._layout.qpos(q)
+        self._data.qvel[: self._layout.nv] = self._layout.qvel(q, v)
         self._generator = np.random.default_rng(seed)
         propulsion = self.robot.spec.propulsion
         if self._rotors is not None and propulsion is not None:
@@ -158,6 +160,17 @@ class World:
         body = int(self._model.body(self.built.mjcf.bodies[point.joint]).id)
         force = np.array(push.force, dtype=float)
         self._pushes.append(_ActivePush(body, point.position, force, self._steps + steps))
+
+    def throw(self, sign: int = 1) -> None:
+        """Throw the ball of the scenario now.
+
+        Raises:
+            InputError: The scenario has no ball.
+        """
+        if self.ball is None:
+            raise InputError("has no ball", where="world", hint="take a scenario with [throw]")
+        self.ball.throw(self._data, sign)
+        self._mujoco.mj_step1(self._model, self._data)
 
     def step(self, command: Command | ActuatorCommand, count: int = 1) -> None:
         """Take physics steps under one command.
@@ -236,7 +249,8 @@ class World:
         speeds = np.zeros(0) if self._rotors is None else self._rotors.speeds
         phases = np.zeros(0) if self._vibration is None else self._vibration.phases
         data = self._data
-        return _Sample(self._layout, data.qpos.copy(), data.qvel.copy(), speeds, phases, self._force.copy())
+        qpos, qvel = data.qpos[: self._layout.nqpos].copy(), data.qvel[: self._layout.nv].copy()
+        return _Sample(self._layout, qpos, qvel, speeds, phases, self._force.copy())
 
     def _apply_pushes(self) -> None:
         if not self._pushes:
@@ -268,16 +282,17 @@ class World:
             raise InputError("has not been reset", where="world", hint="call reset(q) first")
 
 
-def build_world(robot: Robot, scene: Scene, q: ArrayLike | None = None) -> World:
+def build_world(robot: Robot, scene: Scene, q: ArrayLike | None = None, throw: Throw | None = None) -> World:
     """Build the simulation of a robot in its surroundings.
 
     Args:
         robot: The robot.
         scene: Its surroundings.
         q: Posture at which surfaces with a gap are placed, shape (nq,).  The default posture of the robot by default.
+        throw: The ball that is thrown.
 
     Raises:
         InputError: MuJoCo is not installed, or the scene does not fit the robot.
     """
     start = robot.posture() if q is None else robot.check_posture(np.asarray(q, dtype=float), where="start posture")
-    return World(robot, scene, build_scene(robot, scene, start))
+    return World(robot, scene, build_scene(robot, scene, start, throw))

@@ -18,7 +18,8 @@ from impact_posture.escape import xml_name
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import actuation_matrix
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.scene import Physics, Scene, Shape, Surface
+from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Shape, Surface
+from impact_posture.simulation.throw import BALL, Throw, add_ball
 
 # Families with the same velocities, in the same axes, in Pinocchio and MuJoCo.
 _DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")
@@ -36,6 +37,7 @@ class BuiltScene:
         points: A point on each surface, world, m, by name.
         gaps: Distance of each shape from each surface in the start posture, m, by surface and shape.
         shape_geoms: Name of the geom of each shape, in the order of the scene.
+        throw: The ball that is thrown, or ``None``.
     """
 
     mjcf: Mjcf
@@ -43,15 +45,17 @@ class BuiltScene:
     points: Mapping[str, Array]
     gaps: Mapping[tuple[str, str], float]
     shape_geoms: tuple[str, ...]
+    throw: Throw | None = None
 
 
-def build_scene(robot: Robot, scene: Scene, q: Array) -> BuiltScene:
+def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None) -> BuiltScene:
     """Build the model of a robot in its surroundings.
 
     Args:
         robot: The robot.
         scene: Its surroundings.
         q: Start posture, shape (nq,), which defines the gaps and the default centers of the shapes.
+        throw: The ball that is thrown.
 
     Raises:
         FrameNotFound: The frame of a shape does not exist.
@@ -82,17 +86,25 @@ def build_scene(robot: Robot, scene: Scene, q: Array) -> BuiltScene:
         name = xml_name(f"surface {surface.name}")
         mjcf.add_plane(name, points[surface.name], normals[surface.name])
         for geom in geoms:
-            mjcf.spec.add_pair(
-                geomname1=name,
-                geomname2=geom,
-                condim=3 if surface.friction else 1,
-                friction=(surface.friction, surface.friction, 0.0, 0.0, 0.0),
-                solref=surface.solref,
-                solimp=(*surface.solimp, *_SOLIMP_SHAPE),
-            )
+            _add_pair(mjcf, name, geom, surface)
+    if throw is not None:
+        add_ball(mjcf, throw)
+        _add_pair(mjcf, BALL, xml_name(f"shape {throw.frame}"), throw)
     _add_rotors(mjcf, robot)
     _add_motors(mjcf, robot)
-    return BuiltScene(mjcf, normals, points, gaps, tuple(geoms))
+    return BuiltScene(mjcf, normals, points, gaps, tuple(geoms), throw)
+
+
+def _add_pair(mjcf: Mjcf, first: str, second: str, law: ContactLaw) -> None:
+    """Let two geoms touch."""
+    mjcf.spec.add_pair(
+        geomname1=first,
+        geomname2=second,
+        condim=3 if law.friction else 1,
+        friction=(law.friction, law.friction, 0.0, 0.0, 0.0),
+        solref=law.solref,
+        solimp=(*law.solimp, *_SOLIMP_SHAPE),
+    )
 
 
 def _set_physics(spec: Any, physics: Physics) -> None:

@@ -74,6 +74,7 @@ STUDIES = {
         Study("hops", "global_search:hops", "basin hopping beside multi-start; seeds", 10, target="study-global"),
         Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
         Study("robustness", "robustness.study", "where each controller helps; draws", 40, target="study-robustness"),
+        Study("real-impacts", "real_impacts", "balls, strikes, taps, as predicted", target="study-real-impacts"),
         Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
     )
 }

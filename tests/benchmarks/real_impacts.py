@@ -1,0 +1,112 @@
+"""Impacts of robots that stand, reach and fly: what the rigid model predicts of each controller, then its run.
+
+The prediction needs no run.  The controller braces in a robot that does exactly what it plans, and the rigid model
+takes the posture that is reached and the speed of the scenario.  Runs that are done are kept in build/real-impacts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from impact_posture.errors import ImpactPostureError, MetricError
+from impact_posture.experiment.jobs import Job, execute
+from impact_posture.impact.coulomb import coulomb_impact
+from impact_posture.processes import fork_map
+from impact_posture.simulation.baselines import resting_posture
+from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory
+from impact_posture.simulation.scenario import RepeatedContacts, set_up
+from impact_posture.simulation.scenario_file import read_scenario, scenario_path
+from impact_posture.simulation.throw import Throw, thrown_jumps
+from tests.benchmarks.core import ROOT, Request, say, table
+
+SCENARIOS = (
+    "talos-throw", "solo8-throw", "talos-strike", "g1-strike", "solo12-landing", "panda-tap", "hextilt-poke"
+)  # fmt: skip
+COMPARED = ("nominal", "robust", "robust-sticking", "robust-flow", "posture", "stiff")
+HEAD = (
+    "controller", "predicted: H", "√S jump", "Coulomb jump", "of nominal", "measured jump", "of nominal",
+    "motion in the window", "over the second", "peak force, N", "saturated in / out, s", "status",
+)  # fmt: skip
+FOLDER = ROOT / "build" / "real-impacts"
+
+
+def predicted(factory: ControllerFactory, name: str) -> dict[str, float | None]:
+    """H, the sticking and the Coulomb jump in the posture that a controller braces to, before any run."""
+    setup = factory.setup
+    task, oracle = setup.scenario.task, factory.objective().oracle
+    q = resting_posture(factory.driver(name), task.settle)
+    found = oracle.quantities(q)
+    if isinstance(task, Throw):
+        _, sticking, coulomb = thrown_jumps(oracle, q, task, task.speed)
+        return {"H": found.H, "sticking": sticking, "coulomb": coulomb}
+    assert isinstance(task, RepeatedContacts)
+    sticking = None if found.S is None else task.speed * float(np.sqrt(found.S))
+    try:
+        jump = task.speed * float(np.linalg.norm(coulomb_impact(oracle, q).jump))
+    except MetricError:
+        jump = None
+    return {"H": found.H, "sticking": sticking, "coulomb": jump}
+
+
+def result(scenario: str, name: str) -> dict[str, Any]:
+    """The prediction and the run of one controller, kept by the content of the scenario."""
+    key = hashlib.sha256(scenario_path(scenario).read_bytes()).hexdigest()[:12]
+    kept = FOLDER / f"{scenario}-{name}-{key}.json"
+    if kept.is_file():
+        return dict(json.loads(kept.read_text(encoding="utf-8")))
+    try:
+        before = predicted(ControllerFactory(set_up(read_scenario(scenario))), name)
+        _, document = execute(Job(scenario, name, 0))
+        found = {"predicted": before, "status": document["status"], "metrics": document["metrics"]}
+        found["offline"] = (document["offline"] or {}).get("note", "")
+        found["why"] = "; ".join(dict.fromkeys(event["what"] for event in document["events"]))
+    except ImpactPostureError as error:
+        found = {"predicted": None, "status": "no answer", "metrics": None, "offline": "", "why": error.line}
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    kept.write_text(json.dumps(found), encoding="utf-8")
+    return found
+
+
+def lines(request: Request) -> Iterator[str]:
+    """A table for each scenario."""
+    controllers = [c for c in COMPARED if c in CONTROLLERS]
+    pairs = [(s, c) for s in SCENARIOS if request.only in s for c in controllers]
+    found: dict[tuple[str, str], dict[str, Any]] = {}
+    with fork_map(lambda k: result(*pairs[k]), len(pairs), request.jobs) as answers:
+        for k, answer in answers:
+            found[pairs[k]] = answer
+            say(f"\r{len(found)} of {len(pairs)} runs", end="")
+    for scenario in dict.fromkeys(s for s, _ in pairs):
+        yield from ("", f"## {scenario}", "", f"{read_scenario(scenario).description}. Seed 0.", "")
+        rows = {c: found[s, c] for s, c in pairs if s == scenario}
+        yield from table(HEAD, [_row(name, row, rows["nominal"]) for name, row in rows.items()])
+        notes = [f"`{name}`: {text}" for name, row in rows.items() for text in (row["offline"], row["why"]) if text]
+        yield from ("", *(f"- {note}." for note in notes))
+
+
+def _row(name: str, row: dict[str, Any], nominal: dict[str, Any]) -> list[str]:
+    before, base = row["predicted"] or {}, nominal["predicted"]
+    jumps = [before.get(key) for key in ("sticking", "coulomb")]
+    cells = [f"`{name}`", _number(before.get("H")), *map(_number, jumps), _ratio(jumps[1], base["coulomb"])]
+    found, other = row["metrics"], nominal["metrics"]
+    if found is None:
+        return [*cells, "–", "–", "–", "–", "–", "–", row["status"]]
+    pairs = [(found[key], other and other[key]) for key in ("peak_jump", "q_total_impact", "q_total_recovery")]
+    saturation = found["saturation_s"]
+    return [
+        *cells, _number(pairs[0][0]), *(_ratio(*pair) for pair in pairs), f"{found['peak_force']:.0f}",
+        f"{saturation['inside']:.2f} / {saturation['outside']:.2f}", row["status"],
+    ]  # fmt: skip
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"
+
+
+def _ratio(value: float | None, base: float | None) -> str:
+    return "–" if value is None or not base else f"{value / base:.2f}"
