@@ -15,11 +15,11 @@ from impact_posture.errors import ImpactPostureError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import Metrics, before, measure
-from impact_posture.simulation.offline import SHARE, holds
+from impact_posture.simulation.offline import SHARE, is_held
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, Setup
-from impact_posture.simulation.scenario_objective import interpreted
+from impact_posture.simulation.scenario_objective import interpreted, scenario_objective
 from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, RANGES, Draw, draw, prepare
 
 SCHEMA = 1
@@ -122,7 +122,7 @@ def _admit(chosen: Draw, runs: _RUNS) -> tuple[ControllerFactory, Outcome]:
         setup = prepare(chosen)
     except ImpactPostureError as error:
         raise NotAdmissible(f"no start ({type(error).__name__})") from None
-    if not holds(setup, setup.q):
+    if not is_held(setup, scenario_objective(setup)):
         raise NotAdmissible(f"the motors do not hold the start with {100 * SHARE:.0f} % of their limits")
     factory = ControllerFactory(setup, gradient_of=interpreted)
     nominal = outcome(factory, NOMINAL, runs)
