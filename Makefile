@@ -22,7 +22,7 @@ help:
 	@echo "make study-global   how complete the search global is, and basin hopping beside multi-start"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
 	@echo "make study-feasible  what it costs to be clear of collisions and held by the motors, over the catalogue"
-	@echo "make study-robustness  where each controller helps: 40 random variations of each experiment (an hour or two)"
+	@echo "make study-robustness  where each controller helps, and which targets it keeps: variations of each experiment (some hours; goes on where it was)"
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make pictures    draw the pictures that the documentation shows"
@@ -102,7 +102,8 @@ reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks reproduction --write
 
 study-robustness: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks robustness --jobs $(JOBS) --write
+	$(BIN)/python -m tests.benchmarks points --jobs $(JOBS)
+	$(BIN)/python -m tests.benchmarks robustness envelope --write
 
 calibration: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks restitution --write

@@ -23,9 +23,9 @@ SHARE = 0.8
 # Weight of the squared distance from the start, relative to the objective there.  A humanoid goes half as far for a
 # hundredth of the objective, and so stays clear of postures whose load its controller shares badly between the legs.
 _NEARNESS = 0.005
-# Distances that the start may make impossible, most wanted first: from the joint stops, rad (m), because a robot on a
-# stop braces on it, and of the center of mass from the edges of the support polygon, m, because an impact tips a robot
-# that stands on its heels.
+# Distances that the start may make impossible, most wanted first: from the joint stops, rad (m), because a robot on
+# a stop braces on it, and of the center of mass from the edges of the support polygon, m, because an impact tips a
+# robot that stands on its heels.
 _MARGINS = ((0.1, 0.05), (0.0, 0.05), (0.0, 0.025), (0.0, 0.0))
 
 

@@ -72,7 +72,9 @@ STUDIES = {
         Study("elastic", "elastic.study", "arms with elastic joints in MuJoCo; postures", 20, target="study-elastic"),
         Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
         Study("hops", "global_search:hops", "basin hopping beside multi-start; seeds", 10, target="study-global"),
-        Study("robustness", "robustness.study", "where each controller helps; draws", 40, target="study-robustness"),
+        Study("points", "robustness.study:points", "runs the points of the next two; random draws", 40, page=False),
+        Study("robustness", "robustness.study", "where each controller helps", target="study-robustness"),
+        Study("envelope", "robustness.study:kept_targets", "targets that are kept", target="study-robustness"),
         Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
     )
 }
