@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-robustness reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-robustness study-scan reproduction calibration regression
 .PHONY: pictures clean
 
 help:
@@ -23,6 +23,7 @@ help:
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
 	@echo "make study-feasible  what it costs to be clear of collisions and held by the motors, over the catalogue"
 	@echo "make study-robustness  where each controller helps, and which targets it keeps: variations of each experiment (some hours; goes on where it was)"
+	@echo "make study-scan     what decides along the redundancy of an arm and of a humanoid, as a picture"
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make pictures    draw the pictures that the documentation shows"
@@ -104,6 +105,9 @@ reproduction: $(VENV)/.installed-test
 study-robustness: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks points --jobs $(JOBS)
 	$(BIN)/python -m tests.benchmarks robustness envelope --write
+
+study-scan: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks scan --write
 
 calibration: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks restitution --write
