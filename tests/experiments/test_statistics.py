@@ -97,12 +97,14 @@ def test_the_gravest_of_two_pushes_is_told() -> None:
     ("changed", "missed"),
     [
         ({}, ()),
-        ({"q_total_impact": 1.1}, ("reduction", "recovery")),
+        ({"q_total_impact": 1.1}, ("reduction",)),
         # Stored in the window and given back after it.
-        ({"q_total_recovery": 4.4}, ("recovery",)),
+        ({"q_total_recovery": 4.7}, ("recovery",)),
+        ({"q_total_recovery": 4.2}, ()),
         ({"peak_recovery": 3.1}, ("peak_recovery",)),
         ({"peak_jump": 3.1}, ("peak_jump",)),
         ({"saturation_inside": 0.11}, ("saturation",)),
+        ({"saturation_outside": 0.21}, ("saturation_outside",)),
         ({"stops": ("elbow",)}, ("stops",)),
         ({"rested": False}, ("rested",)),
     ],
