@@ -11,9 +11,12 @@ from typing import Literal, get_args
 from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.settings import ObjectiveKind
-from impact_posture.simulation.baselines import FlowPosture, InvariantDriver, StiffDriver, StiffPosture, WalkerDriver
+from impact_posture.simulation.baselines import FlowPosture, WalkerDriver, resting_posture, spring_of_term
 from impact_posture.simulation.driver import Driver, PostureDriver, RobustDriver
+from impact_posture.simulation.impact_aware import ImpactAwareDriver
+from impact_posture.simulation.invariant import InvariantDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
+from impact_posture.simulation.reference_spreading import ReferenceSpreadingDriver
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
 from impact_posture.simulation.task_formulations import nominal_posture, posture_options
@@ -28,11 +31,21 @@ MEANING: dict[str, str] = {
     "robust-speed": "the same with the gradient of V, the jump per approach speed",
     "robust-sticking": "the same with the gradient of S, the jump where the contact sticks",
     "posture": "the offline optimum as posture, no gradient",
-    "stiff": "the start posture, as stiff as the term would make it",
+    "stiff": "the start posture, as stiff as the term is where robust rests",
+    "posture-stiff": "the offline optimum, as stiff as the term is there",
     "invariant": "nominal, feedback projected on the impact-invariant subspace around the impact",
+    "reference-spreading": "nominal, references before and after the impact, none of velocity between",
+    "impact-aware": "nominal, rates and torques after an impact limited before it",
     "walker": "the gradient's flow as reference of the posture task",
 }
 CONTROLLERS = tuple(MEANING)
+_STIFF = "-stiff"
+_PLAIN = {
+    "nominal": Driver,
+    "invariant": InvariantDriver,
+    "reference-spreading": ReferenceSpreadingDriver,
+    "impact-aware": ImpactAwareDriver,
+}
 _KINDS: dict[str, ObjectiveKind] = {"robust-speed": "speed", "robust-sticking": "sticking"}
 # Entry points by which other installed packages add controllers.
 GROUP = "impact_posture.controllers"
@@ -104,21 +117,33 @@ class ControllerFactory:
         if mode == "held" and not (name.startswith("robust") or name == "walker"):
             raise InputError(f"'{name}' has no term to hold", where="--mode", hint="only robust… and walker have one")
         setup, robot = self.setup, self.setup.robot
+        if name == "stiff":
+            return self._stiffened("nominal", "robust", gain)
+        if name.endswith(_STIFF):
+            return self._stiffened(name.removesuffix(_STIFF), name.removesuffix(_STIFF), gain)
         if name == "posture":
             return PostureDriver(setup, nominal_posture(setup), self.offline.q)
-        if name == "nominal":
-            return Driver(setup, nominal_posture(setup))
-        if name == "invariant":
-            return InvariantDriver(setup, nominal_posture(setup))
+        if name in _PLAIN:
+            return _PLAIN[name](setup, nominal_posture(setup))
         term, gradient = setup.scenario.control.robust, self.gradient(_KINDS.get(name, "impulse"))
         K, options = term.gain if gain is None else gain, posture_options(setup)
-        if name == "stiff":
-            return StiffDriver(setup, StiffPosture(robot, gradient, K, **options))
         activation = Activation(ramp=term.ramp, live=mode == "live")
         robust = ImpactRobustPosture(robot, gradient, K=K, fade=term.fade, activation=activation, **options)
         posture = FlowPosture(robot, robust) if name == "walker" else robust
         driver = WalkerDriver if name == "walker" else RobustDriver
         return driver(setup, posture, robust)
+
+    def _stiffened(self, name: str, at: str, gain: float | None) -> Driver:
+        """Make a controller with the spring that the term of ``robust`` is in the posture that ``at`` braces to."""
+        robust = self.driver("robust", gain=gain)
+        assert isinstance(robust, RobustDriver)  # noqa: S101 (the name says it)
+        seconds = self.setup.scenario.task.settle
+        reached = resting_posture(robust, seconds)
+        if at != "robust":
+            reached = resting_posture(self.driver(at), seconds)
+        driver, strength = self.driver(name), robust.term.K / robust.term.scale
+        driver.posture.stiffen(spring_of_term(self.setup.robot, self.gradient(), reached, strength))
+        return driver
 
     def _driver_from_outside(self, name: str, mode: Mode, gain: float | None) -> Driver:
         """Make a controller of another installed package."""

@@ -32,7 +32,8 @@ class Assembly:
     - ``contacts``: ``J ν̇ = a`` of the hard contacts;
     - ``levels``: ``J ν̇ = a`` of each strict level;
     - ``controls``: ``u_min ≤ u(z) ≤ u_max``;
-    - ``cones``: friction.
+    - ``cones``: friction;
+    - ``limits``: the row limits of the formulation.
 
     Bounds on the variables are the acceleration bounds of the joint limits.
 
@@ -42,7 +43,7 @@ class Assembly:
         rank: The independent rows of the levels, and the QP without the others.
         levels: Names and rows of the strict levels, the most important first; hard contacts come first of all, as
             ``contacts``.
-        limits: Entries of ``[z; A z]`` that come from joint limits.
+        limits: Entries of ``[z; A z]`` that come from joint limits and row limits.
         names: Name of each entry of ``[z; A z]``.
     """
 
@@ -53,8 +54,8 @@ class Assembly:
         strict = [task for level in formulation.levels for task in level]
         self._hard_rows, self._soft = np.flatnonzero(self.contacts.hard), np.flatnonzero(~self.contacts.hard)
         widths = (actuators.blind.shape[1], self._hard_rows.size, sum(task.size for task in strict))
-        (blind, hard, levels, controls, cones), m = stacked_rows(
-            (*widths, actuators.controls, self.contacts.cone.shape[0])
+        (blind, hard, levels, controls, cones, *self._row_limits), m = stacked_rows(
+            (*widths, actuators.controls, self.contacts.cone.shape[0], *(r.size for r in formulation.row_limits))
         )
         spare, forces = actuators.spare.shape[1], self.contacts.size
         (_, self._w, self._f), n = stacked_rows((nv, spare, forces))
@@ -69,7 +70,7 @@ class Assembly:
         self._place_rows(blind, hard, levels, controls, cones)
         self._place_cost(robot)
         self.levels = self._name_levels(hard, levels)
-        self.limits = np.arange(nv)
+        self.limits = np.concatenate([np.arange(nv), np.arange(qp.n + cones.stop, qp.n + m)])
         # Forces count by the acceleration of the robot's mass, or lifting its weight would be the cheapest motion.
         units = np.ones(qp.n)
         units[self._f] = robot.mass
@@ -87,6 +88,7 @@ class Assembly:
                 for c, rows in zip(self.contacts.contacts, self.contacts.cone_rows, strict=True)
                 for k in range(rows.stop - rows.start)
             ),
+            *(f"{limit.name}[{k}]" for limit in formulation.row_limits for k in range(limit.size)),
         )
         self._free = np.zeros(nv)
 
@@ -107,6 +109,9 @@ class Assembly:
         self.contacts.update(state)
         if self.bounds is not None:
             self.bounds.update(state)
+        for limit, rows in zip(self.formulation.row_limits, self._row_limits, strict=True):
+            at = self._at(rows)
+            self.qp.A[rows, : self._nv], self.qp.lower[at], self.qp.upper[at] = limit.rows(state)
         self._fill_dynamics(state)
         self._fill_cost(state)
         self.rank.update()

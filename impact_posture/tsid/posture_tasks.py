@@ -21,6 +21,10 @@ class JointPosture(Task):
     lead the base, give its six entries no weight (``base_weight = 0``).
 
     A new ``q_des`` is faded in (:meth:`move_to`), hence ``ν̇*`` does not jump.
+
+    Attributes:
+        stiffness: Matrix ``K_p`` of :meth:`stiffen`, 1/s², shape (nv, nv), or ``None``.
+        damping: Matrix ``K_d`` that belongs to it, 1/s, shape (nv, nv), or ``None``.
     """
 
     constant = True
@@ -59,6 +63,18 @@ class JointPosture(Task):
         self._target = robot.posture() if self._given is None else self._given.copy()
         self._next, self._blend, self._over = self._target.copy(), 1.0, 1.0
         self._eye = np.eye(robot.nv)
+        self.stiffness: Array | None = None
+        self.damping: Array | None = None
+
+    def stiffen(self, added: Array) -> None:
+        """Use ``K = K_p + added`` and the critical ``D = 2 K^½`` as gains from now on.
+
+        Args:
+            added: Symmetric positive semidefinite stiffness, 1/s², shape (nv, nv).
+        """
+        self.stiffness = np.diag(self.kp) + added
+        values, vectors = np.linalg.eigh(self.stiffness)
+        self.damping = (vectors * (2 * np.sqrt(np.maximum(values, 0.0)))) @ vectors.T
 
     @property
     def target(self) -> Array:
@@ -105,13 +121,15 @@ class JointPosture(Task):
 
     def pull(self, state: State) -> Array:
         """Return ``K_p (q_des ⊖ q)``, shape (nv,); a fresh array."""
-        return np.asarray(self.kp * self.error(state))
+        error = self.error(state)
+        return np.asarray(self.kp * error if self.stiffness is None else self.stiffness @ error)
 
     def desired(self, state: State) -> Array:
         """Return ``ν̇*``, shape (nv,), without the product of ``J``, which is the identity."""
         wanted = self.pull(state)
         wanted += self._acceleration
-        wanted += self.kd * (self._velocity - state.v)
+        slow = self._velocity - state.v
+        wanted += self.kd * slow if self.damping is None else self.damping @ slow
         more = self.feedforward(state)
         if more is not None:
             wanted += more

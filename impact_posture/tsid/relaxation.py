@@ -96,7 +96,7 @@ def _relax(assembly: Assembly, solver: Solver) -> Outcome:
 def _opened(assembly: Assembly, nearest: Array, least: float, stray: float) -> QP:
     """Return the QP in which rows that ``nearest`` misses by more than ``least`` stay there, up to ``stray``."""
     asked, limits = assembly.rank.qp, assembly.limits
-    qp, values = asked.copy(), nearest[limits]
+    qp, values = asked.copy(), asked.values(nearest)[limits]
     room = np.where(_passed(asked, nearest, limits) > 0, stray * (1.0 + np.abs(values)), 0.0)
     qp.lower[limits] = np.minimum(qp.lower[limits], values) - room
     qp.upper[limits] = np.maximum(qp.upper[limits], values) + room
@@ -124,7 +124,7 @@ def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, .
 def _gave_way(assembly: Assembly, z: Array) -> tuple[Relaxed, ...]:
     limits = assembly.limits
     most = float(np.max(_passed(assembly.qp, z, limits), initial=0.0))
-    opened = most > _OFF * (1.0 + float(np.max(np.abs(z[limits]))))
+    opened = most > _OFF * (1.0 + float(np.max(np.abs(assembly.qp.values(z)[limits]))))
     return (*([Relaxed("joint limits", most)] if opened else []), *missed(assembly, z, equations=True))
 
 
@@ -141,18 +141,20 @@ def _hierarchy(assembly: Assembly) -> list[Level]:
     always = np.ones(qp.m, dtype=bool)
     for _, rows in assembly.levels:
         always[rows] = False
+    always[limits[limits >= n] - n] = False
     lower, upper = qp.lower[n:], qp.upper[n:]
     levels = [rank.rows(level, equations=True) for _, level in assembly.levels]
     return [
         Level(qp.A[always], lower[always], upper[always]),
-        Level(np.eye(n)[limits], qp.lower[limits], qp.upper[limits]),
+        Level(np.vstack([np.eye(n), qp.A])[limits], qp.lower[limits], qp.upper[limits]),
         *(Level(qp.A[rows], lower[rows], upper[rows]) for rows in levels),
     ]
 
 
 def _passed(qp: QP, z: Array, limits: NDArray[np.intp]) -> Array:
     """Return the violation of the bounds of joint limits by ``z``; negative where they hold."""
-    return np.asarray(np.maximum(qp.lower[limits] - z[limits], z[limits] - qp.upper[limits]))
+    values = qp.values(z)[limits]
+    return np.asarray(np.maximum(qp.lower[limits] - values, values - qp.upper[limits]))
 
 
 def _minimize(qp: QP, start: Array, solver: Solver) -> Solved | None:
