@@ -25,6 +25,8 @@ from impact_posture.simulation.scenario_objective import interpreted, scenario_o
 from impact_posture.simulation.world import build_world
 from tests.benchmarks.core import ROOT, Request, Vector, cell, say, table
 from tests.benchmarks.robustness.draws import Draw, prepare
+from tests.benchmarks.robustness.envelope import percent
+from tests.benchmarks.robustness.page import MARK
 
 ARM, HUMANOID = "aerial-vertical", "talos-push"
 PICTURE = ROOT / "docs" / "images" / "where-bracing-helps.png"
@@ -64,10 +66,42 @@ class Place:
 def lines(request: Request) -> Iterator[str]:
     """Run both scans, draw them where the page is written, and print their tables."""
     scans = {name: _scan(name, request) for name in (ARM, HUMANOID) if request.only in name}
+    yield " ".join(_caption(scans))
+    yield from ("", MARK, "")
     for name, places in scans.items():
         yield from _told(name, places)
     if request.write:
         draw(scans[ARM], scans[HUMANOID])
+
+
+def _caption(scans: Mapping[str, Sequence[Place]]) -> Iterator[str]:
+    """What the picture shows, in words."""
+    if ARM in scans:
+        fine = [p for p in scans[ARM] if p.status == "completed"]
+        start = min(fine, key=lambda p: abs(p.at - _SHIPPED))
+        best, last = min(fine, key=lambda p: p.H), fine[-1]
+        most = max((p for p in fine if p.at < start.at), key=lambda p: p.motion)
+        yield (
+            f"Left, every posture that the arm can take over the floor: its one redundancy is the bend of the elbow. "
+            f"H is lowest at {best.at:g} rad, where {_against(best, start)}. On the way there from the shipped "
+            f"{start.at:g} rad, the motion at first changes by {percent(most.motion / start.motion - 1)} (at "
+            f"{most.at:g} rad). The other way, at {last.at:g} rad, H rises from {start.H:.0f} to {last.H:.0f}, and "
+            f"{_against(last, start)}."
+        )
+    if HUMANOID in scans:
+        fine = [p for p in scans[HUMANOID] if p.status == "completed"]
+        start, end, most = fine[0], fine[-1], max(fine, key=lambda p: p.V)
+        yield (
+            f"Right, the straight way of the humanoid from its start to the offline optimum, on its feet. √H falls "
+            f"to {math.sqrt(end.H / start.H):.2f} and the motion to {end.motion / start.motion:.2f}, while √V first "
+            f"rises to {math.sqrt(most.V / start.V):.2f}: a push has an impulse, not a speed."
+        )
+
+
+def _against(one: Place, other: Place) -> str:
+    motion, jump = (percent(getattr(one, name) / getattr(other, name) - 1) for name in ("motion", "jump"))
+    force = one.force / other.force
+    return f"the motion changes by {motion}, the jump by {jump} and the force by a factor of {force:.2g}"
 
 
 def _scan(name: str, request: Request) -> list[Place]:
