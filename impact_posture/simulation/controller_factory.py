@@ -12,7 +12,7 @@ from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputE
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.baselines import FlowPosture, WalkerDriver, resting_posture, spring_of_term
-from impact_posture.simulation.driver import Driver, PostureDriver, RobustDriver
+from impact_posture.simulation.driver import Driver, FlowDriver, PostureDriver, RobustDriver
 from impact_posture.simulation.impact_aware import ImpactAwareDriver
 from impact_posture.simulation.invariant import InvariantDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
@@ -22,6 +22,7 @@ from impact_posture.simulation.scenario_objective import Gradient, compiled, int
 from impact_posture.simulation.task_formulations import nominal_posture, posture_options
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 
 Mode = Literal["live", "held"]
 # Descriptions for tables and help.
@@ -30,6 +31,7 @@ MEANING: dict[str, str] = {
     "robust": "its posture task with -K grad H, the paper's",
     "robust-speed": "the same with the gradient of V, the jump per approach speed",
     "robust-sticking": "the same with the gradient of S, the jump where the contact sticks",
+    "robust-flow": "the posture flows to lower H before the impact, without a gain",
     "posture": "the offline optimum as posture, no gradient",
     "stiff": "the start posture, as stiff as the term is where robust rests",
     "posture-stiff": "the offline optimum, as stiff as the term is there",
@@ -127,6 +129,8 @@ class ControllerFactory:
             return _PLAIN[name](setup, nominal_posture(setup))
         term, gradient = setup.scenario.control.robust, self.gradient(_KINDS.get(name, "impulse"))
         K, options = term.gain if gain is None else gain, posture_options(setup)
+        if name == "robust-flow":
+            return FlowDriver(setup, ReferenceFlowPosture(robot, gradient, **options))
         activation = Activation(ramp=term.ramp, live=mode == "live")
         robust = ImpactRobustPosture(robot, gradient, K=K, fade=term.fade, activation=activation, **options)
         posture = FlowPosture(robot, robust) if name == "walker" else robust

@@ -16,6 +16,7 @@ from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.smooth_step import smooth
 
 # Time in which references move to a new posture, s.
@@ -111,6 +112,36 @@ class RobustDriver(Driver):
     def level(self) -> float:
         """Activation of the term, 0 to 1."""
         return self.term.activation.level
+
+
+class FlowDriver(Driver):
+    """Controller whose posture flows to lower impacts, from :meth:`brace` on."""
+
+    posture: ReferenceFlowPosture
+    _now = 0.0
+
+    def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
+        """Return the command, and keep the time."""
+        self._now = reading.t
+        return super().tick(reading, reference)
+
+    def brace(self) -> None:
+        """Let the posture flow."""
+        self.posture.brace()
+
+    def hold(self) -> None:
+        """Hold the posture that the flow has reached."""
+        self.posture.contact()
+
+    def expect(self, t: float) -> None:
+        """Rest early enough before an impact at a time, s."""
+        if self.posture.flow.on:
+            self.posture.brace(t - self._now)
+
+    @property
+    def level(self) -> float:
+        """Whether the posture may flow: 0 or 1."""
+        return self.posture.level
 
 
 class PostureDriver(Driver):

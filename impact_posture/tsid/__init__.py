@@ -9,6 +9,8 @@ from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.reference_flow import FlowOptions, ReferenceFlow
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task import Task
 from impact_posture.tsid.task_formulation import (
     TaskFormulation,
@@ -22,6 +24,7 @@ __all__ = [
     "CenterOfMass",
     "Command",
     "Controller",
+    "FlowOptions",
     "FrameAligned",
     "FramePose",
     "FramePosition",
@@ -31,6 +34,8 @@ __all__ = [
     "LimitLaw",
     "Phase",
     "Point",
+    "ReferenceFlow",
+    "ReferenceFlowPosture",
     "Report",
     "Status",
     "SupportContact",

@@ -17,6 +17,7 @@ from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.qp import EQUALITY, Solver
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.relaxation import Outcome, Relaxed, missed, solve
 from impact_posture.tsid.state import State, checked_velocity
 from impact_posture.tsid.task import Task
@@ -82,8 +83,8 @@ class Report:
         residuals: ``ÿ − ÿ*`` of each task by name, and of ``contacts``.
         active: Names of the active bounds, with ``lower`` or ``upper``.
         dynamics: ``‖Mν̇ + h − Gu − Jᵀf − J_eᵀF̂‖_∞``.
-        level: Activation of the impact-robust term.
-        objective: ``H`` (or the objective) of that term; NaN without one.
+        level: Activation of a posture task that prepares for impacts, 0 to 1.
+        objective: ``H`` (or the objective) of that task; NaN without one.
         iterations: Iterations of the QP solver.
     """
 
@@ -165,6 +166,8 @@ class Controller:
         posture = self.formulation.posture
         if isinstance(posture, ImpactRobustPosture):
             posture.normalize(state, assembly.redundancy(state))
+        elif isinstance(posture, ReferenceFlowPosture):
+            posture.begin(state, self.formulation, self.actuators)
         self._damping = _HOLD * np.diag(state.M)[self.actuators.base :].copy()
         # The initial command holds the robot against gravity.
         held = self.actuators.solve(state.h, np.zeros(self.actuators.spare.shape[1]))
@@ -231,7 +234,6 @@ class Controller:
             for name, multiplier, sense in zip(assembly.names, solved.multipliers, assembly.qp.sense, strict=True):
                 if multiplier and sense != EQUALITY:
                     active.append((name, "upper" if multiplier > 0 else "lower"))
-        robust = posture if isinstance(posture, ImpactRobustPosture) else None
         return Report(
             self._status,
             self._outcome.relaxed,
@@ -239,8 +241,8 @@ class Controller:
             residuals,
             tuple(active),
             dynamics,
-            0.0 if robust is None else robust.activation.level,
-            float("nan") if robust is None else robust.value,
+            0.0 if posture is None else posture.level,
+            float("nan") if posture is None else posture.value,
             0 if solved is None else solved.iterations,
         )
 

@@ -159,6 +159,11 @@ class ImpactRobustPosture(JointPosture):
         self.activation.enter(Phase.RELEASE)
         self._hold = self._hold or was_on
 
+    @property
+    def level(self) -> float:
+        """Level ``α`` of the activation, 0 to 1."""
+        return self.activation.level
+
     # ---- the task -------------------------------------------------------------------------------------------------
 
     def reset(self, state: State) -> None:

@@ -25,9 +25,11 @@ class JointPosture(Task):
     Attributes:
         stiffness: Matrix ``K_p`` of :meth:`stiffen`, 1/s², shape (nv, nv), or ``None``.
         damping: Matrix ``K_d`` that belongs to it, 1/s, shape (nv, nv), or ``None``.
+        value: Objective at the last evaluation, if the task has one; else NaN.
     """
 
     constant = True
+    value = float("nan")
 
     def __init__(
         self,
@@ -80,6 +82,11 @@ class JointPosture(Task):
     def target(self) -> Array:
         """``q_des``, shape (nq,); during a fade, the new one.  Change it by :meth:`move_to`."""
         return self._next if self._blend < 1 else self._target
+
+    @property
+    def level(self) -> float:
+        """Level at which the task prepares for an impact, 0 to 1; this one does not."""
+        return 0.0
 
     def reset(self, state: State) -> None:
         """Take the target of the constructor, or the present posture if there is none."""

@@ -1,0 +1,287 @@
+"""Flow of a reference posture to lower impacts, on contacts and tasks, limited in speed and acceleration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.arrays import Array
+from impact_posture.errors import InputError, MetricError
+from impact_posture.robot.robot import Robot
+from impact_posture.tsid.actuators import Actuators
+from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
+from impact_posture.tsid.flow_direction import FlowDirection, Redundancy
+from impact_posture.tsid.frame_tasks import FramePose, FramePosition
+from impact_posture.tsid.qp import stacked_rows
+from impact_posture.tsid.state import State
+from impact_posture.tsid.static_controls import StaticControls, polygon_edges
+from impact_posture.tsid.task import Task
+from impact_posture.tsid.task_formulation import TaskFormulation
+
+Gradient = Callable[[Array], tuple[float, Array]]
+
+# Step of the differences along the redundancy, rad.
+_STEP = 1e-4
+# Time constant with which the reference comes back to contacts and tasks, s.
+_RETURN = 0.1
+# Speed below which a flow that is off stands still, rad/s (m/s).
+_STILL = 1e-5
+# Pull to zero of the base's share in a motion that the joints do not determine.
+_IDLE = 1e-9
+
+
+@dataclass(frozen=True)
+class FlowOptions:
+    """Parameters of the reference flow; the same for every robot.
+
+    Attributes:
+        speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
+        acceleration: Largest acceleration ``a``, rad/s² (m/s²); ``v/a`` is the time constant of the flow.
+        rho: ρ, pull of the joints towards the start per rad², relative to ``H₀``.
+        mu: μ, least curvature per rad², relative to ``H₀``.
+        epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.
+        joint_margin: Distance from the joint limits, rad (m).
+        com_margin: Distance of the center of mass from the edges of the support polygon, m.
+        share: Share of the actuators' limits that holding ``q_r`` may take.
+        tracking: Error of the joints at which the flow waits for the robot, rad (m).
+    """
+
+    speed: float = 1.0
+    acceleration: float = 2.0
+    rho: float = 0.01
+    mu: float = 0.05
+    epsilon: float = 3e-4
+    joint_margin: float = 0.1
+    com_margin: float = 0.05
+    share: float = 0.8
+    tracking: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range."""
+        positive = (self.speed, self.acceleration, self.mu, self.epsilon, self.share, self.tracking)
+        if not (min(positive) > 0 and min(self.rho, self.joint_margin, self.com_margin) >= 0 and self.share <= 1):
+            raise InputError("a number is out of range", where="flow options", hint="see the docstring")
+
+
+class ReferenceFlow:
+    """Saddle-free Newton flow of a reference posture ``q_r`` in the null space of contacts and tasks.
+
+    ``H`` and ``∇H`` are evaluated at ``q_r`` and not at the measured posture, so that noise, tracking errors and the
+    impact itself do not enter.  An update takes :data:`PHASES` ticks, one part each.  All memory is in arrays whose
+    sizes do not change, except for the basis of the redundancy.
+
+    Contacts stay at their places, and tasks of the strict levels and weighted tasks at their targets.  Only the
+    ``led`` tasks (center of mass, base orientation) follow the flow.  Joints that ``robot.toml`` holds do not move.
+
+    Attributes:
+        q: ``q_r``, shape (nq,).
+        velocity: ``u`` with ``q̇_r = u``, rad/s (m/s), shape (nv,).
+        acceleration: ``u̇``, shape (nv,).
+        value: ``H(q_r)`` at the last update.
+        start: ``H₀``, its value at the reset.
+        on: Whether the flow may move.
+        resting: Whether no step promises a decrease of more than ε.
+        failed: Whether the last evaluation raised or was not finite.  The flow then brakes.
+        led: Tasks that follow the flow.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        gradient: Gradient,
+        formulation: TaskFormulation,
+        actuators: Actuators,
+        options: FlowOptions,
+    ) -> None:
+        """Size the buffers.
+
+        Args:
+            robot: The robot.
+            gradient: ``q → (H, ∇H)``.
+            formulation: Tasks and contacts.
+            actuators: Rotors and motors.
+            options: Parameters.
+        """
+        self._model, self._gradient, self.options = robot.model, gradient, options
+        self._contacts = formulation.contacts
+        self._state = State(robot, formulation.points)
+        weighted = [t for t in formulation.weighted if not isinstance(t, CenterOfMass | BaseOrientation)]
+        self.led = tuple(t for t in formulation.weighted if t not in weighted)
+        self._tasks = [task for level in formulation.levels for task in level] + weighted
+        self._base, nv = actuators.base, robot.nv
+        fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
+        sizes = [c.size for c in self._contacts] + [t.size for t in self._tasks]
+        self._places, self._count = stacked_rows(sizes)
+        self._J, self._e = np.zeros((self._count + len(fixed), nv)), np.zeros(self._count + len(fixed))
+        self._J[np.arange(self._count, self._J.shape[0]), fixed] = 1.0
+        self._static = StaticControls(actuators, self._contacts, options.share)
+        self.q, self.velocity, self.acceleration = robot.posture(), np.zeros(nv), np.zeros(nv)
+        self._robot = robot
+
+    def reset(self, q: Array) -> None:
+        """Begin at rest at a posture, shape (nq,), and measure the curvature there.
+
+        Raises:
+            MetricError: The gradient does not exist there, or ``H`` vanishes.
+        """
+        options, state = self.options, self._state
+        self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
+        self._first, self._here = self.q.copy(), self.q.copy()
+        self._wanted, self._flow, self._still = np.zeros((3, self.velocity.size))
+        self._phase, self._next, self._elapsed, self._clock = 0, 0, 0.0, 0.0
+        self._deadline = np.inf
+        self.on, self.resting, self.failed = False, False, False
+        state.update(q, self.velocity)
+        kinds = {3: FramePosition, 6: FramePose}
+        held: list[Task] = [kinds[c.size](c.point) for c in self._contacts]
+        self._held = [*held, *self._tasks]
+        for task, rows in zip(self._held, self._places, strict=True):
+            task.reset(state)
+            self._J[rows] = task.jacobian(state)
+        self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
+        normals, self._offsets = polygon_edges(state, self._contacts)
+        self._edges = normals
+        limits = {"rho": options.rho, "mu": options.mu, "margin": options.joint_margin}
+        self.direction = FlowDirection(self._robot, normals, self._static.limited.size, **limits)
+        self.start = 1.0
+        self.value, _ = self._evaluate(self.q)
+        if not (np.isfinite(self.value) and self.value != 0):
+            raise MetricError("the objective vanishes or does not exist", where="reset", hint="start elsewhere")
+        self.start = abs(self.value)
+        self._look()
+        for k in range(self._space.basis.shape[1]):
+            self._next = k
+            self._probe(1.0)
+            self._probe(-1.0)
+        self._next = 0
+
+    def advance(self, dt: float, measured: Array) -> None:
+        """Advance by ``dt`` seconds; ``measured`` is the configuration of the robot that follows, shape (nq,)."""
+        self._clock += dt
+        self._elapsed += dt
+        self._measured = measured
+        phase, self._phase = self._phase, (self._phase + 1) % len(PHASES)
+        PHASES[phase](self)
+        self.velocity += dt * self.acceleration
+        self.q[:] = pin.integrate(self._model, self.q, dt * self.velocity)
+
+    def rest_at(self, after: float) -> None:
+        """Come to rest within ``after`` seconds from now, as far as the acceleration permits, and stay."""
+        self._deadline = self._clock + after
+
+    @property
+    def moves(self) -> bool:
+        """Whether :meth:`advance` has anything to do."""
+        return self.on or bool(np.abs(self.velocity).max() > _STILL)
+
+    # ---- the parts of an update, one a tick -----------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Evaluate objective, constraints and limits at ``q_r``."""
+        state, direction = self._state, self.direction
+        self._place(self.q)
+        self._here[:] = self.q
+        for task, rows in zip(self._held, self._places, strict=True):
+            self._e[rows] = task.error(state)
+        self.value, self._slope = self._evaluate(self.q)
+        self._space = space = Redundancy.of(self._J)
+        self._multipliers = space.inverse.T @ self._slope
+        rooms = self._offsets
+        if rooms.size:
+            rooms = -rooms - self.options.com_margin - self._edges @ state.center_of_mass()[0][:2]
+        self.shares = self._static.shares(state, self._J)
+        direction.limit(state, rooms, self.shares)
+
+    def _probe(self, sign: float) -> None:
+        """Evaluate the reduced gradient and the static controls beside ``q_r``, and learn from both sides."""
+        Z = self._space.basis
+        if self.failed or not Z.shape[1]:
+            return
+        z = Z[:, self._next % Z.shape[1]]
+        # Both sides of the posture of the last look, because the flow has moved on since.
+        q = pin.integrate(self._model, self._here, sign * _STEP * z)
+        _, slope = self._evaluate(q)
+        self._place(q)
+        found = slope - self._J.T @ self._multipliers, self._static.shares(self._state, self._J)
+        if sign > 0:
+            self._ahead = z, *found
+        elif not self.failed:
+            z, *ahead = self._ahead
+            curvature, controls = ((a - b) / (2 * _STEP) for a, b in zip(ahead, found, strict=True))
+            self.direction.learn(z, curvature, controls)
+            self._next += 1
+
+    def _probe_ahead(self) -> None:
+        self._probe(1.0)
+
+    def _probe_behind(self) -> None:
+        self._probe(-1.0)
+
+    def _direct(self) -> None:
+        """Find the step, and whether it is worth moving."""
+        offset = pin.difference(self._model, self._first, self.q)
+        self._wanted[:] = 0.0
+        if self.failed:
+            return
+        self._wanted[:] = self.direction.newton(self._space, self._slope, offset, self._e)
+        gain, least = self.direction.gain, self.options.epsilon
+        self.resting = gain < (4 * least if self.resting else least)
+
+    def _govern(self) -> None:
+        """Limit speed and acceleration, and return to contacts and tasks."""
+        options, Z = self.options, self._space.basis
+        period, self._elapsed = self._elapsed, 0.0
+        error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
+        fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
+        fastest = min(fastest, options.acceleration * max(self._deadline - self._clock, 0.0))
+        wanted = self._wanted * (options.acceleration / options.speed)
+        if not self.on or self.resting:
+            fastest = 0.0
+        step = limited(wanted, fastest) - self._flow
+        self._flow = Z @ (Z.T @ (self._flow + limited(step, options.acceleration * period)))
+        self._e /= _RETURN
+        for task, rows in zip(self._held, self._places, strict=True):
+            self._e[rows] += task.target_velocity
+        back = self._space.inverse @ self._e
+        if self._base:
+            # Of all motions that bring the tasks there, that of the base and not of the joints.
+            joints = Z[self._base :]
+            square = joints.T @ joints
+            square.flat[:: square.shape[0] + 1] += _IDLE
+            back -= Z @ np.linalg.solve(square, joints.T @ back[self._base :])
+        self.acceleration[:] = (self._flow + back - self.velocity) / period
+
+    def _place(self, q: Array) -> None:
+        """Evaluate the Jacobian of the constraints at a posture."""
+        state = self._state.update(q, self._still)
+        for task, J in self._turning:
+            J[:] = task.jacobian(state)
+
+    def _evaluate(self, q: Array) -> tuple[float, Array]:
+        """Return ``H`` and a copy of ``∇H/H₀``, zero where they do not exist."""
+        try:
+            value, gradient = self._gradient(q)
+            found = np.array(gradient, dtype=float) / self.start
+            self.failed = not np.isfinite(found).all()
+        except Exception:
+            # A user's function may raise anything, but the tick must go on.  `failed` reports it.
+            self.failed = True
+        return (np.nan, np.zeros(self.velocity.size)) if self.failed else (float(value), found)
+
+
+PHASES = (
+    ReferenceFlow._look,
+    ReferenceFlow._probe_ahead,
+    ReferenceFlow._probe_behind,
+    ReferenceFlow._direct,
+    ReferenceFlow._govern,
+)
+
+
+def limited(vector: Array, largest: float) -> Array:
+    """Return the vector, shortened so that no entry exceeds ``largest``."""
+    size = float(np.abs(vector).max(initial=0.0))
+    return vector * (largest / size) if size > largest else vector

@@ -1,0 +1,133 @@
+"""Posture task whose target flows to a posture with lower impacts."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.errors import InputError
+from impact_posture.robot.robot import Robot
+from impact_posture.tsid.actuators import Actuators
+from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
+from impact_posture.tsid.impact_robust import Gradient, gradient_of
+from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.reference_flow import FlowOptions, ReferenceFlow
+from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import TaskFormulation
+
+
+class ReferenceFlowPosture(JointPosture):
+    """``ν̇* = K_p (q_r ⊖ q) + K_d (u − ν) + u̇``, where ``q_r`` follows the reference flow.
+
+    There is no gain for ``∇H``.  :class:`~impact_posture.tsid.reference_flow.ReferenceFlow` has a speed, an
+    acceleration and a rule when to rest, which are the same for every robot.  Center of mass and base orientation of
+    a standing robot follow ``q_r`` too.
+
+    Attributes:
+        settle: Time at rest before a known impact, s: four time constants ``1/√K_p``.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        gradient: Gradient | ImpactGradient,
+        *,
+        options: FlowOptions | None = None,
+        name: str = "flow posture",
+        **gains: Any,
+    ) -> None:
+        """Set gains and options.
+
+        Args:
+            robot: The robot.
+            gradient: ``q → (H, ∇H)``, or a compiled export, whose own objective is then used.
+            options: Parameters of the flow.
+            name: Name in reports.
+            gains: As of :class:`~impact_posture.tsid.posture_tasks.JointPosture`.
+        """
+        super().__init__(robot, name=name, **gains)
+        self._function = gradient if callable(gradient) else gradient_of(gradient)
+        self.options = options or FlowOptions()
+        self._flow: ReferenceFlow | None = None
+        self._data = robot.model.createData()
+        slowest = float(self.kp[6 if robot.floating else 0 :].min(initial=np.inf))
+        self.settle = 4.0 / np.sqrt(slowest) if 0 < slowest < np.inf else 0.0
+
+    @property
+    def flow(self) -> ReferenceFlow:
+        """The flow.
+
+        Raises:
+            InputError: No controller with this task has been reset.
+        """
+        if self._flow is None:
+            raise InputError("has no posture to flow from", where=self.name, hint="reset the controller first")
+        return self._flow
+
+    def brace(self, t_impact: float | None = None) -> None:
+        """Let the flow go, because an impact is coming.
+
+        Args:
+            t_impact: Time until the impact, s.  The flow then rests :attr:`settle` earlier and stays, as far as its
+                acceleration permits.
+
+        Raises:
+            InputError: The time is not finite, or no controller with this task has been reset.
+        """
+        if t_impact is not None and not math.isfinite(t_impact):
+            raise InputError("the time is not finite", where=f"{self.name}: t_impact", hint="give seconds from now")
+        self.flow.on = True
+        self.flow.rest_at(np.inf if t_impact is None else t_impact - self.settle)
+
+    def contact(self) -> None:
+        """Stop the flow and hold what it has reached."""
+        self.flow.on = False
+
+    def release(self) -> None:
+        """Stop the flow and hold what it has reached, as :meth:`contact` does."""
+        self.contact()
+
+    @property
+    def level(self) -> float:
+        """Whether the flow may move: 0 or 1."""
+        return 0.0 if self._flow is None else float(self._flow.on)
+
+    def begin(self, state: State, formulation: TaskFormulation, actuators: Actuators) -> None:
+        """Start the flow at a state; the controller calls this at ``reset``.
+
+        Raises:
+            MetricError: The gradient does not exist there, or ``H`` vanishes.
+        """
+        flow = ReferenceFlow(self._robot, self._function, formulation, actuators, self.options)
+        flow.reset(state.q)
+        self._flow, self.value = flow, flow.value
+        self._velocity[:] = self._acceleration[:] = 0.0
+
+    def advance(self, state: State, dt: float) -> None:
+        """Advance the flow, and move the targets of the posture and of the tasks that it leads."""
+        super().advance(state, dt)
+        flow = self.flow
+        if not flow.moves:
+            return
+        flow.advance(dt, state.q)
+        self.value = flow.value
+        self._target[:], self._velocity[:], self._acceleration[:] = flow.q, flow.velocity, flow.acceleration
+        if flow.led:
+            self._lead(flow)
+
+    def _lead(self, flow: ReferenceFlow) -> None:
+        """Move center of mass and base orientation with the flow."""
+        data = self._data
+        pin.centerOfMass(self._model, data, flow.q, flow.velocity, flow.acceleration, False)
+        for task in flow.led:
+            if isinstance(task, CenterOfMass):
+                task.target = np.array(data.com[0])
+                task.target_velocity, task.target_acceleration = data.vcom[0], data.acom[0]
+            elif isinstance(task, BaseOrientation):
+                task.target = pin.Quaternion(flow.q[3:7]).matrix()
+                task.target_velocity = flow.velocity[3:6]
+                task.target_acceleration = flow.acceleration[3:6]

@@ -1,0 +1,84 @@
+"""Controls that hold a posture at rest, as shares of what the actuators may give, and the polygon of the feet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from impact_posture.arrays import Array
+from impact_posture.tsid.actuators import Actuators
+from impact_posture.tsid.contacts import SupportContact
+from impact_posture.tsid.state import State
+
+# Weight of a moment (N·m) relative to that of a force (N) in the choice of contact wrenches.
+_MOMENT = 100.0
+# Share of the trace that makes the balance of the base solvable where the feet cannot carry it.
+_TINY = 1e-12
+
+
+class StaticControls:
+    """Controls at rest, ``u = G⁺(h − Jᵀf)``, from the middle of their range in units of a share of its half.
+
+    The contact wrenches ``f`` carry the base with the least weighted norm.  Redundant rotors share evenly.
+
+    Attributes:
+        limited: Controls that have limits, shape (m,).
+    """
+
+    def __init__(self, actuators: Actuators, contacts: Sequence[SupportContact], share: float) -> None:
+        """Set the share of the limits that rest may take, 0 to 1."""
+        base = actuators.base
+        self.limited = np.flatnonzero(np.isfinite(actuators.upper) & np.isfinite(actuators.lower))
+        lower, upper = actuators.lower[self.limited], actuators.upper[self.limited]
+        self._middle, self._half = (upper + lower) / 2, share * (upper - lower) / 2
+        wrench = np.array([1.0] * 3 + [_MOMENT] * 3)
+        self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
+        self._count, self._base = self._ease.size, base
+        # u = inverse · force for everything but the contacts.
+        self._inverse = np.zeros((actuators.controls, actuators.G.shape[0]))
+        self._inverse[: actuators.rotors, :base] = actuators.inverse
+        self._inverse[actuators.rotors :, base:] = np.eye(actuators.controls - actuators.rotors)
+        self._inverse = self._inverse[self.limited] / self._half[:, None]
+
+    def shares(self, state: State, J: Array) -> Array:
+        """Return the shares at a state with ``ν = 0``, shape (m,); within ±1 the posture can be held.
+
+        Args:
+            state: The state, whose ``h`` is gravity.
+            J: Jacobian whose first rows are those of the contacts, shape (≥ contact rows, nv).
+        """
+        force = np.array(state.h)
+        if self._count:
+            J = J[: self._count]
+            A = J[:, : self._base].T
+            eased = A * self._ease
+            square = eased @ A.T
+            # Feet on a line carry no moment about it.
+            square.flat[:: self._base + 1] += _TINY * square.trace()
+            force -= J.T @ (eased.T @ np.linalg.solve(square, force[: self._base]))
+        return np.asarray(self._inverse @ force - self._middle / self._half)
+
+
+def polygon_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:
+    """Return ``n`` (k, 2) and ``b`` (k,) of the support polygon ``n·c + b ≤ 0`` of feet on level ground, m.
+
+    Feet that span no area allow no motion of the center of mass: each direction then is an edge out of reach.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    corners = []
+    for contact in contacts:
+        here = state.at(contact.point)
+        for sign in product((-1, 1), repeat=2):
+            corner = np.array([*np.multiply(sign, contact.half), 0.0])
+            corners.append((here.position + here.rotation @ corner)[:2])
+    if not corners:
+        return np.zeros((0, 2)), np.zeros(0)
+    try:
+        found = ConvexHull(np.array(corners)).equations
+    except QhullError:
+        return np.vstack([np.eye(2), -np.eye(2)]), np.full(4, np.inf)
+    found = np.unique(np.round(found, 12), axis=0)
+    return found[:, :2], found[:, 2]

@@ -1,0 +1,224 @@
+"""The reference flow: it lowers the objective on the constraints, within its limits, and comes to rest in time."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from impact_posture.errors import InputError, MetricError
+from impact_posture.robot.robot import Robot
+from impact_posture.tsid.actuators import Actuators
+from impact_posture.tsid.controller import Controller, Status
+from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.reference_flow import PHASES, FlowOptions, ReferenceFlow
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
+from tests.benchmarks.flow import course, formulation_for
+from tests.helpers import Vector, rng, robot
+from tests.test_tsid_controller import DT, integrate
+
+ROBOTS = ("tilthex_arm", "hextilt", "panda", "solo8")
+Well = Callable[[Vector], tuple[float, Vector]]
+
+
+def well(r: Robot, goal: Vector, depth: float = 0.1) -> Well:
+    """A bowl around a posture: its least value is a share of that at the robot's own."""
+    base = 6 if r.floating else 0
+
+    def function(q: Vector) -> tuple[float, Vector]:
+        away = np.array(pin.difference(r.model, goal, q))
+        away[:base] = 0.0
+        # Joints add, hence the gradient is the difference itself.
+        return depth + 0.5 * float(away @ away), away
+
+    return function
+
+
+def goal_of(r: Robot, key: object, size: float) -> Vector:
+    """A posture whose joints are up to ``size`` rad from the robot's own."""
+    way = size * rng(r.name, key).uniform(-1, 1, r.nv)
+    way[: 6 if r.floating else 0] = 0.0
+    return np.array(pin.integrate(r.model, r.posture(), way))
+
+
+def flow_of(r: Robot, function: Well, **options: float) -> ReferenceFlow:
+    formulation = formulation_for(r, JointPosture(r))
+    flow = ReferenceFlow(r, function, formulation, Actuators(r), FlowOptions(**options))
+    flow.reset(r.posture())
+    return flow
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_it_lowers_the_objective_and_rests(name: str) -> None:
+    r = robot(name)
+    flow = flow_of(r, well(r, goal_of(r, "rest", 0.6)))
+    found = course(flow, r.posture(), 8.0)
+    assert found.rested < 8.0 and found.missed < 1e-3
+    assert np.diff(found.values).max() < 1e-6 and found.values[-1] < 0.999
+
+
+@settings(max_examples=2, deadline=None)
+@given(st.integers(0, 10**6))
+@pytest.mark.parametrize("name", ["panda", "talos"])
+def test_no_limit_is_crossed_wherever_the_goal_is(name: str, seed: int) -> None:
+    r = robot(name)
+    flow = flow_of(r, well(r, goal_of(r, seed, 3.0)))
+    options, start = flow.options, flow.shares.copy()
+    lower, upper = (np.array(flow._state.room[k]) for k in (1, 0))
+    worst = max(1.0, float(np.abs(start).max()))
+    flow.on = True
+    for _ in range(1500):
+        before = flow.velocity.copy()
+        flow.advance(DT, flow.q)
+        assert np.abs(flow._flow).max() <= options.speed * (1 + 1e-9)
+        assert np.abs(flow.velocity - before).max() <= 1.6 * options.acceleration * DT
+        assert np.abs(flow.shares).max() < worst + 0.03
+    room = flow._state.update(flow.q, np.zeros(r.nv)).room
+    for now, at_start in ((room[1], lower), (room[0], upper)):
+        bounded = np.isfinite(now)
+        margin = np.minimum(options.joint_margin, (room[0] + room[1])[bounded] / 8)
+        assert (now[bounded] > np.minimum(margin, at_start[bounded]) - 5e-3).all()
+
+
+def test_the_rest_is_an_optimum_under_the_constraints() -> None:
+    """SciPy's SLSQP, which knows nothing of the flow, finds no better posture nearby."""
+    r = robot("panda")
+    function = well(r, goal_of(r, "optimum", 1.0))
+    flow = flow_of(r, function, rho=0.0, epsilon=1e-9)
+    found = course(flow, r.posture(), 12.0)
+    frame, data = r.frame_id("panda_hand_tcp"), r.model.createData()
+    pin.framesForwardKinematics(r.model, data, r.posture())
+    home = data.oMf[frame].copy()
+
+    def pose(q: Vector) -> Vector:
+        pin.framesForwardKinematics(r.model, data, q)
+        return np.array(pin.log6(home.actInv(data.oMf[frame])).vector)
+
+    room = np.minimum(0.1, (r.model.upperPositionLimit - r.model.lowerPositionLimit) / 8)
+    bounds = list(zip(r.model.lowerPositionLimit + room, r.model.upperPositionLimit - room, strict=True))
+    bounds[7:] = [(x, x) for x in r.posture()[7:]]
+    best = scipy.optimize.minimize(
+        function, found.q, jac=True, method="SLSQP", bounds=bounds, constraints={"type": "eq", "fun": pose},
+        options={"ftol": 1e-14, "maxiter": 200},
+    )  # fmt: skip
+    assert best.success and found.values[-1] * function(r.posture())[0] == pytest.approx(best.fun, rel=1e-3)
+
+
+def test_a_tick_evaluates_at_most_one_gradient() -> None:
+    r, calls = robot("solo8"), [0]
+    inner = well(r, goal_of(r, "calls", 0.5))
+
+    def function(q: Vector) -> tuple[float, Vector]:
+        calls[0] += 1
+        return inner(q)
+
+    flow = flow_of(r, function)
+    flow.on = True
+    counts = []
+    for _ in range(4 * len(PHASES)):
+        calls[0] = 0
+        flow.advance(DT, flow.q)
+        counts.append(calls[0])
+    assert max(counts) == 1 and sum(counts) == 4 * 3
+
+
+def flying(function: Well) -> tuple[Controller, ReferenceFlowPosture, Vector, Vector]:
+    r = robot("tilthex_arm")
+    posture = ReferenceFlowPosture(r, function)
+    controller = Controller(r, formulation_for(r, posture))
+    q, v = r.posture(), np.zeros(r.nv)
+    controller.reset(q, v)
+    return controller, posture, q, v
+
+
+@functools.cache
+def arm_well() -> Well:
+    return well(robot("tilthex_arm"), goal_of(robot("tilthex_arm"), "arm", 1.0))
+
+
+@pytest.mark.parametrize("t_impact", [1.6, 2.0])
+def test_it_rests_before_an_impact_at_a_known_time(t_impact: float) -> None:
+    controller, posture, q, v = flying(arm_well())
+    posture.brace(t_impact)
+    moved, start = 0.0, q.copy()
+    for k in range(round((t_impact + 0.5) / DT)):
+        command = controller.tick(k * DT, q, v)
+        assert command.status is Status.SOLVED
+        if k * DT > t_impact - posture.settle + 0.01:
+            # What is left brings contacts and tasks back.
+            assert not np.abs(posture.flow.velocity).max() > 1e-3
+        if k * DT >= t_impact:
+            assert np.abs(v).max() < 5e-3
+        q, v = integrate(robot("tilthex_arm"), q, v, command)
+        moved = float(np.abs(posture.target[7:] - start[7:]).max())
+    assert moved > 0.005
+    # It stays until it is told again.
+    posture.brace()
+    for k in range(400):
+        controller.tick(t_impact + 0.5 + k * DT, q, v)
+    assert np.abs(posture.target[7:] - start[7:]).max() > moved + 0.05
+
+
+def test_contact_and_release_stop_it_and_a_reset_forgets_all() -> None:
+    controller, posture, q, v = flying(arm_well())
+
+    def torques(count: int) -> list[Vector]:
+        return [controller.tick(k * DT, q, v).u for k in range(count)]
+
+    still = torques(20)
+    posture.brace()
+    assert posture.level == 1
+    torques(300)
+    for stop in (posture.contact, posture.release):
+        stop()
+        assert posture.level == 0
+        torques(2000)
+        target = posture.target.copy()
+        torques(20)
+        np.testing.assert_array_equal(posture.target, target)
+    controller.reset(q, v)
+    np.testing.assert_array_equal(torques(20), still)
+
+
+def test_a_gradient_that_fails_stops_the_flow_until_it_is_back() -> None:
+    fails = [False]
+
+    def function(q: Vector) -> tuple[float, Vector]:
+        if fails[0]:
+            raise MetricError("does not exist there", where="H", hint="start elsewhere")
+        return arm_well()(q)
+
+    controller, posture, q, v = flying(function)
+    posture.brace()
+    for k in range(900):
+        fails[0] = 300 <= k < 800
+        assert controller.tick(k * DT, q, v).status is Status.SOLVED
+        if k == 750:
+            # It brakes evenly.
+            assert posture.flow.failed and not np.abs(posture.flow.velocity).max() > 1e-4
+    assert not posture.flow.failed and np.abs(posture.flow.velocity).max() > 0.01
+
+
+@pytest.mark.parametrize("case", ["options", "share", "time", "before", "flat", "nan"])
+def test_what_cannot_flow_is_refused(case: str) -> None:
+    r = robot("tilthex_arm")
+    with pytest.raises((InputError, MetricError)) as caught:
+        if case == "options":
+            FlowOptions(speed=0.0)
+        elif case == "share":
+            FlowOptions(share=1.2)
+        elif case == "time":
+            flying(arm_well())[1].brace(float("nan"))
+        elif case == "before":
+            ReferenceFlowPosture(r, arm_well()).brace()
+        elif case == "flat":
+            flying(lambda q: (0.0, np.zeros(r.nv)))
+        else:
+            flying(lambda q: (1.0, np.full(r.nv, np.nan)))
+    assert caught.value.hint
