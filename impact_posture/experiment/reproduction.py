@@ -71,7 +71,7 @@ def controllers_of(scenario: str, everything: bool) -> tuple[str, ...]:
     """Return the labels of the controllers of a reproduction, nominal first."""
     if everything:
         return (*CONTROLLERS, *HELD, *([FREE] if scenario.endswith("-push") else []))
-    return tuple(dict.fromkeys(("nominal", "robust", RECOMMENDED[scenario])))
+    return tuple(dict.fromkeys(("nominal", "robust", "robust-flow", RECOMMENDED[scenario])))
 
 
 def jobs_of(plan: Plan, seeds: int) -> list[Job]:

@@ -16,7 +16,7 @@ from impact_posture.experiment.jobs import Job, execute, lost, parse_controller
 from impact_posture.experiment.reproduction import missed_targets
 from impact_posture.experiment.statistics import Row, row_of
 from impact_posture.impact.contact import point_on
-from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory
+from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import before
 from impact_posture.simulation.offline import SHARE, is_held
 from impact_posture.simulation.run import Run
@@ -27,7 +27,7 @@ from tests.benchmarks.robustness.variations import RANGES
 SCHEMA = 2
 NOMINAL = "nominal"
 # Nominal first.
-COMPARED = tuple(c for c in (NOMINAL, "robust", "robust-flow", "posture", "stiff") if c in CONTROLLERS)
+COMPARED = (NOMINAL, "robust", "robust-flow", "posture", "stiff")
 # Share of a nominal run's ticks outside the windows that may be at a limit in a random draw.
 SATURATED = 0.05
 # Random draws of a point before it is given up.
