@@ -15,7 +15,7 @@ from impact_posture.posture.problem import Requirements
 from impact_posture.posture.problem_settings import requirements
 from impact_posture.posture.solve import solve
 from impact_posture.progress import tell
-from impact_posture.settings import ProblemSettings
+from impact_posture.settings import FRICTION, ProblemSettings
 from impact_posture.simulation.scenario import Setup
 
 # Share of the limits that holding a posture may take.
@@ -95,7 +95,7 @@ def scenario_requirements(setup: Setup, objective: ImpactObjective) -> Requireme
         contact_pose="free" if control.end_effector is None else control.end_effector.pose,
         base="level" if control.tilt is not None and setup.robot.floating else "free",
         regularization=_NEARNESS,
-        **({} if control.footing is None else {"friction": control.footing.friction}),
+        friction=FRICTION if control.footing is None else control.footing.friction,
     )
     demands = requirements(settings, objective)
     return replace(demands, com_over_feet=bool(objective.supports), com_asked=False, limit_share=SHARE)
