@@ -115,7 +115,7 @@ def advice(found: Reproduction, beside: Reproduction | None = None) -> list[str]
             f"**{markdown(scenario)}**: `{best.controller}` ({MEANING[best.controller.partition(':')[0]]}) moves "
             f"{reduction_text(best)} less than nominal, over the recovery {percent(best.recovery)}"
         )
-        line += f", but with {missed}." if missed else ", every target met."
+        line += f", but with {missed}." if missed else ", every target met at this point."
         line += _force(best, found.row(scenario, "nominal"))
         line += _held(best, (beside or found).row(scenario, f"{best.controller}:held"))
         if robust is not None and robust is not best and robust.reduction is not None:

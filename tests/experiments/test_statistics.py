@@ -141,7 +141,7 @@ def test_the_best_meets_the_targets_first_and_moves_least_second() -> None:
 def test_the_summary_leads_with_a_choice_and_says_what_is_wrong() -> None:
     found = Reproduction(4, tuple(rows()))
     lines = advice(found)
-    assert len(lines) == 1 and "`posture`" in lines[0] and "every target met" in lines[0]
+    assert len(lines) == 1 and "`posture`" in lines[0] and "every target met at this point." in lines[0]
     assert "a higher peak jump than nominal" in lines[0]
     text = summary(found)
     assert text.index("What to choose") < text.index("Table I")
