@@ -111,8 +111,8 @@ def _counts(records: Records) -> Iterator[str]:
     yield f"Planned are {planned} variations in all, and 40 random draws of each scenario."
     yield (
         f"Shortened against the shipped scenarios: one seed of noise, {COUNT} contacts instead of 5, {DWELL:g} s "
-        f"behind the surface and {PAUSE:g} s between contacts; the pushes have both signs. So the way back from the surface "
-        "is part of the second after an impact, for all controllers alike."
+        f"behind the surface and {PAUSE:g} s between contacts; the pushes have both signs. So the way back "
+        "from the surface is part of the second after an impact, for all controllers alike."
     )
 
 
