@@ -82,7 +82,8 @@ def _caption(scans: Mapping[str, Sequence[Place]]) -> Iterator[str]:
         best, last = min(fine, key=lambda p: p.H), fine[-1]
         most = max((p for p in fine if p.at < start.at), key=lambda p: p.motion)
         yield (
-            f"Left, the arm over the floor, whose one redundancy is the bend of the elbow. H is lowest at {best.at:g} rad, where {_against(best, start)}. On the way there from the shipped "
+            "Left, the arm over the floor, whose one redundancy is the bend of the elbow. H is lowest at "
+            f"{best.at:g} rad, where {_against(best, start)}. On the way there from the shipped "
             f"{start.at:g} rad, the motion at first changes by {percent(most.motion / start.motion - 1)} (at "
             f"{most.at:g} rad). The other way, at {last.at:g} rad, H rises from {start.H:.0f} to {last.H:.0f}, and "
             f"{_against(last, start)}."
