@@ -104,7 +104,8 @@ reproduction: $(VENV)/.installed-test
 
 study-robustness: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks points --jobs $(JOBS)
-	$(BIN)/python -m tests.benchmarks robustness envelope --write
+	$(BIN)/python -m tests.benchmarks robustness --write
+	$(BIN)/python -m tests.benchmarks envelope --write
 
 study-scan: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks scan --write

@@ -44,7 +44,7 @@ def page(records: Records) -> Iterator[str]:
     """All of it, as lines of Markdown."""
     yield from ("### What to choose", "")
     yield from (_choice(name, own) for name, own in records.items() if tried(own))
-    yield from (_tuned(name, own) for name, own in records.items() if len(tried(own)) > 1)
+    yield from (_tuned(name, own) for name, own in records.items() if sum(bool(r.draw.name) for r in tried(own)) > 1)
     yield ""
     yield from _counts(records)
     yield from ("", "### Over the envelope", "")
