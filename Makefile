@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-scan reproduction calibration regression
 .PHONY: pictures clean
 
 help:
@@ -23,8 +23,9 @@ help:
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
 	@echo "make study-feasible  what it costs to be clear of collisions and held by the motors, over the catalogue"
 	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts (an hour)"
-	@echo "make study-robustness  where each controller helps: 40 random variations of each experiment (an hour or two)"
 	@echo "make study-real-impacts  balls, strikes, taps: what the rigid model predicts, and what MuJoCo finds (some minutes)"
+	@echo "make study-robustness  where each controller helps, and which targets it keeps: variations of each experiment (some hours; goes on where it was)"
+	@echo "make study-scan     what decides along the redundancy of an arm and of a humanoid, as a picture"
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make pictures    draw the pictures that the documentation shows"
@@ -107,7 +108,12 @@ reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks reproduction --write
 
 study-robustness: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks robustness --jobs $(JOBS) --write
+	$(BIN)/python -m tests.benchmarks points --jobs $(JOBS)
+	$(BIN)/python -m tests.benchmarks robustness --write
+	$(BIN)/python -m tests.benchmarks envelope --write
+
+study-scan: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks scan --write
 
 study-real-impacts: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks real-impacts --jobs $(JOBS) --write

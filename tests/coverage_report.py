@@ -21,7 +21,6 @@ REASONS = {
     "cli/commands/reproduce.py": "the page for people: tests ask for JSON",
     "impact_posture/posture/nlp.py": "what Ctrl-C does while IPOPT runs in the main process",
     "impact_posture/posture/solve.py": "second guesses and failures that no test problem meets",
-    "impact_posture/simulation/offline.py": "an optimum that motors cannot hold: no test scenario has one",
 }
 
 

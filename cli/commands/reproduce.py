@@ -15,7 +15,9 @@ from impact_posture_cli.progress import progress
 All = Annotated[
     bool,
     typer.Option(
-        "--all", rich_help_panel=RUN, help="Every controller, not only nominal, robust and the recommended."
+        "--all",
+        rich_help_panel=RUN,
+        help="Every controller, not only nominal, robust, robust-flow and the recommended.",
     ),
 ]
 Scenarios = Annotated[

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError, SpecError
-from impact_posture.experiment.jobs import SCHEMA, Job, controller_factory, execute
+from impact_posture.experiment.jobs import Job, controller_factory, execute, lost
 from impact_posture.libraries import source_key
 from impact_posture.output_folder import is_ours, write_record, write_whole
 from impact_posture.posture.nlp import one_blas_thread
@@ -181,10 +181,7 @@ def _run(job: Job, store: Store | None) -> Document:
         if isinstance(error, InputError) and not isinstance(error, MetricError):
             # A mistake of the user is the same for all seeds, and no result.
             raise
-        event = {"status": "control lost", "time": getattr(error, "time", None), "what": str(error), "sign": None}
-        return {"schema": SCHEMA, "scenario": job.scenario, "controller": job.controller, "mode": job.mode,
-                "free": job.free, "seed": job.seed, "status": "control lost", "events": [event], "metrics": None,
-                "prediction": None, "windows": [], "runs": []}  # fmt: skip
+        return lost(job, error)
     if store is not None:
         store.make()
         for one in runs:

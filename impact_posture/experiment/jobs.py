@@ -21,7 +21,7 @@ from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 
-SCHEMA = "impact-posture/simulation/3"
+SCHEMA = "impact-posture/simulation/4"
 
 
 @dataclass(frozen=True)
@@ -80,13 +80,17 @@ def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
     return ControllerFactory(set_up(read_scenario(scenario)), free)
 
 
-def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
+def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[Run, ...], dict[str, Any]]:
     """Run a job and return its runs and its document.
+
+    Args:
+        job: The job.
+        factory: A variation of its scenario to run instead.
 
     Raises:
         ImpactPostureError: As :func:`impact_posture.simulation.run.run`, or the scenario cannot be set up.
     """
-    factory = controller_factory(job.scenario, job.free)
+    factory = controller_factory(job.scenario, job.free) if factory is None else factory
     scenario = factory.setup.scenario
     if job.sign is not None and job.sign not in scenario.signs:
         raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, hint="leave --sign out")
@@ -116,6 +120,14 @@ def execute(job: Job) -> tuple[tuple[Run, ...], dict[str, Any]]:
         "versions": versions() | {"mujoco": metadata.version("mujoco")},
     }
     return runs, jsonable(document)
+
+
+def lost(job: Job, error: Exception) -> dict[str, Any]:
+    """Return the document of a job that failed on its own, with the status ``control lost`` and without runs."""
+    event = {"status": "control lost", "time": getattr(error, "time", None), "what": str(error), "sign": None}
+    return {"schema": SCHEMA, "scenario": job.scenario, "controller": job.controller, "mode": job.mode,
+            "free": job.free, "seed": job.seed, "status": "control lost", "events": [event], "metrics": None,
+            "prediction": None, "windows": [], "runs": []}  # fmt: skip
 
 
 def jsonable(content: object) -> Any:

@@ -16,8 +16,8 @@ from impact_posture.simulation.controller_factory import MEANING
 _DECIMALS = 4
 # Metrics in the table of a scenario, with their significant digits.
 _COLUMNS = {
-    "peak_jump": 3, "peak_recovery": 3, "peak_force": 3, "saturation_inside": 2, "saturation_outside": 2,
-    "relaxed_ticks": 2,
+    "peak_jump": 3, "peak_recovery": 3, "saturation_inside": 2, "saturation_outside": 2, "relaxed_ticks": 2,
+    "peak_force": 3,
 }  # fmt: skip
 # What the columns of the tables mean.
 LEGEND = (
@@ -46,8 +46,8 @@ def table_one(found: Reproduction) -> str:
 def scenario_table(rows: Sequence[Row]) -> str:
     """Return the table of all controllers of a scenario."""
     head = (
-        "controller|status|q_total_impact|reduction|over the recovery|peak jump|in the recovery|peak force, N|"
-        "saturated inside, s|outside, s|relaxed ticks|H before|measured / predicted jump|targets"
+        "controller|status|q_total_impact|reduction|over the recovery|peak jump|in the recovery|saturated inside, s|"
+        "outside, s|relaxed ticks|peak force, N|over nominal's|H before|measured / predicted jump|targets"
     )
     lines = []
     for row in rows:
@@ -60,6 +60,7 @@ def scenario_table(rows: Sequence[Row]) -> str:
                 reduction_text(row),
                 percent(row.recovery) if row.controller != "nominal" else "–",
                 *(interval_text(row.metrics[name], digits) for name, digits in _COLUMNS.items()),
+                "–" if row.force is None else f"{row.force.mean:.2f}",
                 "–" if row.H is None else f"{row.H:.3g}",
                 "–" if row.ratio is None else f"{row.ratio:.2f}",
                 targets_text(row),
@@ -114,7 +115,7 @@ def advice(found: Reproduction, beside: Reproduction | None = None) -> list[str]
             f"**{markdown(scenario)}**: `{best.controller}` ({MEANING[best.controller.partition(':')[0]]}) moves "
             f"{reduction_text(best)} less than nominal, over the recovery {percent(best.recovery)}"
         )
-        line += f", but with {missed}." if missed else ", every target met."
+        line += f", but with {missed}." if missed else ", every target met at this point."
         line += _force(best, found.row(scenario, "nominal"))
         line += _held(best, (beside or found).row(scenario, f"{best.controller}:held"))
         if robust is not None and robust is not best and robust.reduction is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -58,7 +58,8 @@ class Row:
         stops: Joints that reached a position limit within an impact window of any run.
         rested: Whether the robot was at rest before every push.
         H: Mean of H just before the impacts.
-        ratio: Mean ratio of the measured jump to the frictionless jump of the rigid model.
+        ratio: Mean ratio of the measured jump to that of the rigid model with the friction of the surface.
+        force: Ratio of ``peak_force`` to that of nominal with the same seed, ``None`` as for ``reduction``.
     """
 
     scenario: str
@@ -75,6 +76,7 @@ class Row:
     rested: bool
     H: float | None
     ratio: float | None
+    force: Interval | None
 
 
 def value_of(document: Document, quantity: str) -> float:
@@ -112,8 +114,12 @@ def row_of(scenario: str, controller: str, own: Sequence[Document], nominal: Seq
     def paired(name: str, compare: Callable[[float, float], float]) -> Interval:
         return Interval.of([compare(value_of(d, name), value_of(n, name)) for d, n in pairs])
 
+    def share(name: str) -> Interval | None:
+        return paired(name, lambda mine, nominal: mine / nominal) if fair else None
+
     def reduction(name: str) -> Interval | None:
-        return paired(name, lambda mine, nominal: 1 - mine / nominal) if fair else None
+        found = share(name)
+        return found and replace(found, mean=1 - found.mean)
 
     return Row(
         scenario=scenario,
@@ -130,6 +136,7 @@ def row_of(scenario: str, controller: str, own: Sequence[Document], nominal: Seq
         rested=all(d["metrics"]["rested"] for d in good),
         H=_mean([d["prediction"]["H"] for d in good]),
         ratio=_mean([d["prediction"]["ratio"] for d in good]),
+        force=share("peak_force"),
     )
 
 

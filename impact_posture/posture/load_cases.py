@@ -86,16 +86,16 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
     Args:
         objective: What is minimized, with its contacts, supports and model variants.
         q: A posture with the feet in place, shape (nq,).
-        requirements: The friction of the feet, and the force to hold.
+        requirements: The friction of the feet, the force to hold, and the share of the limits that it may take.
 
     Raises:
         InputError: A force is to be held, but nothing is known about what holds the robot.
     """
-    robot, force = objective.robot, requirements.hold_force
+    robot, force, share = objective.robot, requirements.hold_force, requirements.limit_share
     weight = robot.mass * float(np.linalg.norm(robot.model.gravity.linear))
-    rotors = _rotors(robot, weight) if robot.floating else []
+    rotors = _rotors(robot, weight, share) if robot.floating else []
     feet = _feet(objective, weight, requirements.friction) if robot.floating else []
-    limits = torque_limits(robot.model)
+    limits = share * torque_limits(robot.model)
     reach, rank = _reach(StaticLoad(robot.model, [*rotors, *feet]), q) if robot.floating else (np.zeros((0, 6)), 0)
     unknown = ""
     if robot.floating and not (rotors or feet):
@@ -118,6 +118,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
         limit = weight * rotors[0].lower, weight * rotors[0].upper
         thrusts = Thrusts(rotors[0].names, np.asarray(np.linalg.pinv(rotors[0].columns / weight)), *limit)
         sources, balance = [], balance[:0]
+    within = "limits" if share == 1 else f"{100 * share:g} % of their limits"
     cases = []
     for model, variant in _models(objective):
         for pushed in (0.0, force) if force else (0.0,):
@@ -125,7 +126,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
             names = robot.tangent_names
             rest = Equilibrium(model, [*sources, *pushes], weight, limits, balance, thrusts, names)
             name = (f"while it pushes with {pushed:g} N" if pushed else "at rest") + variant
-            cases.append(LoadCase(name, f"{what} within limits {name}", rest, reach[rank:]))
+            cases.append(LoadCase(name, f"{what} within {within} {name}", rest, reach[rank:]))
     return LoadCases(tuple(cases), tuple(notes))
 
 
@@ -146,11 +147,13 @@ def _models(objective: Objective) -> list[tuple[pin.Model, str]]:
     return found
 
 
-def _rotors(robot: Robot, weight: float) -> list[ForceSource]:
+def _rotors(robot: Robot, weight: float, share: float) -> list[ForceSource]:
     propulsion = robot.spec.propulsion
     if propulsion is None:
         return []
-    low, high = (np.full(len(propulsion.rotors), limit / weight) for limit in thrust_limits(propulsion))
+    least, most = thrust_limits(propulsion)
+    middle, half = (most + least) / 2, share * (most - least) / 2
+    low, high = (np.full(len(propulsion.rotors), limit / weight) for limit in (middle - half, middle + half))
     columns = weight * allocation_matrix(robot.model, propulsion)
     names = tuple(rotor.name for rotor in propulsion.rotors)
     return [ForceSource(PointOnLink(1, np.zeros(3), np.eye(3)), columns, low, high, names, in_frame=True)]

@@ -41,6 +41,7 @@ class Requirements:
         keep_contacts: The impact must neither lift nor slide a foot.
         friction: Friction coefficient of the feet.
         holdable: Thrusts, torques and forces of the feet that hold the posture stay within their limits.
+        limit_share: Share of the limits of torques and thrusts that holding may take; of a range, about its middle.
         hold_force: Force that each contact pushes back with after the impact, N, which has to be held as well.
         least_mobility: Least G of each contact, 1/kg, for the bound on the peak force; 0 for none.
         largest_jump: Largest jump of a joint per approach speed; infinite for no bound.
@@ -67,6 +68,7 @@ class Requirements:
     keep_contacts: bool = False
     friction: float = 0.7
     holdable: bool = False
+    limit_share: float = 1.0
     hold_force: float = 0.0
     least_mobility: float = 0.0
     largest_jump: float = float("inf")

@@ -33,7 +33,7 @@ class Prediction:
         sticking: Jump if the contact sticks, ``v √S`` (for an approach along the normal), or ``None`` for pushes.
         coulomb: Jump with the friction of the surface, ``v √C`` (likewise), or ``None`` for pushes.
         measured: Measured jump, as in :class:`~impact_posture.simulation.metrics.Metrics`.
-        ratio: ``measured`` over ``frictionless``, or ``None`` if the latter vanishes.
+        ratio: ``measured`` over ``coulomb`` (for pushes, over ``frictionless``), or ``None`` if the latter vanishes.
     """
 
     contact: int
@@ -72,7 +72,8 @@ def predict(setup: Setup, objective: ImpactObjective, run: Run) -> tuple[Predict
             sticking = None if here.S is None else approach * float(np.sqrt(here.S))
             coulomb = approach * float(np.sqrt(KINDS["coulomb"].value(objective.oracle, q)))
         measured = jump(setup, run.series, window)
-        ratio = measured / smooth if smooth > 1e-9 else None
+        expected = smooth if coulomb is None else coulomb
+        ratio = measured / expected if expected > 1e-9 else None
         jumps = smooth, sticking, coulomb, measured
         found.append(Prediction(window.contact, here.H, here.G, here.V, here.S, approach, *jumps, ratio))
     return tuple(found)

@@ -73,8 +73,11 @@ STUDIES = {
         Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
         Study("hops", "global_search:hops", "basin hopping beside multi-start; seeds", 10, target="study-global"),
         Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
-        Study("robustness", "robustness.study", "where each controller helps; draws", 40, target="study-robustness"),
         Study("real-impacts", "real_impacts", "balls, strikes, taps, as predicted", target="study-real-impacts"),
+        Study("points", "robustness.study:points", "runs the points of the next two; random draws", 40, page=False),
+        Study("robustness", "robustness.study", "where each controller helps", target="study-robustness"),
+        Study("envelope", "robustness.study:kept_targets", "targets that are kept", target="study-robustness"),
+        Study("scan", "scan", "what decides along the redundancy; postures of each robot", 11, target="study-scan"),
         Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
     )
 }

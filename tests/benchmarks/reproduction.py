@@ -54,9 +54,9 @@ def _parts(found: Reproduction, every: Reproduction) -> Iterator[str]:
     shown = f"seeds {seeds}; mean ± half of the 95 % confidence interval" if found.seeds > 2 else (
         f"seeds {seeds}; too few for intervals" if found.seeds > 1 else "seed 0 alone: no means, no intervals"
     )  # fmt: skip
-    yield from ("## What to choose", "\n".join(f"- {line}" for line in advice(found, every)))
-    yield from ("## Table I of the paper, and ours", f"`q_total_impact`, {shown}.", table_one(found), LEGEND)
+    yield from ("### What did best at this point", "\n".join(f"- {line}" for line in advice(found, every)))
+    yield from ("### Table I of the paper, and ours", f"`q_total_impact`, {shown}.", table_one(found), LEGEND)
     few = f"means over seeds 0 to {every.seeds - 1}" if every.seeds > 1 else "seed 0"
     for scenario in found.scenarios:
-        yield from (f"## {scenario}", scenario_table(found.of(scenario)), f"Every controller, {few}:")
+        yield from (f"### {scenario}", scenario_table(found.of(scenario)), f"Every controller, {few}:")
         yield from (scenario_table(every.of(scenario)), " ".join(remarks(every, scenario)))

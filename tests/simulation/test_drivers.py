@@ -105,7 +105,7 @@ def test_the_other_gradients_lower_their_own_metric(controller: str) -> None:
 def test_all_controllers_share_gains_tasks_and_weights() -> None:
     for name in ("aerial-lateral", "talos-push"):
         made = factory(name)
-        made.offline = vars(made).get("offline") or OfflinePosture(made.setup.q, 1.0, 1.0, 1.0, 0.0, 0.0)
+        made.offline = vars(made).get("offline") or OfflinePosture(made.setup.q, 1.0, 1.0, 0.0)
         nominal = made.driver("nominal").controller.formulation
         for controller in CONTROLLERS:
             formulation = made.driver(controller).controller.formulation

@@ -130,6 +130,7 @@ def test_a_drop_that_slides_jumps_as_predicted(friction: float) -> None:
     e = restitution(setup, run, 0.5)
     assert found.coulomb is not None and found.sticking is not None
     assert found.measured == pytest.approx((1 + e) * found.coulomb, rel=0.05)
+    assert found.ratio == pytest.approx(found.measured / found.coulomb)
 
 
 def test_the_peak_is_the_impacts_and_nothing_else_moves_it() -> None:

@@ -1,64 +1,73 @@
-"""What becomes of one configuration: every controller runs through it, and what goes wrong is an outcome too."""
+"""What becomes of one point of the envelope: every controller runs through it, and a failure is an outcome too."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.errors import ImpactPostureError, SimulationDiverged
+from impact_posture.errors import ImpactPostureError
+from impact_posture.experiment.batch import Document
+from impact_posture.experiment.jobs import Job, execute, lost, parse_controller
+from impact_posture.experiment.reproduction import missed_targets
+from impact_posture.experiment.statistics import Row, row_of
 from impact_posture.impact.contact import point_on
 from impact_posture.simulation.controller_factory import ControllerFactory
-from impact_posture.simulation.metrics import Metrics, before, measure
-from impact_posture.simulation.offline import SHARE, holds
-from impact_posture.simulation.prediction import predict
-from impact_posture.simulation.run import Run, run
-from impact_posture.simulation.scenario import RepeatedContacts, Setup
+from impact_posture.simulation.metrics import before
+from impact_posture.simulation.offline import SHARE, is_held
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario_objective import interpreted
-from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, RANGES, Draw, draw, prepare
+from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, Draw, draw, prepare
+from tests.benchmarks.robustness.variations import RANGES
 
-SCHEMA = 1
+SCHEMA = 2
 NOMINAL = "nominal"
-# The robust term that is off, with the posture that it reached, when the push comes.
-HELD = "robust:held"
-AERIAL = (NOMINAL, "robust", "robust-speed", "posture")
-PUSHED = (NOMINAL, "robust", HELD, "posture")
-# Share of the motors' limits with which the start must be held; share of a nominal run's ticks outside the windows
-# that may be at a limit.
+# Nominal first.
+COMPARED = (NOMINAL, "robust", "robust-flow", "posture", "stiff")
+# Share of a nominal run's ticks outside the windows that may be at a limit in a random draw.
 SATURATED = 0.05
-# Draws of a configuration before it is given up.
+# Random draws of a point before it is given up.
 ATTEMPTS = 40
-# Tilt (rad) from which on a robot that flies has lost itself; share of its height below which one that stands has
-# fallen: only its feet meet the ground, the rest falls through.
-_TILT, _HEIGHT = math.pi / 4, 0.3
-_RUNS = Callable[[ControllerFactory, str], tuple[Run, ...]]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Of one controller in one configuration."""
-
-    failure: str = ""  # what went wrong; empty: nothing
-    metrics: Mapping[str, float] = field(default_factory=dict)  # as simulation.metrics.Metrics; empty: there are none
-    stops: tuple[str, ...] = ()
-    H: float | None = None  # before the impacts, mean
-    V: float | None = None  # the same
-    offset: float | None = None  # of the center of mass from the line of the first impact, m
+# What a record does not keep of a document.
+_LEFT_OUT = ("windows", "versions", "runs")
+_Play = Callable[[Job, ControllerFactory], tuple[tuple[Run, ...], Document]]
 
 
 @dataclass(frozen=True)
 class Record:
-    """Of one configuration: the draw, why each before it was rejected, the start, and outcomes by controller."""
+    """One point of the envelope.
+
+    Attributes:
+        draw: The point.
+        rejected: Why each draw before was rejected, or why this variation cannot be tried.
+        q: Start posture, empty for a variation that cannot be tried.
+        documents: Documents of the runs, by label of the controller.  With ``offset``, the distance of the center of
+            mass from the line of the first impact, m.
+    """
 
     draw: Draw
-    rejected: tuple[str, ...]
-    q: tuple[float, ...]
-    outcomes: Mapping[str, Outcome]
+    rejected: tuple[str, ...] = ()
+    q: tuple[float, ...] = ()
+    documents: Mapping[str, Document] = field(default_factory=dict)
+
+    def row(self, controller: str) -> Row:
+        """Return the results of a controller against nominal at this point."""
+        own, nominal = self.documents[controller], self.documents[NOMINAL]
+        return row_of(self.draw.scenario, controller, [own], [nominal])
+
+    def missed(self, controller: str) -> dict[str, str]:
+        """Return the targets that a controller misses here, ``completed`` among them."""
+        missed = missed_targets(self.row(controller))
+        return {"completed": "no completed run"} if missed is None else missed
+
+    def failure(self, controller: str) -> str:
+        """Return the status of a run that did not complete, else nothing."""
+        status = str(self.documents[controller]["status"])
+        return "" if status == "completed" else status
 
     def to_json(self) -> str:
         """The record as text."""
@@ -69,106 +78,99 @@ class Record:
         """Back again; ``None`` where the study has changed since."""
         found = json.loads(text)
         chosen = Draw(**found["draw"])
-        if chosen.scenario not in RANGES or found["key"] != key(chosen.scenario):
+        same = chosen.scenario in RANGES and found["key"] == key(chosen.scenario)
+        # A variation that was renumbered is another one.
+        if not same or (chosen.name and draw(chosen.scenario, chosen.number, seed=chosen.seed) != chosen):
             return None
-        outcomes = {name: Outcome(**{**o, "stops": tuple(o["stops"])}) for name, o in found["outcomes"].items()}
-        return cls(chosen, tuple(found["rejected"]), tuple(found["q"]), outcomes)
-
-
-def controllers(scenario: str) -> tuple[str, ...]:
-    """Those that run in a scenario."""
-    return AERIAL if scenario.startswith("aerial") else PUSHED
+        return cls(chosen, tuple(found["rejected"]), tuple(found["q"]), found["documents"])
 
 
 def key(scenario: str) -> str:
     """What a kept record must have in common with this code."""
     ranges = tuple((r.name, r.low, r.high, r.scale) for r in RANGES[scenario])
-    return repr((SCHEMA, controllers(scenario), SHARE, SATURATED, ranges, COUNT, DWELL, PATIENCE, PAUSE))
+    return repr((SCHEMA, SHARE, SATURATED, ranges, COUNT, DWELL, PATIENCE, PAUSE))
 
 
 class NotAdmissible(Exception):
-    """A draw that makes no experiment: the nominal controller itself does not get through it."""
+    """A point that makes no experiment: the nominal controller itself does not get through it."""
 
 
-def play(factory: ControllerFactory, controller: str) -> tuple[Run, ...]:
-    """One run, noise of seed 0."""
-    name, _, mode = controller.partition(":")
-    return run(factory, name, mode="held" if mode else "live")
+def point(scenario: str, number: int, seed: int, known: Record | None = None, play: _Play = execute) -> Record:
+    """Return one point, with what is known of it and the runs that it lacks.
 
-
-def configuration(scenario: str, number: int, seed: int, runs: _RUNS = play) -> Record:
-    """Draw until the nominal controller gets through, then let all controllers.
+    A random draw is repeated until the nominal controller gets through.  A variation is not.
 
     Raises:
         NotAdmissible: No draw was.
     """
+    if known is not None and (known.documents or known.draw.name):
+        return _complete(known, ControllerFactory(prepare(known.draw), gradient_of=interpreted), play)
     rejected: list[str] = []
     for attempt in range(ATTEMPTS):
         chosen = draw(scenario, number, attempt, seed)
         try:
-            factory, nominal = _admit(chosen, runs)
+            factory, nominal = _admit(chosen, play)
         except NotAdmissible as error:
             rejected.append(str(error))
+            if chosen.name:
+                return Record(chosen, tuple(rejected))
             continue
-        outcomes = {NOMINAL: nominal}
-        for name in controllers(scenario)[1:]:
-            outcomes[name] = outcome(factory, name, runs)
-        return Record(chosen, tuple(rejected), tuple(float(x) for x in factory.setup.q), outcomes)
+        q = tuple(float(x) for x in factory.setup.q)
+        return _complete(Record(chosen, tuple(rejected), q, {NOMINAL: nominal}), factory, play)
     raise NotAdmissible(f"{scenario} {number}: none of {ATTEMPTS} draws is admissible: {sorted(set(rejected))}")
 
 
-def _admit(chosen: Draw, runs: _RUNS) -> tuple[ControllerFactory, Outcome]:
+def _complete(record: Record, factory: ControllerFactory, play: _Play) -> Record:
+    documents = dict(record.documents)
+    for label in COMPARED:
+        if label not in documents:
+            documents[label] = _document(factory, record.draw.scenario, label, play)
+    return replace(record, documents=documents)
+
+
+def is_complete(record: Record | None) -> bool:
+    """Whether a record has every controller, or is of a variation that cannot be tried."""
+    return record is not None and (not record.documents or set(COMPARED) <= set(record.documents))
+
+
+def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
     try:
         setup = prepare(chosen)
     except ImpactPostureError as error:
         raise NotAdmissible(f"no start ({type(error).__name__})") from None
-    if not holds(setup, setup.q):
-        raise NotAdmissible(f"the motors do not hold the start with {100 * SHARE:.0f} % of their limits")
+    # Interpreted gradients take a run no longer, and every armature and mounting would be compiled anew.
     factory = ControllerFactory(setup, gradient_of=interpreted)
-    nominal = outcome(factory, NOMINAL, runs)
-    if nominal.failure:
-        raise NotAdmissible(f"nominal {nominal.failure}")
-    if nominal.metrics["saturation_outside"] > SATURATED * nominal.metrics["duration"]:
+    if not is_held(setup, factory.objective()):
+        raise NotAdmissible(f"the motors do not hold the start with {100 * SHARE:.0f} % of their limits")
+    nominal = _document(factory, chosen.scenario, NOMINAL, play)
+    if nominal["status"] != "completed":
+        raise NotAdmissible(f"nominal {nominal['status']}")
+    metrics = nominal["metrics"]
+    if not metrics["rested"]:
+        raise NotAdmissible("nominal did not come to rest")
+    if not chosen.name and metrics["saturation_s"]["outside"] > SATURATED * nominal["duration"]:
         raise NotAdmissible(f"nominal is at a limit for over {100 * SATURATED:.0f} % of the time between the impacts")
     return factory, nominal
 
 
-def outcome(factory: ControllerFactory, controller: str, runs: _RUNS = play) -> Outcome:
-    """Let a controller run; what it raises is what becomes of it."""
+def _document(factory: ControllerFactory, scenario: str, label: str, play: _Play) -> Document:
+    """Let a controller run with the noise of seed 0; what it raises is what becomes of it."""
+    name, mode, free = parse_controller(label)
+    job = Job(scenario, name, 0, mode, free)
     try:
-        [found] = runs(factory, controller)
-    except SimulationDiverged:
-        return Outcome("diverged")
+        runs, found = play(job, factory)
     except (ImpactPostureError, np.linalg.LinAlgError) as error:
-        return Outcome(f"raised {type(error).__name__}")
-    setup, metrics = factory.setup, measure(factory.setup, found)
-    impacts = predict(setup, factory.objective(), found)
-    numbers = {name: float(value) for name, value in asdict(metrics).items() if isinstance(value, int | float)}
-    return Outcome(
-        _failure(setup, found, metrics),
-        {**numbers, "duration": float(found.series.t[-1])},
-        metrics.stops,
-        float(np.mean([b.H for b in impacts])) if impacts else None,
-        float(np.mean([b.V for b in impacts])) if impacts else None,
-        _offset(factory, found),
-    )
-
-
-def _failure(setup: Setup, found: Run, metrics: Metrics) -> str:
-    task, series = setup.scenario.task, found.series
-    if isinstance(task, RepeatedContacts):
-        upright = np.array([pin.Quaternion(q[3:7]).matrix()[2, 2] for q in series.q[::10]])
-        if (upright < math.cos(_TILT)).any():
-            return "tipped over"
-        return "missed a contact" if metrics.contacts < task.count else ""
-    # The ground is at height zero.
-    if (series.q[:, 2] < _HEIGHT * series.q[0, 2]).any():
-        return "fell"
-    return "" if metrics.rested else "did not come to rest"
+        return {**lost(job, error), "runs": [], "duration": 0.0, "offset": None}
+    signs = [{"sign": part["sign"]} for part in found["runs"]]
+    kept = {name: value for name, value in found.items() if name not in _LEFT_OUT}
+    duration = max(float(run.series.t[-1]) for run in runs)
+    return {**kept, "runs": signs, "duration": duration, "offset": _offset(factory, runs[0])}
 
 
 def _offset(factory: ControllerFactory, found: Run) -> float | None:
     """Distance of the center of mass from the line along which the first impact acts."""
+    if not found.of("impact"):
+        return None
     robot, contact = factory.setup.robot, factory.objective().contact
     q = found.series.q[before(found.series, found.of("impact")[0])]
     place = Numeric(robot.model).at(q).placement(point_on(robot, contact.frame, contact.offset)).translation

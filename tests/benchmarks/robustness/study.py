@@ -1,6 +1,6 @@
-"""Where does each controller help?  Random variations of the shipped experiments, every controller in each.
+"""Where does each controller help?  Variations of the shipped experiments, every controller in each.
 
-Each configuration that is done stays in build/robustness; a run that was interrupted goes on from there.
+Each point that is done stays in build/robustness; a run that was interrupted goes on from there.
 """
 
 from __future__ import annotations
@@ -11,60 +11,77 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from impact_posture.dynamics.mjcf import import_mujoco
+from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.processes import fork_map
 from tests.benchmarks.core import ROOT, Request, machine, say
-from tests.benchmarks.robustness.draws import RANGES
-from tests.benchmarks.robustness.outcomes import NotAdmissible, Record, configuration
-from tests.benchmarks.robustness.page import page
+from tests.benchmarks.robustness import envelope, page
+from tests.benchmarks.robustness.outcomes import NotAdmissible, Record, is_complete, point
+from tests.benchmarks.robustness.variations import RANGES, VARIATIONS
 
 
-def lines(request: Request) -> Iterator[str]:
-    """The page, once all configurations are there; or one configuration, run anew."""
+def points(request: Request) -> Iterator[str]:
+    """Run the points that are not kept yet; or one point anew."""
     import_mujoco()
     scenarios = [name for name in RANGES if request.only in name]
     began = time.perf_counter()
     try:
         if request.number is not None:
-            yield from (configuration(name, request.number, request.seed).to_json() for name in scenarios)
+            yield from (point(name, request.number, request.seed).to_json() for name in scenarios)
             return
-        store = Store(ROOT / "build" / "robustness", request.seed)
-        records = study(scenarios, request.count, request.seed, request.jobs, store)
+        wanted = {name: len(VARIATIONS[name]) + request.count for name in scenarios}
+        study(wanted, request.seed, request.jobs, _store(request))
     except NotAdmissible as error:
         raise SystemExit(str(error)) from None
-    yield from page(records, request.seed)
+    kept = _store(request).complete(scenarios)
+    yield ", ".join(f"{name}: {len(own)} points" for name, own in kept.items())
     say(f"{machine('mujoco')}; {time.perf_counter() - began:.0f} s")
 
 
+def lines(request: Request) -> Iterator[str]:
+    """The page of where controllers help, from the points that are kept."""
+    yield from page.page(_store(request).complete([n for n in RANGES if request.only in n]), request.seed)
+
+
+def kept_targets(request: Request) -> Iterator[str]:
+    """The page of the targets that controllers keep, from the points that are kept."""
+    yield from envelope.page(_store(request).complete([n for n in RANGES if request.only in n]))
+
+
+def _store(request: Request) -> Store:
+    return Store(ROOT / "build" / "robustness", request.seed)
+
+
 def study(
-    scenarios: Sequence[str],
-    configurations: int,
+    points: dict[str, int],
     seed: int,
     jobs: int,
     store: Store,
-    run: Callable[[str, int, int], Record] = configuration,
+    run: Callable[..., Record] = point,
     tell: Callable[[str], None] = say,
-) -> dict[str, list[Record]]:
-    """Run the configurations that the store lacks; all of them, by scenario."""
-    # By number first: a study that is cut short has as many of each scenario.
-    wanted = [(name, number) for number in range(configurations) for name in scenarios]
-    missing = [each for each in wanted if store.get(*each) is None]
+) -> None:
+    """Run the points that the store lacks.
+
+    The scenarios take turns and every controller runs through a point before the next one, so that a study that is
+    cut short has the same points of all controllers.
+    """
+    wanted = [(name, number) for number in range(max(points.values())) for name in points if number < points[name]]
+    missing = [each for each in wanted if not is_complete(store.get(*each))]
 
     def one(index: int) -> str:
         name, number = missing[index]
-        began = time.perf_counter()
+        began = time.process_time()
         # Kept by the process that ran it: nothing that is done is lost when the others are stopped.
-        store.keep(run(name, number, seed))
-        return f"{name} {number}: {time.perf_counter() - began:.0f} s"
+        with one_blas_thread():
+            store.keep(run(name, number, seed, store.get(name, number)))
+        return f"{name} {number}: {time.process_time() - began:.0f} s"
 
     with fork_map(one, len(missing), jobs) as done:
         for count, (_, words) in enumerate(done, 1):
             tell(f"{count}/{len(missing)} {words}")
-    found = [store.get(*each) for each in wanted]
-    return {name: [r for r in found if r is not None and r.draw.scenario == name] for name in scenarios}
 
 
 class Store:
-    """Finished configurations of a study, a file each: an interrupted study goes on where it was."""
+    """Finished points of a study, a file each: an interrupted study goes on where it was."""
 
     def __init__(self, folder: Path, seed: int) -> None:
         self._folder, self._seed = folder, seed
@@ -73,7 +90,7 @@ class Store:
         return self._folder / f"seed-{self._seed}" / scenario / f"{number:03d}.json"
 
     def get(self, scenario: str, number: int) -> Record | None:
-        """What was kept of a configuration, if it still holds."""
+        """What was kept of a point, if it still holds."""
         file = self._file(scenario, number)
         return Record.from_json(file.read_text(encoding="utf-8")) if file.is_file() else None
 
@@ -84,3 +101,13 @@ class Store:
         beside = file.with_suffix(f".{os.getpid()}")
         beside.write_text(record.to_json() + "\n", encoding="utf-8")
         beside.replace(file)
+
+    def complete(self, scenarios: Sequence[str]) -> dict[str, list[Record]]:
+        """Return the points of each scenario up to the first that is not complete."""
+        found: dict[str, list[Record]] = {}
+        for name in scenarios:
+            found[name] = []
+            while is_complete(record := self.get(name, len(found[name]))):
+                assert record is not None
+                found[name].append(record)
+        return found

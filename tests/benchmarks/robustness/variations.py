@@ -1,0 +1,140 @@
+"""What varies in the shipped scenarios: the ranges of random draws, and the variations one at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Range:
+    """What a draw chooses, from low to high: ``linear``, ``log``, or ``sign`` (one of the two ends)."""
+
+    name: str
+    low: float
+    high: float
+    words: str
+    scale: str = "linear"
+
+    def draw(self, rng: np.random.Generator) -> float:
+        """Choose a value."""
+        if self.scale == "sign":
+            return self.low if rng.random() < 0.5 else self.high
+        if self.scale == "log":
+            return float(np.exp(rng.uniform(np.log(self.low), np.log(self.high))))
+        return float(rng.uniform(self.low, self.high))
+
+    def text(self) -> str:
+        """The range, as the page shows it."""
+        how = {"linear": "{} … {}", "log": "{} … {}, log-uniform", "sign": "{} or {}"}[self.scale]
+        return how.format(f"{self.low:g}", f"{self.high:g}")
+
+
+_COMMON = (
+    Range("armature", 0.1, 3.0, "armature of every joint, times the scenario's", "log"),
+    Range("gain", 0.25, 4.0, "K, times the scenario's", "log"),
+    Range("contact", 0.25, 4.0, "stiffness of the surface, times the scenario's", "log"),
+)
+_TOOL = (
+    Range("tilt", -5.0, 5.0, "tool off the normal, in the arm's plane, degrees"),
+    Range("roll", -3.0, 3.0, "tool off the normal, across, degrees"),
+)
+_SLIP = Range("friction", 0.15, 0.6, "friction of the surface")
+
+
+def _pushed(stir: float) -> tuple[Range, ...]:
+    words = "start: size of random changes of the joints, rad, pulled back onto the feet's places"
+    return (
+        Range("stir", 0.02, stir, words),
+        Range("force", 0.6, 1.4, "push, times the scenario's"),
+        Range("stiffness", 0.5, 2.0, "gains of center of mass, base and posture, times the scenario's", "log"),
+        Range("friction", 0.5, 1.0, "friction of the ground"),
+        *_COMMON,
+    )
+
+
+RANGES: dict[str, tuple[Range, ...]] = {
+    "aerial-vertical": (
+        Range("elbow", 0.4, 1.2, "start: elbow's bend, rad; shoulder so that the tool looks at the floor"),
+        Range("fold", -1.0, 1.0, "start: which way the elbow bends", "sign"),
+        *_TOOL,
+        Range("speed", 0.25, 0.6, "approach, m/s"),
+        Range("x", -0.04, 0.10, "shoulder's pitch axis ahead of the base's center, m"),
+        Range("z", -0.10, -0.02, "shoulder's height over the base's center, m"),
+        _SLIP,
+        *_COMMON,
+    ),
+    "aerial-lateral": (
+        Range("shoulder", -1.9, -0.6, "start: shoulder's pitch, rad; elbow so that the tool looks at the wall"),
+        *_TOOL,
+        Range("speed", 0.2, 0.45, "approach, m/s"),
+        Range("x", 0.0, 0.13, "shoulder's pitch axis ahead of the base's center, m"),
+        Range("z", -0.10, 0.0, "shoulder's height over the base's center, m"),
+        _SLIP,
+        *_COMMON,
+    ),
+    # A quadruped stands in more ways than a humanoid.
+    "solo8-push": _pushed(0.3),
+    "talos-push": _pushed(0.15),
+}
+# Where the URDF has the shoulder's pitch axis, m.
+URDF_X, URDF_Z = 0.08, -0.06
+
+SHIPPED, OWN_MOUNTING, OWN_ARMATURE = "as shipped", "the robot's own mounting", "the robot's own armature (÷ 3)"
+_GAIN = {"K × 0.5": {"gain": 0.5}, "K × 2": {"gain": 2.0}}
+_ARMATURE = {"armature ÷ 3": {"armature": 1 / 3}, "armature × 3": {"armature": 3.0}}
+_CONTACT = {"surface ÷ 4 as stiff": {"contact": 0.25}, "surface × 4 as stiff": {"contact": 4.0}}
+_AERIAL_SLIP = {"μ 0.15": {"friction": 0.15}, "μ 0.6": {"friction": 0.6}}
+_PUSHED = {
+    SHIPPED: {},
+    **_GAIN,
+    "start stirred, first": {"stir": 0.15},
+    **_ARMATURE,
+    "push × 0.5": {"force": 0.5},
+    "push × 1.5": {"force": 1.5},
+    "start stirred, second": {"stir": 0.15},
+    "μ 0.5": {"friction": 0.5},
+    "μ 1.2": {"friction": 1.2},
+    **_CONTACT,
+    "start stirred, third": {"stir": 0.15},
+    "gains × 0.5": {"stiffness": 0.5},
+    "gains × 2": {"stiffness": 2.0},
+}
+# One value changed at a time, everything else as shipped; those of most interest first.
+VARIATIONS: dict[str, dict[str, dict[str, float]]] = {
+    "aerial-vertical": {
+        SHIPPED: {},
+        **_GAIN,
+        "elbow 0.5": {"elbow": 0.5},
+        "elbow 1.3": {"elbow": 1.3},
+        **_ARMATURE,
+        OWN_MOUNTING: {"x": URDF_X},
+        "speed × 0.5": {"speed": 0.25},
+        "speed × 1.5": {"speed": 0.75},
+        "elbow 0.7": {"elbow": 0.7},
+        "elbow −0.9": {"elbow": 0.9, "fold": -1.0},
+        "mounted 4 cm back": {"x": -0.04},
+        "mounted 4 cm ahead": {"x": 0.04},
+        **_CONTACT,
+        **_AERIAL_SLIP,
+    },
+    "aerial-lateral": {
+        SHIPPED: {},
+        **_GAIN,
+        "shoulder −0.75": {"shoulder": -0.75},
+        "shoulder −1.4": {"shoulder": -1.4},
+        OWN_ARMATURE: {"armature": 1 / 3},
+        "armature × 3": {"armature": 3.0},
+        "speed × 0.5": {"speed": 0.15},
+        "speed × 1.5": {"speed": 0.45},
+        "speed × 1.67 (as vertical)": {"speed": 0.5},
+        "shoulder −1.7": {"shoulder": -1.7},
+        "mounted 3 cm higher": {"z": -0.03},
+        "mounted 3 cm lower": {"z": -0.09},
+        **_CONTACT,
+        **_AERIAL_SLIP,
+    },
+    "solo8-push": _PUSHED,
+    "talos-push": _PUSHED,
+}

@@ -1,0 +1,85 @@
+"""The offline posture of a scenario: its constraints are those of optimize, and the motors hold it with room."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.posture.build_problem import build_problem
+from impact_posture.posture.load_cases import load_cases
+from impact_posture.posture.search import feasible
+from impact_posture.robot.actuation import allocation_matrix, thrust_limits
+from impact_posture.simulation import offline
+from impact_posture.simulation.offline import SHARE, is_held, offline_posture, scenario_requirements
+from impact_posture.simulation.scenario import set_up
+from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_objective import scenario_objective
+from tests.simulation.factories import needs_mujoco
+
+needs_mujoco()
+
+
+@pytest.mark.parametrize("name", ["aerial-vertical", "aerial-lateral", "solo8-push"])
+def test_it_keeps_what_optimize_demands(name: str) -> None:
+    setup = set_up(read_scenario(name))
+    objective = scenario_objective(setup)
+    found, demands = offline_posture(setup, objective, starts=3), scenario_requirements(setup, objective)
+    assert demands.collision and demands.holdable and demands.limit_share == SHARE
+    problem = build_problem(setup.robot, objective, setup.q, demands)
+    assert problem.surroundings is not None
+    assert not problem.surroundings.collisions(found.q)
+    assert feasible(problem, found.q)
+    assert found.note == "" and found.objective < found.initial and found.distance > 0.1
+    assert found.objective == pytest.approx(objective.value(found.q))
+
+
+@pytest.mark.parametrize("name", ["aerial-vertical", "aerial-lateral"])
+def test_a_flying_robot_holds_it_with_room(name: str) -> None:
+    """By inverse dynamics and the allocation alone."""
+    setup = set_up(read_scenario(name))
+    q, robot = offline_posture(setup, scenario_objective(setup), starts=1).q, setup.robot
+    torque = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
+    effort = np.asarray(robot.model.effortLimit)
+    assert (np.abs(torque[6:]) <= SHARE * effort[6:] + 1e-9).all()
+    propulsion = robot.spec.propulsion
+    assert propulsion is not None
+    low, high = thrust_limits(propulsion)
+    thrusts = np.linalg.solve(allocation_matrix(robot.model, propulsion), torque[:6])
+    assert (np.abs(thrusts - (low + high) / 2) <= SHARE * (high - low) / 2 + 1e-9).all()
+
+
+def test_the_share_of_the_limits_counts() -> None:
+    """A start is held up to the very share that it takes, about the middle of the range of the rotors."""
+    setup = set_up(read_scenario("aerial-lateral"))
+    objective = scenario_objective(setup)
+    assert is_held(setup, objective)
+    demands = scenario_requirements(setup, objective)
+    whole = load_cases(objective, setup.q, replace(demands, limit_share=1.0)).holding(setup.q)
+    assert whole is not None
+    for share, fits in ((1.01 * whole.largest_share, True), (0.99 * whole.largest_share, False)):
+        cases = load_cases(objective, setup.q, replace(demands, limit_share=share))
+        part = cases.holding(setup.q)
+        assert part is not None and part.feasible is fits
+        assert part.largest_share == pytest.approx(whole.largest_share / share)
+        assert f"within {100 * share:g} % of their limits at rest" in cases.cases[0].words
+
+
+def test_a_note_says_where_collisions_cannot_be_demanded(monkeypatch: pytest.MonkeyPatch) -> None:
+    setup = set_up(read_scenario("aerial-vertical"))
+    objective = scenario_objective(setup)
+    # No posture keeps all links a meter apart.
+    demands = replace(scenario_requirements(setup, objective), clearance=1.0)
+    monkeypatch.setattr(offline, "scenario_requirements", lambda *_: demands)
+    found = offline_posture(setup, objective, starts=1)
+    assert found.note.startswith("links may touch in the offline posture, because none without collisions was found")
+    assert "\n" not in found.note and found.objective < found.initial
+
+
+def test_without_the_feet_nothing_is_demanded_of_them() -> None:
+    setup = set_up(read_scenario("solo8-push"))
+    objective = scenario_objective(setup, free=True)
+    assert not scenario_requirements(setup, objective).com_over_feet
+    assert offline_posture(setup, objective, starts=1).objective < objective.value(setup.q)
