@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
 
-from impact_posture.errors import CompilerError, SpecError
+from impact_posture.errors import CompilerError, SpecError, one_line
 from impact_posture.escape import file_name
 from impact_posture.output_folder import whole_folder, write_record
 from impact_posture.posture.global_search import SelfMotionMap
@@ -34,10 +34,54 @@ if TYPE_CHECKING:
 
 FORMATS = ("png",)
 
-FinishRequest = tuple[
-    Path, np.ndarray, np.ndarray, NullSpacePath, SelfMotionMap | None, dict[str, Any], bool, Sequence[str], int
-]
-Finished = tuple[int, int, "tuple[Export, str] | None"]
+
+
+class FinishRequest(NamedTuple):
+    """What :func:`finish_result` makes.  It can be sent to a process.
+
+    Attributes:
+        folder: The folder.
+        initial: Posture before, shape (nq,).
+        optimal: Posture after, shape (nq,).
+        path: The null-space path between them.
+        mapped: The self-motion map, if there is one.
+        document: The content of ``result.json``.
+        codegen: Whether to export the C code.
+        formats: Formats of the figures.
+        jobs: Number of processes.
+        report: Whether to write ``report.html``.
+        meshes: Whether the report may hold the meshes of the user's own URDF.
+    """
+
+    folder: Path
+    initial: np.ndarray
+    optimal: np.ndarray
+    path: NullSpacePath
+    mapped: SelfMotionMap | None
+    document: dict[str, Any]
+    codegen: bool
+    formats: Sequence[str]
+    jobs: int
+    report: bool
+    meshes: bool
+
+
+class Finished(NamedTuple):
+    """A step of :func:`finish_result` that has ended.
+
+    Attributes:
+        done: Number of finished steps.
+        count: Number of all steps.
+        export: The export and why it could not be built, if this step made it.
+        report_error: Why there is no report, if this step failed to make it.
+    """
+
+    done: int
+    count: int
+    export: tuple[Export, str] | None = None
+    report_error: str = ""
+
+
 Finish = Callable[[FinishRequest], Iterator[Finished]]
 # Exceptions from reading a changed or incomplete result.
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, EOFError, BadZipFile, RecursionError)
@@ -51,11 +95,13 @@ class Written:
         out: The folder.
         export: The C export, or ``None``.
         compiler_error: Why the C code could not be built; empty if it was built, or if there is no compiler.
+        report_error: Why there is no report; empty if there is one, or if none was wanted.
     """
 
     out: Path
     export: Export | None
     compiler_error: str = ""
+    report_error: str = ""
 
 
 def default_out(prepared: Prepared) -> Path:
@@ -75,6 +121,8 @@ def write_result(
     force: bool = False,
     codegen: bool = True,
     formats: Sequence[str] = FORMATS,
+    report: bool = True,
+    meshes: bool = False,
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
     finish: Finish | None = None,
@@ -92,8 +140,10 @@ def write_result(
         force: Replace an earlier result.
         codegen: Export, build and check the C code, too.
         formats: Formats of the figures.
+        report: Write ``report.html``, too.
+        meshes: Let it hold the meshes of the user's own URDF.
         jobs: Processes that draw and compile side by side.
-        progress: Called with ``(done, all)`` after each figure and after the C code.
+        progress: Called with ``(done, all)`` after each figure, the C code and the report.
         finish: :func:`finish_result` of this problem, in another process; in this one by default.
 
     Raises:
@@ -101,7 +151,7 @@ def write_result(
     """
     path = null_space_path(solution.problem, solution.initial, solution.q)
     made: Export | None = None
-    failure = ""
+    failure = report_error = ""
     with whole_folder(out, force=force, kind="result") as folder:
         _write_json(folder / "result.json", document)
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff, mapped))  # type: ignore[arg-type]
@@ -111,35 +161,48 @@ def write_result(
             from impact_posture.path.files import write_path
 
             write_path(folder, prepared.impact.robot, motion)
-        request = (folder, solution.initial, solution.q, path, mapped, document, codegen, formats, jobs)
-        for done, count, exported in (finish or partial(finish_result, prepared))(request):
-            if exported is not None:
-                made, failure = exported
+        request = FinishRequest(
+            folder, solution.initial, solution.q, path, mapped, document, codegen, formats, jobs, report, meshes
+        )
+        for step in (finish or partial(finish_result, prepared))(request):
+            if step.export is not None:
+                made, failure = step.export
+            report_error = step.report_error
             if progress:
-                progress(done, count)
-    return Written(out, made, failure)
+                progress(step.done, step.count)
+    return Written(out, made, failure, report_error)
 
 
 def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finished]:
-    """Draw the figures of a result and export its C code; yield after each.
+    """Draw the figures of a result, export its C code and write its report; yield after each.
 
     Args:
         prepared: The problem.
-        request: The folder, the postures before and after, the path between them, the self-motion map, the content of
-            ``result.json``, whether to export, the formats of the figures, and the number of processes.  It can be
-            sent to a process.
-
-    Yields:
-        The number of finished files, the number of all files, and what :func:`_export` returns if it has ended.
+        request: What to make.
     """
-    folder, initial, optimal, path, mapped, document, codegen, formats, jobs = request
+    folder, initial, optimal, path, mapped, document = request[:6]
     # The C code comes first, because it takes longest.
-    tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
+    tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if request.codegen else []
     view = _view(prepared, initial, optimal, path, document, _motion(folder, document, prepared.impact.robot), mapped)
-    tasks += _drawings(view, folder, formats)
-    with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
+    tasks += _drawings(view, folder, request.formats)
+    count = len(tasks) + request.report
+    with fork_map(lambda index: tasks[index](), len(tasks), request.jobs) as results:
         for done, (index, result) in enumerate(results, start=1):
-            yield done, len(tasks), result if codegen and index == 0 else None
+            yield Finished(done, count, result if request.codegen and index == 0 else None)
+    if request.report:
+        # It shows the figures, so it comes last.
+        yield Finished(count, count, report_error=_report(prepared, view, request))
+
+
+def _report(prepared: Prepared, view: ResultView, request: FinishRequest) -> str:
+    """Write the report; return why that failed, because a result is kept without it."""
+    try:
+        from impact_posture.report.result_report import write_result_report
+
+        write_result_report(request.folder, prepared, view, request.document, meshes=request.meshes)
+    except Exception as error:
+        return one_line(f"{type(error).__name__}: {error}")
+    return ""
 
 
 def _export(prepared: Prepared, optimal: np.ndarray, folder: Path) -> tuple[Export, str]:
@@ -246,8 +309,43 @@ def _write_json(path: Path, document: dict[str, object]) -> None:
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
+class LoadedResult(NamedTuple):
+    """A result folder that was read back.
+
+    Attributes:
+        prepared: The problem.
+        view: The view from which its figures are drawn.
+        document: The content of ``result.json``.
+    """
+
+    prepared: Prepared
+    view: ResultView
+    document: dict[str, Any]
+
+
 def load_view(folder: Path) -> ResultView:
-    """Read the view of a result folder, from which its figures are drawn.
+    """Read the view of a result folder, from which its figures are drawn; see :func:`load_result`."""
+    return load_result(folder).view
+
+
+def rewrite_report(folder: Path, *, meshes: bool = False) -> Path:
+    """Write ``report.html`` of a result folder again; return its path.
+
+    Raises:
+        SpecError: As :func:`load_result`.
+        OutputError: It cannot be written.
+    """
+    from impact_posture.report.result_report import write_result_report
+
+    loaded = load_result(folder)
+    try:
+        return write_result_report(folder, *loaded, meshes=meshes)
+    except _BROKEN as error:
+        raise _broken(folder, error) from None
+
+
+def load_result(folder: Path) -> LoadedResult:
+    """Read a result folder.
 
     Raises:
         SpecError: The folder is no result folder, or was made with another robot model.
@@ -274,10 +372,13 @@ def load_view(folder: Path) -> ResultView:
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
             for key in ("initial", "optimal")
         )
-        return _view(
-            prepared, initial, optimal, path, document, _motion(folder, document, prepared.impact.robot), mapped
-        )
+        motion = _motion(folder, document, robot)
+        view = _view(prepared, initial, optimal, path, document, motion, mapped)
+        return LoadedResult(prepared, view, document)
     except _BROKEN as error:
-        raise SpecError(
-            f"is no whole result ({type(error).__name__}: {error})", where=str(folder), hint="run optimize again"
-        ) from None
+        raise _broken(folder, error) from None
+
+
+def _broken(folder: Path, error: Exception) -> SpecError:
+    what = f"is no whole result ({type(error).__name__}: {error})"
+    return SpecError(what, where=str(folder), hint="run optimize again")

@@ -1,0 +1,180 @@
+"""The shapes of a robot as the page draws them: small meshes, each stored once."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.arrays import Array
+from impact_posture.collision.geometry import load_geometry
+from impact_posture.collision.parts import hull_surface, surface_of
+from impact_posture.collision.shape_points import shape_points
+from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.report.mesh_license import MeshLicense, license_of
+from impact_posture.robot.robot import Robot
+
+# Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
+_MOST_TRIANGLES = 150_000
+# Corners of a mesh are whole multiples of its extent over this.
+_LEVELS = 65535
+_GRAY = (0.72, 0.74, 0.77, 1.0)
+# Bytes of a COLLADA file in which its colors are sought.
+_HEAD = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A triangle mesh with whole coordinates.
+
+    Attributes:
+        corners: Corners as multiples of ``step`` from ``low``, shape (k, 3).
+        faces: Triangles as indices, shape (n, 3).
+        low: Least coordinates, m, shape (3,).
+        step: Length of a unit, m.
+    """
+
+    corners: NDArray[np.uint16]
+    faces: NDArray[np.int_]
+    low: Array
+    step: float
+
+    @property
+    def points(self) -> Array:
+        """Corners, m, shape (k, 3)."""
+        return self.low + self.step * self.corners
+
+
+@dataclass(frozen=True)
+class Part:
+    """A solid that moves with a joint.
+
+    Attributes:
+        joint: Index of the joint.
+        solid: Index of the solid.
+        placement: Placement in the axes of the joint.
+        color: Red, green, blue and opacity, 0 to 1.
+    """
+
+    joint: int
+    solid: int
+    placement: pin.SE3
+    color: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnRobot:
+    """The shapes of a robot.
+
+    Attributes:
+        solids: The meshes.
+        parts: Where they are.
+        licenses: Where meshes of others come from, and on what terms.
+        notes: What is drawn in place of something else, one line each.
+    """
+
+    solids: tuple[Solid, ...]
+    parts: tuple[Part, ...]
+    licenses: tuple[MeshLicense, ...]
+    notes: tuple[str, ...]
+
+
+@lru_cache(maxsize=4)
+def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
+    """Return the visual shapes of a robot; hulls for meshes that may not be passed on; sticks where nothing is there.
+
+    Args:
+        robot: The robot.
+        meshes: Pass on the meshes of the user's own URDF, too.
+    """
+    described, warnings = read_urdf_shapes(robot, "visual")
+    loaded = load_geometry(robot, described)
+    by_name = {shape.name: shape for shape in described}
+    licenses: dict[str, MeshLicense] = {}
+    index: dict[object, int] = {}
+    surfaces: list[tuple[Array, NDArray[np.int_]]] = []
+    parts, hulls = [], False
+    for placed in loaded.model.geometryObjects:
+        shape = by_name[placed.name]
+        known = None if shape.mesh is None else license_of(shape.mesh)
+        hull = shape.mesh is not None and not (meshes or (known and known.allows))
+        if known and not hull:
+            licenses[known.package] = known
+        hulls |= hull
+        # The same file at the same scale is the same mesh; an address in memory would name another one later.
+        key = (shape.kind, shape.sizes, shape.mesh)
+        if key not in index:
+            index[key] = len(surfaces)
+            surfaces.append(hull_surface(shape_points(placed.geometry)) if hull else surface_of(placed.geometry))
+        parts.append(Part(int(placed.parentJoint), index[key], placed.placement, shape.color or _file_color(shape)))
+    notes = [*warnings, *loaded.warnings]
+    if hulls:
+        notes.append("meshes are drawn as their convex hulls, because a page passes them on (`meshes`)")
+    if not parts:
+        surfaces, parts = _sticks(robot)
+        notes.append("the robot has no shapes that can be drawn: sticks join its joints")
+    solids = _reduced([_quantized(*surface) for surface in surfaces])
+    return DrawnRobot(tuple(solids), tuple(parts), tuple(licenses.values()), tuple(notes))
+
+
+def quantized_hull(points: Array) -> Solid:
+    """Return the convex hull of points."""
+    return _quantized(*hull_surface(points))
+
+
+def _quantized(points: Array, faces: NDArray[np.int_]) -> Solid:
+    low = points.min(axis=0)
+    step = max(float(np.ptp(points, axis=0).max()), 1e-9) / _LEVELS
+    return _welded(Solid(np.round((points - low) / step).astype(np.uint16), faces, low, step), 0)
+
+
+def _welded(solid: Solid, bits: int) -> Solid:
+    """Join the corners that agree but for their last ``bits``, and drop the triangles that vanish."""
+    keys = (solid.corners >> bits).astype(np.int64) @ (1 << np.array([32, 16, 0]))
+    _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
+    faces = merged[solid.faces]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    # In the order of their first use corners differ little from the last ones, so that they compress well.
+    used, at = np.unique(faces, return_index=True)
+    order = used[np.argsort(at)]
+    renamed = np.empty(len(first), dtype=int)
+    renamed[order] = np.arange(len(order))
+    return Solid(solid.corners[first[order]], renamed[faces], solid.low, solid.step)
+
+
+def _reduced(solids: list[Solid]) -> list[Solid]:
+    """Weld the corners within a length that grows until all meshes together have few enough triangles."""
+    length = max((solid.step for solid in solids), default=0.0)
+    while sum(len(solid.faces) for solid in solids) > _MOST_TRIANGLES:
+        length *= 2
+        bits = [max(int(np.log2(length / solid.step)), 0) for solid in solids]
+        solids = [_welded(solid, k) if k else solid for solid, k in zip(solids, bits, strict=True)]
+    return solids
+
+
+def _sticks(robot: Robot) -> tuple[list[tuple[Array, NDArray[np.int_]]], list[Part]]:
+    """Return rods from each joint to the next ones."""
+    model = robot.model
+    spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
+    radius = 0.02 * max(0.1, *(float(np.linalg.norm(span)) for _, span in spans))
+    ball = shape_points(coal.Sphere(radius))
+    surfaces = [hull_surface(np.vstack([ball, ball + span])) for _, span in spans]
+    return surfaces, [Part(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
+
+
+def _file_color(shape: UrdfShape) -> tuple[float, ...]:
+    """Return the mean of the colors in a COLLADA file, which its loader drops; gray for another shape."""
+    if shape.mesh is None or shape.mesh.suffix.lower() != ".dae":
+        return _GRAY
+    with Path(shape.mesh).open("rb") as file:
+        head = file.read(_HEAD)
+    found: list[Any] = re.findall(rb"<diffuse>\s*<color[^>]*>\s*([\d.eE+-]+)\s+([\d.eE+-]+)\s+([\d.eE+-]+)\s", head)
+    colors = [tuple(map(float, color)) for color in found]
+    return (*np.clip(np.mean(colors, axis=0), 0.0, 1.0).tolist(), 1.0) if colors else _GRAY
