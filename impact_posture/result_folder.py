@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 FORMATS = ("png",)
 
 
-
 class FinishRequest(NamedTuple):
     """What :func:`finish_result` makes.  It can be sent to a process.
 

@@ -94,8 +94,8 @@ def render(content: Content, scene: Scene, pictures: Sequence[tuple[str, str]]) 
 
 
 def figures(folder: Path) -> list[tuple[str, str]]:
-    """Return name and address of each figure in a folder and those below: SVG if there is one, else PNG in fewer colors."""
-    found = sorted(p for p in folder.rglob("*") if p.suffix in _TYPES and p.is_file() and "runs" not in p.parts)
+    """Return name and address of each figure in a folder and below: SVG if there is one, else PNG in fewer colors."""
+    found = sorted(p for p in folder.rglob("*") if p.suffix in _TYPES and p.is_file())
     each = [list(same) for _, same in groupby(found, key=lambda path: path.with_suffix(""))]
     return [(str(p[-1].relative_to(folder).with_suffix("")), _address(p[-1])) for p in each]
 
@@ -106,7 +106,9 @@ def _address(path: Path) -> str:
         from PIL import Image
 
         with Image.open(path) as picture, io.BytesIO() as file:
-            picture.convert("RGB").quantize(_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(file, "PNG", optimize=True)
+            picture.convert("RGB").quantize(_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+                file, "PNG", compress_level=7
+            )
             content = file.getvalue()
     return f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(content).decode('ascii')}"
 
@@ -136,13 +138,17 @@ def _charts(track: Track) -> list[dict[str, Any]]:
     x = LEFT + (RIGHT - LEFT) * (track.times - track.times[0]) / ((track.times[-1] - track.times[0]) or 1.0)
     for series in track.series:
         known = np.isfinite(series.values)
-        low, high = (float(series.values[known].min()), float(series.values[known].max())) if known.any() else (0.0, 0.0)
+        low, high = (
+            (float(series.values[known].min()), float(series.values[known].max())) if known.any() else (0.0, 0.0)
+        )
         low = min(low, 0.0) if low < 0.4 * high else low
         y = BOTTOM - (BOTTOM - TOP) * (series.values - low) / ((high - low) or 1.0)
+        ends = [number(float(series.values[k])) for k in (0, -1)]
         charts.append({
-            "name": series.name, "unit": series.unit, "lines": _lines(x, y, known), "low": number(low), "high": number(high),
-            "first": number(float(track.times[0])), "last": f"{number(float(track.times[-1]))} {track.unit}".rstrip(),
-            "words": f"{series.name} from {number(float(series.values[0]))} to {number(float(series.values[-1]))} {series.unit}".rstrip(),
+            "name": series.name, "unit": series.unit, "lines": _lines(x, y, known),
+            "low": number(low), "high": number(high),
+            "first": number(float(track.times[0])), "last": number(float(track.times[-1])),
+            "words": f"{series.name} from {ends[0]} to {ends[1]} {series.unit}".rstrip(),
         })  # fmt: skip
     return charts
 
@@ -152,5 +158,6 @@ def _lines(x: Array, y: Array, known: Array) -> list[str]:
     lines = []
     for good, indices in groupby(range(len(x)), key=lambda k: bool(known[k])):
         if good:
-            lines.append(" ".join(f"{x[k]:.1f},{y[k]:.1f}" for k in indices))
+            # Frames a millisecond apart mostly fall on the same place.
+            lines.append(" ".join(point for point, _ in groupby(f"{x[k]:.1f},{y[k]:.1f}" for k in indices)))
     return lines

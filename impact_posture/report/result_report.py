@@ -12,7 +12,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.coulomb_contacts import coulomb_jump
 from impact_posture.impact.quantity_table import quantities, quantity_rows
-from impact_posture.plot.view import ResultView, SEPARATOR, header_lines, number
+from impact_posture.plot.view import SEPARATOR, ResultView, header_lines, number
 from impact_posture.posture.problem_settings import Prepared
 from impact_posture.report.page import Content, Table, write_page
 from impact_posture.report.scene import Scene, Series, Track, Wall
@@ -55,8 +55,12 @@ def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> 
             point = point_on(robot, one.frame, one.offset)
             at = numeric.placement(point)
             n = np.array(one.normal)
-            walls.append(Wall("surface", at.translation[None], at.rotation @ n if one.normal_frame == "contact" else n))
-    return Scene(robot, draw_robot(robot, meshes), view.objective.contact, (_track(prepared, view),), tuple(walls), True)
+            walls.append(
+                Wall("surface", at.translation[None], at.rotation @ n if one.normal_frame == "contact" else n)
+            )
+    return Scene(
+        robot, draw_robot(robot, meshes), view.objective.contact, (_track(prepared, view),), tuple(walls), True
+    )
 
 
 def _track(prepared: Prepared, view: ResultView) -> Track:
@@ -141,6 +145,6 @@ def _moves(view: ResultView, document: dict[str, Any]) -> str:
         end = "the optimum" if document["path"]["found"] else "the best posture that was reached"
         return f"The slider follows the motion of --path from the initial posture to {end}, over time. {arrows}."
     return (
-        "The slider follows the straight line between the two postures, each point pulled onto the constraints. "
-        f"It is no motion plan: limits of speed and collisions on the way are not checked (--path does that). {arrows}."
+        "The slider follows the straight line between the two postures, each point pulled onto the constraints. It is "
+        f"no motion plan: limits of speed and collisions on the way are not checked (--path does that). {arrows}."
     )

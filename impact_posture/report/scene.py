@@ -7,6 +7,7 @@ import gzip
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -114,15 +115,18 @@ class Scene:
                 walls.append({"kind": wall.kind, "shape": len(solids)})
                 solids.append(quantized_hull(wall.points))
             else:
-                at = center + wall.normal * ((wall.points[0] - center) @ wall.normal) if wall.kind == "ground" else wall.points[0]
+                at = (
+                    center + wall.normal * ((wall.points[0] - center) @ wall.normal)
+                    if wall.kind == "ground"
+                    else wall.points[0]
+                )
                 walls.append({"kind": wall.kind, "point": at, "normal": wall.normal, "size": 0.75 * size})
         normal = self.tracks[0].normals[0]
+        pairs = zip(model.parents, model.inertias, strict=True)
+        parts = [(p.joint, p.solid, pin.SE3ToXYZQUAT(p.placement), p.color) for p in self.drawn.parts]
         content = {
-            "joints": [{"parent": int(model.parents[k]), "center": model.inertias[k].lever.tolist()} for k in range(model.njoints)],
-            "parts": [
-                {"joint": p.joint, "shape": p.solid, "pose": pin.SE3ToXYZQUAT(p.placement).tolist(), "color": p.color}
-                for p in self.drawn.parts
-            ],
+            "joints": [{"parent": int(parent), "center": inertia.lever.tolist()} for parent, inertia in pairs],
+            "parts": [dict(zip(("joint", "shape", "pose", "color"), part, strict=True)) for part in parts],
             "shapes": [_solid(solid) for solid in solids],
             "walls": walls,
             "tracks": tracks,
@@ -131,7 +135,7 @@ class Scene:
             "center": center.tolist(),
             "eye": _EYES[np.argmin(np.abs(_EYES @ normal / np.linalg.norm(_EYES[0]) - _SLANT))].tolist(),
             "scale": {
-                "ellipsoid": 0.16 * size / _largest(np.linalg.eigvalsh(t.ellipsoids).max() ** 0.5 for t in self.tracks),
+                "ellipsoid": 0.16 * size / _largest(map(_longest_axis, self.tracks)),
                 "jump": 0.3 * size / _largest(track["largest_jump"] for track in tracks),
                 "force": 0.35 * size / _largest(_norms(t.forces) ** 0.5 for t in self.tracks if t.forces is not None),
             },
@@ -161,7 +165,7 @@ class Scene:
             "jumps": _levels(arrows.reshape(frames, -1)),
             "largest_jump": _norms(arrows),
             "forces": None if track.forces is None else track.forces.astype(np.float32),
-            "series": [{"unit": s.unit, "values": s.values.astype(np.float32)} for s in track.series],
+            "series": [{"values": s.values.astype(np.float32)} for s in track.series],
         }
 
     def _box(self) -> tuple[Array, Array]:
@@ -181,6 +185,10 @@ def _norms(vectors: Array) -> float:
     return float(np.linalg.norm(vectors, axis=-1).max())
 
 
+def _longest_axis(track: Track) -> float:
+    return float(np.linalg.eigvalsh(track.ellipsoids).max()) ** 0.5
+
+
 def _largest(values: Iterable[float]) -> float:
     """Return the largest value, or one where all are zero, so that a scale stays finite."""
     return max(values, default=0.0) or 1.0
@@ -188,7 +196,7 @@ def _largest(values: Iterable[float]) -> float:
 
 def _straighten(quaternions: Array) -> None:
     """Choose the sign of each quaternion that is nearer to the last frame's, so that the viewer can go between."""
-    for before, now in zip(quaternions[:-1], quaternions[1:], strict=True):
+    for before, now in pairwise(quaternions):
         now[(before * now).sum(axis=-1) < 0] *= -1
 
 

@@ -71,7 +71,7 @@ function arrow(color, radius) {
   for (const part of group.children) part.renderOrder = 2;
   group.span = (from, along) => {
     const length = along.length(), head = Math.min(1, length / (12 * radius));
-    group.visible = length > 2e-3 * data.size;
+    group.visible = length > 0.01 * data.size;
     group.position.copy(from); group.quaternion.setFromUnitVectors(new Vector3(0, 1, 0), along.normalize());
     group.children[0].scale.y = Math.max(length - 8 * radius * head, 1e-9);
     group.children[1].position.y = length; group.children[1].scale.setScalar(head || 1e-9);
@@ -157,7 +157,7 @@ function show() {
   $('where').textContent = track.unit ? `t = ${time.toFixed(3)} ${track.unit}` : `${Math.round(100 * share)} % of the way`;
   $('slider').value = at; $('slider').setAttribute('aria-valuetext', $('where').textContent);
   track.series.forEach((series, k) => {
-    charts[k].querySelector('output').textContent = `${format(row(series.values, 1)[0])} ${series.unit}`;
+    charts[k].querySelector('output').textContent = format(row(series.values, 1)[0]);
     for (const end of ['x1', 'x2']) charts[k].querySelector('.cursor').setAttribute(end, 60 + 330 * share);
   });
   if (!waiting) { waiting = true; requestAnimationFrame(() => { waiting = false; draw(); }); }

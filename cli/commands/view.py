@@ -1,0 +1,22 @@
+"""``impact-posture view DIR``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from impact_posture_cli.commands.report import OutputFolder
+
+
+def view(folder: OutputFolder) -> None:
+    """Run ``impact-posture view``."""
+    import webbrowser
+
+    from impact_posture.errors import InputError
+    from impact_posture.report import REPORT
+
+    page = Path(folder) / REPORT
+    if not page.is_file():
+        hint = f"make it with `impact-posture report {folder}`" if page.parent.is_dir() else "name a folder"
+        raise InputError("is not there", where=str(page), hint=hint)
+    if not webbrowser.open(page.resolve().as_uri()):
+        raise InputError("no browser could be started", where=str(page), hint="open this file in a browser")
