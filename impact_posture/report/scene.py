@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -186,12 +186,12 @@ def _norms(vectors: Array) -> float:
 
 
 def _longest_axis(track: Track) -> float:
-    return float(np.linalg.eigvalsh(track.ellipsoids).max()) ** 0.5
+    return float(np.sqrt(np.linalg.eigvalsh(track.ellipsoids).max()))
 
 
 def _largest(values: Iterable[float]) -> float:
     """Return the largest value, or one where all are zero, so that a scale stays finite."""
-    return max(values, default=0.0) or 1.0
+    return float(max(values, default=0.0)) or 1.0
 
 
 def _straighten(quaternions: Array) -> None:
@@ -215,9 +215,7 @@ def _levels(columns: Array) -> dict[str, Any]:
 def _packed(content: dict[str, Any]) -> tuple[str, str]:
     buffer = bytearray()
 
-    def place(array: Any) -> Sequence[object]:
-        if not isinstance(array, np.ndarray):
-            return array.tolist()  # type: ignore[no-any-return]
+    def place(array: Any) -> Any:
         if array.dtype.name not in _TYPES:
             return array.tolist()
         buffer.extend(bytes(-len(buffer) % 4))

@@ -104,8 +104,8 @@ function stage(renderer) {
   const shapes = data.shapes.map(geometry), body = robot(shapes, false), ghost = robot(shapes, true), walls = data.walls.map((one) => wall(one, shapes));
   const normal = arrow(0x000000, 0.004 * data.size), force = arrow(0x0046a0, 0.008 * data.size), jumps = body.map(() => arrow(0xc24a00, 0.004 * data.size));
   const now = ellipsoid(0x0072b2, 0.35, false), first = ellipsoid(0x883300, 0.45, true);
-  scene.add(body[0], ghost[0], ...walls, normal, force, ...jumps, now, first, new AmbientLight(0xffffff, 1.4));
-  for (const [x, y, z, power] of [[3, -4, 6, 2], [-4, 3, 2, 1]]) { const sun = new DirectionalLight(0xffffff, power); sun.position.set(x, y, z); scene.add(sun); }
+  scene.add(body[0], ghost[0], ...walls, normal, force, ...jumps, now, first, new AmbientLight(0xffffff, 1.1));
+  for (const [x, y, z, power] of [[3, -4, 6, 1.5], [-4, 3, 2, 0.8]]) { const sun = new DirectionalLight(0xffffff, power); sun.position.set(x, y, z); scene.add(sun); }
 
   const controls = new OrbitControls(camera, canvas);
   controls.listenToKeyEvents(canvas); controls.addEventListener('change', () => show());
