@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.impact.contact import ImpactContact, point_on
@@ -159,12 +160,12 @@ class Scene:
             "unit": track.unit,
             "times": track.times.astype(np.float32),
             "poses": _levels(poses.reshape(frames, -1)),
-            "points": at.astype(np.float32),
-            "normals": track.normals.astype(np.float32),
-            "ellipsoids": np.array([root(e)[np.triu_indices(3)] for e in track.ellipsoids], dtype=np.float32),
+            "points": _levels(at),
+            "normals": _levels(track.normals),
+            "ellipsoids": _levels(np.array([root(e)[np.triu_indices(3)] for e in track.ellipsoids])),
             "jumps": _levels(arrows.reshape(frames, -1)),
             "largest_jump": _norms(arrows),
-            "forces": None if track.forces is None else track.forces.astype(np.float32),
+            "forces": None if track.forces is None else _levels(track.forces),
             "series": [{"values": s.values.astype(np.float32)} for s in track.series],
         }
 
@@ -202,14 +203,23 @@ def _straighten(quaternions: Array) -> None:
 
 def _solid(solid: Solid) -> dict[str, Any]:
     kind = np.uint16 if len(solid.corners) <= 65536 else np.uint32
-    corners = {"values": solid.corners, "low": solid.low.tolist(), "step": [solid.step] * 3}
-    return {"corners": corners, "faces": solid.faces.astype(kind)}
+    corners = {"values": _differences(solid.corners), "low": solid.low.tolist(), "step": [solid.step] * 3}
+    return {"corners": corners, "faces": _differences(solid.faces.astype(kind).reshape(-1, 1))}
+
+
+def _differences(rows: NDArray[Any]) -> NDArray[Any]:
+    """Return the differences between rows of whole numbers, the first from zero, which compress better.
+
+    They wrap around, and the sums of the viewer wrap back.
+    """
+    return np.diff(rows, axis=0, prepend=np.zeros_like(rows[:1]))
 
 
 def _levels(columns: Array) -> dict[str, Any]:
     """Return columns as whole levels between the least and the largest value of each."""
     low, step = columns.min(axis=0), np.maximum(np.ptp(columns, axis=0), 1e-12) / 65535
-    return {"values": np.round((columns - low) / step).astype(np.uint16), "low": low.tolist(), "step": step.tolist()}
+    values = np.round((columns - low) / step).astype(np.uint16)
+    return {"values": _differences(values), "low": low.tolist(), "step": step.tolist()}
 
 
 def _packed(content: dict[str, Any]) -> tuple[str, str]:
