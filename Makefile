@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 JOBS ?= 2
 
 .PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-scan reproduction calibration regression
-.PHONY: pictures clean
+.PHONY: pictures viewer clean
 
 help:
 	@echo "make demo        install into .venv, optimize a real robot, leave pictures and C code in demo/"
@@ -29,6 +29,7 @@ help:
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make pictures    draw the pictures that the documentation shows"
+	@echo "make viewer      rebuild the script of report.html from its sources; needs npm"
 	@echo "make clean       remove what make made"
 
 $(BIN)/python:
@@ -53,6 +54,8 @@ demo: $(VENV)/.installed
 	@cp docs/demo.txt demo/LOOK.txt
 	@echo
 	@cat demo/LOOK.txt
+	@echo
+	@echo "Open demo/report.html in a browser, or: $(BIN)/impact-posture view demo"
 
 test: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -q
@@ -123,6 +126,15 @@ calibration: $(VENV)/.installed-test
 
 regression: $(VENV)/.installed
 	$(BIN)/python -m tests.regression.make
+
+# The script of report.html from npm's packages by their lock file, in a folder of its own; VIEWER_OUT= writes elsewhere.
+VIEWER := impact_posture/report/viewer
+VIEWER_OUT ?= $(VIEWER)/viewer.min.js
+viewer:
+	@rm -rf build/viewer && mkdir -p build/viewer && cp $(VIEWER)/package.json $(VIEWER)/package-lock.json $(VIEWER)/viewer.js build/viewer
+	cd build/viewer && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error
+	cd build/viewer && node_modules/.bin/esbuild viewer.js --bundle --minify --target=es2022 --legal-comments=none --outfile=bundle.js --log-level=warning
+	@{ echo '/*! three.js'; cat build/viewer/node_modules/three/LICENSE; echo '*/'; cat build/viewer/bundle.js; } > $(VIEWER_OUT)
 
 pictures: $(VENV)/.installed
 	$(BIN)/python docs/pictures.py

@@ -65,6 +65,11 @@ CompileLibrary = Annotated[
     bool, option("--compile", panel=OUTPUT, help="Build the shared library and compare it with other libraries.")
 ]
 NoCodegen = Annotated[bool, option("--no-codegen", panel=OUTPUT, help="Leave the C export out.")]
+NoReport = Annotated[bool, option("--no-report", panel=OUTPUT, help="Leave report.html out.")]
+Meshes = Annotated[
+    bool,
+    option("--meshes", panel=OUTPUT, help="Put meshes of your own URDF into report.html, which passes them on."),
+]
 Json = Annotated[bool, option("--json", panel=OUTPUT, help="One JSON document on standard output.")]
 Quiet = Annotated[bool, option("--quiet", "-q", panel=OUTPUT, help="The result alone: no warnings, no progress.")]
 Jobs = Annotated[int, option("--jobs", panel=OUTPUT, min=1, help="Processes that search.")]

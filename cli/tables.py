@@ -48,19 +48,6 @@ def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: 
     return [*rows, ("joint model", describe_joints(impact.robot))]
 
 
-def quantities(impact: ResolvedImpact) -> list[tuple[str, str, str]]:
-    """Return key, unit and meaning of H, G, V, S and E in the metric of an impact."""
-    kinetic = impact.metric.kind == "kinetic"
-    per_impulse, per_speed = ("1/kg", "kg") if kinetic else ("jump²/(N·s)²", "jump²/(m/s)²")
-    return [
-        ("H", per_impulse, "jump² per impulse²"),
-        ("G", "1/kg", "inverse effective mass along n"),
-        ("V", per_speed, "jump² per approach speed², no friction"),
-        ("S", per_speed, "the same when the contact sticks"),
-        ("E", "kg", "energy lost per approach speed², e = 0"),
-    ]
-
-
 def worst_tables(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[str, Any]]) -> None:
     """Show each of several contacts alone, and the objective of each model variant.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,23 +21,31 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def early_writer(settings: ProblemSettings, jobs: int) -> Iterator[Finish | None]:
+def early_writer(
+    settings: ProblemSettings, jobs: int, *, report: bool = True, meshes: bool = False
+) -> Iterator[Finish | None]:
     """Yield :func:`~impact_posture.result_folder.finish_result` of a problem, in a process that prepares for it.
 
     Yield ``None`` for a single job, or where the system has no place for a process or its temporary files.
+
+    Args:
+        settings: The problem.
+        jobs: Number of processes.
+        report: Whether there will be a report, whose shapes take time to load.
+        meshes: Whether the report may hold the meshes of the user's own URDF.
     """
     with ExitStack() as stack:
         finish = None
         if jobs > 1 and "fork" in multiprocessing.get_all_start_methods():
             try:
                 folder = stack.enter_context(scratch_folder())
-                finish = stack.enter_context(fork_server(partial(_load, settings, folder)))
+                finish = stack.enter_context(fork_server(partial(_load, settings, folder, report, meshes)))
             except (OSError, OutputError):
                 finish = None
         yield finish
 
 
-def _load(settings: ProblemSettings, folder: Path) -> Finish:
+def _load(settings: ProblemSettings, folder: Path, report: bool, meshes: bool) -> Finish:
     # The process may be killed.  Then nobody else removes its temporary files, of which matplotlib makes some.
     tempfile.tempdir = str(folder)
     import impact_posture.codegen.export
@@ -45,4 +53,11 @@ def _load(settings: ProblemSettings, folder: Path) -> Finish:
     from impact_posture.posture.problem_settings import prepare
     from impact_posture.result_folder import finish_result
 
-    return partial(finish_result, prepare(settings))
+    prepared = prepare(settings)
+    if report:
+        # What goes wrong here goes wrong again for the report, which says so.
+        with suppress(Exception):
+            from impact_posture.report.shapes import draw_robot
+
+            draw_robot(prepared.impact.robot, meshes)
+    return partial(finish_result, prepared)

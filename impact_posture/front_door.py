@@ -356,6 +356,8 @@ class PostureResult:
         force: bool = False,
         codegen: bool = True,
         formats: Sequence[str] = FORMATS,
+        report: bool = True,
+        meshes: bool = False,
         jobs: int = 2,
         progress: Progress | None = None,
         finish: Finish | None = None,
@@ -367,8 +369,10 @@ class PostureResult:
             force: Replace an earlier result.
             codegen: Whether to export, build and check the C code as well.
             formats: Formats of the pictures: ``png``, ``svg``, ``pdf``.
+            report: Whether to write ``report.html``, a page with all of it and the robot in 3-D.
+            meshes: Whether the page may hold the meshes of the user's own URDF, which it then passes on.
             jobs: Processes that draw and compile side by side.
-            progress: Called after each figure and after the C code with the numbers done and in all.
+            progress: Called after each figure, the C code and the report with the numbers done and in all.
             finish: What draws and compiles; :func:`~impact_posture.early_writer.early_writer` by the command line.
 
         Returns:
@@ -380,7 +384,8 @@ class PostureResult:
         return write_result(
             self._prepared, self.solution, self.document, Path(out), tradeoff=self.tradeoff, motion=self.motion,
             mapped=self._mapped,
-            force=force, codegen=codegen, formats=formats, jobs=jobs, progress=progress, finish=finish,
+            force=force, codegen=codegen, formats=formats, report=report, meshes=meshes, jobs=jobs,
+            progress=progress, finish=finish,
         )  # fmt: skip
 
     def plot(

@@ -12,7 +12,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from impact_posture.errors import CompilerError, SpecError
+from impact_posture.errors import CompilerError, SpecError, one_line
 from impact_posture.escape import file_name
 from impact_posture.output_folder import whole_folder, write_record
 from impact_posture.posture.global_search import SelfMotionMap
@@ -35,9 +35,10 @@ if TYPE_CHECKING:
 FORMATS = ("png",)
 
 FinishRequest = tuple[
-    Path, np.ndarray, np.ndarray, NullSpacePath, SelfMotionMap | None, dict[str, Any], bool, Sequence[str], int
-]
-Finished = tuple[int, int, "tuple[Export, str] | None"]
+    Path, np.ndarray, np.ndarray, NullSpacePath, SelfMotionMap | None, dict[str, Any], bool, Sequence[str], int,
+    bool, bool,
+]  # fmt: skip
+Finished = tuple[int, int, "tuple[Export, str] | str | None"]
 Finish = Callable[[FinishRequest], Iterator[Finished]]
 # Exceptions from reading a changed or incomplete result.
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, EOFError, BadZipFile, RecursionError)
@@ -51,11 +52,13 @@ class Written:
         out: The folder.
         export: The C export, or ``None``.
         compiler_error: Why the C code could not be built; empty if it was built, or if there is no compiler.
+        report_error: Why there is no report; empty if there is one, or if none was wanted.
     """
 
     out: Path
     export: Export | None
     compiler_error: str = ""
+    report_error: str = ""
 
 
 def default_out(prepared: Prepared) -> Path:
@@ -75,6 +78,8 @@ def write_result(
     force: bool = False,
     codegen: bool = True,
     formats: Sequence[str] = FORMATS,
+    report: bool = True,
+    meshes: bool = False,
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
     finish: Finish | None = None,
@@ -92,8 +97,10 @@ def write_result(
         force: Replace an earlier result.
         codegen: Export, build and check the C code, too.
         formats: Formats of the figures.
+        report: Write ``report.html``, too.
+        meshes: Let it hold the meshes of the user's own URDF.
         jobs: Processes that draw and compile side by side.
-        progress: Called with ``(done, all)`` after each figure and after the C code.
+        progress: Called with ``(done, all)`` after each figure, the C code and the report.
         finish: :func:`finish_result` of this problem, in another process; in this one by default.
 
     Raises:
@@ -101,7 +108,7 @@ def write_result(
     """
     path = null_space_path(solution.problem, solution.initial, solution.q)
     made: Export | None = None
-    failure = ""
+    failure = report_error = ""
     with whole_folder(out, force=force, kind="result") as folder:
         _write_json(folder / "result.json", document)
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff, mapped))  # type: ignore[arg-type]
@@ -111,35 +118,55 @@ def write_result(
             from impact_posture.path.files import write_path
 
             write_path(folder, prepared.impact.robot, motion)
-        request = (folder, solution.initial, solution.q, path, mapped, document, codegen, formats, jobs)
-        for done, count, exported in (finish or partial(finish_result, prepared))(request):
-            if exported is not None:
-                made, failure = exported
+        request = (
+            folder, solution.initial, solution.q, path, mapped, document, codegen, formats, jobs, report, meshes
+        )  # fmt: skip
+        for done, count, result in (finish or partial(finish_result, prepared))(request):
+            if isinstance(result, str):
+                report_error = result
+            elif result is not None:
+                made, failure = result
             if progress:
                 progress(done, count)
-    return Written(out, made, failure)
+    return Written(out, made, failure, report_error)
 
 
 def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finished]:
-    """Draw the figures of a result and export its C code; yield after each.
+    """Draw the figures of a result, export its C code and write its report; yield after each.
 
     Args:
         prepared: The problem.
         request: The folder, the postures before and after, the path between them, the self-motion map, the content of
-            ``result.json``, whether to export, the formats of the figures, and the number of processes.  It can be
-            sent to a process.
+            ``result.json``, whether to export, the formats of the figures, the number of processes, whether to write
+            a report, and whether it may hold the user's own meshes.  It can be sent to a process.
 
     Yields:
-        The number of finished files, the number of all files, and what :func:`_export` returns if it has ended.
+        The number of finished files, the number of all files, and what :func:`_export` or :func:`_report` returns if
+        it has ended.
     """
-    folder, initial, optimal, path, mapped, document, codegen, formats, jobs = request
+    folder, initial, optimal, path, mapped, document, codegen, formats, jobs, report, meshes = request
     # The C code comes first, because it takes longest.
     tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
     view = _view(prepared, initial, optimal, path, document, _motion(folder, document, prepared.impact.robot), mapped)
     tasks += _drawings(view, folder, formats)
+    count = len(tasks) + report
     with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
         for done, (index, result) in enumerate(results, start=1):
-            yield done, len(tasks), result if codegen and index == 0 else None
+            yield done, count, result if codegen and index == 0 else None
+    if report:
+        # It shows the figures, so it comes last.
+        yield count, count, _report(folder, prepared, view, document, meshes)
+
+
+def _report(folder: Path, prepared: Prepared, view: ResultView, document: dict[str, Any], meshes: bool) -> str:
+    """Write the report; return why that failed, because a result is kept without it."""
+    try:
+        from impact_posture.report.result_report import write_result_report
+
+        write_result_report(folder, prepared, view, document, meshes=meshes)
+    except Exception as error:
+        return one_line(f"{type(error).__name__}: {error}")
+    return ""
 
 
 def _export(prepared: Prepared, optimal: np.ndarray, folder: Path) -> tuple[Export, str]:
@@ -253,6 +280,27 @@ def load_view(folder: Path) -> ResultView:
     Raises:
         SpecError: The folder is no result folder, or was made with another robot model.
     """
+    return _load(folder)[1]
+
+
+def rewrite_report(folder: Path, *, meshes: bool = False) -> Path:
+    """Write ``report.html`` of a result folder again; return its path.
+
+    Raises:
+        SpecError: As :func:`load_view`.
+        OutputError: It cannot be written.
+    """
+    from impact_posture.report.result_report import write_result_report
+
+    loaded = _load(folder)
+    try:
+        return write_result_report(folder, *loaded, meshes=meshes)
+    except _BROKEN as error:
+        raise _broken(folder, error) from None
+
+
+def _load(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
+    """Read problem, view and ``result.json`` of a result folder."""
     if not (folder / "result.json").is_file():
         raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
     try:
@@ -275,10 +323,13 @@ def load_view(folder: Path) -> ResultView:
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
             for key in ("initial", "optimal")
         )
-        return _view(
-            prepared, initial, optimal, path, document, _motion(folder, document, prepared.impact.robot), mapped
-        )
+        motion = _motion(folder, document, robot)
+        view = _view(prepared, initial, optimal, path, document, motion, mapped)
+        return prepared, view, document
     except _BROKEN as error:
-        raise SpecError(
-            f"is no whole result ({type(error).__name__}: {error})", where=str(folder), hint="run optimize again"
-        ) from None
+        raise _broken(folder, error) from None
+
+
+def _broken(folder: Path, error: Exception) -> SpecError:
+    what = f"is no whole result ({type(error).__name__}: {error})"
+    return SpecError(what, where=str(folder), hint="run optimize again")

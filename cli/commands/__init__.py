@@ -14,6 +14,8 @@ COMMANDS: Final[dict[str, str]] = {
     "evaluate": "Measure an impact at a posture: H, G, V, S, E, ellipsoid, gradient, predicted jump.",
     "optimize": "Find the posture that takes the impact best; write posture, pictures and C code.",
     "plot": "Draw a result again: ellipsoids, postures, jumps, the null-space path.",
+    "report": "Write report.html of an output folder again: one offline page, with the robot in 3-D.",
+    "view": "Open report.html of an output folder in the browser.",
     "codegen": "Write the metric and its gradient as C code for a controller.",
     "verify": "Compute H, G, Λ_c and ∇H in every way there is and compare: pass or fail.",
     "simulate": "Run a controller through an experiment in MuJoCo; write metrics, time series and figures.",

@@ -9,7 +9,7 @@ import typer
 
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Processes, ScenarioName, Seeds, rows_table
-from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.output import Page, complain, print_json
 from impact_posture_cli.progress import progress
 
 Controllers = Annotated[
@@ -30,6 +30,8 @@ def compare(
     out: Out = None,
     force: options.Force = False,
     format: options.Formats = None,
+    no_report: options.NoReport = False,
+    meshes: options.Meshes = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -46,10 +48,16 @@ def compare(
     if folder is not None:
         check_output(folder, force=force, kind="comparison")
     store = None if folder is None else store_beside(folder)
+    failure = ""
     with progress("running", "runs", shown=not (quiet or json)) as advance:
         found = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance)
         if folder is not None and store is not None:
-            write_comparison(folder, found, plan, store, force=force, formats=format or FORMATS)
+            failure = write_comparison(
+                folder, found, plan, store,
+                force=force, formats=format or FORMATS, report=not no_report, meshes=meshes,
+            )  # fmt: skip
+    if failure and not quiet:
+        complain(f"warning: there is no report.html: {failure}")
     if json:
         print_json(found.comparison())
         return

@@ -8,7 +8,7 @@ from impact_posture.settings import ImpactSettings
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, number, print_json, vector
 from impact_posture_cli.settings_options import Given, with_settings
-from impact_posture_cli.tables import alone_line, contact_names, impact_rows, quantities, worst_lines, worst_tables
+from impact_posture_cli.tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 
 if TYPE_CHECKING:
     from impact_posture.impact.classical_ellipsoids import Ellipsoid
@@ -66,6 +66,7 @@ def evaluate(
 
 
 def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
+    from impact_posture.impact.quantity_table import quantities
 
     mine, free = (
         found.scalars.to_dict(),
@@ -77,7 +78,7 @@ def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     )
     rows = [
         (f"  {key}", number(mine[key]), *(() if free is None else (number(free[key]),)), unit, words)
-        for key, unit, words in quantities(impact)
+        for key, unit, words in quantities(impact.metric)
     ]
     masses = [number(value, missing="unbounded") for value in (mass if free is not None else mass[:1])]
     rows.append(("  1/G", *masses, "kg", "effective mass along n"))

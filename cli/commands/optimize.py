@@ -12,10 +12,9 @@ from impact_posture_cli import options
 from impact_posture_cli.output import Page, number, print_json
 from impact_posture_cli.progress import progress
 from impact_posture_cli.settings_options import Given, with_settings
-from impact_posture_cli.tables import alone_line, contact_names, impact_rows, quantities, worst_lines, worst_tables
+from impact_posture_cli.tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 
 if TYPE_CHECKING:
-    from impact_posture.impact.resolved_impact import ResolvedImpact
     from impact_posture.posture.problem_settings import Prepared
     from impact_posture.posture.solve import PostureSolution
     from impact_posture.result_folder import Written
@@ -41,6 +40,8 @@ def optimize(
     force: options.Force = False,
     no_codegen: options.NoCodegen = False,
     format: options.Formats = None,
+    no_report: options.NoReport = False,
+    meshes: options.Meshes = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -49,7 +50,7 @@ def optimize(
     _refuse_idle(given, settings)
     from impact_posture.early_writer import early_writer
 
-    with early_writer(settings, jobs) as finish:
+    with early_writer(settings, jobs, report=not no_report, meshes=meshes) as finish:
         from impact_posture.front_door import PostureProblem
         from impact_posture.front_door import optimize as solve
         from impact_posture.output_folder import check_output
@@ -95,12 +96,16 @@ def optimize(
                 force=force,
                 codegen=not no_codegen,
                 formats=format or FORMATS,
+                report=not no_report,
+                meshes=meshes,
                 jobs=jobs,
                 progress=advance,
                 finish=finish,
             )
     if written.compiler_error:
         page.warnings([f"the C code in c/ is written but could not be built: {written.compiler_error}"])
+    if written.report_error:
+        page.warnings([f"there is no report.html: {written.report_error}"])
     if json:
         print_json(result.document)
     elif not quiet:
@@ -164,6 +169,7 @@ def _announce(page: Page, prepared: Prepared) -> None:
 
 
 def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
+    from impact_posture.impact.quantity_table import quantity_rows
     from impact_posture.posture.caveats import percent
 
     initial, optimal = document["initial"], document["optimal"]
@@ -172,12 +178,10 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     for line in document["verdict"]["advice"]:
         page.line(f"  {line}")
     page.gap()
-    minimized = ("objective", "", f"what was minimized ({impact.objective.kind})")
     rows = [
-        (f"  {key}", number(initial[key]), number(optimal[key]), unit, words)
-        for key, unit, words in (minimized, *quantities(impact))
+        (f"  {row.key}", number(row.before), number(row.after), row.unit, row.meaning)
+        for row in quantity_rows(impact, initial, optimal)
     ]
-    rows += _impulse_and_force(impact, initial, optimal)
     page.table(("", *blocks, "unit", "meaning"), rows, right=(1, 2))
     frames = contact_names(impact.objective.contacts)
     alone_line(page, frames, "H, G, V, S, E")
@@ -216,22 +220,6 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
         _path(page, document["path"])
     # The warnings of the robot were printed before the solver started.
     page.warnings(document["warnings"][len(prepared.impact.warnings) :])
-
-
-def _impulse_and_force(
-    impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]
-) -> list[tuple[str, str, str, str, str]]:
-    """Return the rows of the impulse with friction and of the peak force without, where they are known."""
-    jumps = [block["jump"]["coulomb"] for block in (initial, optimal)]
-    forces = [(block["compression"] or {}).get("peak_force") for block in (initial, optimal)]
-    at, rows = f"at {impact.speed:g} m/s", []
-    if None not in jumps and impact.speed:
-        sizes = [sum(v * v for v in jump["impulse"]) ** 0.5 for jump in jumps]
-        words = f"impulse {at}, friction {impact.contact.friction:g}"
-        rows.append(("  impulse", number(sizes[0]), number(sizes[1]), "N·s", words))
-    if None not in forces:
-        rows.append(("  force", number(forces[0]), number(forces[1]), "N", f"peak force {at}, no friction"))
-    return rows
 
 
 def _holding(page: Page, before: dict[str, Any] | None, after: dict[str, Any] | None) -> None:

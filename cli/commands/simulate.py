@@ -64,6 +64,8 @@ def simulate(
     out: Out = None,
     force: options.Force = False,
     format: options.Formats = None,
+    no_report: options.NoReport = False,
+    meshes: options.Meshes = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -84,7 +86,11 @@ def simulate(
         with one_blas_thread():
             runs, document = execute(job)
         formats = format or FORMATS
-        write_simulation(folder, job, runs, document, force=force, formats=formats)
+        failure = write_simulation(
+            folder, job, runs, document, force=force, formats=formats, report=not no_report, meshes=meshes
+        )
+    if failure and not quiet:
+        complain(f"warning: there is no report.html: {failure}")
     if json:
         print_json(document)
     else:

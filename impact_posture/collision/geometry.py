@@ -47,9 +47,14 @@ def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
     """Load the shapes that a URDF describes; a mesh that cannot be used is left out with a warning."""
     model, largest = robot.model, largest_extent(robot)
     kept, solids, warnings = [], [], []
+    # Limbs share meshes, and loading one may take a tenth of a second.
+    loaded: dict[object, Any] = {}
     for shape in described:
         try:
-            solids.append(shape.load(largest))
+            key = (shape.kind, shape.sizes, shape.mesh)
+            if key not in loaded:
+                loaded[key] = shape.load(largest)
+            solids.append(loaded[key])
             kept.append(shape)
         except UnusableShape as fault:
             warnings.append(left_out(shape.name, fault))

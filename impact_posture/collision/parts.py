@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import coal
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.collision.shape_points import shape_points
@@ -15,6 +16,8 @@ from impact_posture.collision.swept_hull import SweptHull, hull_corners, separat
 
 TOLERANCE = 0.001
 """Tolerance (m) of the hulls of parts, finer than that of others, because bodies in hollows have little room."""
+
+Triangles = NDArray[np.int_]
 
 # A cut is sought across each axis, at so many places that divide the extent evenly.
 _PLACES = 9
@@ -41,16 +44,27 @@ def triangles_of(shapes: Iterable[pin.GeometryObject]) -> Array:
     """
     found = []
     for shape in shapes:
-        solid: Any = shape.geometry
-        points = shape_points(solid)
-        if isinstance(solid, coal.BVHModelBase):
-            corners = (solid.tri_indices(k) for k in range(solid.num_tris))
-            faces = np.array([(triangle[0], triangle[1], triangle[2]) for triangle in corners])
-        else:
-            points = hull_corners(points)
-            faces = SweptHull("", "", 0, points, 0.0).faces
+        points, faces = surface_of(shape.geometry)
         found.append((points @ shape.placement.rotation.T + shape.placement.translation)[faces])
     return np.concatenate(found)
+
+
+def surface_of(solid: Any) -> tuple[Array, Triangles]:
+    """Return the corners of a shape in its own axes, shape (k, 3), m, and its triangles as indices, shape (n, 3).
+
+    They are those of a mesh, or of the hull around a primitive shape.
+    """
+    points = shape_points(solid)
+    if isinstance(solid, coal.BVHModelBase):
+        corners = (solid.tri_indices(k) for k in range(solid.num_tris))
+        return points, np.array([(triangle[0], triangle[1], triangle[2]) for triangle in corners])
+    return hull_surface(points)
+
+
+def hull_surface(points: Array) -> tuple[Array, Triangles]:
+    """Return corners and triangles of the convex hull of points, as :func:`surface_of` does."""
+    corners = hull_corners(points)
+    return corners, SweptHull("", "", 0, corners, 0.0).faces.astype(int)
 
 
 def best_cut(triangles: Array, other: SweptHull, placements: Sequence[pin.SE3]) -> Cut:

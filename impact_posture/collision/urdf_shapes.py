@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -53,6 +54,7 @@ class UrdfShape:
         kind: Tag of the URDF, such as ``box`` or ``mesh``.
         sizes: Numbers of the tag in the order of the URDF, m; the scale of a mesh.
         mesh: File of a mesh.
+        color: Red, green, blue and opacity, 0 to 1, if the URDF states them.
     """
 
     name: str
@@ -61,6 +63,7 @@ class UrdfShape:
     kind: str
     sizes: tuple[float, ...]
     mesh: Path | None = None
+    color: tuple[float, ...] | None = None
 
     @cached_property
     def y_up(self) -> bool:
@@ -129,10 +132,14 @@ def largest_extent(robot: Robot) -> float:
     return max(_LARGEST, _LARGEST_SHARE * float(np.linalg.norm(np.ptp(np.array(points), axis=0))))
 
 
-def read_urdf_shapes(robot: Robot) -> tuple[list[UrdfShape], list[str]]:
-    """Read the collision shapes of a URDF, and the visual ones of links without.
+def read_urdf_shapes(robot: Robot, first: str = "collision") -> tuple[list[UrdfShape], list[str]]:
+    """Read the collision shapes of a URDF, and the visual ones of links without; or the other way round.
 
     Meshes are found but not read.
+
+    Args:
+        robot: The robot.
+        first: The shapes that count where a link has both, ``collision`` or ``visual``.
 
     Returns:
         The shapes, and one line for each shape left out.
@@ -147,15 +154,17 @@ def read_urdf_shapes(robot: Robot) -> tuple[list[UrdfShape], list[str]]:
     folders += [located.folder / Path(folder).expanduser() for folder in located.spec.model.package_dirs]
     folders += [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
     shapes, warnings = [], []
-    for link in parse_urdf(located.urdf).iter("link"):
+    root = parse_urdf(located.urdf)
+    colors = {tag.get("name", ""): tag for tag in root.findall("material")}
+    for link in root.iter("link"):
         name = link.get("name", "")
         if not robot.model.existFrame(name, pin.FrameType.BODY):
             raise UrdfError("has changed since the robot was loaded", where=str(located.urdf), hint="load it again")
-        tags = link.findall("collision") or link.findall("visual")
+        tags = link.findall(first) or link.findall("visual") or link.findall("collision")
         for k, tag in enumerate(tags):
             called = name if len(tags) == 1 else f"{name}[{k}]"
             try:
-                shapes.append(_read(tag, called, name, located.urdf, folders))
+                shapes.append(_read(tag, called, name, located.urdf, folders, colors))
             except UnusableShape as fault:
                 warnings.append(left_out(called, fault))
     return shapes, warnings
@@ -181,7 +190,9 @@ def disabled_links(robot: Robot) -> set[frozenset[str]]:
     return {frozenset((tag.get("link1", ""), tag.get("link2", ""))) for tag in tags}
 
 
-def _read(tag: ET.Element, name: str, link: str, urdf: Path, folders: Sequence[Path]) -> UrdfShape:
+def _read(
+    tag: ET.Element, name: str, link: str, urdf: Path, folders: Sequence[Path], colors: Mapping[str, ET.Element]
+) -> UrdfShape:
     shape = next(iter(tag.findall("geometry/*")), None)
     if shape is None or shape.tag not in _SIZES:
         known = ", ".join(_SIZES)
@@ -199,7 +210,18 @@ def _read(tag: ET.Element, name: str, link: str, urdf: Path, folders: Sequence[P
     )
     placement = pin.SE3(pin.rpy.rpyToMatrix(np.array(rpy)), np.array(xyz))
     mesh = _find_mesh(shape.get("filename", ""), urdf, folders) if shape.tag == "mesh" else None
-    return UrdfShape(name, link, placement, shape.tag, tuple(sizes), mesh)
+    material = tag.find("material")
+    return UrdfShape(name, link, placement, shape.tag, tuple(sizes), mesh, _color(material, colors))
+
+
+def _color(material: ET.Element | None, named: Mapping[str, ET.Element]) -> tuple[float, ...] | None:
+    """Return the color of a shape, its own or that of a named material; ``None`` for none that can be read."""
+    for tag in () if material is None else (material, named.get(material.get("name", ""))):
+        color = None if tag is None else tag.find("color")
+        if color is not None:
+            with suppress(UnusableShape):
+                return tuple(np.clip(_numbers(color.get("rgba", ""), 4, "<color rgba>"), 0.0, 1.0).tolist())
+    return None
 
 
 def _numbers(text: str, count: int, where: str) -> list[float]:

@@ -12,10 +12,11 @@ from impact_posture.experiment.figures import draw_reproduction, draw_runs, draw
 from impact_posture.experiment.jobs import Job
 from impact_posture.experiment.reproduction import Plan, Reproduction, jobs_of
 from impact_posture.experiment.reproduction_summary import summary
+from impact_posture.experiment.run_reports import COMPARISON, SIMULATION, keep_runs, try_report
 from impact_posture.output_folder import whole_folder
 from impact_posture.simulation.run import Run
 
-SIMULATION, COMPARISON, REPRODUCTION = "run.json", "comparison.json", "reproduction.json"
+REPRODUCTION = "reproduction.json"
 FORMATS = ("png",)
 
 
@@ -27,8 +28,13 @@ def write_simulation(
     *,
     force: bool = False,
     formats: Sequence[str] = FORMATS,
-) -> None:
-    """Write ``run.json``, ``series.npz`` (``series-minus.npz`` for a push with sign -1), and figures.
+    report: bool = True,
+    meshes: bool = False,
+) -> str:
+    """Write ``run.json``, ``series.npz`` (``series-minus.npz`` for a push with sign -1), figures and ``report.html``.
+
+    Returns:
+        Why there is no report; empty if there is one, or if none was wanted.
 
     Raises:
         OutputError: The folder exists without ``force``, is not ours, or cannot be written.
@@ -38,20 +44,37 @@ def write_simulation(
         for one in runs:
             one.series.save(folder / f"series{'' if one.sign > 0 else '-minus'}.npz")
         draw_runs(job, runs, document, folder, formats)
+        return try_report(folder, job.scenario, meshes=meshes) if report else ""
 
 
 def write_comparison(
-    out: Path, found: Reproduction, plan: Plan, store: Store, *, force: bool = False, formats: Sequence[str] = FORMATS
-) -> None:
-    """Write ``comparison.json`` and figures of the first seed, and remove the store.
+    out: Path,
+    found: Reproduction,
+    plan: Plan,
+    store: Store,
+    *,
+    force: bool = False,
+    formats: Sequence[str] = FORMATS,
+    report: bool = True,
+    meshes: bool = False,
+) -> str:
+    """Write ``comparison.json``, figures, ``runs/`` and ``report.html`` of the first seed, and remove the store.
+
+    Returns:
+        Why there is no report; empty if there is one, or if none was wanted.
 
     Raises:
         OutputError: As :func:`write_simulation`.
     """
     with whole_folder(out, force=force, kind="comparison") as folder:
         _write_json(folder / COMPARISON, found.comparison())
-        draw_side_by_side(jobs_of(plan, seeds=1), store, folder, formats)
+        jobs, failure = jobs_of(plan, seeds=1), ""
+        draw_side_by_side(jobs, store, folder, formats)
+        if report:
+            keep_runs(folder, jobs, store)
+            failure = try_report(folder, jobs[0].scenario, meshes=meshes)
     store.remove()
+    return failure
 
 
 def write_reproduction(

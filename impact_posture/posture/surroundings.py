@@ -191,6 +191,11 @@ class Surroundings:
 
     def collisions(self, q: Array) -> list[tuple[str, str]]:
         """Return the original shapes that touch each other, the surface, the ground or an obstacle at ``q``."""
+        planes, solids = self.walls_at(q)
+        return mesh_collisions(self.robot, self.shapes, q, solids, planes)
+
+    def walls_at(self, q: Array) -> tuple[list[HalfSpace], list[tuple[SweptHull, frozenset[int]]]]:
+        """Return the planes and the bodies that the links stay clear of at ``q``, each with its exempt joints."""
         numeric = Numeric(self.robot.model).at(q)
         planes, solids = [], []
         for wall in self._walls:
@@ -202,7 +207,7 @@ class Surroundings:
                 hull = wall.body.hull
                 corners = hull.vertices @ at.rotation.T + at.translation
                 solids.append((SweptHull(hull.name, hull.link, 0, corners, hull.radius), wall.exempt))
-        return mesh_collisions(self.robot, self.shapes, q, solids, planes)
+        return planes, solids
 
     def _stands_behind(self, plane: Body, exempt: frozenset[int]) -> str:
         """Name something that cannot move and lies behind a plane: a foot, or the place of a fixed base."""

@@ -1,0 +1,23 @@
+"""``impact-posture view DIR``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from impact_posture_cli import options
+from impact_posture_cli.commands.report import OutputFolder, show_written
+
+
+def view(folder: OutputFolder, json: options.Json = False, quiet: options.Quiet = False) -> None:
+    """Run ``impact-posture view``."""
+    import webbrowser
+
+    from impact_posture.errors import InputError
+    from impact_posture.report import REPORT
+
+    page = Path(folder) / REPORT
+    if not page.is_file():
+        raise InputError("is not there", where=str(page), hint=f"make it with `impact-posture report {folder}`")
+    if not webbrowser.open(page.resolve().as_uri()):
+        raise InputError("no browser could be started", where=str(page), hint="open this file in a browser")
+    show_written("view", page, json=json, quiet=quiet)

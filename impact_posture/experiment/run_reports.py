@@ -1,0 +1,201 @@
+"""Reports of runs and comparisons, from the files of their folders."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from impact_posture.errors import ImpactPostureError, SpecError, one_line
+from impact_posture.escape import file_name
+from impact_posture.experiment.batch import Document, Store
+from impact_posture.experiment.figures import run_view
+from impact_posture.experiment.jobs import Job, controller_factory
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.plot.run_view import RunView, run_header
+from impact_posture.plot.view import number
+from impact_posture.report.page import Content, Table, write_page
+from impact_posture.report.run_report import run_scene, thin
+from impact_posture.simulation.scenario_file import known_scenarios, scenario_path
+from impact_posture.simulation.series import Series, Window
+
+SIMULATION, COMPARISON, RUNS = "run.json", "comparison.json", "runs"
+# Metrics of a table: key, unit and meaning.
+_METRICS = (
+    ("q_total_impact", "m, rad", "way of the robot in the impact windows, ∫‖ν‖dt"),
+    ("q_total_recovery", "m, rad", "the same until 1 s after each impact began"),
+    ("peak_jump", "m/s, rad/s", "largest ‖ν − ν⁻‖ within 15 ms of the touch, mean of the contacts"),
+    ("peak_jump_max", "m/s, rad/s", "the largest of the contacts"),
+    ("peak_recovery", "m/s, rad/s", "as peak_jump, until 1 s after each impact began"),
+    ("peak_force", "N", "largest normal force in the impact windows"),
+    ("slip", "m", "way that the contact slid in the impact windows"),
+)
+_BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, RecursionError)
+_MOVES = (
+    "The slider goes through time: every millisecond within the impact windows, every 25 ms elsewhere. Within a "
+    "window, the orange arrows show the change of velocity since it began. H, V, S and the ellipsoid are those of "
+    "the rigid model at the state of the robot."
+)
+
+
+def keep_runs(folder: Path, jobs: Sequence[Job], store: Store) -> None:
+    """Write the document and the ticks that a report shows of each stored job into ``runs/`` of a comparison.
+
+    Raises:
+        OSError: They cannot be written.
+    """
+    (folder / RUNS).mkdir()
+    for job in jobs:
+        document = store.find(job)
+        if document is None or not document["runs"]:
+            continue
+        path = folder / RUNS / _stem(job.label)
+        path.with_name(f"{path.name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        part = document["runs"][0]
+        windows = [Window(**window) for window in part["windows"]]
+        thin(Series.load(store.series(job, part["sign"])), windows).save(_series(path, part["sign"]))
+
+
+def try_report(folder: Path, scenario: str, *, meshes: bool) -> str:
+    """Write the report of a folder; return why that failed, because the runs are kept without it."""
+    try:
+        write_run_report(folder, scenario, meshes=meshes)
+    except Exception as error:
+        return one_line(str(error) if isinstance(error, ImpactPostureError) else f"{type(error).__name__}: {error}")
+    return ""
+
+
+def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) -> Path:
+    """Write ``report.html`` of a run or comparison into its folder, from the files there; return its path.
+
+    Args:
+        folder: A folder that ``simulate`` or ``compare`` wrote.
+        scenario: Name or file of the scenario; from the folder by default.
+        meshes: Pass on the meshes of the user's own URDF, too.
+
+    Raises:
+        SpecError: The folder is none of these, or its files do not fit.
+        ImpactPostureError: The scenario cannot be set up any more.
+        OutputError: The report cannot be written.
+    """
+    try:
+        if (folder / SIMULATION).is_file():
+            document = _read(folder / SIMULATION)
+            runs = _runs(document, folder / "series", scenario, len(document["runs"]))
+            content = _run_content(document, runs[0][0], _job(document, scenario))
+        else:
+            document, runs = _read(folder / COMPARISON), []
+            for stem in (_stem(row["controller"]) for row in document["rows"]):
+                if (folder / RUNS / f"{stem}.json").is_file():
+                    runs += _runs(_read(folder / RUNS / f"{stem}.json"), folder / RUNS / stem, scenario, 1)
+            content = _comparison_content(document, runs[0][0])
+        return write_page(folder, content, run_scene(runs, meshes=meshes))
+    except _BROKEN as error:
+        what = f"holds no whole run or comparison ({type(error).__name__}: {error})"
+        raise SpecError(what, where=str(folder), hint="run simulate or compare again") from None
+
+
+def _read(path: Path) -> Document:
+    document: Document = json.loads(path.read_text(encoding="utf-8"))
+    return document
+
+
+def _stem(label: str) -> str:
+    return file_name(label.replace(":", "-"))
+
+
+def _series(stem: Path, sign: int) -> Path:
+    return stem.with_name(f"{stem.name}{'' if sign > 0 else '-minus'}.npz")
+
+
+def _job(document: Document, scenario: str) -> Job:
+    """Return the job of a document, with the scenario by its name if it is a shipped one."""
+    name, source = str(document["scenario"]), str(document["source"])
+    shipped = name in known_scenarios() and Path(source) == scenario_path(name)
+    place = scenario or (name if shipped else source)
+    return Job(place, document["controller"], document["seed"], document["mode"], document["free"], document["gain"])
+
+
+def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tuple[RunView, ImpactObjective]]:
+    """Return the first runs of a document with their impact."""
+    job, found = _job(document, scenario), []
+    factory = controller_factory(job.scenario, job.free)
+    if document["model_sha256"] != factory.setup.robot.model_sha256:
+        raise SpecError("was run with another robot model", where=str(stem.parent), hint="run it again")
+    for part in document["runs"][:count]:
+        windows = [Window(**window) for window in part["windows"]]
+        ticks = thin(Series.load(_series(stem, part["sign"])), windows)
+        view = run_view(job, ticks, windows, part["sign"], part["status"])
+        label = f"{view.label}, push {part['sign']:+d}" if count > 1 else view.label
+        found.append((replace(view, label=label), factory.objective()))
+    return found
+
+
+def _run_content(document: Document, view: RunView, job: Job) -> Content:
+    scenario = controller_factory(job.scenario, job.free).setup.scenario
+    options = ["simulate", job.scenario, "--controller", job.controller, "--seed", str(job.seed)]
+    options += ["--mode", "held"] * (job.mode == "held") + ["--free"] * job.free
+    options += ["--gain", f"{job.gain:g}"] * (job.gain != scenario.control.robust.gain)
+    if scenario.push and len(document["runs"]) < len(scenario.push.signs):
+        options += ["--sign", f"{document['runs'][0]['sign']:+d}"]
+    metrics, status = document["metrics"], document["status"]
+    verdict = [f"{status}: its numbers are no result" if metrics is None else f"{status}: {_summary(metrics)}"]
+    verdict += [f"t = {event['time']:.2f} s: {event['what']}" for event in document["events"]]
+    rows = [] if metrics is None else [(key, number(metrics[key]), unit, words) for key, unit, words in _METRICS]
+    if document["prediction"] is not None:
+        rows.append(
+            ("H before", number(document["prediction"]["H"]), "jump²/(N·s)²", "jump² per impulse² at the impacts")
+        )
+    return Content(
+        title=run_header([view])[0],
+        command=shlex.join(["impact-posture", *options]),
+        facts=tuple(run_header([view])[1]),
+        verdict=tuple(verdict),
+        tables=(Table("Metrics", ("", "value", "unit", "meaning"), tuple(rows)),),
+        moves=_MOVES,
+        notes=tuple(document["warnings"]),
+    )
+
+
+def _summary(metrics: Mapping[str, Any]) -> str:
+    jump, force = number(metrics["peak_jump"]), number(metrics["peak_force"])
+    return f"the impacts change the velocity by up to {jump} (m/s and rad/s), with forces of up to {force} N"
+
+
+def _comparison_content(document: Document, view: RunView) -> Content:
+    rows = document["rows"]
+    labels = [str(row["controller"]) for row in rows]
+    table = [("status", *(str(row["status"]) for row in rows), "", "")]
+    for key, unit, meaning in _METRICS:
+        table.append((key, *(_interval(row["metrics"].get(key)) for row in rows), unit, meaning))
+    verdict = []
+    for row in rows:
+        if row["reduction"] is not None and row["controller"] != "nominal":
+            share = row["reduction"]["mean"]
+            verdict.append(f"{row['controller']} moves {abs(share):.0%} {'less' if share > 0 else 'more'}")
+    line = (
+        f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
+    )
+    seeds = str(len(document["seeds"]))
+    command = ["impact-posture", "compare", view.scenario, "--controllers", ",".join(labels), "--seeds", seeds]
+    return Content(
+        title=f"{document['scenario']}: {', '.join(labels)}",
+        command=shlex.join(command),
+        facts=tuple(run_header([view])[1]),
+        verdict=(line, *(f"{row['controller']}: {reason}" for row in rows for reason in row["failed"])),
+        tables=(
+            Table(f"Means of {seeds} seeds, with 95 % intervals", ("", *labels, "unit", "meaning"), tuple(table)),
+        ),
+        moves=f"{_MOVES} The runs are those of the first seed.",
+        notes=(),
+    )
+
+
+def _interval(found: Mapping[str, Any] | None) -> str:
+    if found is None:
+        return "–"
+    half = "" if found["half_width"] is None else f" ± {number(found['half_width'])}"
+    return f"{number(found['mean'])}{half}"

@@ -1,0 +1,154 @@
+"""The page of a report: words, tables, curves and figures that need no script, and a viewer that does."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from impact_posture.escape import printable
+from impact_posture.output_folder import write_whole
+from impact_posture.plot.view import number
+from impact_posture.report import REPORT
+from impact_posture.report.scene import Scene, Track
+from impact_posture.version import __version__
+
+_VIEWER = Path(__file__).parent / "viewer"
+# Colors of a figure: its lines and letters have few, and 64 keep it a quarter of the size.
+_COLORS = 64
+_TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
+# Place of a curve in its chart, in the units of its view box.
+_LEFT, _RIGHT, _TOP, _BOTTOM = 60.0, 390.0, 8.0, 92.0
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text.
+
+    Attributes:
+        title: Title.
+        head: Titles of the columns.
+        rows: Cells; those after the first are numbers or short words.
+    """
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a page says beside its scene and figures.
+
+    Attributes:
+        title: Title.
+        command: Command that makes the same result again.
+        facts: Small print below the title.
+        verdict: Lines, the most important first.
+        tables: Tables.
+        moves: What the slider goes through, in a sentence.
+        notes: What to know, one line each.
+        sources: Files that the command reads, by name, with their content.
+    """
+
+    title: str
+    command: str
+    facts: tuple[str, ...]
+    verdict: tuple[str, ...]
+    tables: tuple[Table, ...]
+    moves: str
+    notes: tuple[str, ...]
+    sources: tuple[tuple[str, str], ...] = ()
+
+
+def write_page(folder: Path, content: Content, scene: Scene) -> Path:
+    """Write ``report.html`` into a folder, with the figures that lie there; return its path.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    write_whole(folder / REPORT, render(content, scene, figures(folder)))
+    return folder / REPORT
+
+
+def render(content: Content, scene: Scene, pictures: Sequence[tuple[str, str]]) -> str:
+    """Return the page.  Each text of it is escaped, and it may load nothing and run nothing but its own viewer."""
+    packed, arrays = scene.pack()
+    viewer, style = ((_VIEWER / name).read_text(encoding="utf-8") for name in ("viewer.min.js", "page.css"))
+    # Scripts end at "</", wherever it stands.
+    data = packed.replace("<", "\\u003c")
+    text: str = _template().render(
+        content=content, scene=scene, pictures=pictures, data=data, arrays=arrays, viewer=viewer, style=style,
+        version=__version__, charts=[_charts(track) for track in scene.tracks],
+        hashes={"script": _hash(viewer), "style": _hash(style)},
+    )  # fmt: skip
+    return text
+
+
+def figures(folder: Path) -> list[tuple[str, str]]:
+    """Return name and address of each figure in a folder and below: SVG if there is one, else PNG in fewer colors."""
+    found = sorted(p for p in folder.rglob("*") if p.suffix in _TYPES and p.is_file())
+    each = [list(same) for _, same in groupby(found, key=lambda path: path.with_suffix(""))]
+    return [(str(p[-1].relative_to(folder).with_suffix("")), _address(p[-1])) for p in each]
+
+
+def _address(path: Path) -> str:
+    content = path.read_bytes()
+    if path.suffix == ".png":
+        from PIL import Image
+
+        with Image.open(path) as picture, io.BytesIO() as file:
+            picture.convert("RGB").quantize(_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+                file, "PNG", compress_level=7
+            )
+            content = file.getvalue()
+    return f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def _hash(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+
+
+@cache
+def _template() -> Any:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    def shown(value: object) -> object:
+        return printable(value, keep="\n\t") if isinstance(value, str) and not isinstance(value, Markup) else value
+
+    # Every text is escaped, and stripped of what turns the direction of writing.
+    return Environment(
+        loader=FileSystemLoader(_VIEWER), autoescape=True, undefined=StrictUndefined, finalize=shown,
+        trim_blocks=True, lstrip_blocks=True,
+    ).get_template("page.html.jinja")  # fmt: skip
+
+
+def _charts(track: Track) -> list[dict[str, Any]]:
+    """Return each curve of a track as lines in its chart, with the marks of its axes."""
+    charts = []
+    x = _LEFT + (_RIGHT - _LEFT) * (track.times - track.times[0]) / ((track.times[-1] - track.times[0]) or 1.0)
+    for name, unit, values in track.curves:
+        known = np.isfinite(values)
+        low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
+        low = min(low, 0.0) if low < 0.4 * high else low
+        y = _BOTTOM - (_BOTTOM - _TOP) * (values - low) / ((high - low) or 1.0)
+        # Frames a millisecond apart mostly fall on the same place.
+        points = [(f"{a:.1f},{b:.1f}", bool(good)) for a, b, good in zip(x, y, known, strict=True)]
+        runs = [(good, dict(each)) for good, each in groupby(points, key=lambda point: point[1])]
+        ends = [number(float(values[k])) for k in (0, -1)]
+        charts.append({
+            "name": name, "unit": unit, "lines": [" ".join(each) for good, each in runs if good],
+            "low": number(low), "high": number(high),
+            "first": number(float(track.times[0])), "last": number(float(track.times[-1])),
+            "words": f"{name} from {ends[0]} to {ends[1]} {unit}".rstrip(),
+        })  # fmt: skip
+    return charts

@@ -1,0 +1,139 @@
+"""The report of a posture optimization: the robot on its way from the initial posture to the optimum."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from impact_posture.arrays import Array
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.contact import point_on
+from impact_posture.impact.coulomb_contacts import coulomb_jump
+from impact_posture.impact.quantity_table import quantity_rows
+from impact_posture.plot.view import SEPARATOR, ResultView, header_lines, number
+from impact_posture.posture.problem_settings import Prepared
+from impact_posture.report.page import Content, Table, write_page
+from impact_posture.report.scene import Scene, Track, impact_curves
+from impact_posture.report.shapes import draw_robot
+
+# Most frames of a way: more are not seen.
+_MOST = 121
+
+
+def write_result_report(
+    folder: Path, prepared: Prepared, view: ResultView, document: dict[str, Any], *, meshes: bool = False
+) -> Path:
+    """Write ``report.html`` of a result into its folder; return its path.
+
+    Args:
+        folder: The folder, with ``problem.toml`` and the figures.
+        prepared: The problem.
+        view: Its solution.
+        document: The content of ``result.json``.
+        meshes: Pass on the meshes of the user's own URDF, too.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    scene = result_scene(prepared, view, meshes)
+    return write_page(folder, _content(folder, prepared, view, document), scene)
+
+
+def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> Scene:
+    """Return the scene of a result, with the surface where the problem has it: behind the link that touches it."""
+    around, q = prepared.problem.surroundings, view.q_initial
+    if around is not None:
+        walls, solids = around.walls_at(q)
+        planes = [("ground" if wall.name == "ground" else "surface", wall.point, wall.normal) for wall in walls]
+    else:
+        numeric, planes, solids = Numeric(view.robot.model).at(q), [], []
+        for one in view.objective.contacts:
+            at = numeric.placement(point_on(view.robot, one.frame, one.offset))
+            turn = at.rotation if one.normal_frame == "contact" else np.eye(3)
+            planes.append(("surface", at.translation, turn @ one.normal))
+    bodies = tuple(hull.vertices for hull, _ in solids)
+    return Scene(
+        draw_robot(view.robot, meshes), view.objective, (_track(prepared, view),), tuple(planes), bodies, True
+    )
+
+
+def _track(prepared: Prepared, view: ResultView) -> Track:
+    times, unit, q = _way(view)
+    rebound, stiffness = (1 + view.restitution) * view.speed, prepared.impact.contact_stiffness
+    found, jumps, impulses = [view.objective.oracle.quantities(one) for one in q], [], []
+    for one, at in zip(found, q, strict=True):
+        jump = coulomb_jump(view.objective, at, rebound)
+        smooth = rebound / one.G if one.G > 0 else 0.0
+        jumps.append(smooth * one.jump if jump is None else jump.velocity)
+        impulses.append(smooth if jump is None else jump.impulse_size)
+    curves = [*impact_curves(found, prepared.impact.metric), ("impulse", "N·s", np.array(impulses))]
+    if stiffness is not None:
+        curves.append(("peak force", "N", np.array([stiffness.peak_force(one.G, view.speed) for one in found])))
+    return Track("", times, unit, q, found, np.array(jumps), tuple(curves))
+
+
+def _way(view: ResultView) -> tuple[Array, str, Array]:
+    """Return the places on the way that the slider takes, their unit, and the postures there."""
+    if view.motion is not None and len(view.motion.t) > 1:
+        kept = np.unique(np.linspace(0, len(view.motion.t) - 1, _MOST).astype(int))
+        return view.motion.t[kept], "s", view.motion.q[kept]
+    if view.path is not None and view.path.s[-1] > 0:
+        # Points that fall on one another would have no order.
+        kept = np.flatnonzero(np.diff(view.path.s, prepend=-1.0) > 0)
+        return view.path.s[kept], "", view.path.q[kept]
+    return np.array([0.0, 1.0]), "", np.array([view.q_initial, view.q_optimal])
+
+
+def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[str, Any]) -> Content:
+    title, small = header_lines(view)
+    rows = quantity_rows(prepared.impact, document["initial"], document["optimal"])
+    certificate, solver = document["certificate"], document["solver"]
+    checks = [
+        ("stationarity", certificate["stationarity"], ""),
+        ("violation of the constraints", certificate["primal"], ""),
+        ("complementarity", certificate["complementarity"], ""),
+        ("pose error", certificate["pose_error_m"], "m"),
+        ("pose error", certificate["pose_error_rad"], "rad"),
+    ]
+    active = [f"active: {one['constraint']}, {one['side']}" for one in document["active"]]
+    return Content(
+        title=title,
+        command="impact-posture optimize problem.toml",
+        facts=tuple(small[0].split(SEPARATOR)),
+        verdict=(document["verdict"]["line"], *document["verdict"]["advice"]),
+        tables=(
+            Table(
+                "Before and after",
+                ("", "before", "after", "unit", "meaning"),
+                tuple((row.key, number(row.before), number(row.after), row.unit, row.meaning) for row in rows),
+            ),
+            Table(
+                f"Certificate, recomputed with {certificate['recomputed_with']}",
+                ("", "value", "unit"),
+                tuple((name, f"{value:.1e}", unit) for name, value, unit in checks),
+            ),
+        ),
+        moves=_moves(view, document),
+        notes=(
+            f"{solver['certified_starts']} of {solver['starts']} starts ended at a certified posture.",
+            f"{document['redundancy']} degrees of freedom are left by the constraints at the optimum.",
+            *document["constraints"], *active, *document["notes"], *document["warnings"],
+        ),
+        sources=(("problem.toml", (folder / "problem.toml").read_text(encoding="utf-8")),),
+    )  # fmt: skip
+
+
+def _moves(view: ResultView, document: dict[str, Any]) -> str:
+    arrows = "The orange arrows show the predicted velocity jump at the stated speed and friction"
+    if view.objective.others:
+        arrows += f", of the impact at {view.objective.contact.frame} alone"
+    if view.motion is not None and len(view.motion.t) > 1:
+        end = "the optimum" if document["path"]["found"] else "the best posture that was reached"
+        return f"The slider follows the motion of --path from the initial posture to {end}, over time. {arrows}."
+    return (
+        "The slider follows the straight line between the two postures, each point pulled onto the constraints. "
+        "It is no motion plan: limits of speed and collisions on the way are not checked (--path does that). "
+        f"{arrows}."
+    )

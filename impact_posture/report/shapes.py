@@ -1,0 +1,170 @@
+"""The shapes of a robot as the page draws them: small meshes, each stored once."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.arrays import Array
+from impact_posture.collision.geometry import load_geometry
+from impact_posture.collision.parts import Triangles, hull_surface, surface_of
+from impact_posture.collision.shape_points import shape_points
+from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.report.mesh_license import MeshLicense, license_of
+from impact_posture.report.submeshes import renumbered
+from impact_posture.robot.robot import Robot
+
+# Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
+_MOST_TRIANGLES = 150_000
+# Corners of a mesh are whole multiples of its extent over this.
+_LEVELS = 65535
+_GRAY = (0.72, 0.74, 0.77, 1.0)
+# Darker colors would hide the form.
+_DARKEST = 0.2
+# Bytes of a COLLADA file in which its colors are sought.
+_HEAD = 200_000
+
+Color = tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A triangle mesh with whole coordinates.
+
+    Attributes:
+        corners: Corners as multiples of ``step`` from ``low``, shape (k, 3).
+        faces: Triangles as indices, shape (n, 3).
+        low: Least coordinates, m, shape (3,).
+        step: Length of a unit, m.
+    """
+
+    corners: NDArray[np.uint16]
+    faces: Triangles
+    low: Array
+    step: float
+
+    @property
+    def points(self) -> Array:
+        """Corners, m, shape (k, 3)."""
+        return self.low + self.step * self.corners
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnRobot:
+    """The shapes of a robot.
+
+    Attributes:
+        solids: The meshes.
+        parts: Joint, index of a mesh, placement in the axes of the joint, and color (red, green, blue, opacity).
+        licenses: Where meshes of others come from, and on what terms.
+        notes: What is drawn in place of something else, one line each.
+    """
+
+    solids: tuple[Solid, ...]
+    parts: tuple[tuple[int, int, pin.SE3, Color], ...]
+    licenses: tuple[MeshLicense, ...]
+    notes: tuple[str, ...]
+
+
+@lru_cache(maxsize=4)
+def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
+    """Return the visual shapes of a robot; hulls for meshes that may not be passed on; sticks where nothing is there.
+
+    Args:
+        robot: The robot.
+        meshes: Pass on the meshes of the user's own URDF, too.
+    """
+    described, warnings = read_urdf_shapes(robot, "visual")
+    loaded = load_geometry(robot, described)
+    by_name = {shape.name: shape for shape in described}
+    licenses: dict[str, MeshLicense] = {}
+    solids: dict[tuple[object, ...], Solid] = {}
+    parts, notes = [], [*warnings, *loaded.warnings]
+    for placed in loaded.model.geometryObjects:
+        shape = by_name[placed.name]
+        known = None if shape.mesh is None else license_of(shape.mesh)
+        hull = shape.mesh is not None and not (meshes or (known and known.allows))
+        if known and not hull:
+            licenses[known.package] = known
+        # The same file at the same scale is the same mesh; an address in memory would name another one later.
+        key = (shape.kind, shape.sizes, shape.mesh, hull)
+        if key not in solids:
+            solids[key] = hull_of(shape_points(placed.geometry)) if hull else _solid_of(placed.geometry)
+        parts.append((int(placed.parentJoint), list(solids).index(key), placed.placement, _color(shape)))
+    if any(key[-1] for key in solids):
+        notes.append("meshes are drawn as their convex hulls, because a page passes them on (`meshes`)")
+    if not parts:
+        solids, parts = _sticks(robot)
+        notes.append("the robot has no shapes that can be drawn: sticks join its joints")
+    return DrawnRobot(tuple(_reduced(list(solids.values()))), tuple(parts), tuple(licenses.values()), tuple(notes))
+
+
+def hull_of(points: Array) -> Solid:
+    """Return the convex hull of points."""
+    return _quantized(*hull_surface(points))
+
+
+def _solid_of(solid: Any) -> Solid:
+    """Return a shape, or its hull where the triangles of its mesh are not known."""
+    points, faces = surface_of(solid)
+    found = renumbered(points, faces) if isinstance(solid, coal.BVHModelBase) else faces
+    return hull_of(points) if found is None else _quantized(points, found)
+
+
+def _quantized(points: Array, faces: Triangles) -> Solid:
+    low = points.min(axis=0)
+    step = max(float(np.ptp(points, axis=0).max()), 1e-9) / _LEVELS
+    return _welded(Solid(np.round((points - low) / step).astype(np.uint16), faces, low, step), 0)
+
+
+def _welded(solid: Solid, bits: int) -> Solid:
+    """Join the corners that agree but for their last ``bits``, and drop the triangles that vanish."""
+    keys = (solid.corners >> bits).astype(np.int64) @ (1 << np.array([32, 16, 0]))
+    _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
+    faces = merged[solid.faces]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    # In the order of their first use corners differ little from the last ones, so that they compress well.
+    used, at = np.unique(faces, return_index=True)
+    order = used[np.argsort(at)]
+    renamed = np.empty(len(first), dtype=int)
+    renamed[order] = np.arange(len(order))
+    return Solid(solid.corners[first[order]], renamed[faces], solid.low, solid.step)
+
+
+def _reduced(solids: list[Solid]) -> list[Solid]:
+    """Weld the corners within a length that grows until all meshes together have few enough triangles."""
+    length = max(solid.step for solid in solids)
+    while sum(len(solid.faces) for solid in solids) > _MOST_TRIANGLES:
+        length *= 2
+        bits = [max(int(np.log2(length / solid.step)), 0) for solid in solids]
+        solids = [_welded(solid, k) if k else solid for solid, k in zip(solids, bits, strict=True)]
+    return solids
+
+
+def _sticks(robot: Robot) -> tuple[dict[tuple[object, ...], Solid], list[tuple[int, int, pin.SE3, Color]]]:
+    """Return rods from each joint to the next ones."""
+    model = robot.model
+    spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
+    ball = shape_points(coal.Sphere(0.02 * max(0.1, *(float(np.linalg.norm(span)) for _, span in spans))))
+    rods: dict[tuple[object, ...], Solid] = {
+        (k,): hull_of(np.vstack([ball, ball + span])) for k, (_, span) in enumerate(spans)
+    }
+    return rods, [(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
+
+
+def _color(shape: UrdfShape) -> Color:
+    """Return the color of a shape: that of the URDF, the mean of a COLLADA file (which coal drops), or gray."""
+    *color, opacity = shape.color or _GRAY
+    if shape.color is None and shape.mesh is not None and shape.mesh.suffix.lower() == ".dae":
+        with shape.mesh.open("rb") as file:
+            head = file.read(_HEAD)
+        found = re.findall(rb"<diffuse>\s*<color[^>]*>\s*([\d.eE+-]+)\s+([\d.eE+-]+)\s+([\d.eE+-]+)\s", head)
+        color = np.mean([[float(v) for v in one] for one in found] or [color], axis=0).tolist()
+    return (*np.clip(color, _DARKEST, 1.0).tolist(), opacity)
