@@ -70,13 +70,13 @@ class Finished(NamedTuple):
 
     Attributes:
         done: Number of finished steps.
-        count: Number of all steps.
+        total: Number of all steps.
         export: The export and why it could not be built, if this step made it.
         report_error: Why there is no report, if this step failed to make it.
     """
 
     done: int
-    count: int
+    total: int
     export: tuple[Export, str] | None = None
     report_error: str = ""
 
@@ -168,7 +168,7 @@ def write_result(
                 made, failure = step.export
             report_error = step.report_error
             if progress:
-                progress(step.done, step.count)
+                progress(step.done, step.total)
     return Written(out, made, failure, report_error)
 
 
@@ -184,13 +184,13 @@ def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finish
     tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if request.codegen else []
     view = _view(prepared, initial, optimal, path, document, _motion(folder, document, prepared.impact.robot), mapped)
     tasks += _drawings(view, folder, request.formats)
-    count = len(tasks) + request.report
+    total = len(tasks) + request.report
     with fork_map(lambda index: tasks[index](), len(tasks), request.jobs) as results:
         for done, (index, result) in enumerate(results, start=1):
-            yield Finished(done, count, result if request.codegen and index == 0 else None)
+            yield Finished(done, total, result if request.codegen and index == 0 else None)
     if request.report:
         # It shows the figures, so it comes last.
-        yield Finished(count, count, report_error=_report(prepared, view, request))
+        yield Finished(total, total, report_error=_report(prepared, view, request))
 
 
 def _report(prepared: Prepared, view: ResultView, request: FinishRequest) -> str:

@@ -17,6 +17,8 @@ from impact_posture.collision.swept_hull import SweptHull, hull_corners, separat
 TOLERANCE = 0.001
 """Tolerance (m) of the hulls of parts, finer than that of others, because bodies in hollows have little room."""
 
+Triangles = NDArray[np.int_]
+
 # A cut is sought across each axis, at so many places that divide the extent evenly.
 _PLACES = 9
 # The best cut is sought with so many triangles at most, and is made through all.
@@ -47,7 +49,7 @@ def triangles_of(shapes: Iterable[pin.GeometryObject]) -> Array:
     return np.concatenate(found)
 
 
-def surface_of(solid: Any) -> tuple[Array, NDArray[np.int_]]:
+def surface_of(solid: Any) -> tuple[Array, Triangles]:
     """Return the corners of a shape in its own axes, shape (k, 3), m, and its triangles as indices, shape (n, 3).
 
     They are those of a mesh, or of the hull around a primitive shape.
@@ -59,10 +61,10 @@ def surface_of(solid: Any) -> tuple[Array, NDArray[np.int_]]:
     return hull_surface(points)
 
 
-def hull_surface(points: Array) -> tuple[Array, NDArray[np.int_]]:
+def hull_surface(points: Array) -> tuple[Array, Triangles]:
     """Return corners and triangles of the convex hull of points, as :func:`surface_of` does."""
     corners = hull_corners(points)
-    return corners, SweptHull("", "", 0, corners, 0.0).faces
+    return corners, SweptHull("", "", 0, corners, 0.0).faces.astype(int)
 
 
 def best_cut(triangles: Array, other: SweptHull, placements: Sequence[pin.SE3]) -> Cut:

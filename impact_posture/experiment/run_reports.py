@@ -166,39 +166,36 @@ def _summary(metrics: Mapping[str, Any]) -> str:
 
 
 def _comparison_content(document: Document, view: RunView) -> Content:
-    rows, verdict = [], []
-    for row in document["rows"]:
-        cells = []
-        for key, _, _ in _METRICS:
-            mean = row["metrics"].get(key)
-            half = None if mean is None else mean["half_width"]
-            cells.append(
-                "–" if mean is None else number(mean["mean"]) + (f" ± {number(half)}" if half is not None else "")
-            )
-        rows.append((row["controller"], row["status"], *cells))
-        less = row["reduction"]
-        if less is not None and row["controller"] != "nominal":
-            share = less["mean"]
-            verdict.append(
-                f"{row['controller']} moves {abs(share):.0%} {'less' if share > 0 else 'more'} than nominal"
-            )
-    labels = ",".join(row["controller"] for row in document["rows"])
-    seeds = len(document["seeds"])
-    units = tuple(f"{key}, {unit}" for key, unit, _ in _METRICS)
-    return Content(
-        title=f"{document['scenario']}: {labels.replace(',', ', ')}",
-        command=shlex.join(
-            ["impact-posture", "compare", view.scenario, "--controllers", labels, "--seeds", str(seeds)]
-        ),
-        facts=tuple(run_header([view])[1]),
-        verdict=(
-            "; ".join(verdict) + " in the impact windows."
-            if verdict
-            else "No controller can be held against nominal.",
-        ),
-        tables=(
-            Table("Means of the seeds, with 95 % intervals from 3 seeds on", ("", "status", *units), tuple(rows)),
-        ),
-        moves=f"{_MOVES} Shown are the runs of the first seed.",
-        notes=tuple(f"{key}: {words}" for key, _, words in _METRICS),
+    rows = document["rows"]
+    labels = [str(row["controller"]) for row in rows]
+    table = [("status", *(str(row["status"]) for row in rows), "", "")]
+    for key, unit, meaning in _METRICS:
+        table.append((key, *(_interval(row["metrics"].get(key)) for row in rows), unit, meaning))
+    verdict = []
+    for row in rows:
+        if row["reduction"] is not None and row["controller"] != "nominal":
+            share = row["reduction"]["mean"]
+            verdict.append(f"{row['controller']} moves {abs(share):.0%} {'less' if share > 0 else 'more'}")
+    line = (
+        f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
     )
+    seeds = str(len(document["seeds"]))
+    command = ["impact-posture", "compare", view.scenario, "--controllers", ",".join(labels), "--seeds", seeds]
+    return Content(
+        title=f"{document['scenario']}: {', '.join(labels)}",
+        command=shlex.join(command),
+        facts=tuple(run_header([view])[1]),
+        verdict=(line, *(f"{row['controller']}: {reason}" for row in rows for reason in row["failed"])),
+        tables=(
+            Table(f"Means of {seeds} seeds, with 95 % intervals", ("", *labels, "unit", "meaning"), tuple(table)),
+        ),
+        moves=f"{_MOVES} The runs are those of the first seed.",
+        notes=(),
+    )
+
+
+def _interval(found: Mapping[str, Any] | None) -> str:
+    if found is None:
+        return "–"
+    half = "" if found["half_width"] is None else f" ± {number(found['half_width'])}"
+    return f"{number(found['mean'])}{half}"

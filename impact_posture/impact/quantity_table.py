@@ -54,8 +54,8 @@ def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict
     forces = [(block["compression"] or {}).get("peak_force") for block in (initial, optimal)]
     at = f"at {impact.speed:g} m/s"
     if None not in jumps and impact.speed:
-        sizes = [sum(v * v for v in jump["impulse"]) ** 0.5 for jump in jumps]
-        rows.append(QuantityRow("impulse", *sizes, "N·s", f"impulse {at}, friction {impact.contact.friction:g}"))
+        first, last = (sum(v * v for v in jump["impulse"]) ** 0.5 for jump in jumps)
+        rows.append(QuantityRow("impulse", first, last, "N·s", f"impulse {at}, friction {impact.contact.friction:g}"))
     if None not in forces:
-        rows.append(QuantityRow("force", *forces, "N", f"peak force {at}, no friction"))
+        rows.append(QuantityRow("force", forces[0], forces[1], "N", f"peak force {at}, no friction"))
     return rows

@@ -86,11 +86,12 @@ def render(content: Content, scene: Scene, pictures: Sequence[tuple[str, str]]) 
     viewer, style = ((_VIEWER / name).read_text(encoding="utf-8") for name in ("viewer.min.js", "page.css"))
     # Scripts end at "</", wherever it stands.
     data = packed.replace("<", "\\u003c")
-    return _template().render(
+    text: str = _template().render(
         content=content, scene=scene, pictures=pictures, data=data, arrays=arrays, viewer=viewer, style=style,
         version=__version__, charts=[_charts(track) for track in scene.tracks],
         hashes={"script": _hash(viewer), "style": _hash(style)},
     )  # fmt: skip
+    return text
 
 
 def figures(folder: Path) -> list[tuple[str, str]]:

@@ -145,6 +145,7 @@ def _moves(view: ResultView, document: dict[str, Any]) -> str:
         end = "the optimum" if document["path"]["found"] else "the best posture that was reached"
         return f"The slider follows the motion of --path from the initial posture to {end}, over time. {arrows}."
     return (
-        "The slider follows the straight line between the two postures, each point pulled onto the constraints. It is "
-        f"no motion plan: limits of speed and collisions on the way are not checked (--path does that). {arrows}."
+        "The slider follows the straight line between the two postures, each point pulled onto the constraints. "
+        "It is no motion plan: limits of speed and collisions on the way are not checked (--path does that). "
+        f"{arrows}."
     )

@@ -5,13 +5,14 @@ from __future__ import annotations
 import base64
 import gzip
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.impact.contact import ImpactContact, point_on
@@ -159,12 +160,12 @@ class Scene:
             "unit": track.unit,
             "times": track.times.astype(np.float32),
             "poses": _levels(poses.reshape(frames, -1)),
-            "points": at.astype(np.float32),
-            "normals": track.normals.astype(np.float32),
-            "ellipsoids": np.array([root(e)[np.triu_indices(3)] for e in track.ellipsoids], dtype=np.float32),
+            "points": _levels(at),
+            "normals": _levels(track.normals),
+            "ellipsoids": _levels(np.array([root(e)[np.triu_indices(3)] for e in track.ellipsoids])),
             "jumps": _levels(arrows.reshape(frames, -1)),
             "largest_jump": _norms(arrows),
-            "forces": None if track.forces is None else track.forces.astype(np.float32),
+            "forces": None if track.forces is None else _levels(track.forces),
             "series": [{"values": s.values.astype(np.float32)} for s in track.series],
         }
 
@@ -186,12 +187,12 @@ def _norms(vectors: Array) -> float:
 
 
 def _longest_axis(track: Track) -> float:
-    return float(np.linalg.eigvalsh(track.ellipsoids).max()) ** 0.5
+    return float(np.sqrt(np.linalg.eigvalsh(track.ellipsoids).max()))
 
 
 def _largest(values: Iterable[float]) -> float:
     """Return the largest value, or one where all are zero, so that a scale stays finite."""
-    return max(values, default=0.0) or 1.0
+    return float(max(values, default=0.0)) or 1.0
 
 
 def _straighten(quaternions: Array) -> None:
@@ -202,22 +203,29 @@ def _straighten(quaternions: Array) -> None:
 
 def _solid(solid: Solid) -> dict[str, Any]:
     kind = np.uint16 if len(solid.corners) <= 65536 else np.uint32
-    corners = {"values": solid.corners, "low": solid.low.tolist(), "step": [solid.step] * 3}
-    return {"corners": corners, "faces": solid.faces.astype(kind)}
+    corners = {"values": _differences(solid.corners), "low": solid.low.tolist(), "step": [solid.step] * 3}
+    return {"corners": corners, "faces": _differences(solid.faces.astype(kind).reshape(-1, 1))}
+
+
+def _differences(rows: NDArray[Any]) -> NDArray[Any]:
+    """Return the differences between rows of whole numbers, the first from zero, which compress better.
+
+    They wrap around, and the sums of the viewer wrap back.
+    """
+    return np.diff(rows, axis=0, prepend=np.zeros_like(rows[:1]))
 
 
 def _levels(columns: Array) -> dict[str, Any]:
     """Return columns as whole levels between the least and the largest value of each."""
     low, step = columns.min(axis=0), np.maximum(np.ptp(columns, axis=0), 1e-12) / 65535
-    return {"values": np.round((columns - low) / step).astype(np.uint16), "low": low.tolist(), "step": step.tolist()}
+    values = np.round((columns - low) / step).astype(np.uint16)
+    return {"values": _differences(values), "low": low.tolist(), "step": step.tolist()}
 
 
 def _packed(content: dict[str, Any]) -> tuple[str, str]:
     buffer = bytearray()
 
-    def place(array: Any) -> Sequence[object]:
-        if not isinstance(array, np.ndarray):
-            return array.tolist()  # type: ignore[no-any-return]
+    def place(array: Any) -> Any:
         if array.dtype.name not in _TYPES:
             return array.tolist()
         buffer.extend(bytes(-len(buffer) % 4))

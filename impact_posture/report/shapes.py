@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.collision.geometry import load_geometry
-from impact_posture.collision.parts import hull_surface, surface_of
+from impact_posture.collision.parts import Triangles, hull_surface, surface_of
 from impact_posture.collision.shape_points import shape_points
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.report.mesh_license import MeshLicense, license_of
+from impact_posture.report.submeshes import renumbered
 from impact_posture.robot.robot import Robot
 
 # Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
@@ -26,6 +27,7 @@ _MOST_TRIANGLES = 150_000
 # Corners of a mesh are whole multiples of its extent over this.
 _LEVELS = 65535
 _GRAY = (0.72, 0.74, 0.77, 1.0)
+_DARKEST = 0.2
 # Bytes of a COLLADA file in which its colors are sought.
 _HEAD = 200_000
 
@@ -42,7 +44,7 @@ class Solid:
     """
 
     corners: NDArray[np.uint16]
-    faces: NDArray[np.int_]
+    faces: Triangles
     low: Array
     step: float
 
@@ -99,7 +101,7 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
     by_name = {shape.name: shape for shape in described}
     licenses: dict[str, MeshLicense] = {}
     index: dict[object, int] = {}
-    surfaces: list[tuple[Array, NDArray[np.int_]]] = []
+    surfaces: list[tuple[Array, Triangles]] = []
     parts, hulls = [], False
     for placed in loaded.model.geometryObjects:
         shape = by_name[placed.name]
@@ -112,8 +114,8 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
         key = (shape.kind, shape.sizes, shape.mesh)
         if key not in index:
             index[key] = len(surfaces)
-            surfaces.append(hull_surface(shape_points(placed.geometry)) if hull else surface_of(placed.geometry))
-        parts.append(Part(int(placed.parentJoint), index[key], placed.placement, shape.color or _file_color(shape)))
+            surfaces.append(_hull(placed.geometry) if hull else _surface(placed.geometry))
+        parts.append(Part(int(placed.parentJoint), index[key], placed.placement, _color(shape)))
     notes = [*warnings, *loaded.warnings]
     if hulls:
         notes.append("meshes are drawn as their convex hulls, because a page passes them on (`meshes`)")
@@ -124,12 +126,23 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
     return DrawnRobot(tuple(solids), tuple(parts), tuple(licenses.values()), tuple(notes))
 
 
+def _hull(solid: Any) -> tuple[Array, Triangles]:
+    return hull_surface(shape_points(solid))
+
+
+def _surface(solid: Any) -> tuple[Array, Triangles]:
+    """Return corners and triangles of a shape, or of its hull where those of its mesh are not known."""
+    points, faces = surface_of(solid)
+    found = renumbered(points, faces) if isinstance(solid, coal.BVHModelBase) else faces
+    return _hull(solid) if found is None else (points, found)
+
+
 def quantized_hull(points: Array) -> Solid:
     """Return the convex hull of points."""
     return _quantized(*hull_surface(points))
 
 
-def _quantized(points: Array, faces: NDArray[np.int_]) -> Solid:
+def _quantized(points: Array, faces: Triangles) -> Solid:
     low = points.min(axis=0)
     step = max(float(np.ptp(points, axis=0).max()), 1e-9) / _LEVELS
     return _welded(Solid(np.round((points - low) / step).astype(np.uint16), faces, low, step), 0)
@@ -159,7 +172,7 @@ def _reduced(solids: list[Solid]) -> list[Solid]:
     return solids
 
 
-def _sticks(robot: Robot) -> tuple[list[tuple[Array, NDArray[np.int_]]], list[Part]]:
+def _sticks(robot: Robot) -> tuple[list[tuple[Array, Triangles]], list[Part]]:
     """Return rods from each joint to the next ones."""
     model = robot.model
     spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
@@ -167,6 +180,12 @@ def _sticks(robot: Robot) -> tuple[list[tuple[Array, NDArray[np.int_]]], list[Pa
     ball = shape_points(coal.Sphere(radius))
     surfaces = [hull_surface(np.vstack([ball, ball + span])) for _, span in spans]
     return surfaces, [Part(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
+
+
+def _color(shape: UrdfShape) -> tuple[float, ...]:
+    """Return the color of a shape, not so dark that its form is lost."""
+    *color, opacity = shape.color or _file_color(shape)
+    return (*np.clip(color, _DARKEST, 1.0).tolist(), opacity)
 
 
 def _file_color(shape: UrdfShape) -> tuple[float, ...]:
@@ -177,4 +196,4 @@ def _file_color(shape: UrdfShape) -> tuple[float, ...]:
         head = file.read(_HEAD)
     found: list[Any] = re.findall(rb"<diffuse>\s*<color[^>]*>\s*([\d.eE+-]+)\s+([\d.eE+-]+)\s+([\d.eE+-]+)\s", head)
     colors = [tuple(map(float, color)) for color in found]
-    return (*np.clip(np.mean(colors, axis=0), 0.0, 1.0).tolist(), 1.0) if colors else _GRAY
+    return (*np.mean(colors, axis=0).tolist(), 1.0) if colors else _GRAY

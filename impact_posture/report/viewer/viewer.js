@@ -11,15 +11,17 @@ const TYPES = { u2: Uint16Array, u4: Uint32Array, f4: Float32Array };
 let data, buffer, track, draw = () => {}, at = 0, playing = false, waiting = false;
 
 const plain = ([type, offset, count]) => new TYPES[type](buffer, offset, count);
-const levels = ({ values, low, step }) => Float32Array.from(plain(values), (v, i) => low[i % low.length] + step[i % low.length] * v);
+// The arrays hold the differences between rows; sums wrap around in the type of the array, as the differences did.
+const summed = (array, width) => { for (let i = width; i < array.length; i++) array[i] += array[i - width]; return array; };
+const levels = ({ values, low, step }) => Float32Array.from(summed(plain(values), low.length), (v, i) => low[i % low.length] + step[i % low.length] * v);
 
 async function load() {
   const bytes = Uint8Array.from(atob($('arrays').textContent), (c) => c.charCodeAt(0));
   buffer = await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'))).arrayBuffer();
   data = JSON.parse($('scene').textContent);
   for (const t of data.tracks) {
-    for (const key of ['times', 'points', 'normals', 'ellipsoids', 'forces']) t[key] = t[key] && plain(t[key]);
-    for (const key of ['poses', 'jumps']) t[key] = levels(t[key]);
+    for (const key of ['poses', 'points', 'normals', 'ellipsoids', 'jumps', 'forces']) t[key] = t[key] && levels(t[key]);
+    t.times = plain(t.times);
     for (const series of t.series) series.values = plain(series.values);
     t.last = t.times.length - 1;
   }
@@ -37,7 +39,7 @@ const vector = (array, k = 0) => new Vector3(...row(array, 3, k));
 function geometry({ corners, faces }) {
   const found = new BufferGeometry();
   found.setAttribute('position', new BufferAttribute(levels(corners), 3));
-  found.setIndex(new BufferAttribute(plain(faces), 1));
+  found.setIndex(new BufferAttribute(summed(plain(faces), 1), 1));
   return toCreasedNormals(found, 0.6);
 }
 
@@ -104,8 +106,8 @@ function stage(renderer) {
   const shapes = data.shapes.map(geometry), body = robot(shapes, false), ghost = robot(shapes, true), walls = data.walls.map((one) => wall(one, shapes));
   const normal = arrow(0x000000, 0.004 * data.size), force = arrow(0x0046a0, 0.008 * data.size), jumps = body.map(() => arrow(0xc24a00, 0.004 * data.size));
   const now = ellipsoid(0x0072b2, 0.35, false), first = ellipsoid(0x883300, 0.45, true);
-  scene.add(body[0], ghost[0], ...walls, normal, force, ...jumps, now, first, new AmbientLight(0xffffff, 1.4));
-  for (const [x, y, z, power] of [[3, -4, 6, 2], [-4, 3, 2, 1]]) { const sun = new DirectionalLight(0xffffff, power); sun.position.set(x, y, z); scene.add(sun); }
+  scene.add(body[0], ghost[0], ...walls, normal, force, ...jumps, now, first, new AmbientLight(0xffffff, 1.1));
+  for (const [x, y, z, power] of [[3, -4, 6, 1.5], [-4, 3, 2, 0.8]]) { const sun = new DirectionalLight(0xffffff, power); sun.position.set(x, y, z); scene.add(sun); }
 
   const controls = new OrbitControls(camera, canvas);
   controls.listenToKeyEvents(canvas); controls.addEventListener('change', () => show());
