@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -34,53 +34,11 @@ if TYPE_CHECKING:
 
 FORMATS = ("png",)
 
-
-class FinishRequest(NamedTuple):
-    """What :func:`finish_result` makes.  It can be sent to a process.
-
-    Attributes:
-        folder: The folder.
-        initial: Posture before, shape (nq,).
-        optimal: Posture after, shape (nq,).
-        path: The null-space path between them.
-        mapped: The self-motion map, if there is one.
-        document: The content of ``result.json``.
-        codegen: Whether to export the C code.
-        formats: Formats of the figures.
-        jobs: Number of processes.
-        report: Whether to write ``report.html``.
-        meshes: Whether the report may hold the meshes of the user's own URDF.
-    """
-
-    folder: Path
-    initial: np.ndarray
-    optimal: np.ndarray
-    path: NullSpacePath
-    mapped: SelfMotionMap | None
-    document: dict[str, Any]
-    codegen: bool
-    formats: Sequence[str]
-    jobs: int
-    report: bool
-    meshes: bool
-
-
-class Finished(NamedTuple):
-    """A step of :func:`finish_result` that has ended.
-
-    Attributes:
-        done: Number of finished steps.
-        total: Number of all steps.
-        export: The export and why it could not be built, if this step made it.
-        report_error: Why there is no report, if this step failed to make it.
-    """
-
-    done: int
-    total: int
-    export: tuple[Export, str] | None = None
-    report_error: str = ""
-
-
+FinishRequest = tuple[
+    Path, np.ndarray, np.ndarray, NullSpacePath, SelfMotionMap | None, dict[str, Any], bool, Sequence[str], int,
+    bool, bool,
+]  # fmt: skip
+Finished = tuple[int, int, "tuple[Export, str] | str | None"]
 Finish = Callable[[FinishRequest], Iterator[Finished]]
 # Exceptions from reading a changed or incomplete result.
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, EOFError, BadZipFile, RecursionError)
@@ -160,15 +118,16 @@ def write_result(
             from impact_posture.path.files import write_path
 
             write_path(folder, prepared.impact.robot, motion)
-        request = FinishRequest(
+        request = (
             folder, solution.initial, solution.q, path, mapped, document, codegen, formats, jobs, report, meshes
-        )
-        for step in (finish or partial(finish_result, prepared))(request):
-            if step.export is not None:
-                made, failure = step.export
-            report_error = step.report_error
+        )  # fmt: skip
+        for done, count, result in (finish or partial(finish_result, prepared))(request):
+            if isinstance(result, str):
+                report_error = result
+            elif result is not None:
+                made, failure = result
             if progress:
-                progress(step.done, step.total)
+                progress(done, count)
     return Written(out, made, failure, report_error)
 
 
@@ -177,28 +136,34 @@ def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finish
 
     Args:
         prepared: The problem.
-        request: What to make.
+        request: The folder, the postures before and after, the path between them, the self-motion map, the content of
+            ``result.json``, whether to export, the formats of the figures, the number of processes, whether to write
+            a report, and whether it may hold the user's own meshes.  It can be sent to a process.
+
+    Yields:
+        The number of finished files, the number of all files, and what :func:`_export` or :func:`_report` returns if
+        it has ended.
     """
-    folder, initial, optimal, path, mapped, document = request[:6]
+    folder, initial, optimal, path, mapped, document, codegen, formats, jobs, report, meshes = request
     # The C code comes first, because it takes longest.
-    tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if request.codegen else []
+    tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
     view = _view(prepared, initial, optimal, path, document, _motion(folder, document, prepared.impact.robot), mapped)
-    tasks += _drawings(view, folder, request.formats)
-    total = len(tasks) + request.report
-    with fork_map(lambda index: tasks[index](), len(tasks), request.jobs) as results:
+    tasks += _drawings(view, folder, formats)
+    count = len(tasks) + report
+    with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
         for done, (index, result) in enumerate(results, start=1):
-            yield Finished(done, total, result if request.codegen and index == 0 else None)
-    if request.report:
+            yield done, count, result if codegen and index == 0 else None
+    if report:
         # It shows the figures, so it comes last.
-        yield Finished(total, total, report_error=_report(prepared, view, request))
+        yield count, count, _report(folder, prepared, view, document, meshes)
 
 
-def _report(prepared: Prepared, view: ResultView, request: FinishRequest) -> str:
+def _report(folder: Path, prepared: Prepared, view: ResultView, document: dict[str, Any], meshes: bool) -> str:
     """Write the report; return why that failed, because a result is kept without it."""
     try:
         from impact_posture.report.result_report import write_result_report
 
-        write_result_report(request.folder, prepared, view, request.document, meshes=request.meshes)
+        write_result_report(folder, prepared, view, document, meshes=meshes)
     except Exception as error:
         return one_line(f"{type(error).__name__}: {error}")
     return ""
@@ -308,47 +273,33 @@ def _write_json(path: Path, document: dict[str, object]) -> None:
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-class LoadedResult(NamedTuple):
-    """A result folder that was read back.
-
-    Attributes:
-        prepared: The problem.
-        view: The view from which its figures are drawn.
-        document: The content of ``result.json``.
-    """
-
-    prepared: Prepared
-    view: ResultView
-    document: dict[str, Any]
-
-
 def load_view(folder: Path) -> ResultView:
-    """Read the view of a result folder, from which its figures are drawn; see :func:`load_result`."""
-    return load_result(folder).view
+    """Read the view of a result folder, from which its figures are drawn.
+
+    Raises:
+        SpecError: The folder is no result folder, or was made with another robot model.
+    """
+    return _load(folder)[1]
 
 
 def rewrite_report(folder: Path, *, meshes: bool = False) -> Path:
     """Write ``report.html`` of a result folder again; return its path.
 
     Raises:
-        SpecError: As :func:`load_result`.
+        SpecError: As :func:`load_view`.
         OutputError: It cannot be written.
     """
     from impact_posture.report.result_report import write_result_report
 
-    loaded = load_result(folder)
+    loaded = _load(folder)
     try:
         return write_result_report(folder, *loaded, meshes=meshes)
     except _BROKEN as error:
         raise _broken(folder, error) from None
 
 
-def load_result(folder: Path) -> LoadedResult:
-    """Read a result folder.
-
-    Raises:
-        SpecError: The folder is no result folder, or was made with another robot model.
-    """
+def _load(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
+    """Read problem, view and ``result.json`` of a result folder."""
     if not (folder / "result.json").is_file():
         raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
     try:
@@ -373,7 +324,7 @@ def load_result(folder: Path) -> LoadedResult:
         )
         motion = _motion(folder, document, robot)
         view = _view(prepared, initial, optimal, path, document, motion, mapped)
-        return LoadedResult(prepared, view, document)
+        return prepared, view, document
     except _BROKEN as error:
         raise _broken(folder, error) from None
 

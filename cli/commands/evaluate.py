@@ -78,7 +78,7 @@ def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     )
     rows = [
         (f"  {key}", number(mine[key]), *(() if free is None else (number(free[key]),)), unit, words)
-        for key, unit, words in quantities(impact)
+        for key, unit, words in quantities(impact.metric)
     ]
     masses = [number(value, missing="unbounded") for value in (mass if free is not None else mass[:1])]
     rows.append(("  1/G", *masses, "kg", "effective mass along n"))

@@ -23,10 +23,13 @@ def report(
     quiet: options.Quiet = False,
 ) -> None:
     """Run ``impact-posture report``."""
-    from impact_posture.folder_report import rewrite_report
     from impact_posture.output_folder import add_to_record
 
     place = Path(folder)
+    if any((place / name).is_file() for name in ("run.json", "comparison.json")):
+        from impact_posture.experiment.run_reports import write_run_report as rewrite_report
+    else:
+        from impact_posture.result_folder import rewrite_report
     with progress("writing", shown=not (quiet or json)):
         written = rewrite_report(place, meshes=meshes)
     add_to_record(place, [written])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
+    from impact_posture.impact.metric import Metric
     from impact_posture.impact.resolved_impact import ResolvedImpact
 
 
@@ -26,9 +27,9 @@ class QuantityRow(NamedTuple):
     meaning: str
 
 
-def quantities(impact: ResolvedImpact) -> list[tuple[str, str, str]]:
-    """Return key, unit and meaning of H, G, V, S and E in the metric of an impact."""
-    kinetic = impact.metric.kind == "kinetic"
+def quantities(metric: Metric) -> list[tuple[str, str, str]]:
+    """Return key, unit and meaning of H, G, V, S and E in a metric."""
+    kinetic = metric.kind == "kinetic"
     per_impulse, per_speed = ("1/kg", "kg") if kinetic else ("jump²/(N·s)²", "jump²/(m/s)²")
     return [
         ("H", per_impulse, "jump² per impulse²"),
@@ -48,7 +49,7 @@ def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict
         optimal: The block ``optimal`` of ``result.json``.
     """
     minimized = ("objective", "", f"what was minimized ({impact.objective.kind})")
-    named = (minimized, *quantities(impact))
+    named = (minimized, *quantities(impact.metric))
     rows = [QuantityRow(key, initial[key], optimal[key], unit, words) for key, unit, words in named]
     jumps = [block["jump"]["coulomb"] for block in (initial, optimal)]
     forces = [(block["compression"] or {}).get("peak_force") for block in (initial, optimal)]

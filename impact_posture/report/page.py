@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.escape import printable
 from impact_posture.output_folder import write_whole
 from impact_posture.plot.view import number
@@ -27,7 +26,7 @@ _VIEWER = Path(__file__).parent / "viewer"
 _COLORS = 64
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 # Place of a curve in its chart, in the units of its view box.
-LEFT, RIGHT, TOP, BOTTOM = 60.0, 390.0, 8.0, 92.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 60.0, 390.0, 8.0, 92.0
 
 
 @dataclass(frozen=True)
@@ -136,29 +135,20 @@ def _template() -> Any:
 def _charts(track: Track) -> list[dict[str, Any]]:
     """Return each curve of a track as lines in its chart, with the marks of its axes."""
     charts = []
-    x = LEFT + (RIGHT - LEFT) * (track.times - track.times[0]) / ((track.times[-1] - track.times[0]) or 1.0)
-    for series in track.series:
-        known = np.isfinite(series.values)
-        low, high = (
-            (float(series.values[known].min()), float(series.values[known].max())) if known.any() else (0.0, 0.0)
-        )
+    x = _LEFT + (_RIGHT - _LEFT) * (track.times - track.times[0]) / ((track.times[-1] - track.times[0]) or 1.0)
+    for name, unit, values in track.curves:
+        known = np.isfinite(values)
+        low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
         low = min(low, 0.0) if low < 0.4 * high else low
-        y = BOTTOM - (BOTTOM - TOP) * (series.values - low) / ((high - low) or 1.0)
-        ends = [number(float(series.values[k])) for k in (0, -1)]
+        y = _BOTTOM - (_BOTTOM - _TOP) * (values - low) / ((high - low) or 1.0)
+        # Frames a millisecond apart mostly fall on the same place.
+        points = [(f"{a:.1f},{b:.1f}", bool(good)) for a, b, good in zip(x, y, known, strict=True)]
+        runs = [(good, dict(each)) for good, each in groupby(points, key=lambda point: point[1])]
+        ends = [number(float(values[k])) for k in (0, -1)]
         charts.append({
-            "name": series.name, "unit": series.unit, "lines": _lines(x, y, known),
+            "name": name, "unit": unit, "lines": [" ".join(each) for good, each in runs if good],
             "low": number(low), "high": number(high),
             "first": number(float(track.times[0])), "last": number(float(track.times[-1])),
-            "words": f"{series.name} from {ends[0]} to {ends[1]} {series.unit}".rstrip(),
+            "words": f"{name} from {ends[0]} to {ends[1]} {unit}".rstrip(),
         })  # fmt: skip
     return charts
-
-
-def _lines(x: Array, y: Array, known: Array) -> list[str]:
-    """Return the points of the stretches where a curve is known."""
-    lines = []
-    for good, indices in groupby(range(len(x)), key=lambda k: bool(known[k])):
-        if good:
-            # Frames a millisecond apart mostly fall on the same place.
-            lines.append(" ".join(point for point, _ in groupby(f"{x[k]:.1f},{y[k]:.1f}" for k in indices)))
-    return lines

@@ -11,11 +11,11 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.coulomb_contacts import coulomb_jump
-from impact_posture.impact.quantity_table import quantities, quantity_rows
+from impact_posture.impact.quantity_table import quantity_rows
 from impact_posture.plot.view import SEPARATOR, ResultView, header_lines, number
 from impact_posture.posture.problem_settings import Prepared
 from impact_posture.report.page import Content, Table, write_page
-from impact_posture.report.scene import Scene, Series, Track, Wall
+from impact_posture.report.scene import Scene, Track, impact_curves
 from impact_posture.report.shapes import draw_robot
 
 # Most frames of a way: more are not seen.
@@ -42,48 +42,36 @@ def write_result_report(
 
 
 def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> Scene:
-    """Return the scene of a result."""
-    robot, q = view.robot, view.q_initial
-    numeric = Numeric(robot.model).at(q)
-    walls = []
-    if prepared.problem.surroundings is not None:
-        planes, solids = prepared.problem.surroundings.walls_at(q)
-        walls += [Wall("ground" if p.name == "ground" else "surface", p.point[None], p.normal) for p in planes]
-        walls += [Wall("body", hull.vertices) for hull, _ in solids]
+    """Return the scene of a result, with the surface where the problem has it: behind the link that touches it."""
+    around, q = prepared.problem.surroundings, view.q_initial
+    if around is not None:
+        walls, solids = around.walls_at(q)
+        planes = [("ground" if wall.name == "ground" else "surface", wall.point, wall.normal) for wall in walls]
     else:
+        numeric, planes, solids = Numeric(view.robot.model).at(q), [], []
         for one in view.objective.contacts:
-            point = point_on(robot, one.frame, one.offset)
-            at = numeric.placement(point)
-            n = np.array(one.normal)
-            walls.append(
-                Wall("surface", at.translation[None], at.rotation @ n if one.normal_frame == "contact" else n)
-            )
+            at = numeric.placement(point_on(view.robot, one.frame, one.offset))
+            turn = at.rotation if one.normal_frame == "contact" else np.eye(3)
+            planes.append(("surface", at.translation, turn @ one.normal))
+    bodies = tuple(hull.vertices for hull, _ in solids)
     return Scene(
-        robot, draw_robot(robot, meshes), view.objective.contact, (_track(prepared, view),), tuple(walls), True
+        draw_robot(view.robot, meshes), view.objective, (_track(prepared, view),), tuple(planes), bodies, True
     )
 
 
 def _track(prepared: Prepared, view: ResultView) -> Track:
     times, unit, q = _way(view)
-    rebound = (1 + view.restitution) * view.speed
-    found = [view.objective.oracle.quantities(one) for one in q]
-    jumps, impulses = [], []
+    rebound, stiffness = (1 + view.restitution) * view.speed, prepared.impact.contact_stiffness
+    found, jumps, impulses = [view.objective.oracle.quantities(one) for one in q], [], []
     for one, at in zip(found, q, strict=True):
         jump = coulomb_jump(view.objective, at, rebound)
         smooth = rebound / one.G if one.G > 0 else 0.0
         jumps.append(smooth * one.jump if jump is None else jump.velocity)
         impulses.append(smooth if jump is None else jump.impulse_size)
-    values = {name: np.array([getattr(one, name) for one in found], dtype=float) for name in "HGVS"}
-    units = {key: unit for key, unit, _ in quantities(prepared.impact)}
-    series = [Series(name, units[name], values[name]) for name in "HVS"]
-    series.append(Series("impulse", "N·s", np.array(impulses)))
-    stiffness = prepared.impact.contact_stiffness
+    curves = [*impact_curves(found, prepared.impact.metric), ("impulse", "N·s", np.array(impulses))]
     if stiffness is not None:
-        series.append(Series("peak force", "N", np.array([stiffness.peak_force(one.G, view.speed) for one in found])))
-    return Track(
-        "", times, unit, q, np.array([one.ellipsoid for one in found]), np.array([one.normal for one in found]),
-        np.array(jumps), tuple(series),
-    )  # fmt: skip
+        curves.append(("peak force", "N", np.array([stiffness.peak_force(one.G, view.speed) for one in found])))
+    return Track("", times, unit, q, found, np.array(jumps), tuple(curves))
 
 
 def _way(view: ResultView) -> tuple[Array, str, Array]:

@@ -6,20 +6,18 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.plot.run_view import RunView, Span
-from impact_posture.report.scene import Scene, Series, Track, Wall
+from impact_posture.report.scene import Scene, Track, impact_curves
 from impact_posture.report.shapes import draw_robot
 from impact_posture.simulation.series import Series as RunSeries
 from impact_posture.simulation.series import Window
 
-# Time between frames in impact windows and elsewhere, s; H, V and S are evaluated no more often than KEY, and go
-# straight between.
-FINE, COARSE, KEY = 0.001, 0.025, 0.01
+# Time between frames in impact windows and elsewhere, s.
+FINE, COARSE = 0.001, 0.025
 # No position of a robot that is under control is larger, m or rad.
 _AWAY = 1e3
 
@@ -60,41 +58,25 @@ def run_scene(runs: Sequence[tuple[RunView, ImpactObjective]], *, meshes: bool =
         runs: The runs, with the ticks of :func:`thin`, and the impact that each is about.
         meshes: Pass on the meshes of the user's own URDF, too.
     """
-    first = runs[0][0]
-    walls = []
+    first, objective = runs[0]
+    planes = []
     if first.surface is not None:
-        walls.append(Wall("surface", first.surface[None], np.array(first.contact.normal)))
+        planes.append(("surface", first.surface, np.array(first.contact.normal)))
     if first.supports:
         numeric = Numeric(first.robot.model).at(first.q[0])
         feet = [numeric.placement(point_on(first.robot, s.frame, s.offset)).translation for s in first.supports]
-        walls.append(Wall("ground", min(feet, key=lambda foot: float(foot[2]))[None], np.array([0.0, 0.0, 1.0])))
-    tracks = tuple(_track(view, objective) for view, objective in runs)
-    return Scene(first.robot, draw_robot(first.robot, meshes), first.contact, tracks, tuple(walls), False)
+        planes.append(("ground", min(feet, key=lambda foot: float(foot[2])), np.array([0.0, 0.0, 1.0])))
+    tracks = tuple(_track(view, one) for view, one in runs)
+    return Scene(draw_robot(first.robot, meshes), objective, tracks, tuple(planes), (), False)
 
 
 def _track(view: RunView, objective: ImpactObjective) -> Track:
-    keys = [0]
-    for k in range(1, len(view.t)):
-        if view.t[k] - view.t[keys[-1]] >= KEY - 1e-9 or k == len(view.t) - 1:
-            keys.append(k)
-    found = [objective.oracle.quantities(view.q[k]) for k in keys]
-
-    def between(values: Sequence[object]) -> Array:
-        known = np.array(values, dtype=float).reshape(len(keys), -1)
-        columns = [np.interp(view.t, view.t[keys], column) for column in known.T]
-        return np.array(columns).T
-
     jumps = np.zeros_like(view.v)
     for window in view.impacts:
         within = (view.t >= window.begin) & (view.t <= window.end)
         if within.any():
             jumps[within] = view.v[within] - view.v[max(int(np.argmax(within)) - 1, 0)]
-    series = [Series(name, unit, between([getattr(one, name) for one in found])[:, 0]) for name, unit in _UNITS]
-    series.append(Series("contact force", "N", np.linalg.norm(view.force, axis=1)))
-    return Track(
-        view.name, view.t, "s", view.q, between([one.ellipsoid for one in found]).reshape(-1, 3, 3),
-        between([one.normal for one in found]), jumps, tuple(series), view.force,
-    )  # fmt: skip
-
-
-_UNITS = (("H", "jump²/(N·s)²"), ("V", "jump²/(m/s)²"), ("S", "jump²/(m/s)²"))
+    found = [objective.oracle.quantities(q) for q in view.q]
+    force = ("largest normal force", "N", view.peak)
+    curves = (*impact_curves(found, objective.metric), force)
+    return Track(view.name, view.t, "s", view.q, found, jumps, curves, view.force)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -15,9 +15,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
-from impact_posture.impact.contact import ImpactContact, point_on
+from impact_posture.impact.contact import point_on
+from impact_posture.impact.metric import Metric
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.impact.quantity_table import quantities
 from impact_posture.plot.shapes import root
-from impact_posture.report.shapes import DrawnRobot, Solid, quantized_hull
+from impact_posture.report.shapes import DrawnRobot, Solid, hull_of
 from impact_posture.robot.robot import Robot
 
 _TYPES = {"uint16": "u2", "uint32": "u4", "float32": "f4"}
@@ -25,21 +29,8 @@ _TYPES = {"uint16": "u2", "uint32": "u4", "float32": "f4"}
 _EYES = np.array([[x, y, 0.55] for x in (1.1, -1.1) for y in (-1.25, 1.25)])
 # The camera sees the surface under this cosine with its normal best: neither edge-on nor from behind.
 _SLANT = 0.35
-
-
-@dataclass(frozen=True, eq=False)
-class Series:
-    """A quantity at the frames of a track.
-
-    Attributes:
-        name: Name in the chart.
-        unit: Unit; empty for none.
-        values: Values, shape (frames,); NaN where undefined.
-    """
-
-    name: str
-    unit: str
-    values: Array
+# Name, unit and values at the frames of a curve.
+Curve = tuple[str, str, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +42,9 @@ class Track:
         times: Times, s, or the way along a path, rad mixed with m, increasing, shape (frames,).
         unit: ``s`` for times; empty for a way.
         q: Configurations, shape (frames, nq).
-        ellipsoids: ``Λ_c`` of the impact, shape (frames, 3, 3).
-        normals: World normals, shape (frames, 3).
+        found: Quantities of the impact at each frame.
         jumps: Velocity jump ``Δν``, shape (frames, nv).
-        series: Curves.
+        curves: Curves, NaN where undefined.
         forces: Contact force on the robot, world, N, shape (frames, 3); ``None`` to show none.
     """
 
@@ -62,26 +52,10 @@ class Track:
     times: Array
     unit: str
     q: Array
-    ellipsoids: Array
-    normals: Array
+    found: Sequence[ImpactQuantities]
     jumps: Array
-    series: tuple[Series, ...]
+    curves: tuple[Curve, ...]
     forces: Array | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Wall:
-    """A plane or a convex body that stands in the world.
-
-    Attributes:
-        kind: ``surface``, ``ground`` or ``body``.
-        points: A point of the plane, shape (1, 3), or points whose hull is the body, shape (k, 3), world, m.
-        normal: World unit normal of the plane, shape (3,).
-    """
-
-    kind: str
-    points: Array
-    normal: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,63 +63,57 @@ class Scene:
     """All that the viewer draws.
 
     Attributes:
-        robot: The robot.
-        drawn: Its shapes.
-        contact: The contact of the impact.
+        drawn: The shapes of the robot.
+        objective: The impact.
         tracks: Motions to choose from.
-        walls: What stands around the robot.
+        planes: Name (``surface`` or ``ground``), point (m) and unit normal of each plane, world.
+        bodies: Points of each convex body that stands in the world, shape (k, 3), m.
         ghost: Whether the first frame stays visible while the robot moves on.
     """
 
-    robot: Robot
     drawn: DrawnRobot
-    contact: ImpactContact
+    objective: ImpactObjective
     tracks: tuple[Track, ...]
-    walls: tuple[Wall, ...]
+    planes: tuple[tuple[str, Array, Array], ...]
+    bodies: tuple[Array, ...]
     ghost: bool
 
     def pack(self) -> tuple[str, str]:
         """Return the scene as JSON, and its arrays as base64 of a gzipped buffer into which the JSON points."""
-        model, solids = self.robot.model, list(self.drawn.solids)
-        tracks = [self._track(track) for track in self.tracks]
+        model, tracks = self.objective.robot.model, [self._track(track) for track in self.tracks]
         low, high = self._box()
         size, center = float(np.linalg.norm(high - low)), (low + high) / 2
-        walls: list[dict[str, Any]] = []
-        for wall in self.walls:
-            if wall.normal is None:
-                walls.append({"kind": wall.kind, "shape": len(solids)})
-                solids.append(quantized_hull(wall.points))
-            else:
-                at = (
-                    center + wall.normal * ((wall.points[0] - center) @ wall.normal)
-                    if wall.kind == "ground"
-                    else wall.points[0]
-                )
-                walls.append({"kind": wall.kind, "point": at, "normal": wall.normal, "size": 0.75 * size})
-        normal = self.tracks[0].normals[0]
-        pairs = zip(model.parents, model.inertias, strict=True)
-        parts = [(p.joint, p.solid, pin.SE3ToXYZQUAT(p.placement), p.color) for p in self.drawn.parts]
+        walls: list[dict[str, Any]] = [{"shape": len(self.drawn.solids) + k} for k in range(len(self.bodies))]
+        for kind, point, n in self.planes:
+            at = center + n * ((point - center) @ n) if kind == "ground" else point
+            walls.append({"kind": kind, "point": at, "normal": n, "size": 0.75 * size})
+        slants = np.abs(_EYES @ self.tracks[0].found[0].normal / np.linalg.norm(_EYES[0]) - _SLANT)
+        axes = (float(np.linalg.norm(one.ellipsoid, 2)) ** 0.5 for track in self.tracks for one in track.found)
+        joints = zip(model.parents, model.inertias, strict=True)
         content = {
-            "joints": [{"parent": int(parent), "center": inertia.lever.tolist()} for parent, inertia in pairs],
-            "parts": [dict(zip(("joint", "shape", "pose", "color"), part, strict=True)) for part in parts],
-            "shapes": [_solid(solid) for solid in solids],
+            "joints": [{"parent": int(parent), "center": inertia.lever} for parent, inertia in joints],
+            "parts": [
+                {"joint": joint, "shape": solid, "pose": pin.SE3ToXYZQUAT(at), "color": color}
+                for joint, solid, at, color in self.drawn.parts
+            ],
+            "shapes": [_solid(solid) for solid in (*self.drawn.solids, *map(hull_of, self.bodies))],
             "walls": walls,
             "tracks": tracks,
             "ghost": self.ghost,
             "size": size,
-            "center": center.tolist(),
-            "eye": _EYES[np.argmin(np.abs(_EYES @ normal / np.linalg.norm(_EYES[0]) - _SLANT))].tolist(),
+            "center": center,
+            "eye": _EYES[np.argmin(slants)],
             "scale": {
-                "ellipsoid": 0.16 * size / _largest(map(_longest_axis, self.tracks)),
+                "ellipsoid": 0.16 * size / _largest(axes),
                 "jump": 0.3 * size / _largest(track["largest_jump"] for track in tracks),
-                "force": 0.35 * size / _largest(_norms(t.forces) ** 0.5 for t in self.tracks if t.forces is not None),
+                "force": 0.35 * size / _largest(_norm(t.forces) ** 0.5 for t in self.tracks if t.forces is not None),
             },
-        }  # fmt: skip
+        }
         return _packed(content)
 
     def _track(self, track: Track) -> dict[str, Any]:
-        robot, point = self.robot, point_on(self.robot, self.contact.frame, self.contact.offset)
-        data, frames = robot.model.createData(), len(track.q)
+        robot, contact, frames = self.objective.robot, self.objective.contact, len(track.q)
+        data, point = robot.model.createData(), point_on(robot, contact.frame, contact.offset)
         poses, at = np.empty((frames, robot.model.njoints - 1, 7)), np.empty((frames, 3))
         arrows = np.zeros((frames, robot.model.njoints, 3))
         for k, (q, jump) in enumerate(zip(track.q, track.jumps, strict=True)):
@@ -155,56 +123,62 @@ class Scene:
             for j in range(1, robot.model.njoints):
                 twist, lever = data.v[j], robot.model.inertias[j].lever
                 arrows[k, j] = data.oMi[j].rotation @ (twist.linear + np.cross(twist.angular, lever))
-        _straighten(poses[:, :, 3:])
+        # The viewer goes straight from frame to frame, so a quaternion takes the sign that is nearer to the last one.
+        for before, now in pairwise(poses[:, :, 3:]):
+            now[(before * now).sum(axis=-1) < 0] *= -1
         return {
             "unit": track.unit,
             "times": track.times.astype(np.float32),
             "poses": _levels(poses.reshape(frames, -1)),
             "points": _levels(at),
-            "normals": _levels(track.normals),
-            "ellipsoids": _levels(np.array([root(e)[np.triu_indices(3)] for e in track.ellipsoids])),
+            "normals": _levels(np.array([one.normal for one in track.found])),
+            "ellipsoids": _levels(np.array([root(one.ellipsoid)[np.triu_indices(3)] for one in track.found])),
             "jumps": _levels(arrows.reshape(frames, -1)),
-            "largest_jump": _norms(arrows),
+            "largest_jump": _norm(arrows),
             "forces": None if track.forces is None else _levels(track.forces),
-            "series": [{"values": s.values.astype(np.float32)} for s in track.series],
+            "curves": [values.astype(np.float32) for _, _, values in track.curves],
         }
 
     def _box(self) -> tuple[Array, Array]:
         """Return the corners of the box around the robot at the first and last frame of each track."""
-        data, found = self.robot.model.createData(), []
-        for track in self.tracks:
-            for q in track.q[[0, -1]]:
-                pin.forwardKinematics(self.robot.model, data, q)
-                for part in self.drawn.parts:
-                    points, at = self.drawn.solids[part.solid].points, data.oMi[part.joint] * part.placement
-                    found += [f(points @ at.rotation.T + at.translation, axis=0) for f in (np.min, np.max)]
+        robot: Robot = self.objective.robot
+        data, found = robot.model.createData(), []
+        for q in (q for track in self.tracks for q in track.q[[0, -1]]):
+            pin.forwardKinematics(robot.model, data, q)
+            for joint, solid, placement, _ in self.drawn.parts:
+                at = data.oMi[joint] * placement
+                points = self.drawn.solids[solid].points @ at.rotation.T + at.translation
+                found += [points.min(axis=0), points.max(axis=0)]
         return np.min(found, axis=0), np.max(found, axis=0)
 
 
-def _norms(vectors: Array) -> float:
+def impact_curves(found: Sequence[ImpactQuantities], metric: Metric) -> list[Curve]:
+    """Return the curves of H, V and S."""
+    units = {key: unit for key, unit, _ in quantities(metric)}
+    return [(name, units[name], np.array([getattr(one, name) for one in found], dtype=float)) for name in "HVS"]
+
+
+def _norm(vectors: Array) -> float:
     """Return the largest norm of vectors along the last axis."""
     return float(np.linalg.norm(vectors, axis=-1).max())
 
 
-def _longest_axis(track: Track) -> float:
-    return float(np.sqrt(np.linalg.eigvalsh(track.ellipsoids).max()))
-
-
 def _largest(values: Iterable[float]) -> float:
     """Return the largest value, or one where all are zero, so that a scale stays finite."""
-    return float(max(values, default=0.0)) or 1.0
-
-
-def _straighten(quaternions: Array) -> None:
-    """Choose the sign of each quaternion that is nearer to the last frame's, so that the viewer can go between."""
-    for before, now in pairwise(quaternions):
-        now[(before * now).sum(axis=-1) < 0] *= -1
+    return max(values, default=0.0) or 1.0
 
 
 def _solid(solid: Solid) -> dict[str, Any]:
     kind = np.uint16 if len(solid.corners) <= 65536 else np.uint32
-    corners = {"values": _differences(solid.corners), "low": solid.low.tolist(), "step": [solid.step] * 3}
+    corners = {"values": _differences(solid.corners), "low": solid.low, "step": [solid.step] * 3}
     return {"corners": corners, "faces": _differences(solid.faces.astype(kind).reshape(-1, 1))}
+
+
+def _levels(columns: Array) -> dict[str, Any]:
+    """Return columns as whole levels between the least and the largest value of each."""
+    low, step = columns.min(axis=0), np.maximum(np.ptp(columns, axis=0), 1e-12) / 65535
+    values = np.round((columns - low) / step).astype(np.uint16)
+    return {"values": _differences(values), "low": low, "step": step}
 
 
 def _differences(rows: NDArray[Any]) -> NDArray[Any]:
@@ -213,13 +187,6 @@ def _differences(rows: NDArray[Any]) -> NDArray[Any]:
     They wrap around, and the sums of the viewer wrap back.
     """
     return np.diff(rows, axis=0, prepend=np.zeros_like(rows[:1]))
-
-
-def _levels(columns: Array) -> dict[str, Any]:
-    """Return columns as whole levels between the least and the largest value of each."""
-    low, step = columns.min(axis=0), np.maximum(np.ptp(columns, axis=0), 1e-12) / 65535
-    values = np.round((columns - low) / step).astype(np.uint16)
-    return {"values": _differences(values), "low": low.tolist(), "step": step.tolist()}
 
 
 def _packed(content: dict[str, Any]) -> tuple[str, str]:
@@ -233,6 +200,6 @@ def _packed(content: dict[str, Any]) -> tuple[str, str]:
         buffer.extend(array.tobytes())
         return [_TYPES[array.dtype.name], at, array.size]
 
-    text = json.dumps(content, default=place)
-    # A packed page of the same result is the same, so no time of day is in it.
+    # NaN is no JSON.  No time of day is in the buffer, so that the same result has the same page.
+    text = json.dumps(content, default=place, allow_nan=False)
     return text, base64.b64encode(gzip.compress(bytes(buffer), 6, mtime=0)).decode("ascii")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import coal
@@ -27,9 +26,12 @@ _MOST_TRIANGLES = 150_000
 # Corners of a mesh are whole multiples of its extent over this.
 _LEVELS = 65535
 _GRAY = (0.72, 0.74, 0.77, 1.0)
+# Darker colors would hide the form.
 _DARKEST = 0.2
 # Bytes of a COLLADA file in which its colors are sought.
 _HEAD = 200_000
+
+Color = tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,36 +56,19 @@ class Solid:
         return self.low + self.step * self.corners
 
 
-@dataclass(frozen=True)
-class Part:
-    """A solid that moves with a joint.
-
-    Attributes:
-        joint: Index of the joint.
-        solid: Index of the solid.
-        placement: Placement in the axes of the joint.
-        color: Red, green, blue and opacity, 0 to 1.
-    """
-
-    joint: int
-    solid: int
-    placement: pin.SE3
-    color: tuple[float, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class DrawnRobot:
     """The shapes of a robot.
 
     Attributes:
         solids: The meshes.
-        parts: Where they are.
+        parts: Joint, index of a mesh, placement in the axes of the joint, and color (red, green, blue, opacity).
         licenses: Where meshes of others come from, and on what terms.
         notes: What is drawn in place of something else, one line each.
     """
 
     solids: tuple[Solid, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[tuple[int, int, pin.SE3, Color], ...]
     licenses: tuple[MeshLicense, ...]
     notes: tuple[str, ...]
 
@@ -100,46 +85,37 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
     loaded = load_geometry(robot, described)
     by_name = {shape.name: shape for shape in described}
     licenses: dict[str, MeshLicense] = {}
-    index: dict[object, int] = {}
-    surfaces: list[tuple[Array, Triangles]] = []
-    parts, hulls = [], False
+    solids: dict[object, Solid] = {}
+    parts, notes = [], [*warnings, *loaded.warnings]
     for placed in loaded.model.geometryObjects:
         shape = by_name[placed.name]
         known = None if shape.mesh is None else license_of(shape.mesh)
         hull = shape.mesh is not None and not (meshes or (known and known.allows))
         if known and not hull:
             licenses[known.package] = known
-        hulls |= hull
         # The same file at the same scale is the same mesh; an address in memory would name another one later.
-        key = (shape.kind, shape.sizes, shape.mesh)
-        if key not in index:
-            index[key] = len(surfaces)
-            surfaces.append(_hull(placed.geometry) if hull else _surface(placed.geometry))
-        parts.append(Part(int(placed.parentJoint), index[key], placed.placement, _color(shape)))
-    notes = [*warnings, *loaded.warnings]
-    if hulls:
+        key = (shape.kind, shape.sizes, shape.mesh, hull)
+        if key not in solids:
+            solids[key] = hull_of(shape_points(placed.geometry)) if hull else _solid_of(placed.geometry)
+        parts.append((int(placed.parentJoint), list(solids).index(key), placed.placement, _color(shape)))
+    if any(key[3] for key in solids):
         notes.append("meshes are drawn as their convex hulls, because a page passes them on (`meshes`)")
     if not parts:
-        surfaces, parts = _sticks(robot)
+        solids, parts = _sticks(robot)
         notes.append("the robot has no shapes that can be drawn: sticks join its joints")
-    solids = _reduced([_quantized(*surface) for surface in surfaces])
-    return DrawnRobot(tuple(solids), tuple(parts), tuple(licenses.values()), tuple(notes))
+    return DrawnRobot(tuple(_reduced(list(solids.values()))), tuple(parts), tuple(licenses.values()), tuple(notes))
 
 
-def _hull(solid: Any) -> tuple[Array, Triangles]:
-    return hull_surface(shape_points(solid))
-
-
-def _surface(solid: Any) -> tuple[Array, Triangles]:
-    """Return corners and triangles of a shape, or of its hull where those of its mesh are not known."""
-    points, faces = surface_of(solid)
-    found = renumbered(points, faces) if isinstance(solid, coal.BVHModelBase) else faces
-    return _hull(solid) if found is None else (points, found)
-
-
-def quantized_hull(points: Array) -> Solid:
+def hull_of(points: Array) -> Solid:
     """Return the convex hull of points."""
     return _quantized(*hull_surface(points))
+
+
+def _solid_of(solid: Any) -> Solid:
+    """Return a shape, or its hull where the triangles of its mesh are not known."""
+    points, faces = surface_of(solid)
+    found = renumbered(points, faces) if isinstance(solid, coal.BVHModelBase) else faces
+    return hull_of(points) if found is None else _quantized(points, found)
 
 
 def _quantized(points: Array, faces: Triangles) -> Solid:
@@ -164,7 +140,7 @@ def _welded(solid: Solid, bits: int) -> Solid:
 
 def _reduced(solids: list[Solid]) -> list[Solid]:
     """Weld the corners within a length that grows until all meshes together have few enough triangles."""
-    length = max((solid.step for solid in solids), default=0.0)
+    length = max(solid.step for solid in solids)
     while sum(len(solid.faces) for solid in solids) > _MOST_TRIANGLES:
         length *= 2
         bits = [max(int(np.log2(length / solid.step)), 0) for solid in solids]
@@ -172,28 +148,21 @@ def _reduced(solids: list[Solid]) -> list[Solid]:
     return solids
 
 
-def _sticks(robot: Robot) -> tuple[list[tuple[Array, Triangles]], list[Part]]:
+def _sticks(robot: Robot) -> tuple[dict[object, Solid], list[tuple[int, int, pin.SE3, Color]]]:
     """Return rods from each joint to the next ones."""
     model = robot.model
     spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
-    radius = 0.02 * max(0.1, *(float(np.linalg.norm(span)) for _, span in spans))
-    ball = shape_points(coal.Sphere(radius))
-    surfaces = [hull_surface(np.vstack([ball, ball + span])) for _, span in spans]
-    return surfaces, [Part(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
+    ball = shape_points(coal.Sphere(0.02 * max(0.1, *(float(np.linalg.norm(span)) for _, span in spans))))
+    solids: dict[object, Solid] = {k: hull_of(np.vstack([ball, ball + span])) for k, (_, span) in enumerate(spans)}
+    return solids, [(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
 
 
-def _color(shape: UrdfShape) -> tuple[float, ...]:
-    """Return the color of a shape, not so dark that its form is lost."""
-    *color, opacity = shape.color or _file_color(shape)
+def _color(shape: UrdfShape) -> Color:
+    """Return the color of a shape: that of the URDF, the mean of a COLLADA file (which coal drops), or gray."""
+    *color, opacity = shape.color or _GRAY
+    if shape.color is None and shape.mesh is not None and shape.mesh.suffix.lower() == ".dae":
+        with shape.mesh.open("rb") as file:
+            head = file.read(_HEAD)
+        found = re.findall(rb"<diffuse>\s*<color[^>]*>\s*([\d.eE+-]+)\s+([\d.eE+-]+)\s+([\d.eE+-]+)\s", head)
+        color = np.mean([[float(v) for v in one] for one in found] or [color], axis=0).tolist()
     return (*np.clip(color, _DARKEST, 1.0).tolist(), opacity)
-
-
-def _file_color(shape: UrdfShape) -> tuple[float, ...]:
-    """Return the mean of the colors in a COLLADA file, which its loader drops; gray for another shape."""
-    if shape.mesh is None or shape.mesh.suffix.lower() != ".dae":
-        return _GRAY
-    with Path(shape.mesh).open("rb") as file:
-        head = file.read(_HEAD)
-    found: list[Any] = re.findall(rb"<diffuse>\s*<color[^>]*>\s*([\d.eE+-]+)\s+([\d.eE+-]+)\s+([\d.eE+-]+)\s", head)
-    colors = [tuple(map(float, color)) for color in found]
-    return (*np.mean(colors, axis=0).tolist(), 1.0) if colors else _GRAY

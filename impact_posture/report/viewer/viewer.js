@@ -22,7 +22,7 @@ async function load() {
   for (const t of data.tracks) {
     for (const key of ['poses', 'points', 'normals', 'ellipsoids', 'jumps', 'forces']) t[key] = t[key] && levels(t[key]);
     t.times = plain(t.times);
-    for (const series of t.series) series.values = plain(series.values);
+    t.curves = t.curves.map(plain);
     t.last = t.times.length - 1;
   }
 }
@@ -158,8 +158,8 @@ function show() {
   const [time] = row(track.times, 1), share = (time - track.times[0]) / span(), charts = all(`[data-track="${data.tracks.indexOf(track)}"] [data-series]`);
   $('where').textContent = track.unit ? `t = ${time.toFixed(3)} ${track.unit}` : `${Math.round(100 * share)} % of the way`;
   $('slider').value = at; $('slider').setAttribute('aria-valuetext', $('where').textContent);
-  track.series.forEach((series, k) => {
-    charts[k].querySelector('output').textContent = format(row(series.values, 1)[0]);
+  track.curves.forEach((values, k) => {
+    charts[k].querySelector('output').textContent = format(row(values, 1)[0]);
     for (const end of ['x1', 'x2']) charts[k].querySelector('.cursor').setAttribute(end, 60 + 330 * share);
   });
   if (!waiting) { waiting = true; requestAnimationFrame(() => { waiting = false; draw(); }); }
