@@ -51,6 +51,8 @@ demo: $(VENV)/.installed
 	@cp docs/demo.txt demo/LOOK.txt
 	@echo
 	@cat demo/LOOK.txt
+	@echo
+	@echo "Open demo/report.html in a browser, or: $(BIN)/impact-posture view demo"
 
 test: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -q

@@ -34,6 +34,7 @@ import impact_posture.experiment.reproduction
 import impact_posture.impact.evaluation
 import impact_posture.plot.snapshots
 import impact_posture.posture.robustness
+import impact_posture.report.result_report
 import impact_posture.result_folder
 import impact_posture.robot.robot_summary
 import impact_posture.verification.verification
@@ -164,6 +165,11 @@ def _command(
         figures = impact_posture.experiment.figures
         figures.draw_run = figures.draw_comparison = lambda *arguments: []
         impact_posture.plot.snapshots.snapshots_figure = blank
+        if words[0] != "report":
+            # A page without figures is made where it is what a test is about.
+            impact_posture.report.result_report.write_result_report = lambda *arguments, **options: None
+            impact_posture.report.shapes.draw_robot = lambda *arguments: None
+            impact_posture.experiment.folders.try_report = lambda *arguments, **options: ""
     if prepare is not None:
         prepare()
     sys.argv = ["impact-posture", *words]

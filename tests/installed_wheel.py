@@ -32,7 +32,12 @@ COMMANDS = [
     ["simulate solo8-push --format png --out run"],
     ["compare solo8-push --controllers nominal --seeds 1 --jobs 1 --format png --out comparison"],
     ["reproduce --scenario solo8-push --seeds 1 --jobs 1 --format png --out reproduction"],
-    ["optimize ur5 --normal 0 0 1 --format png --out result", "plot result --format svg --out pictures"],
+    [
+        "optimize ur5 --normal 0 0 1 --format png --out result",
+        "plot result --format svg --out pictures",
+        "report result",
+        "view result",
+    ],
     ["robots", "inspect tilthex_arm", "evaluate ur5 --normal 0 0 1", "verify ur5 --samples 2"],
     ["codegen ur5 --normal 0 0 1 --compile --out exported"],
 ]
@@ -45,7 +50,7 @@ class Failed(Exception):
 def run(command: list[str], folder: Path, fine: tuple[int, ...] = (0,)) -> subprocess.CompletedProcess[str]:
     """Run a command outside the tree; nothing of the caller's Python leads back into it."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON") and k != "MYPYPATH"}
-    environment |= {"IMPACT_POSTURE_CACHE": str(folder / "cache"), "COLUMNS": "100"}
+    environment |= {"IMPACT_POSTURE_CACHE": str(folder / "cache"), "COLUMNS": "100", "BROWSER": "true"}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     if done.returncode not in fine:
         raise Failed(f"{' '.join(command)}: exit code {done.returncode}\n{done.stdout}{done.stderr}")

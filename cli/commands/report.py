@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
+from impact_posture.escape import printable
 from impact_posture_cli import options
-from impact_posture_cli.output import Page, print_json
+from impact_posture_cli.output import print_json
 from impact_posture_cli.progress import progress
 
 OutputFolder = Annotated[
@@ -33,7 +34,12 @@ def report(
     with progress("writing", shown=not (quiet or json)):
         written = rewrite_report(place, meshes=meshes)
     add_to_record(place, [written])
+    show_written("report", written, json=json, quiet=quiet)
+
+
+def show_written(command: str, page: Path, *, json: bool, quiet: bool) -> None:
+    """Print the path of a page."""
     if json:
-        print_json({"schema": "impact-posture/report/1", "file": str(written)})
-    else:
-        Page(quiet=quiet).line(str(written))
+        print_json({"schema": f"impact-posture/{command}/1", "file": str(page)})
+    elif not quiet:
+        print(printable(str(page)))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from impact_posture_cli.commands.report import OutputFolder
+from impact_posture_cli import options
+from impact_posture_cli.commands.report import OutputFolder, show_written
 
 
-def view(folder: OutputFolder) -> None:
+def view(folder: OutputFolder, json: options.Json = False, quiet: options.Quiet = False) -> None:
     """Run ``impact-posture view``."""
     import webbrowser
 
@@ -16,7 +17,7 @@ def view(folder: OutputFolder) -> None:
 
     page = Path(folder) / REPORT
     if not page.is_file():
-        hint = f"make it with `impact-posture report {folder}`" if page.parent.is_dir() else "name a folder"
-        raise InputError("is not there", where=str(page), hint=hint)
+        raise InputError("is not there", where=str(page), hint=f"make it with `impact-posture report {folder}`")
     if not webbrowser.open(page.resolve().as_uri()):
         raise InputError("no browser could be started", where=str(page), hint="open this file in a browser")
+    show_written("view", page, json=json, quiet=quiet)

@@ -150,8 +150,9 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plot, "draw_all", lambda *_: [])
         result_folder.write_result(
-            prepared, solution, result_document(prepared, solution), place / "out", codegen=False, jobs=1
-        )
+            prepared, solution, result_document(prepared, solution), place / "out",
+            codegen=False, report=False, jobs=1,
+        )  # fmt: skip
     return place / "out"
 
 
@@ -201,10 +202,10 @@ def spoil_entries(folder: Path, rng: random.Random) -> None:
 WAYS = (spoil_document, spoil_arrays, spoil_bytes, spoil_entries)
 
 
-@pytest.mark.parametrize("command", ["plot", "codegen"])
+@pytest.mark.parametrize("command", ["plot", "codegen", "report"])
 def test_spoiled_results(command: str, result: Path, arena: Path, hostile_full: bool) -> None:
     rng = random.Random(command)
-    more = ("--figure", "jump", "--format", "svg") if command == "plot" else STOP
+    more = {"plot": ("--figure", "jump", "--format", "svg"), "codegen": STOP, "report": ()}[command]
 
     def arrange(k: int) -> None:
         shutil.rmtree(arena / "out", ignore_errors=True)
