@@ -131,7 +131,15 @@ def start(
 ) -> BaseProcess:
     """Start what :func:`run` waits for, its standard output and error on these descriptors."""
     words = [str(argument) for argument in arguments]
-    target = (words, cwd, {"COLUMNS": "80", "NO_COLOR": "1", **(env or {})}, prepare, out, errors, pictures)
+    target = (
+        words,
+        cwd,
+        {"COLUMNS": "80", "NO_COLOR": "1", "BROWSER": "true", **(env or {})},
+        prepare,
+        out,
+        errors,
+        pictures,
+    )
     child = multiprocessing.get_context("fork").Process(target=_command, args=target)
     child.start()
     return child

@@ -1,0 +1,129 @@
+"""A headless Chromium without a network, spoken to through a pipe (Chrome DevTools Protocol)."""
+
+from __future__ import annotations
+
+import base64
+import io
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+SIZE = (640, 480)
+
+
+class Tab:
+    """A tab; ``events`` holds what the browser reported about it."""
+
+    def __init__(self, write: int, read: int) -> None:
+        self.write, self.read, self.count, self.session = write, os.fdopen(read, "rb"), itertools.count(1), ""
+        self.events: list[dict[str, Any]] = []
+        target = self.send("Target.createTarget", url="about:blank")["targetId"]
+        self.session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.send(f"{domain}.enable")
+        self.send(
+            "Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0
+        )
+        self.resize(*SIZE)
+
+    def send(self, method: str, **params: Any) -> dict[str, Any]:
+        number = next(self.count)
+        message = {"id": number, "method": method, "params": params}
+        os.write(
+            self.write, json.dumps(message | ({"sessionId": self.session} if self.session else {})).encode() + b"\0"
+        )
+        while True:
+            text = bytearray()
+            while (byte := self.read.read(1)) not in (b"\0", b""):
+                text += byte
+            assert text, "the browser has gone"
+            found: dict[str, Any] = json.loads(text)
+            if found.get("id") == number:
+                assert "error" not in found, found
+                return dict(found["result"])
+            self.events.append(found)
+
+    def evaluate(self, expression: str) -> Any:
+        found = self.send("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in found, found
+        return found["result"].get("value")
+
+    def resize(self, width: int, height: int) -> None:
+        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def open(self, page: Path, ready: str = "drawn") -> None:
+        """Load a page and wait until it says that it is ready."""
+        self.events.clear()
+        self.send("Page.navigate", url=page.as_uri())
+        for _ in range(600):
+            if self.evaluate("document.documentElement?.dataset.ready") == ready:
+                return
+            time.sleep(0.05)
+        pytest.fail(f"{page} is not '{ready}' after 30 s: {self.complaints()}")
+
+    def picture(self, selector: str) -> np.ndarray:
+        """Return the pixels of an element as they are on the screen, shape (height, width, 3)."""
+        self.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        box = self.evaluate(
+            f"(({{x, y, width, height}}) => ({{x: x + scrollX, y: y + scrollY, width, height, scale: 1}}))"
+            f"(document.querySelector('{selector}').getBoundingClientRect())"
+        )
+        data = self.send("Page.captureScreenshot", format="png", clip=box, captureBeyondViewport=True)["data"]
+        return np.asarray(PIL.Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), dtype=int)
+
+    def complaints(self) -> list[str]:
+        """Return errors of scripts, refusals of the security policy, and requests that left the page."""
+        found = []
+        for event in self.events:
+            kind, about = event.get("method"), event.get("params", {})
+            if kind == "Runtime.exceptionThrown" or (kind == "Log.entryAdded" and about["entry"]["level"] == "error"):
+                found.append(str(about))
+            if kind == "Network.requestWillBeSent" and not about["request"]["url"].startswith(
+                ("file:", "data:", "blob:")
+            ):
+                found.append(about["request"]["url"])
+        return found
+
+
+@contextmanager
+def browser(folder: Path) -> Iterator[Tab]:
+    """Start Chromium with its profile in a folder; skip where there is none."""
+    program = next((path for name in NAMES if (path := shutil.which(name))), None)
+    if program is None:
+        pytest.skip(f"no browser is installed ({', '.join(NAMES)})")
+    flags = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+             "--hide-scrollbars", "--no-first-run", "--disable-extensions", "--disable-background-networking",
+             "--disable-component-update", "--disable-dev-shm-usage", "--remote-debugging-pipe",
+             f"--user-data-dir={folder}")  # fmt: skip
+    (theirs_in, ours_out), (ours_in, theirs_out) = os.pipe(), os.pipe()
+
+    def channels() -> None:
+        # The protocol is read from descriptor 3 and written to 4.
+        read, write = os.dup(theirs_in), os.dup(theirs_out)
+        os.dup2(read, 3)
+        os.dup2(write, 4)
+
+    process = subprocess.Popen(
+        [program, *flags], preexec_fn=channels, close_fds=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    os.close(theirs_in), os.close(theirs_out)
+    try:
+        tab = Tab(ours_out, ours_in)
+        yield tab
+        tab.session = ""
+        tab.send("Browser.close")
+    finally:
+        process.kill()
+        process.wait()

@@ -1,0 +1,348 @@
+"""``report.html``: what it says, what it may hold, and what a browser makes of it."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import impact_posture as ip
+from impact_posture.impact.coulomb_contacts import coulomb_jump
+from impact_posture.report.page import Content, Table, render
+from impact_posture.report.result_report import result_scene
+from impact_posture.report.run_report import thin
+from impact_posture.report.scene import Scene
+from impact_posture.report.shapes import draw_robot
+from impact_posture.report.submeshes import renumbered
+from impact_posture.result_folder import _load
+from impact_posture.robot.robot_loader import locate
+from impact_posture.robot.urdf import parse_urdf
+from impact_posture.simulation.series import Series, Window
+from tests.browser import Tab, browser
+from tests.command import refused, run
+
+HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\"> \u202e & é"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result with two figures."""
+    place = tmp_path_factory.mktemp("report") / "out"
+    options = ("--normal", 0, 0, 1, "--starts", 1, "--jobs", 1, "--no-codegen", "--out", place)
+    done = run("optimize", "tilthex_arm", "--frame", "ee", *options, pictures=("jump", "nullspace"))
+    assert (done.returncode, done.stderr) == (0, "")
+    return place
+
+
+@pytest.fixture(scope="module")
+def scene(folder: Path) -> Scene:
+    prepared, view, _ = _load(folder)
+    return result_scene(prepared, view)
+
+
+class Reader(HTMLParser):
+    """What a page is made of: its tags with attributes, and the text of each."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: dict[str, list[str]] = {}
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        if self.tags:
+            self.texts.setdefault(self.tags[-1][0], []).append(data)
+
+
+def arrays(page: str) -> tuple[dict[str, Any], bytes]:
+    """The scene of a page and the buffer that it points into."""
+    texts = [re.search(rf'id="{name}">(.*?)</script>', page, re.S) for name in ("scene", "arrays")]
+    first, second = (text[1] for text in texts if text)
+    return json.loads(first), gzip.decompress(base64.b64decode(second))
+
+
+def levels(packed: dict[str, Any], buffer: bytes) -> np.ndarray:
+    """Decode what the viewer decodes: sums that wrap, then levels; shape (rows, columns)."""
+    _, offset, count = packed["values"]
+    rows = np.frombuffer(buffer, np.uint16, count, offset).reshape(-1, len(packed["low"]))
+    return np.cumsum(rows, axis=0, dtype=np.uint16) * np.array(packed["step"]) + np.array(packed["low"])
+
+
+# ---- the page ------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_holds_the_result_and_reaches_nothing(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    found, document = Reader(page), json.loads((folder / "result.json").read_text())
+    assert len(page) < 1.3e6
+    assert document["verdict"]["line"] in "".join(found.texts["p"])
+    assert "jump" in found.texts["figcaption"] and sum(tag == "img" for tag, _ in found.tags) == len(
+        list(folder.glob("*.png"))
+    )
+    assert "impact-posture optimize problem.toml" in found.texts["code"]
+    assert (folder / "problem.toml").read_text().split("\n")[0] in "".join(found.texts["pre"])
+    # Nothing is loaded: no address but those within the page.
+    for _, attributes in found.tags:
+        for name in ("src", "href", "srcset", "data", "action"):
+            assert (attributes.get(name) or "data:").startswith("data:")
+    (policy,) = [a["content"] or "" for t, a in found.tags if t == "meta" and "http-equiv" in a]
+    assert policy.startswith("default-src 'none';") and "unsafe" not in policy and "http" not in policy
+    for kind, text in (("script", page.rpartition("<script>")[2].partition("</script>")[0]),
+                       ("style", page.partition("<style>")[2].partition("</style>")[0])):  # fmt: skip
+        assert f"{kind}-src 'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" in policy
+    assert "MIT License" in page and "three.js authors" in page
+
+
+def test_commands(folder: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    shutil.copytree(folder, again)
+    (again / "report.html").unlink()
+    refused(run("view", again), 1, "report.html: is not there", "impact-posture report")
+    done = run("report", again, "--json")
+    assert json.loads(done.stdout) == {"schema": "impact-posture/report/1", "file": str(again / "report.html")}
+    assert (again / "report.html").read_bytes() == (folder / "report.html").read_bytes()
+    assert "report.html" in json.loads((again / ".impact-posture.json").read_text())["files"]
+    opened = tmp_path / "opened"
+    (tmp_path / "browse").write_text(f"#!/bin/sh\nprintf '%s' \"$1\" > '{opened}'\n")
+    (tmp_path / "browse").chmod(0o755)
+    assert run("view", again, env={"BROWSER": str(tmp_path / "browse")}).returncode == 0
+    assert opened.read_text() == (again / "report.html").as_uri()
+    refused(run("view", again, env={"BROWSER": "false"}), 1, "no browser could be started")
+    refused(run("report", tmp_path), 1, "holds no result.json")
+
+
+def test_a_result_is_kept_without_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("no\nroom")
+
+    robot = ip.load_robot("tilthex_arm")
+    result = ip.optimize(
+        ip.PostureProblem(ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1)))), starts=1, jobs=1
+    )
+    monkeypatch.setattr("impact_posture.report.result_report.write_page", fail)
+    monkeypatch.setattr("impact_posture.result_folder._drawings", lambda *_: [])
+    written = result.save(tmp_path / "out", codegen=False, jobs=1)
+    assert written.report_error == "RuntimeError: no room"
+    assert (tmp_path / "out" / "posture.json").is_file() and not (tmp_path / "out" / "report.html").exists()
+    assert not result.save(tmp_path / "bare", codegen=False, report=False, jobs=1).report_error
+
+
+def written(text: str, scene: Scene) -> str:
+    table = Table(text, ("", text), ((text, text),))
+    return render(
+        Content(text, text, (text,), (text,), (table,), text, (text,), ((text, text),)), scene, [(text, "data:,")]
+    )
+
+
+class Packed(Scene):
+    def pack(self) -> tuple[str, str]:
+        return "{}", ""
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.text(min_size=1, max_size=40) | st.sampled_from([HOSTILE, "'\"><b>", "{{ 7 * 7 }}", "]]><!--", "\ud800"]))
+def test_texts_stay_texts(scene: Scene, text: str) -> None:
+    light = Packed(**vars(scene))
+    page = written(text, light)
+    found, plain = Reader(page), Reader(written("x", light))
+    # The tags and their attributes are those of a harmless text, and nothing turns the direction of writing.
+    assert [(tag, list(attributes)) for tag, attributes in found.tags] == [(t, list(a)) for t, a in plain.tags]
+    assert "\u202e" not in page
+
+
+# ---- what moves ----------------------------------------------------------------------------------------------------
+
+
+def test_the_viewer_gets_the_robot_where_it_is(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    packed, buffer = arrays(page)
+    _, view, _ = _load(folder)
+    (track,), model = packed["tracks"], view.robot.model
+    poses = levels(track["poses"], buffer).reshape(-1, model.njoints - 1, 7)
+    jumps = levels(track["jumps"], buffer).reshape(len(poses), model.njoints, 3)
+    assert view.path is not None and len(poses) == len(view.path.q)
+    data = model.createData()
+    for k in (0, 30, 60):
+        pin.forwardKinematics(model, data, view.path.q[k])
+        placed = [pin.SE3.Identity()]
+        for j in range(1, model.njoints):
+            quaternion = poses[k, j - 1, 3:] / np.linalg.norm(poses[k, j - 1, 3:])
+            placed.append(
+                placed[packed["joints"][j]["parent"]] * pin.XYZQUATToSE3(np.r_[poses[k, j - 1, :3], quaternion])
+            )
+            assert np.allclose(placed[j].homogeneous, data.oMi[j].homogeneous, atol=2e-4)
+    # The arrow of a link is the velocity of its center of mass, by a difference along the predicted jump.
+    jump, centers = coulomb_jump(view.objective, view.q_optimal, 1.0), []
+    assert jump is not None
+    for sign in (-1, 1):
+        pin.forwardKinematics(model, data, pin.integrate(model, view.q_optimal, sign * 1e-6 * jump.velocity))
+        centers.append([data.oMi[j].act(model.inertias[j].lever) for j in range(1, model.njoints)])
+    assert np.allclose(jumps[-1, 1:], (np.array(centers[1]) - centers[0]) / 2e-6, atol=1e-3)
+
+
+def test_a_run_is_thinned_where_nothing_happens() -> None:
+    generator, n = np.random.default_rng(3), 4000
+    columns = {name: np.zeros((n, 1)) for name in Series.__dataclass_fields__}
+    columns |= {"t": 0.001 * np.arange(1, n + 1), "force": generator.normal(size=(n, 3)), "peak": generator.random(n)}
+    columns["q"] = np.where(np.arange(n)[:, None] < 3500, 0.0, np.nan)
+    found = thin(Series(**columns), [Window("impact", 0, 1.0, 1.3, True), Window("recovery", 0, 1.0, 2.0, True)])
+    inside = (found.t >= 1.0) & (found.t <= 1.3)
+    assert np.allclose(np.diff(found.t[inside]), 0.001) and inside.sum() >= 300
+    assert np.diff(found.t).max() <= 0.0251 and len(found.t) < 450 and found.t[-1] == columns["t"][3499]
+    # No peak is lost between two frames.
+    assert found.peak.max() == columns["peak"][:3500].max()
+    sizes = np.linalg.norm(columns["force"][:3500], axis=1)
+    assert np.linalg.norm(found.force, axis=1).max() == sizes.max()
+
+
+# ---- shapes --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "largest", "license"),
+    [("talos", 1.2e6, "Apache-2.0"), ("icub", 0.5e6, "CC-BY-SA-4.0"), ("ur5", 0.9e6, "BSD")],
+)
+def test_known_robots_come_with_meshes_and_their_license(name: str, largest: float, license: str) -> None:
+    robot = ip.load_robot(name)
+    drawn = draw_robot(robot)
+    assert [one.license for one in drawn.licenses] == [license] and drawn.licenses[0].upstream.startswith("https://")
+    size = sum(4 / 3 * (solid.corners.nbytes + 2 * solid.faces.size) for solid in drawn.solids)
+    # As large as after compression by half, which every mesh reaches.
+    assert 0.5 * size < largest and sum(len(solid.faces) for solid in drawn.solids) <= 150_000
+    assert robot.settings is not None
+    links = parse_urdf(locate(name, robot.settings).urdf).findall("link")
+    assert len(drawn.parts) >= sum(len(link.findall("visual")) for link in links)
+    for solid in drawn.solids:
+        assert solid.faces.max() == len(solid.corners) - 1 and len(np.unique(solid.faces)) == len(solid.corners)
+
+
+TETRAHEDRON = np.array([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3], [0.02, 0.02, 0.02]])
+URDF = """<robot name="own"><link name="a">{inertial}{a}</link><link name="b">{inertial}{b}</link>
+<joint name="j" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 0.5"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+
+
+def own(folder: Path, a: str, b: str) -> ip.Robot:
+    # The last corner is in a dent: the hull has three corners and the faces of another solid.
+    lines = [f"v {x} {y} {z}" for x, y, z in [*TETRAHEDRON, [0, 0, 0]]]
+    (folder / "dent.obj").write_text(
+        "\n".join([*lines, "f 1 2 4", "f 2 3 4", "f 3 1 4", "f 1 5 2", "f 2 5 3", "f 3 5 1"])
+    )
+    (folder / "own.urdf").write_text(URDF.format(inertial=INERTIAL, a=a, b=b))
+    return ip.load_robot(str(folder / "own.urdf"))
+
+
+def visual(shape: str) -> str:
+    return f'<visual><geometry>{shape}</geometry><material name=""><color rgba="0.5 0.6 0.7 1"/></material></visual>'
+
+
+def test_own_meshes_go_in_only_if_asked(tmp_path: Path) -> None:
+    robot = own(tmp_path, visual('<mesh filename="dent.obj"/>'), visual('<mesh filename="dent.obj" scale="2 2 2"/>'))
+    hulls, meshes = draw_robot(robot), draw_robot(robot, True)
+    assert [len(one.solids[0].corners) for one in (hulls, meshes)] == [4, 5] and hulls.licenses == ()
+    assert "hulls" in hulls.notes[0] and not meshes.notes
+    # Equal files of different size are two meshes.
+    extents = [np.ptp(solid.points, axis=0) for solid in meshes.solids]
+    assert np.allclose(extents, [[0.1, 0.2, 0.3], [0.2, 0.4, 0.6]], atol=1e-5)
+    assert meshes.parts[0][3] == (0.5, 0.6, 0.7, 1.0)
+
+
+def test_primitives_and_robots_without_shapes(tmp_path: Path) -> None:
+    drawn = draw_robot(own(tmp_path, visual('<box size="0.1 0.2 0.3"/>'), visual('<sphere radius="0.1"/>')))
+    assert np.allclose(np.ptp(drawn.solids[0].points, axis=0), [0.1, 0.2, 0.3], atol=1e-5) and not drawn.notes
+    (tmp_path / "bare").mkdir()
+    sticks = draw_robot(own(tmp_path / "bare", "", visual('<mesh filename="missing.obj"/>')))
+    assert len(sticks.parts) == 1 and "sticks" in sticks.notes[-1] and "missing.obj" in sticks.notes[0]
+    assert np.ptp(sticks.solids[0].points[:, 2]) >= 0.5
+
+
+@given(st.lists(st.lists(st.integers(3, 30), min_size=1, max_size=4), min_size=1, max_size=3))
+def test_parts_of_a_file_are_told_apart(nodes: list[list[int]]) -> None:
+    """Nodes of several parts each, numbered as coal does: each part from the first corner of its node."""
+    numbered, true, base = [], [], 0
+    for parts in nodes:
+        node = base
+        for count in parts:
+            fan = np.array([[0, k, k + 1] for k in range(1, count - 1)])
+            numbered.append(fan + node)
+            true.append(fan + base)
+            base += count
+    found = renumbered(np.zeros((base, 3)), np.concatenate(numbered))
+    assert found is not None and np.array_equal(found, np.concatenate(true))
+    # What cannot be told apart is not guessed.
+    assert renumbered(np.zeros((base + 1, 3)), np.concatenate(numbered)) is None
+
+
+# ---- in a browser --------------------------------------------------------------------------------------------------
+
+
+def different(a: np.ndarray, b: np.ndarray) -> float:
+    """The share of the pixels that differ."""
+    return float((np.abs(a - b).sum(axis=2) > 40).mean())
+
+
+def near(picture: np.ndarray, color: tuple[int, int, int], within: int = 40) -> float:
+    """The share of the pixels near a color."""
+    return float((np.abs(picture - np.array(color)).sum(axis=2) < within).mean())
+
+
+def hide(tab: Tab, name: str) -> None:
+    tab.evaluate(f"document.querySelector('#layers [name={name}]').click()")
+
+
+def test_a_browser_draws_it_offline(folder: Path, scene: Scene, tmp_path: Path) -> None:
+    hostile = tmp_path / "hostile.html"
+    hostile.write_text(written(HOSTILE, scene), encoding="utf-8")
+    with browser(tmp_path / "profile") as tab:
+        tab.open(folder / "report.html")
+        before = tab.picture("#view")
+        # The surface and the robot are there: without them the picture is another.
+        hide(tab, "surface")
+        without_surface = tab.picture("#view")
+        assert different(before, without_surface) > 0.05
+        for name in ("robot", "jumps"):
+            hide(tab, name)
+        assert different(without_surface, tab.picture("#view")) > 0.03
+        for name in ("robot", "jumps", "surface"):
+            hide(tab, name)
+        assert different(before, tab.picture("#view")) == 0
+        # The slider moves the robot, and says so; the robot before stays as a ghost.
+        tab.evaluate("document.getElementById('end').click()")
+        after = tab.picture("#view")
+        assert different(before, after) > 0.03
+        hide(tab, "ghost")
+        assert different(after, tab.picture("#view")) > 0.01
+        document = json.loads((folder / "result.json").read_text())
+        shown = tab.evaluate(
+            "[document.getElementById('where').textContent, document.querySelector('figure output').textContent]"
+        )
+        assert shown[0] == "100 % of the way" and float(shown[1]) == pytest.approx(document["optimal"]["H"], rel=1e-3)
+        # On a telephone nothing is wider than the screen.
+        tab.resize(360, 640)
+        assert tab.evaluate("document.documentElement.scrollWidth") <= 360
+        assert not tab.complaints()
+        # Texts that are scripts do nothing.
+        tab.open(hostile)
+        assert tab.evaluate("document.title") != "taken" and not tab.complaints()
+        # Without WebGL: words, curves and figures.
+        none = "HTMLCanvasElement.prototype.getContext = () => null"
+        number = tab.send("Page.addScriptToEvaluateOnNewDocument", source=none)["identifier"]
+        tab.open(folder / "report.html", "words")
+        assert tab.evaluate("!nogl.hidden && view.hidden && document.querySelector('figure img').naturalWidth > 300")
+        tab.send("Page.removeScriptToEvaluateOnNewDocument", identifier=number)
