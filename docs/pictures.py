@@ -8,6 +8,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from PIL import Image
+
 IMAGES = Path(__file__).parent / "images"
 # A command, and which of its figures go where.
 PICTURES = [
@@ -22,6 +24,22 @@ PICTURES = [
 ]
 
 
+# The report of the first command, as a browser shows it.
+BROWSER = ("chromium", "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+           "--hide-scrollbars", "--window-size=1280,1120", "--virtual-time-budget=8000")  # fmt: skip
+
+
+def picture_report(page: Path) -> None:
+    """Take a picture of a report at 60 % of the way, if the browser is there."""
+    if shutil.which(BROWSER[0]) is None:
+        print(f"{BROWSER[0]} is not installed: the picture of the report stays")
+        return
+    shot = page.with_suffix(".png")
+    subprocess.run([*BROWSER, f"--screenshot={shot}", f"{page.as_uri()}#0.6"], check=True, stderr=subprocess.DEVNULL)
+    with Image.open(shot) as picture:
+        picture.convert("RGB").quantize(128).save(IMAGES / "report.png", optimize=True)
+
+
 def main() -> None:
     """Run each command and copy its figures."""
     program = Path(sys.executable).with_name("impact-posture")
@@ -30,6 +48,8 @@ def main() -> None:
             out = Path(folder) / "result"
             more = ["--no-codegen", "--quiet", "--format", "png", "--out", str(out)]
             subprocess.run([str(program), "optimize", *arguments.split(), *more], check=True)
+            if figures is PICTURES[0][1]:
+                picture_report(out / "report.html")
             for figure, name in figures.items():
                 shutil.copy(out / f"{figure}.png", IMAGES / f"{name}.png")
 

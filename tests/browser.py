@@ -7,6 +7,7 @@ import io
 import itertools
 import json
 import os
+import select
 import shutil
 import subprocess
 import time
@@ -27,7 +28,7 @@ class Tab:
     """A tab; ``events`` holds what the browser reported about it."""
 
     def __init__(self, write: int, read: int) -> None:
-        self.write, self.read, self.count, self.session = write, os.fdopen(read, "rb"), itertools.count(1), ""
+        self.write, self.read, self.count, self.session, self.said = write, read, itertools.count(1), "", b""
         self.events: list[dict[str, Any]] = []
         target = self.send("Target.createTarget", url="about:blank")["targetId"]
         self.session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
@@ -45,10 +46,12 @@ class Tab:
             self.write, json.dumps(message | ({"sessionId": self.session} if self.session else {})).encode() + b"\0"
         )
         while True:
-            text = bytearray()
-            while (byte := self.read.read(1)) not in (b"\0", b""):
-                text += byte
-            assert text, "the browser has gone"
+            while b"\0" not in self.said:
+                assert select.select([self.read], [], [], 30)[0], f"no answer to {method} in 30 s"
+                part = os.read(self.read, 1 << 20)
+                assert part, "the browser has gone"
+                self.said += part
+            text, _, self.said = self.said.partition(b"\0")
             found: dict[str, Any] = json.loads(text)
             if found.get("id") == number:
                 assert "error" not in found, found
@@ -63,12 +66,13 @@ class Tab:
     def resize(self, width: int, height: int) -> None:
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
-    def open(self, page: Path, ready: str = "drawn") -> None:
+    def open(self, page: Path, ready: str | None = "drawn") -> None:
         """Load a page and wait until it says that it is ready."""
         self.events.clear()
         self.send("Page.navigate", url=page.as_uri())
         for _ in range(600):
-            if self.evaluate("document.documentElement?.dataset.ready") == ready:
+            done = self.evaluate("document.readyState") == "complete"
+            if done and (ready is None or self.evaluate("document.documentElement.dataset.ready") == ready):
                 return
             time.sleep(0.05)
         pytest.fail(f"{page} is not '{ready}' after 30 s: {self.complaints()}")

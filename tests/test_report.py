@@ -344,5 +344,10 @@ def test_a_browser_draws_it_offline(folder: Path, scene: Scene, tmp_path: Path) 
         none = "HTMLCanvasElement.prototype.getContext = () => null"
         number = tab.send("Page.addScriptToEvaluateOnNewDocument", source=none)["identifier"]
         tab.open(folder / "report.html", "words")
-        assert tab.evaluate("!nogl.hidden && view.hidden && document.querySelector('figure img').naturalWidth > 300")
+        figure = "document.querySelector('[alt=\"Figure jump\"]').naturalWidth > 300"
+        assert tab.evaluate(f"!nogl.hidden && view.hidden && {figure}")
         tab.send("Page.removeScriptToEvaluateOnNewDocument", identifier=number)
+        # Without scripts, too.
+        tab.send("Emulation.setScriptExecutionDisabled", value=True)
+        tab.open(folder / "report.html", None)
+        assert tab.evaluate(f"controls.hidden && document.querySelector('noscript p') !== null && {figure}")

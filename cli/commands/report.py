@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -27,12 +28,13 @@ def report(
     from impact_posture.output_folder import add_to_record
 
     place = Path(folder)
+    rewrite: Callable[..., Path]
     if any((place / name).is_file() for name in ("run.json", "comparison.json")):
-        from impact_posture.experiment.run_reports import write_run_report as rewrite_report
+        from impact_posture.experiment.run_reports import write_run_report as rewrite
     else:
-        from impact_posture.result_folder import rewrite_report
+        from impact_posture.result_folder import rewrite_report as rewrite
     with progress("writing", shown=not (quiet or json)):
-        written = rewrite_report(place, meshes=meshes)
+        written = rewrite(place, meshes=meshes)
     add_to_record(place, [written])
     show_written("report", written, json=json, quiet=quiet)
 

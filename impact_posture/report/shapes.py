@@ -85,7 +85,7 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
     loaded = load_geometry(robot, described)
     by_name = {shape.name: shape for shape in described}
     licenses: dict[str, MeshLicense] = {}
-    solids: dict[object, Solid] = {}
+    solids: dict[tuple[object, ...], Solid] = {}
     parts, notes = [], [*warnings, *loaded.warnings]
     for placed in loaded.model.geometryObjects:
         shape = by_name[placed.name]
@@ -98,7 +98,7 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
         if key not in solids:
             solids[key] = hull_of(shape_points(placed.geometry)) if hull else _solid_of(placed.geometry)
         parts.append((int(placed.parentJoint), list(solids).index(key), placed.placement, _color(shape)))
-    if any(key[3] for key in solids):
+    if any(key[-1] for key in solids):
         notes.append("meshes are drawn as their convex hulls, because a page passes them on (`meshes`)")
     if not parts:
         solids, parts = _sticks(robot)
@@ -148,13 +148,13 @@ def _reduced(solids: list[Solid]) -> list[Solid]:
     return solids
 
 
-def _sticks(robot: Robot) -> tuple[dict[object, Solid], list[tuple[int, int, pin.SE3, Color]]]:
+def _sticks(robot: Robot) -> tuple[dict[tuple[object, ...], Solid], list[tuple[int, int, pin.SE3, Color]]]:
     """Return rods from each joint to the next ones."""
     model = robot.model
     spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
     ball = shape_points(coal.Sphere(0.02 * max(0.1, *(float(np.linalg.norm(span)) for _, span in spans))))
-    solids: dict[object, Solid] = {k: hull_of(np.vstack([ball, ball + span])) for k, (_, span) in enumerate(spans)}
-    return solids, [(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
+    rods = {(k,): hull_of(np.vstack([ball, ball + span])) for k, (_, span) in enumerate(spans)}
+    return dict(rods), [(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
 
 
 def _color(shape: UrdfShape) -> Color:
