@@ -153,8 +153,10 @@ def _sticks(robot: Robot) -> tuple[dict[tuple[object, ...], Solid], list[tuple[i
     model = robot.model
     spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
     ball = shape_points(coal.Sphere(0.02 * max(0.1, *(float(np.linalg.norm(span)) for _, span in spans))))
-    rods = {(k,): hull_of(np.vstack([ball, ball + span])) for k, (_, span) in enumerate(spans)}
-    return dict(rods), [(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
+    rods: dict[tuple[object, ...], Solid] = {
+        (k,): hull_of(np.vstack([ball, ball + span])) for k, (_, span) in enumerate(spans)
+    }
+    return rods, [(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
 
 
 def _color(shape: UrdfShape) -> Color:
