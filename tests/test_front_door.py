@@ -138,7 +138,7 @@ def test_a_result_saves_what_the_command_line_writes(
     # The same files, and on them nothing, as the command has them here.
     for name in ALL_PICTURES:
         monkeypatch.setitem(plot.FIGURES, name, blank)
-    written = result.save(tmp_path / "python", codegen=False, jobs=1)
+    written = result.save(tmp_path / "python", codegen=False, report=False, jobs=1)
     options = ("--normal", 0, 0, 2, "--base", "level", "--starts", 2, "--jobs", 1, "--no-codegen", "--out", "cli")
     done = run("optimize", "tilthex_arm", "--frame", "ee", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -169,6 +169,11 @@ def test_compare(aerial: Path, tmp_path: Path) -> None:
     assert found["rows"][1]["reduction"]["mean"] == pytest.approx(1 - robust["mean"] / nominal["mean"], abs=0.05)
     assert json.loads((tmp_path / "both" / "comparison.json").read_text()) == found
     assert sorted(path.name for path in tmp_path.iterdir()) == ["both"], "the runs' folder has gone"
+    # Its page has both runs, from what the folder keeps of them.
+    assert start("report", "both", "--quiet", cwd=tmp_path).returncode == 0
+    page = (tmp_path / "both" / "report.html").read_text()
+    assert "default-src 'none'" in page and len(page) < 2e6
+    assert all(f'<option value="{k}">{name}</option>' in page for k, name in enumerate(("nominal", "robust")))
 
 
 def test_reproduce(tmp_path: Path) -> None:
