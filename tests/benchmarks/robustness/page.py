@@ -74,10 +74,11 @@ def _is_contact(name: str) -> bool:
 
 
 def _choices(records: Records) -> Iterator[str]:
-    """What to take, scenario by scenario, led by what helped most often."""
+    """What to take, scenario by scenario, led by what helped most among what helped often."""
     for name, own in records.items():
         found = [summarize(own, c) for c in COMPARED if c != NOMINAL]
-        found.sort(key=lambda s: (-s.helps, s.motion[1]))
+        # Of those that help often, the one that helps most at the median.
+        found.sort(key=lambda s: (s.helps < _OFTEN * s.count, s.motion[1]))
         best = found[0]
         good = best.helps >= _OFTEN * best.count and best.motion[1] <= -_MUCH
         lead = f"take `{best.controller}`: it" if good else f"nothing helps reliably; at best `{best.controller}`"
