@@ -73,12 +73,7 @@ STUDIES = {
         Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
         Study("hops", "global_search:hops", "basin hopping beside multi-start; seeds", 10, target="study-global"),
         Study("robustness", "robustness.study", "where each controller helps; draws", 40, target="study-robustness"),
-        Study(
-            "real-impacts",
-            "real_impacts",
-            "balls, strikes, taps: predicted, then simulated",
-            target="study-real-impacts",
-        ),
+        Study("real-impacts", "real_impacts", "balls, strikes, taps, as predicted", target="study-real-impacts"),
         Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
     )
 }

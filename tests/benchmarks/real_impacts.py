@@ -1,7 +1,7 @@
 """Impacts of robots that stand, reach and fly: what the rigid model predicts of each controller, then its run.
 
-The prediction needs no run.  The controller braces in a robot that does exactly what it plans, and the rigid model takes
-the posture that is reached and the speed of the scenario.  Runs that are done are kept in build/real-impacts.
+The prediction needs no run.  The controller braces in a robot that does exactly what it plans, and the rigid model
+takes the posture that is reached and the speed of the scenario.  Runs that are done are kept in build/real-impacts.
 """
 
 from __future__ import annotations
@@ -74,9 +74,8 @@ def result(scenario: str, name: str) -> dict[str, Any]:
 
 def lines(request: Request) -> Iterator[str]:
     """A table for each scenario."""
-    pairs = [
-        (s, c) for s in SCENARIOS if request.only in s for c in COMPARED if c.removesuffix("-stiff") in CONTROLLERS
-    ]
+    controllers = [c for c in COMPARED if c in CONTROLLERS]
+    pairs = [(s, c) for s in SCENARIOS if request.only in s for c in controllers]
     found: dict[tuple[str, str], dict[str, Any]] = {}
     with fork_map(lambda k: result(*pairs[k]), len(pairs), request.jobs) as answers:
         for k, answer in answers:

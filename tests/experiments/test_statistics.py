@@ -181,7 +181,7 @@ def test_names_of_controllers() -> None:
 
 
 def test_what_is_known_of_the_paper_fits_the_scenarios() -> None:
-    assert set(PAPER) == set(RECOMMENDED) == set(known_scenarios())
+    assert set(PAPER) == set(RECOMMENDED) < set(known_scenarios())
     assert set(MEANING) == set(CONTROLLERS)
     for name, row in PAPER.items():
         # The text's percentages are those of its table's rounded numbers, within what rounding allows.
