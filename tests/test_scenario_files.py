@@ -21,6 +21,7 @@ from impact_posture.simulation.scenario_file import known_scenarios, read_scenar
 DOCS = Path(__file__).parents[1] / "docs"
 ARM = DOCS / "examples" / "rail_arm"
 SHIPPED = ("aerial-lateral", "aerial-vertical", "solo8-push", "talos-push")
+REAL = ("g1-strike", "hextilt-poke", "panda-tap", "solo12-landing", "solo8-throw", "talos-strike", "talos-throw")
 
 
 def needs_mujoco() -> None:
@@ -31,8 +32,8 @@ def needs_mujoco() -> None:
 
 
 def test_the_shipped_scenarios_are_known() -> None:
-    assert known_scenarios() == SHIPPED
-    for name in SHIPPED:
+    assert set(known_scenarios()) == {*SHIPPED, *REAL}
+    for name in known_scenarios():
         found = read_scenario(name)
         assert found.name == name and found.description
 
@@ -186,7 +187,7 @@ def test_what_is_wrong_in_a_file_is_one_line(folder: Path, old: str, new: str, w
 
 def test_no_task_is_refused(folder: Path) -> None:
     begin, end = OWN.index("[contacts]"), OWN.index("[control.posture]")
-    with pytest.raises(SpecError, match=r"neither \[contacts\] nor \[push\]"):
+    with pytest.raises(SpecError, match=r"neither \[contacts\], \[push\] nor \[throw\]"):
         read_scenario(write(folder, OWN[:begin] + OWN[end:]))
 
 

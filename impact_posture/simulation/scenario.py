@@ -60,7 +60,7 @@ class RepeatedContacts(Checked):
     window: Positive = 0.3
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class SinglePush(Settling):
     """A standing robot is pushed after it has come to rest.
 
@@ -146,7 +146,8 @@ class ScenarioTable(Scene, RobotSettings):
         super().__post_init__()
         tasks = {key: getattr(self, key) for key in ("contacts", "push", "throw") if getattr(self, key) is not None}
         if len(tasks) != 1:
-            what = " and ".join(f"[{key}]" for key in tasks) or "neither [contacts], [push] nor [throw]"
+            both = "both " + " and ".join(f"[{key}]" for key in tasks)
+            what = both if tasks else "neither [contacts], [push] nor [throw]"
             raise InputError(f"has {what}", hint="have one of them")
         (task, content), shapes = tasks.popitem(), [s.frame for s in self.shapes]
         names = [] if self.contacts is None else [("surface", self.contacts.surface, [s.name for s in self.surfaces])]
@@ -155,6 +156,10 @@ class ScenarioTable(Scene, RobotSettings):
                 table = "surfaces" if key == "surface" else "shapes"
                 hint = f"one of: {', '.join(known)}" if known else f"add it to [[{table}]]"
                 raise InputError(f"key '{task}.{key}': there is no '{name}'", hint=hint)
+        for shape in self.shapes if self.throw else ():
+            if shape.frame == content.frame and (shape.kind != "sphere" or shape.center is None):
+                what = f"a ball is thrown at the {shape.kind} at '{shape.frame}'"
+                raise InputError(what, hint="make it a sphere and give its center, at which the ball flies")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,0 +1,182 @@
+"""A thrown ball obeys mechanics, the rigid model predicts what it does, and the scenarios with real impacts hold."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.errors import ImpactPostureError, InputError, SpecError
+from impact_posture.simulation.actuator_command import ActuatorCommand
+from impact_posture.simulation.controller_factory import ControllerFactory
+from impact_posture.simulation.metrics import measure
+from impact_posture.simulation.outcome import judge
+from impact_posture.simulation.prediction import predict
+from impact_posture.simulation.recorder import feet_of
+from impact_posture.simulation.run import run
+from impact_posture.simulation.scenario import Setup, set_up
+from impact_posture.simulation.scenario_file import SHIPPED, read_scenario
+from impact_posture.simulation.throw import FLIGHT, Throw, thrown_jumps
+from impact_posture.simulation.world import build_world
+from tests.helpers import frame_jacobian, mass_matrix
+from tests.simulation.factories import controller_factory, needs_mujoco
+from tests.test_scenario_files import REAL
+
+# Ways of flight, off the axes too.
+WAYS = ((-1, 0, 0), (0.5, 1.0, 0.0), (0.3, -0.4, -1.0))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _mujoco() -> None:
+    needs_mujoco()
+
+
+@functools.cache
+def thrown(name: str, way: tuple[float, float, float] = (-1, 0, 0), friction: float = 0.5) -> Setup:
+    """A scenario with a throw, soon, along another way, with a contact that is fast beside the robot's motion."""
+    scenario = read_scenario(name)
+    assert scenario.throw is not None
+    quick = {"settle": 0.1, "patience": 0.2, "after": 0.1, "solref": (0.002, 1.0)}
+    throw = replace(scenario.throw, direction=way, friction=friction, **quick)
+    return set_up(replace(scenario, throw=throw, physics=replace(scenario.physics, timestep=0.0005)))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("name", ["solo8-throw", "talos-throw"])
+@pytest.mark.parametrize("way", WAYS)
+def test_a_ball_obeys_mechanics(name: str, way: tuple[float, float, float], sign: int) -> None:
+    setup = thrown(name, way)
+    world, throw, robot = setup.world, setup.scenario.throw, setup.robot
+    assert throw is not None
+    # In weightlessness and without motors, nothing but the contact acts on both.
+    scene = replace(setup.scenario, physics=replace(setup.scenario.physics, gravity=(0, 0, 0)), surfaces=())
+    world = build_world(robot, scene, setup.q, throw)
+    world.reset(setup.q)
+    world.throw(sign)
+    assert world.ball is not None
+    target = world._data.geom_xpos[world.ball._target].copy()
+    begin, speed = world.ball.state(world._data)
+    np.testing.assert_allclose(speed, sign * throw.speed * setup.scenario.normal, atol=1e-12)
+    # It flies at the center and touches when it should.
+    way_there = target - begin
+    np.testing.assert_allclose(np.cross(way_there, speed), 0, atol=1e-9)
+    still = ActuatorCommand(np.zeros(robot.nv - 6), np.zeros(0))
+    frame = [s.frame for s in setup.scenario.shapes].index(throw.frame)
+    reach = throw.radius + setup.scenario.shape.size[0]
+    touches, depth = [], 0.0
+    for _ in range(80):
+        world.step(still)
+        place, _v = world.ball.state(world._data)
+        depth = max(depth, reach - float(np.linalg.norm(place - world._data.geom_xpos[world.ball._target])))
+        shape = world.truth().shapes[frame]
+        touches += [] if shape.began is None else [shape.began]
+    assert touches[0] == pytest.approx(FLIGHT, abs=2 * world.timestep)
+    # The impulse on the shape is what the ball lost and what the robot gained, as linear and as angular momentum.
+    impulse, after = shape.impulse, world.ball.state(world._data)[1]
+    np.testing.assert_allclose(throw.mass * (speed - after), impulse, rtol=1e-6, atol=1e-9)
+    data = robot.model.createData()
+    truth = world.truth()
+    momentum = pin.computeCentroidalMomentum(robot.model, data, truth.q, truth.v)
+    # Rotors of the motors have no momentum of their own; they act on the joints alone.
+    np.testing.assert_allclose(momentum.linear, impulse, rtol=2e-3, atol=1e-3 * np.linalg.norm(impulse))
+    # It neither sticks in the shape nor goes through it.
+    assert 0 < depth < 0.5 * throw.speed * throw.solref[0] * 2
+    assert sign * setup.scenario.normal @ impulse > throw.mass * throw.speed * 0.5
+
+
+@pytest.mark.parametrize("name", ["solo8-throw", "talos-throw"])
+def test_the_prediction_is_the_rigid_impact_of_two_bodies(name: str) -> None:
+    setup = thrown(name, WAYS[1])
+    objective = controller_factory(setup, free=True).objective()
+    throw, q, model = setup.scenario.throw, setup.q, setup.robot.model
+    assert throw is not None
+    # Robot and ball as one system, with the ball's motion as six more velocities.
+    J = frame_jacobian(model, q, setup.robot.frame_id(throw.frame))[:3]
+    M = np.zeros((setup.robot.nv + 6,) * 2)
+    M[:-6, :-6] = mass_matrix(model, q)
+    M[-6:-3, -6:-3], M[-3:, -3:] = throw.mass * np.eye(3), 0.4 * throw.mass * throw.radius**2 * np.eye(3)
+    n = setup.scenario.normal
+    # The point of the ball is its front, r n from its center.
+    arm = throw.radius * np.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])
+    gap = np.hstack([J, -np.eye(3), arm])
+    spread = np.linalg.solve(M, gap.T)
+    before = np.zeros(len(M))
+    before[-6:-3] = throw.speed * n
+    stuck = spread @ np.linalg.solve(gap @ spread, -gap @ before)
+    smooth = spread @ n * float(-n @ gap @ before) / float(n @ gap @ spread @ n)
+    free, sticking, coulomb = thrown_jumps(objective.oracle, q, replace(throw, friction=50.0), throw.speed)
+    assert free == pytest.approx(float(np.linalg.norm(smooth[:-6])), rel=1e-9)
+    assert sticking == coulomb == pytest.approx(float(np.linalg.norm(stuck[:-6])), rel=1e-9)
+    assert thrown_jumps(objective.oracle, q, replace(throw, friction=0.0), throw.speed)[2] == pytest.approx(free)
+
+
+def test_a_robot_that_stands_jumps_as_predicted() -> None:
+    setup = thrown("solo8-throw")
+    made = controller_factory(setup)
+    (found,) = run(made, "nominal", only=1)
+    metrics = measure(setup, found)
+    assert judge(setup, found) == ()
+    assert metrics.contacts == metrics.contacts_asked == 1
+    (impact,) = predict(setup, made.objective(), found)
+    assert impact.approach == pytest.approx(3.0, abs=0.02)
+    # The contact rebounds with 0.13, and the controller acts for 15 ms.
+    assert impact.coulomb is not None
+    assert 0.95 < metrics.peak_jump / impact.coulomb < 1.25
+    assert metrics.peak_force > 10
+    window = found.of("impact")[0]
+    assert window.begin == pytest.approx(found.waited) and window.end - window.begin == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_a_scenario_with_a_real_impact_is_at_rest_at_its_start(name: str) -> None:
+    setup = set_up(read_scenario(name))
+    driver = ControllerFactory(setup).driver("nominal")
+    command = driver.reset(setup.q)
+    setup.world.reset(setup.q, rotor_speed=command.rotor_speed)
+    count = round(setup.scenario.control.period / setup.world.timestep)
+    for _ in range(150):
+        command = driver.tick(setup.world.read())
+        setup.world.step(command, count)
+    truth = setup.world.truth()
+    assert np.linalg.norm(truth.v) < 0.15
+    # Whoever has to stand stands, and what is to hit has not yet.
+    feet = feet_of(setup)
+    assert all(s.touching for s in truth.shapes if s.frame in feet)
+    assert not any(s.touching for s in truth.shapes if s.frame not in feet)
+    lifted = () if setup.scenario.control.footing is None else setup.scenario.control.footing.lifted
+    assert len(driver.controller.formulation.contacts) == len(feet) and not set(lifted) & set(feet)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"base_link"\nmass', '"base"\nmass', r"key 'throw.frame': there is no 'base'; one of: .*base_link"),
+        ("mass = 0.2", "mass = 0.0", r"throw.mass.*greater than 0"),
+        ("direction = [-1, 0, 0]", "direction = [0, 0, 0]", "no direction; give three numbers"),
+        ("speed = 3.0", "sped = 3.0", r"throw.*sped.*speed"),
+        ("leather on plastic\nsolref = [0.004", "leather on plastic\nsolref = [0.0004", "throw: solref"),
+        ('size = [0.05]', 'kind = "box"\nsize = [0.05, 0.05, 0.05]', r"thrown at the box.*a sphere"),
+        ("least = 0.1 ", 'lifted = ["FL_FOT"]\nleast = 0.1 ', r"no frame 'FL_FOT'.*FL_FOOT"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_a_throw_is_one_line(tmp_path: Path, old: str, new: str, words: str) -> None:
+    text = (SHIPPED / "solo8-throw.toml").read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(ImpactPostureError, match=words) as caught:
+        ControllerFactory(set_up(read_scenario(path))).driver("nominal")
+    assert "\n" not in caught.value.line and caught.value.hint
+
+
+def test_a_world_without_a_ball_says_so() -> None:
+    setup = set_up(read_scenario("solo8-push"))
+    setup.world.reset(setup.q)
+    with pytest.raises(InputError, match=r"has no ball.*\[throw\]"):
+        setup.world.throw()
+    with pytest.raises((InputError, SpecError), match="no direction"):
+        Throw(frame="a", mass=1.0, radius=0.1, speed=1.0, direction=(0.0, 0.0, 0.0))
