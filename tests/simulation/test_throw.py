@@ -132,17 +132,18 @@ def test_a_robot_that_stands_jumps_as_predicted() -> None:
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_a_scenario_with_a_real_impact_is_at_rest_at_its_start(name: str) -> None:
+def test_a_scenario_with_a_real_impact_stays_at_its_start(name: str) -> None:
     setup = set_up(read_scenario(name))
     driver = ControllerFactory(setup).driver("nominal")
     command = driver.reset(setup.q)
     setup.world.reset(setup.q, rotor_speed=command.rotor_speed)
     count = round(setup.scenario.control.period / setup.world.timestep)
-    for _ in range(150):
+    for _ in range(100):
         command = driver.tick(setup.world.read())
         setup.world.step(command, count)
     truth = setup.world.truth()
-    assert np.linalg.norm(truth.v) < 0.15
+    # Its feet give way by less than a millimeter, and its sensors shake it.
+    assert np.linalg.norm(pin.difference(setup.robot.model, setup.q, truth.q)) < 0.05
     # Whoever has to stand stands, and what is to hit has not yet.
     feet = feet_of(setup)
     assert all(s.touching for s in truth.shapes if s.frame in feet)
