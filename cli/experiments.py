@@ -18,8 +18,8 @@ ScenarioName = Annotated[
     str,
     typer.Argument(
         metavar="SCENARIO",
-        help="aerial-vertical, aerial-lateral, solo8-push, talos-push, talos-throw, solo8-throw, talos-strike, g1-strike, "
-        "solo12-landing, panda-tap, hextilt-poke, or a path to a scenario.toml.",
+        help="aerial-vertical, aerial-lateral, solo8-push, talos-push, talos-throw, solo8-throw, talos-strike, "
+        "g1-strike, solo12-landing, panda-tap, hextilt-poke, or a path to a scenario.toml.",
     ),
 ]
 Seeds = Annotated[int, typer.Option("--seeds", min=1, rich_help_panel=RUN, help="Seeds a controller, from 0.")]

@@ -13,10 +13,8 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.baselines import FlowPosture, WalkerDriver, resting_posture, spring_of_term
 from impact_posture.simulation.driver import Driver, PostureDriver, RobustDriver
-from impact_posture.simulation.impact_aware import ImpactAwareDriver
-from impact_posture.simulation.invariant import InvariantDriver
+from impact_posture.simulation.impact_baselines import ImpactAwareDriver, InvariantDriver, ReferenceSpreadingDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
-from impact_posture.simulation.reference_spreading import ReferenceSpreadingDriver
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
 from impact_posture.simulation.task_formulations import nominal_posture, posture_options

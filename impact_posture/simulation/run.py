@@ -162,42 +162,29 @@ def _pushes(loop: _Loop, task: SinglePush | Throw, signs: Sequence[int], mode: M
         rested = _settle(loop, task, loop.t + 2 * loop.ramp, []) and rested
     if loop.away is not None:
         return tuple(Run(loop.recorder.series(), (), sign, rested=False, away=loop.away) for sign in signs)
-    first, *others = (
-        partial(_throw, loop, task, sign, rested)
-        if isinstance(task, Throw)
-        else partial(_push, loop, task, sign, rested)
-        for sign in signs
-    )
+    first, *others = (partial(_push, loop, task, sign, rested) for sign in signs)
     with ExitStack() as copies:
         waiting = [copies.enter_context(fork_call(other)) for other in others]
         return (first(), *(collect() for collect in waiting))
 
 
-def _push(loop: _Loop, task: SinglePush, sign: int, rested: bool) -> Run:
-    begin = loop.t
-    loop.driver.expect(begin)
-    push = task.push(sign)
-    loop.world.push(push)
-    loop.recorder.pushed(np.array(push.force), begin, begin + task.duration)
-    for _ in range(round((task.duration + task.after) / loop.period)):
+def _push(loop: _Loop, task: SinglePush | Throw, sign: int, rested: bool) -> Run:
+    begin = expected = loop.t
+    if isinstance(task, Throw):
+        expected, length = begin + FLIGHT, task.window
+        loop.world.throw(sign)
+    else:
+        push, length = task.push(sign), task.duration
+        loop.world.push(push)
+        loop.recorder.pushed(np.array(push.force), begin, begin + length)
+    loop.driver.expect(expected)
+    for _ in range(round((expected - begin + length + task.after) / loop.period)):
         if not loop.tick():
             break
-    ends = {"impact": task.duration, "recovery": min(RECOVERY, task.duration + task.after)}
-    windows = tuple(Window(kind, 0, begin, begin + length, True) for kind, length in ends.items())
-    return Run(loop.recorder.series(), windows, sign, begin, rested, loop.away)
-
-
-def _throw(loop: _Loop, task: Throw, sign: int, rested: bool) -> Run:
-    begin = loop.t
-    loop.driver.expect(begin + FLIGHT)
-    loop.world.throw(sign)
-    for _ in range(round((FLIGHT + task.window + task.after) / loop.period)):
-        if not loop.tick():
-            break
-    touch = loop.recorder.first_touch(begin, np.inf)
-    hit = begin + FLIGHT if touch is None else touch
-    ends = {"impact": task.window, "recovery": min(RECOVERY, task.window + task.after)}
-    windows = tuple(Window(kind, 0, hit, hit + length, touch is not None) for kind, length in ends.items())
+    touch = loop.recorder.first_touch(begin, np.inf) if isinstance(task, Throw) else begin
+    hit = expected if touch is None else touch
+    ends = {"impact": length, "recovery": min(RECOVERY, length + task.after)}
+    windows = tuple(Window(kind, 0, hit, hit + end, touch is not None) for kind, end in ends.items())
     return Run(loop.recorder.series(), windows, sign, hit, rested, loop.away)
 
 

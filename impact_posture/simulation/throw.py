@@ -1,20 +1,29 @@
-"""A body that is thrown at a robot, and what the rigid model says about its impact."""
+"""A ball that is thrown at a robot, in MuJoCo, and what the rigid model says about its impact."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from impact_posture.arrays import Array
+from impact_posture.dynamics.mjcf import Mjcf, import_mujoco
 from impact_posture.errors import InputError
+from impact_posture.escape import xml_name
 from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.robot.spec import NonNegative, Positive
 from impact_posture.simulation.scene import ContactLaw, FiniteVector
 from impact_posture.tables import Checked
 
+# Time from the launch to the touch of a shape at rest, s.  It is short, so that gravity bends the flight by less than
+# a millimeter.
+FLIGHT = 0.01
+# Name of the body and of the geom of the ball.
+BALL = xml_name("thrown ball")
+# Where the ball begins to fall until it is thrown, far away from everything, m.
+_AWAY = (0.0, 0.0, -1e3)
 # Tangential mobility of the surface of a solid sphere, times its mass: 1 + mr²/I with I = ⅖ mr².
 _SPIN = 3.5
 
@@ -70,11 +79,6 @@ class Throw(ContactLaw, Settling):
             raise InputError("key 'throw.direction': no direction", hint="give three numbers, not all zero")
 
 
-# Time from the launch to the touch of a shape at rest, s.  It is short, so that gravity bends the flight by less than
-# a millimeter.
-FLIGHT = 0.01
-
-
 def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> tuple[float, float, float]:
     """Return the velocity jumps ``‖Δν‖`` of the robot without friction, if the ball sticks, and with its friction.
 
@@ -100,3 +104,36 @@ def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> 
         real = way / float(n @ mobility @ way)
     free, sticking, coulomb = (speed * float(np.linalg.norm(spread @ impulse)) for impulse in (plain, stuck, real))
     return free, sticking, coulomb
+
+
+def add_ball(mjcf: Mjcf, throw: Throw) -> None:
+    """Add a solid ball that falls freely, after everything else that moves."""
+    moment = 0.4 * throw.mass * throw.radius**2
+    inertia = {"mass": throw.mass, "ipos": np.zeros(3), "inertia": np.full(3, moment), "explicitinertial": True}
+    body = mjcf.spec.worldbody.add_body(name=BALL, pos=_AWAY, **inertia)
+    body.add_freejoint()
+    sphere = import_mujoco().mjtGeom.mjGEOM_SPHERE
+    body.add_geom(name=BALL, type=sphere, size=(throw.radius, 0.0, 0.0), mass=0.0, contype=0, conaffinity=0)
+
+
+class Ball:
+    """The ball of a compiled model.
+
+    Args:
+        model: The MuJoCo model.
+        throw: The throw.
+    """
+
+    def __init__(self, model: Any, throw: Throw) -> None:
+        joint = int(model.body(BALL).jntadr[0])
+        self._position, self._velocity = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        self._target = model.geom(xml_name(f"shape {throw.frame}")).id
+        way = np.array(throw.direction) / np.linalg.norm(throw.direction)
+        self._velocity_0 = throw.speed * way
+        self._reach = (throw.radius + float(model.geom_size[self._target, 0]) + FLIGHT * throw.speed) * way
+
+    def throw(self, data: Any, sign: int) -> None:
+        """Put the ball where it touches a shape at rest :data:`FLIGHT` later."""
+        start = data.geom_xpos[self._target] - sign * self._reach
+        data.qpos[self._position : self._position + 7] = [*start, 1.0, 0.0, 0.0, 0.0]
+        data.qvel[self._velocity : self._velocity + 6] = [*(sign * self._velocity_0), 0.0, 0.0, 0.0]

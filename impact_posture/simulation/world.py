@@ -17,12 +17,11 @@ from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import hover
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.actuator_command import ActuatorCommand, Push, Truth
-from impact_posture.simulation.ball import Ball
 from impact_posture.simulation.contact_forces import ContactLog
 from impact_posture.simulation.rotors import Rotors, Vibration
 from impact_posture.simulation.scene import Scene
 from impact_posture.simulation.sensor_noise import Reading, SensorNoise
-from impact_posture.simulation.throw import Throw
+from impact_posture.simulation.throw import Ball, Throw
 from impact_posture.simulation.world_builder import BuiltScene, build_scene
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.state import checked_velocity

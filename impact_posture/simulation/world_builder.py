@@ -18,9 +18,8 @@ from impact_posture.escape import xml_name
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import actuation_matrix
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.ball import BALL, add_ball
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Shape, Surface
-from impact_posture.simulation.throw import Throw
+from impact_posture.simulation.throw import BALL, Throw, add_ball
 
 # Families with the same velocities, in the same axes, in Pinocchio and MuJoCo.
 _DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.contacts import SupportContact
 from impact_posture.tsid.points import Point
@@ -43,9 +42,22 @@ class ImpactLimits:
 
     Attributes:
         active: Whether an impact may come.  Otherwise nothing is limited.
+        restitution: ``e``.
+        duration: ``δt``, s.
+        size: Number of rows.
+        points: Points of the robot whose kinematics the limits read from the state.
+
+    Args:
+        robot: The robot.
+        point: The point that hits.
+        normal: Unit normal out of the surface, world, shape (3,).
+        contacts: Contacts that stay through the impact.
+        period: Time to the next tick ``dt``, s.
     """
 
-    name: str = "impact limits"
+    name = "impact limits"
+    restitution = 0.0
+    duration = 5e-3
 
     def __init__(
         self,
@@ -53,35 +65,14 @@ class ImpactLimits:
         point: Point,
         normal: ArrayLike,
         contacts: Sequence[SupportContact] = (),
-        *,
         period: float = 1e-3,
-        restitution: float = 0.0,
-        duration: float = 5e-3,
     ) -> None:
-        """Set what hits, and what the impact may do.
-
-        Args:
-            robot: The robot.
-            point: The point that hits.
-            normal: Unit normal out of the surface, world, shape (3,).
-            contacts: Contacts that stay through the impact.
-            period: Time to the next tick ``dt``, s.
-            restitution: ``e``.
-            duration: ``δt``, s.
-
-        Raises:
-            InputError: A number is out of range.
-        """
-        if not (period > 0 and duration > 0 and 0 <= restitution <= 1):
-            raise InputError("a number is out of range", where=self.name, hint="give seconds above zero, 0 ≤ e ≤ 1")
         self._first = 6 if robot.floating else 0
         effort = np.asarray(robot.model.effortLimit, dtype=float)[self._first :]
         self._torque = np.where(effort > 0, effort, np.inf)
         self._rate = JointRanges(robot).velocity[self._first :]
-        self._contacts, self._point = tuple(contacts), point
-        self.points: Sequence[Point] = (point, *(c.point for c in contacts))
+        self._contacts, self._point, self.points = tuple(contacts), point, (point, *(c.point for c in contacts))
         self._normal, self._period = np.array(normal, dtype=float), period
-        self._rebound, self._duration = 1 + restitution, duration
         self.size, self.active = 2 * self._rate.size, False
 
     def jump(self, state: State) -> tuple[Array, Array]:
@@ -89,7 +80,7 @@ class ImpactLimits:
         J = state.at(self._point).jacobian[:3]
         spread = supported_inverse(state, self._contacts) @ J.T
         mass = np.linalg.pinv(J @ spread, rcond=_RANK, hermitian=True)
-        impulse = -self._rebound * np.outer(mass @ self._normal, self._normal @ J)
+        impulse = -(1 + self.restitution) * np.outer(mass @ self._normal, self._normal @ J)
         return spread @ impulse, J.T @ impulse
 
     def rows(self, state: State) -> tuple[Array, Array, Array]:
@@ -98,7 +89,7 @@ class ImpactLimits:
         if not self.active:
             return np.zeros((self.size, state.nv)), -nothing, nothing
         rates, torques = (part[self._first :] for part in self.jump(state))
-        A = np.vstack([rates, torques / self._duration])
+        A = np.vstack([rates, torques / self.duration])
         now = A @ state.v
         now[: self._rate.size] += state.v[self._first :]
         most = np.concatenate([self._rate, self._torque])

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
-from impact_posture.tsid.points import Point
 from impact_posture.tsid.ranges import JointRanges
 from impact_posture.tsid.state import State
 
@@ -49,23 +46,6 @@ class LimitLaw:
                 where="limit law",
                 hint="raise rate or lower approach",
             )
-
-
-class RowLimit(Protocol):
-    """Linear limit ``lower ≤ A ν̇ ≤ upper`` of the accelerations of one tick.
-
-    Attributes:
-        name: Name in reports.
-        size: Number of rows k.
-        points: Points of the robot whose kinematics the limit reads from the state.
-    """
-
-    name: str
-    size: int
-    points: Sequence[Point]
-
-    def rows(self, state: State) -> tuple[Array, Array, Array]:
-        """Return ``A`` of shape (k, nv), ``lower`` and ``upper`` of shape (k,), infinite where nothing is limited."""
 
 
 class AccelerationBounds:

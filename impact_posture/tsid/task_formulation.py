@@ -10,7 +10,8 @@ from impact_posture.robot.robot import Robot
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
 from impact_posture.tsid.contacts import SupportContact, support_contacts
 from impact_posture.tsid.frame_tasks import EndEffector, FramePose
-from impact_posture.tsid.limits import LimitLaw, RowLimit
+from impact_posture.tsid.impact_limits import ImpactLimits
+from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.task import Task
@@ -29,7 +30,7 @@ class TaskFormulation:
         contacts: Contacts with the ground.
         force_point: Point where a measured contact force acts; ``None`` leaves the force out of the dynamics.
         law: Law that stops joints at their limits; ``None`` leaves the accelerations unlimited.
-        row_limits: Further limits of the accelerations, which give way like those of the joints.
+        row_limits: Limits of expected impacts, which give way like those of the joints.
         force_weight: Weight of contact forces in the cost, 1/N² (a hundred times that for moments, 1/(N·m)²).
         spare_weight: Weight of the choice that redundant rotors leave, 1/N².
     """
@@ -40,7 +41,7 @@ class TaskFormulation:
     contacts: tuple[SupportContact, ...] = ()
     force_point: Point | None = None
     law: LimitLaw | None = field(default_factory=LimitLaw)
-    row_limits: tuple[RowLimit, ...] = ()
+    row_limits: tuple[ImpactLimits, ...] = ()
     force_weight: float = 1e-6
     spare_weight: float = 1e-3
 

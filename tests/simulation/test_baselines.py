@@ -12,7 +12,7 @@ from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.baselines import WalkerDriver, resting_posture, spring_of_term
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.driver import RobustDriver
-from impact_posture.simulation.invariant import InvariantDriver
+from impact_posture.simulation.impact_baselines import InvariantDriver
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts
 from impact_posture.simulation.sensor_noise import Reading

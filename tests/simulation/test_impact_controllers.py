@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impact_posture.simulation.impact_aware import ImpactAwareDriver
+from impact_posture.simulation.impact_baselines import ImpactAwareDriver, ReferenceSpreadingDriver
 from impact_posture.simulation.metrics import before
 from impact_posture.simulation.reference import Reference
-from impact_posture.simulation.reference_spreading import ReferenceSpreadingDriver
 from impact_posture.simulation.scenario import RepeatedContacts
 from impact_posture.simulation.sensor_noise import Reading
 from tests.helpers import Vector, frame_jacobian, mass_matrix, rng
