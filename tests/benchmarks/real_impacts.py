@@ -27,7 +27,7 @@ from tests.benchmarks.core import ROOT, Request, say, table
 SCENARIOS = (
     "talos-throw", "solo8-throw", "talos-strike", "g1-strike", "solo12-landing", "panda-tap", "hextilt-poke"
 )  # fmt: skip
-COMPARED = ("nominal", "robust", "robust-flow", "posture", "stiff", "posture-stiff")
+COMPARED = ("nominal", "robust", "robust-sticking", "robust-flow", "posture", "stiff")
 HEAD = (
     "controller", "predicted: H", "√S jump", "Coulomb jump", "of nominal", "measured jump", "of nominal",
     "motion in the window", "over the second", "peak force, N", "saturated in / out, s", "status",
