@@ -82,11 +82,11 @@ def lines(request: Request) -> Iterator[str]:
             found[pairs[k]] = answer
             say(f"\r{len(found)} of {len(pairs)} runs", end="")
     for scenario in dict.fromkeys(s for s, _ in pairs):
-        yield from ("", f"## {scenario}", "", f"{read_scenario(scenario).description}. Seed 0.", "")
+        yield from (f"### {scenario}", "", f"{read_scenario(scenario).description}. Seed 0.", "")
         rows = {c: found[s, c] for s, c in pairs if s == scenario}
         yield from table(HEAD, [_row(name, row, rows["nominal"]) for name, row in rows.items()])
         notes = [f"`{name}`: {text}" for name, row in rows.items() for text in (row["offline"], row["why"]) if text]
-        yield from ("", *(f"- {note}." for note in notes))
+        yield from ("", *(f"- {note.rstrip('.')}." for note in notes), *([""] if notes else []))
 
 
 def _row(name: str, row: dict[str, Any], nominal: dict[str, Any]) -> list[str]:
