@@ -29,8 +29,8 @@ def end_effector_task(setup: Setup) -> EndEffector | None:
     """
     scenario, gains = setup.scenario, setup.scenario.control.end_effector
     if scenario.contacts is None and gains is not None:
-        hint = "remove [control.end_effector]"
-        raise SpecError("has [control.end_effector], but no [contacts]", where=scenario.source, hint=hint)
+        what = "has [control.end_effector], but a " + ("push" if scenario.push else "throw")
+        raise SpecError(what, where=scenario.source, hint="remove [control.end_effector]")
     if scenario.contacts is None:
         return None
     if gains is None:
