@@ -189,7 +189,7 @@ def test_readme_shows_names_as_text(exports: dict[str, Path]) -> None:
 
 def test_summary_shows_names_as_text() -> None:
     rows = [
-        Row(name, controller, "fell", 1, 0, (name,), {}, None, None, {}, (name,), True, None, None)
+        Row(name, controller, "fell", 1, 0, (name,), {}, None, None, {}, (name,), True, None, None, None)
         for name in ("plain", *NASTY)
         for controller in ("nominal", "robust")
     ]

@@ -95,7 +95,8 @@ class ProgramRows:
                 columns[id(piece.rows)] = range(column, column + piece.variables.numel())
                 column += piece.variables.numel()
         self._differentiate(list(pieces.values()))
-        parts, order = list[Derivatives](), list[int]()
+        # There may be no rows, but there is always x.
+        parts, order = [Derivatives(ca.SX(0, 1), ca.SX(0, nx), ca.SX(nx, nx))], list[int]()
         at = [k for _, block in self._blocks for piece in block for k in columns[id(piece.rows)]]
         for found, block in self._blocks:
             present = [pieces[id(piece.rows)] for piece in block]
