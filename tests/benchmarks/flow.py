@@ -209,11 +209,11 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
             return bool(found.values[-1] * start - best.optimum <= CLOSE * start)
 
         with fork_map(again, len(apart), request.jobs) as results:
-            mended = [good for _, good in results]
-    return _cells(case.name, list(outcomes.values()), best.optimum, mended)
+            arrived = [good for _, good in results]
+    return _cells(case.name, list(outcomes.values()), best.optimum, arrived)
 
 
-def _cells(name: str, outcomes: Sequence[Outcome], best: float, mended: Sequence[bool]) -> list[str]:
+def _cells(name: str, outcomes: Sequence[Outcome], best: float, arrived: Sequence[bool]) -> list[str]:
     rest = np.array([o.course.rested for o in outcomes])
     start, end, optimum = (np.array([getattr(o, key) for o in outcomes]) for key in ("start", "end", "optimum"))
     rises = [float((o.course.values - np.minimum.accumulate(o.course.values)).max()) for o in outcomes]
@@ -230,7 +230,7 @@ def _cells(name: str, outcomes: Sequence[Outcome], best: float, mended: Sequence
         f"{100 * near:.1f} % ({100 * program:.0f} % by the program)",
         f"{100 * np.median(end / optimum - 1):.1f} %",
         f"{100 * np.mean(optimum - best > CLOSE * start):.0f} %",
-        f"{sum(mended)} of {len(mended)}",
+        f"{sum(arrived)} of {len(arrived)}",
         f"{max(o.course.share for o in outcomes) * FlowOptions().share:.3f}",
         f"{min(o.course.room for o in outcomes):.3f}",
         f"{1e3 * max(o.course.missed for o in outcomes):.2f}",
