@@ -25,7 +25,6 @@ from impact_posture.report.result_report import result_scene
 from impact_posture.report.run_report import thin
 from impact_posture.report.scene import Scene
 from impact_posture.report.shapes import draw_robot
-from impact_posture.report.submeshes import renumbered
 from impact_posture.result_folder import _load
 from impact_posture.robot.robot_loader import locate
 from impact_posture.robot.urdf import parse_urdf
@@ -270,23 +269,6 @@ def test_primitives_and_robots_without_shapes(tmp_path: Path) -> None:
     sticks = draw_robot(own(tmp_path / "bare", "", visual('<mesh filename="missing.obj"/>')))
     assert len(sticks.parts) == 1 and "sticks" in sticks.notes[-1] and "missing.obj" in sticks.notes[0]
     assert np.ptp(sticks.solids[0].points[:, 2]) >= 0.5
-
-
-@given(st.lists(st.lists(st.integers(3, 30), min_size=1, max_size=4), min_size=1, max_size=3))
-def test_parts_of_a_file_are_told_apart(nodes: list[list[int]]) -> None:
-    """Nodes of several parts each, numbered as coal does: each part from the first corner of its node."""
-    numbered, true, base = [], [], 0
-    for parts in nodes:
-        node = base
-        for count in parts:
-            fan = np.array([[0, k, k + 1] for k in range(1, count - 1)])
-            numbered.append(fan + node)
-            true.append(fan + base)
-            base += count
-    found = renumbered(np.zeros((base, 3)), np.concatenate(numbered))
-    assert found is not None and np.array_equal(found, np.concatenate(true))
-    # What cannot be told apart is not guessed.
-    assert renumbered(np.zeros((base + 1, 3)), np.concatenate(numbered)) is None
 
 
 # ---- in a browser --------------------------------------------------------------------------------------------------

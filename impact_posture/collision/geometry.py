@@ -11,6 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
+from impact_posture.collision.mesh_triangles import Corrected
 from impact_posture.collision.pairs import pairs_apart
 from impact_posture.collision.shape_points import shape_points
 from impact_posture.collision.urdf_shapes import (
@@ -20,6 +21,7 @@ from impact_posture.collision.urdf_shapes import (
     largest_extent,
     left_out,
 )
+from impact_posture.errors import one_line
 from impact_posture.libraries import source_key
 from impact_posture.robot.robot import Robot
 
@@ -48,14 +50,17 @@ def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
     model, largest = robot.model, largest_extent(robot)
     kept, solids, warnings = [], [], []
     # Limbs share meshes, and loading one may take a tenth of a second.
-    loaded: dict[object, Any] = {}
+    loaded: dict[object, Corrected] = {}
     for shape in described:
         try:
             key = (shape.kind, shape.sizes, shape.mesh)
             if key not in loaded:
                 loaded[key] = shape.load(largest)
-            solids.append(loaded[key])
+            solids.append(loaded[key].mesh)
             kept.append(shape)
+            if not loaded[key].exact:
+                why = f"the parts of {shape.mesh} cannot be told apart; export it as one part"
+                warnings.append(one_line(f"shape {shape.name} is its convex hull: {why}"))
         except UnusableShape as fault:
             warnings.append(left_out(shape.name, fault))
     objects = _placed(model, kept, solids, turned=False)

@@ -8,16 +8,14 @@ from typing import Any, NamedTuple
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
+from impact_posture.collision.mesh_triangles import Triangles, hull_surface, mesh_triangles
 from impact_posture.collision.shape_points import shape_points
 from impact_posture.collision.swept_hull import SweptHull, hull_corners, separation
 
 TOLERANCE = 0.001
 """Tolerance (m) of the hulls of parts, finer than that of others, because bodies in hollows have little room."""
-
-Triangles = NDArray[np.int_]
 
 # A cut is sought across each axis, at so many places that divide the extent evenly.
 _PLACES = 9
@@ -56,15 +54,8 @@ def surface_of(solid: Any) -> tuple[Array, Triangles]:
     """
     points = shape_points(solid)
     if isinstance(solid, coal.BVHModelBase):
-        corners = (solid.tri_indices(k) for k in range(solid.num_tris))
-        return points, np.array([(triangle[0], triangle[1], triangle[2]) for triangle in corners])
+        return points, mesh_triangles(solid)
     return hull_surface(points)
-
-
-def hull_surface(points: Array) -> tuple[Array, Triangles]:
-    """Return corners and triangles of the convex hull of points, as :func:`surface_of` does."""
-    corners = hull_corners(points)
-    return corners, SweptHull("", "", 0, corners, 0.0).faces.astype(int)
 
 
 def best_cut(triangles: Array, other: SweptHull, placements: Sequence[pin.SE3]) -> Cut:

@@ -10,7 +10,7 @@ import coal
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.collision.urdf_shapes import mesh_points
+from impact_posture.collision.mesh_triangles import mesh_points
 
 # Corners of the polygon around a circle: it is 0.5 % larger.
 _SIDES = 32

@@ -9,14 +9,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
 import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
+from impact_posture.collision.mesh_triangles import Corrected, correct, mesh_points
 from impact_posture.errors import UrdfError, one_line
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate, srdf_path
@@ -73,8 +72,8 @@ class UrdfShape:
         with self.mesh.open("rb") as file:
             return b"<up_axis>Y_UP" in file.read(_HEAD)
 
-    def load(self, largest: float) -> Any:
-        """Return the shape of coal.
+    def load(self, largest: float) -> Corrected:
+        """Return the shape of coal, and whether it is what the URDF describes or its convex hull.
 
         Args:
             largest: Largest extent (m) that a shape in meters can have.
@@ -95,9 +94,9 @@ class UrdfShape:
                 return self._load_mesh(largest)
         if max(self.sizes) > largest:
             raise UnusableShape(f"its <{self.kind}> has a size of {max(self.sizes):.3g} m; give sizes in meters")
-        return shape
+        return Corrected(shape, True)
 
-    def _load_mesh(self, largest: float) -> Any:
+    def _load_mesh(self, largest: float) -> Corrected:
         try:
             with quiet_stderr():
                 # Loaded one by one, because the loader keeps what it loads.
@@ -115,12 +114,7 @@ class UrdfShape:
         if extent > largest:
             hint = 'give it in meters or write scale="0.001 0.001 0.001"'
             raise UnusableShape(f"{self.mesh} is {extent:.3g} m large, so it is in millimeters; {hint}")
-        return shape
-
-
-def mesh_points(shape: Any) -> Array:
-    """Return the vertices of a mesh of coal, shape (n, 3)."""
-    return np.asarray(shape.vertices(), dtype=float).reshape(-1, 3)
+        return correct(shape)
 
 
 def largest_extent(robot: Robot) -> float:

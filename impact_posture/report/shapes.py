@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import coal
 import numpy as np
@@ -14,11 +13,11 @@ from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.collision.geometry import load_geometry
-from impact_posture.collision.parts import Triangles, hull_surface, surface_of
+from impact_posture.collision.mesh_triangles import Triangles, hull_surface
+from impact_posture.collision.parts import surface_of
 from impact_posture.collision.shape_points import shape_points
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.report.mesh_license import MeshLicense, license_of
-from impact_posture.report.submeshes import renumbered
 from impact_posture.robot.robot import Robot
 
 # Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
@@ -96,7 +95,7 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
         # The same file at the same scale is the same mesh; an address in memory would name another one later.
         key = (shape.kind, shape.sizes, shape.mesh, hull)
         if key not in solids:
-            solids[key] = hull_of(shape_points(placed.geometry)) if hull else _solid_of(placed.geometry)
+            solids[key] = hull_of(shape_points(placed.geometry)) if hull else _quantized(*surface_of(placed.geometry))
         parts.append((int(placed.parentJoint), list(solids).index(key), placed.placement, _color(shape)))
     if any(key[-1] for key in solids):
         notes.append("meshes are drawn as their convex hulls, because a page passes them on (`meshes`)")
@@ -109,13 +108,6 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
 def hull_of(points: Array) -> Solid:
     """Return the convex hull of points."""
     return _quantized(*hull_surface(points))
-
-
-def _solid_of(solid: Any) -> Solid:
-    """Return a shape, or its hull where the triangles of its mesh are not known."""
-    points, faces = surface_of(solid)
-    found = renumbered(points, faces) if isinstance(solid, coal.BVHModelBase) else faces
-    return hull_of(points) if found is None else _quantized(points, found)
 
 
 def _quantized(points: Array, faces: Triangles) -> Solid:
