@@ -19,7 +19,7 @@ import typer
 
 from impact_posture.errors import ImpactPostureError, one_line
 from impact_posture.escape import printable
-from impact_posture_cli.option_names import as_options, option_of
+from impact_posture.option_names import as_options, option_of
 
 DEBUG_VARIABLE = "IMPACT_POSTURE_DEBUG"
 _INTERRUPTED = 130

@@ -27,6 +27,7 @@ from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.global_search import GlobalSearch, SelfMotionMap, check_searchable, search_globally
+from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.pareto import pareto_front
 from impact_posture.posture.problem import PostureProblem as CoreProblem
 from impact_posture.posture.problem_settings import Prepared, prepare, requirements
@@ -35,7 +36,8 @@ from impact_posture.posture.robustness import Robustness, compare_variants, solv
 from impact_posture.posture.search import Progress
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
-from impact_posture.result_folder import FORMATS, Finish, Written, result_view, write_result
+from impact_posture.result_folder import FORMATS, Finish, Written, write_result
+from impact_posture.result_view import result_view
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.model_variant import ModelVariant, Payload, build_model_variants
 from impact_posture.robot.postures import read_posture
@@ -394,7 +396,9 @@ class PostureResult:
         """Draw the figures into a folder; return their paths."""
         from impact_posture.plot import draw_all
 
-        view = result_view(self._prepared, self.solution, self.document, self.motion, self._mapped)
+        found = self.solution
+        path = null_space_path(found.problem, found.initial, found.q)
+        view = result_view(self._prepared, found.initial, found.q, path, self.document, self.motion, self._mapped)
         return draw_all(view, Path(out), formats, only)
 
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:

@@ -14,7 +14,9 @@ import fcntl
 import json
 import os
 import secrets
+import shlex
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -28,6 +30,7 @@ RECORD = ".impact-posture.json"
 SCHEMA = "impact-posture/folder/1"
 _SCRATCH = ".impact-posture-"
 _SHOWN = 3
+_PROGRAM = "impact-posture"
 
 Kind = Literal["result", "export", "run", "comparison", "reproduction", "runs"]
 
@@ -104,8 +107,21 @@ def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None
         OSError: The record cannot be written.
     """
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
-    content = {"schema": SCHEMA, "kind": kind, "files": files, "products": sorted(products)}
+    content = {"schema": SCHEMA, "kind": kind, "files": files, "products": sorted(products), **_made_by()}
     (folder / RECORD).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def typed_command(folder: Path) -> str:
+    """Return the words with which a user made an output folder; empty where no command line made it."""
+    try:
+        return str(json.loads((folder / RECORD).read_text(encoding="utf-8")).get("command", ""))
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return ""
+
+
+def _made_by() -> dict[str, str]:
+    program, *words = sys.argv or [""]
+    return {"command": shlex.join([_PROGRAM, *words])} if Path(program).stem == _PROGRAM else {}
 
 
 def is_ours(folder: Path, kind: Kind) -> bool:
@@ -279,7 +295,8 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
             with suppress(OSError):
                 fcntl.flock(record, fcntl.LOCK_EX)
             # This follows the lock.  A process that finds the record unlocked finds it empty, and leaves it alone.
-            os.write(record, json.dumps({"schema": SCHEMA, "host": os.uname().nodename}).encode())
+            content = {"schema": SCHEMA, "host": os.uname().nodename, **_made_by()}
+            os.write(record, json.dumps(content).encode())
             yield folder
         finally:
             os.close(record)

@@ -1,36 +1,34 @@
-"""Result folder: write the solution of a posture problem, and read it back."""
+"""Write the solution of a posture problem into a result folder, whole or not at all."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
 
-from impact_posture.errors import CompilerError, SpecError, one_line
+from impact_posture.errors import CompilerError, one_line
 from impact_posture.escape import file_name
 from impact_posture.output_folder import whole_folder, write_record
 from impact_posture.posture.global_search import SelfMotionMap
 from impact_posture.posture.null_space_path import NullSpacePath, null_space_path
-from impact_posture.posture.problem_settings import Prepared, dump_settings, prepare, read_settings, resolved_settings
+from impact_posture.posture.problem_settings import Prepared, dump_settings, resolved_settings
 from impact_posture.posture.result import result_arrays
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
 from impact_posture.processes import fork_map
+from impact_posture.result_view import motion_of, result_view
 from impact_posture.robot.postures import write_posture
-from impact_posture.settings import Against
 
 # Matplotlib and the C export are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
     from impact_posture.path.posture_path import PosturePath
-    from impact_posture.plot import ResultView, TradeOffData
-    from impact_posture.robot.robot import Robot
+    from impact_posture.plot import ResultView
 
 FORMATS = ("png",)
 
@@ -40,8 +38,6 @@ FinishRequest = tuple[
 ]  # fmt: skip
 Finished = tuple[int, int, "tuple[Export, str] | str | None"]
 Finish = Callable[[FinishRequest], Iterator[Finished]]
-# Exceptions from reading a changed or incomplete result.
-_BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, EOFError, BadZipFile, RecursionError)
 
 
 @dataclass(frozen=True)
@@ -147,7 +143,8 @@ def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finish
     folder, initial, optimal, path, mapped, document, codegen, formats, jobs, report, meshes = request
     # The C code comes first, because it takes longest.
     tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
-    view = _view(prepared, initial, optimal, path, document, _motion(folder, document, prepared.impact.robot), mapped)
+    motion = motion_of(folder, document, prepared.impact.robot)
+    view = result_view(prepared, initial, optimal, path, document, motion, mapped)
     tasks += _drawings(view, folder, formats)
     count = len(tasks) + report
     with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
@@ -196,140 +193,6 @@ def _drawings(view: ResultView, folder: Path, formats: Sequence[str]) -> list[Ca
     return [partial(draw_all, view, folder, formats, [name]) for name in drawable(view)]
 
 
-def _motion(folder: Path, document: dict[str, Any], robot: Robot) -> PosturePath | None:
-    """Read the path of a result folder, if it has one."""
-    if "path" not in document:
-        return None
-    from impact_posture.path.files import read_path
-
-    return read_path(folder, document["path"], robot)
-
-
-def result_view(
-    prepared: Prepared,
-    solution: PostureSolution,
-    document: dict[str, Any],
-    motion: PosturePath | None = None,
-    mapped: SelfMotionMap | None = None,
-) -> ResultView:
-    """Return the view of a solution, from which its figures are drawn."""
-    path = null_space_path(solution.problem, solution.initial, solution.q)
-    return _view(prepared, solution.initial, solution.q, path, document, motion, mapped)
-
-
-def _view(
-    prepared: Prepared,
-    initial: np.ndarray,
-    optimal: np.ndarray,
-    path: NullSpacePath,
-    document: dict[str, Any],
-    motion: PosturePath | None,
-    mapped: SelfMotionMap | None,
-) -> ResultView:
-    from impact_posture.plot import ResultView
-
-    impact, around = prepared.impact, prepared.problem.surroundings
-    return ResultView(
-        robot=impact.robot,
-        objective=impact.objective,
-        q_initial=initial,
-        q_optimal=optimal,
-        speed=impact.speed,
-        restitution=impact.restitution,
-        path=path,
-        tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
-        collisions=_collisions(prepared, initial, optimal),
-        depths=() if around is None else tuple(around.depth(c) for c in impact.objective.contacts),
-        motion=motion,
-        self_motion=mapped,
-    )
-
-
-def _collisions(prepared: Prepared, *postures: np.ndarray) -> Any:
-    """Shapes that touch at each of two postures, for an optimization that does not keep them apart."""
-    if prepared.problem.surroundings is not None:
-        return (), ()
-    from impact_posture.collision.mesh_check import mesh_collisions
-    from impact_posture.collision.shapes import load_shapes
-
-    shapes = load_shapes(prepared.impact.robot)
-    return tuple(mesh_collisions(prepared.impact.robot, shapes, q) for q in postures)
-
-
-def _tradeoff_data(points: Sequence[dict[str, Any]], against: Against) -> TradeOffData | None:
-    """Return the ``tradeoff`` of a ``result.json`` as arrays; ``None`` for fewer than two points."""
-    from impact_posture.plot import TradeOffData
-
-    if len(points) < 2:
-        return None
-    keys = ("within", "distance", "objective", "H", "G", "V", "S")
-    columns = {key: np.array([np.nan if p[key] is None else p[key] for p in points], dtype=float) for key in keys}
-    knee = next((k for k, p in enumerate(points) if p["knee"]), None)
-    certified = np.array([bool(p["certified"]) for p in points])
-    return TradeOffData(**columns, certified=certified, knee=knee, against=against)
-
-
 def _write_json(path: Path, document: dict[str, object]) -> None:
     # allow_nan=False: a result with NaN must fail here and not in the program that reads it.
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def load_view(folder: Path) -> ResultView:
-    """Read the view of a result folder, from which its figures are drawn.
-
-    Raises:
-        SpecError: The folder is no result folder, or was made with another robot model.
-    """
-    return _load(folder)[1]
-
-
-def rewrite_report(folder: Path, *, meshes: bool = False) -> Path:
-    """Write ``report.html`` of a result folder again; return its path.
-
-    Raises:
-        SpecError: As :func:`load_view`.
-        OutputError: It cannot be written.
-    """
-    from impact_posture.report.result_report import write_result_report
-
-    loaded = _load(folder)
-    try:
-        return write_result_report(folder, *loaded, meshes=meshes)
-    except _BROKEN as error:
-        raise _broken(folder, error) from None
-
-
-def _load(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
-    """Read problem, view and ``result.json`` of a result folder."""
-    if not (folder / "result.json").is_file():
-        raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
-    try:
-        document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-        prepared = prepare(read_settings(folder / "problem.toml"))
-        with np.load(folder / "result.npz") as arrays:
-            path = NullSpacePath(
-                **{key: arrays[f"path_{key}"] for key in ("q", "s", "H", "G", "V", "S", "objective")}
-            )
-            names = [field.name for field in fields(SelfMotionMap)] if "self_motion_q" in arrays else []
-            mapped = SelfMotionMap(**{name: arrays[f"self_motion_{name}"] for name in names}) if names else None
-        robot, recorded = prepared.impact.robot, str(document["robot"]["model_sha256"])
-        if recorded != robot.model_sha256:
-            raise SpecError(
-                f"was made with another model of {robot.name} (sha256 {recorded[:12]}…)",
-                where=str(folder),
-                hint="run optimize again, or use the URDF and armature of that result",
-            )
-        initial, optimal = (
-            robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
-            for key in ("initial", "optimal")
-        )
-        motion = _motion(folder, document, robot)
-        view = _view(prepared, initial, optimal, path, document, motion, mapped)
-        return prepared, view, document
-    except _BROKEN as error:
-        raise _broken(folder, error) from None
-
-
-def _broken(folder: Path, error: Exception) -> SpecError:
-    what = f"is no whole result ({type(error).__name__}: {error})"
-    return SpecError(what, where=str(folder), hint="run optimize again")

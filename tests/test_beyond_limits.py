@@ -20,7 +20,7 @@ from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.resolved_impact import resolve
 from impact_posture.posture.problem_settings import read_settings
-from impact_posture.result_folder import load_view
+from impact_posture.result_view import load_view
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.spec import read_spec
 from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM, build_model

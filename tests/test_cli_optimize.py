@@ -16,7 +16,7 @@ import pytest
 
 from impact_posture import plot
 from impact_posture.plot.view import header_lines
-from impact_posture.result_folder import load_view
+from impact_posture.result_view import load_view
 from tests.command import ALL_PICTURES, on_terminal, read_terminal, refused, run, start
 
 COMMAND = Path(sys.executable).parent / "impact-posture"

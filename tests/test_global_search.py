@@ -17,7 +17,7 @@ from impact_posture.posture.global_search import GlobalSearch, search_globally
 from impact_posture.posture.missed_optima import estimated_optima, unseen_share
 from impact_posture.posture.problem_settings import prepare, read_settings
 from impact_posture.posture.solve import solve
-from impact_posture.result_folder import load_view
+from impact_posture.result_view import load_view
 from tests.command import refused, run
 from tests.settings import make_settings
 from tests.test_docs_reference import DOCS, rows

@@ -19,13 +19,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import impact_posture as ip
-from impact_posture.impact.coulomb_contacts import coulomb_jump
+from impact_posture.impact.coulomb_contacts import coulomb_jump, coulomb_jumps
 from impact_posture.report.page import Content, Table, render
 from impact_posture.report.result_report import result_scene
 from impact_posture.report.run_report import thin
 from impact_posture.report.scene import Scene
 from impact_posture.report.shapes import draw_robot
-from impact_posture.result_folder import _load
+from impact_posture.result_view import load_result, rewrite_report
 from impact_posture.robot.robot_loader import locate
 from impact_posture.robot.urdf import parse_urdf
 from impact_posture.simulation.series import Series, Window
@@ -47,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def scene(folder: Path) -> Scene:
-    prepared, view, _ = _load(folder)
+    prepared, view, _ = load_result(folder)
     return result_scene(prepared, view)
 
 
@@ -58,6 +58,7 @@ class Reader(HTMLParser):
         super().__init__()
         self.tags: list[tuple[str, dict[str, str | None]]] = []
         self.texts: dict[str, list[str]] = {}
+        self.packed: dict[str, str] = {}
         self.feed(page)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -65,7 +66,10 @@ class Reader(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         if self.tags:
-            self.texts.setdefault(self.tags[-1][0], []).append(data)
+            tag, attributes = self.tags[-1]
+            self.texts.setdefault(tag, []).append(data)
+            if tag == "script":
+                self.packed.setdefault(attributes.get("id") or "", data)
 
 
 def arrays(page: str) -> tuple[dict[str, Any], bytes]:
@@ -93,7 +97,9 @@ def test_the_page_holds_the_result_and_reaches_nothing(folder: Path) -> None:
     assert "jump" in found.texts["figcaption"] and sum(tag == "img" for tag, _ in found.tags) == len(
         list(folder.glob("*.png"))
     )
-    assert "impact-posture optimize problem.toml" in found.texts["code"]
+    # The words that the user typed.
+    command = found.texts["code"][0]
+    assert command.startswith("impact-posture optimize tilthex_arm --frame ee --normal 0 0 1 --starts 1")
     assert (folder / "problem.toml").read_text().split("\n")[0] in "".join(found.texts["pre"])
     # Nothing is loaded: no address but those within the page.
     for _, attributes in found.tags:
@@ -101,10 +107,13 @@ def test_the_page_holds_the_result_and_reaches_nothing(folder: Path) -> None:
             assert (attributes.get(name) or "data:").startswith("data:")
     (policy,) = [a["content"] or "" for t, a in found.tags if t == "meta" and "http-equiv" in a]
     assert policy.startswith("default-src 'none';") and "unsafe" not in policy and "http" not in policy
-    for kind, text in (("script", page.rpartition("<script>")[2].partition("</script>")[0]),
-                       ("style", page.partition("<style>")[2].partition("</style>")[0])):  # fmt: skip
-        assert f"{kind}-src 'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" in policy
-    assert "MIT License" in page and "three.js authors" in page
+    loader, style = (page.rpartition(f"<{tag}>")[2].partition(f"</{tag}>")[0] for tag in ("script", "style"))
+    # Only the loader and the viewer that it unpacks may run.
+    viewer = gzip.decompress(base64.b64decode(found.packed["viewer"])).decode()
+    hashes = [f"'sha256-{base64.b64encode(hashlib.sha256(t.encode()).digest()).decode()}'" for t in (loader, viewer)]
+    assert f"script-src {' '.join(hashes)};" in policy
+    assert f"style-src 'sha256-{base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()}'" in policy
+    assert "three.js authors" in viewer and "MIT License" in page
 
 
 def test_commands(folder: Path, tmp_path: Path) -> None:
@@ -133,12 +142,64 @@ def test_a_result_is_kept_without_its_report(tmp_path: Path, monkeypatch: pytest
     result = ip.optimize(
         ip.PostureProblem(ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1)))), starts=1, jobs=1
     )
-    monkeypatch.setattr("impact_posture.report.result_report.write_page", fail)
     monkeypatch.setattr("impact_posture.result_folder._drawings", lambda *_: [])
-    written = result.save(tmp_path / "out", codegen=False, jobs=1)
+    with monkeypatch.context() as patch:
+        patch.setattr("impact_posture.report.result_report.write_page", fail)
+        written = result.save(tmp_path / "out", codegen=False, jobs=1)
     assert written.report_error == "RuntimeError: no room"
     assert (tmp_path / "out" / "posture.json").is_file() and not (tmp_path / "out" / "report.html").exists()
     assert not result.save(tmp_path / "bare", codegen=False, report=False, jobs=1).report_error
+    # Where no command line made it, the page has the one that makes it again, and names options all the same.
+    assert not rewrite_report(tmp_path / "bare").name.startswith(".")
+    page = (tmp_path / "bare" / "report.html").read_text()
+    assert Reader(page).texts["code"][0] == "impact-posture optimize problem.toml"
+
+
+def test_parameters_are_options_on_the_page(scene: Scene) -> None:
+    content = Content("", "", (), ("`objective='coulomb'` minimizes this jump", "`max_force`"), (), "", ("`meshes`",))
+    texts = Reader(render(content, Packed(**vars(scene)), ())).texts
+    assert "--objective coulomb minimizes this jump" in texts["p"] and "--max-force" in texts["p"]
+    assert "--meshes" in texts["li"]
+
+
+def test_every_contact_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("impact_posture.result_folder._drawings", lambda *_: [])
+    robot = ip.load_robot("solo12")
+    contacts = [ip.ImpactContact(foot, (0, 0, 1)) for foot in ("FL_FOOT", "HR_FOOT")]
+    feet = tuple(ip.Support(foot) for foot in ("FR_FOOT", "HL_FOOT"))
+    objective = ip.ImpactObjective(robot, contacts[0], others=(contacts[1],), supports=feet)
+    problem = ip.PostureProblem(objective, contact_pose="position", collision=False)
+    result = ip.optimize(problem, starts=1, jobs=1, compile="never")
+    result.save(tmp_path / "out", codegen=False, report=False, jobs=1)
+    # A jump takes 15 ms.
+    monkeypatch.setattr(
+        "impact_posture.report.result_report._way", lambda view: (np.arange(2.0), "", view.path.q[:2])
+    )
+    prepared, view, _ = load_result(tmp_path / "out")
+    scene = result_scene(prepared, view)
+    packed, arrays = json.loads(scene.pack()[0]), gzip.decompress(base64.b64decode(scene.pack()[1]))
+    model, data, (track,) = robot.model, robot.model.createData(), packed["tracks"]
+    q = scene.tracks[0].q[-1]
+    pin.framesForwardKinematics(model, data, q)
+    at = levels(track["points"], arrays)[-1].reshape(2, 3)
+    assert np.allclose(at, [data.oMf[robot.frame_id(one.frame)].translation for one in contacts], atol=1e-4)
+    # Each ellipsoid squared is Λ_c of its contact, and the arrow is the jump of both together.
+    for own, single in zip(
+        levels(track["ellipsoids"], arrays)[-1].reshape(2, 6), view.objective.singles, strict=True
+    ):
+        root = np.zeros((3, 3))
+        root[np.triu_indices(3)] = root.T[np.triu_indices(3)] = own
+        expected = single.oracle.quantities(q).ellipsoid
+        assert np.allclose(root @ root, expected, atol=1e-2 * np.abs(expected).max())
+    both = coulomb_jumps(view.objective, q, view.speed)
+    assert both is not None and np.allclose(scene.tracks[0].jumps[-1], both[0].velocity)
+    assert [foot["joint"] for foot in packed["feet"]] == [
+        model.frames[robot.frame_id(foot.frame)].parentJoint for foot in feet
+    ]
+    page = rewrite_report(tmp_path / "out").read_text()
+    captions = Reader(page).texts["caption"]
+    assert "Before and after, at FL_FOOT" in captions and "Before and after, at HR_FOOT" in captions
+    assert "H at FL_FOOT" in page and "impulse at HR_FOOT" in page and "contacts at once" in page
 
 
 def written(text: str, scene: Scene) -> str:
@@ -170,7 +231,7 @@ def test_texts_stay_texts(scene: Scene, text: str) -> None:
 def test_the_viewer_gets_the_robot_where_it_is(folder: Path) -> None:
     page = (folder / "report.html").read_text()
     packed, buffer = arrays(page)
-    _, view, _ = _load(folder)
+    _, view, _ = load_result(folder)
     (track,), model = packed["tracks"], view.robot.model
     poses = levels(track["poses"], buffer).reshape(-1, model.njoints - 1, 7)
     jumps = levels(track["jumps"], buffer).reshape(len(poses), model.njoints, 3)

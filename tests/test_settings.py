@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from impact_posture.errors import ImpactPostureError, SpecError
+from impact_posture.option_names import as_options, option_of
 from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.setting import Setting
 from impact_posture.settings import ProblemSettings
 from impact_posture.tables import validate
 from impact_posture_cli.app import build
-from impact_posture_cli.option_names import as_options, option_of
 from impact_posture_cli.settings_options import _settings_of
 from tests.command import run
 

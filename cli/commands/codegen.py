@@ -40,7 +40,7 @@ def codegen(
     objectives: list[ImpactObjective]
     warnings: tuple[str, ...] = ()
     if from_result:
-        from impact_posture.result_folder import load_view
+        from impact_posture.result_view import load_view
 
         view = load_view(Path(robot))
         objectives, posture = [view.objective], view.q_optimal

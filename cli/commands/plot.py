@@ -36,7 +36,8 @@ def plot(
     """Run ``impact-posture plot``."""
     from impact_posture.output_folder import add_to_record
     from impact_posture.plot import draw_all
-    from impact_posture.result_folder import FORMATS, load_view
+    from impact_posture.result_folder import FORMATS
+    from impact_posture.result_view import load_view
 
     folder = Path(result_dir)
     into = Path(out) if out else folder

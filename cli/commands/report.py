@@ -32,7 +32,7 @@ def report(
     if any((place / name).is_file() for name in ("run.json", "comparison.json")):
         from impact_posture.experiment.run_reports import write_run_report as rewrite
     else:
-        from impact_posture.result_folder import rewrite_report as rewrite
+        from impact_posture.result_view import rewrite_report as rewrite
     with progress("writing", shown=not (quiet or json)):
         written = rewrite(place, meshes=meshes)
     add_to_record(place, [written])

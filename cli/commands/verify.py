@@ -85,7 +85,7 @@ def verify(
 def _of_result(folder: Path) -> ResolvedImpact:
     """Return the impact of a result folder at the optimal posture."""
     from impact_posture.impact.resolved_impact import ResolvedImpact
-    from impact_posture.result_folder import load_view
+    from impact_posture.result_view import load_view
 
     view = load_view(folder)
     return ResolvedImpact(view.objective, view.q_optimal, "the result's optimum", view.speed, view.restitution)

@@ -15,6 +15,7 @@ from impact_posture.experiment.batch import Document, Store
 from impact_posture.experiment.figures import run_view
 from impact_posture.experiment.jobs import Job, controller_factory
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.output_folder import typed_command
 from impact_posture.plot.run_view import RunView, run_header
 from impact_posture.plot.view import number
 from impact_posture.report.page import Content, Table, write_page
@@ -85,13 +86,13 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
         if (folder / SIMULATION).is_file():
             document = _read(folder / SIMULATION)
             runs = _runs(document, folder / "series", scenario, len(document["runs"]))
-            content = _run_content(document, runs[0][0], _job(document, scenario))
+            content = _run_content(folder, document, runs[0][0], _job(document, scenario))
         else:
             document, runs = _read(folder / COMPARISON), []
             for stem in (_stem(row["controller"]) for row in document["rows"]):
                 if (folder / RUNS / f"{stem}.json").is_file():
                     runs += _runs(_read(folder / RUNS / f"{stem}.json"), folder / RUNS / stem, scenario, 1)
-            content = _comparison_content(document, runs[0][0])
+            content = _comparison_content(folder, document, runs[0][0])
         return write_page(folder, content, run_scene(runs, meshes=meshes))
     except _BROKEN as error:
         what = f"holds no whole run or comparison ({type(error).__name__}: {error})"
@@ -134,7 +135,7 @@ def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tup
     return found
 
 
-def _run_content(document: Document, view: RunView, job: Job) -> Content:
+def _run_content(folder: Path, document: Document, view: RunView, job: Job) -> Content:
     scenario = controller_factory(job.scenario, job.free).setup.scenario
     options = ["simulate", job.scenario, "--controller", job.controller, "--seed", str(job.seed)]
     options += ["--mode", "held"] * (job.mode == "held") + ["--free"] * job.free
@@ -151,7 +152,7 @@ def _run_content(document: Document, view: RunView, job: Job) -> Content:
         )
     return Content(
         title=run_header([view])[0],
-        command=shlex.join(["impact-posture", *options]),
+        command=typed_command(folder) or shlex.join(["impact-posture", *options]),
         facts=tuple(run_header([view])[1]),
         verdict=tuple(verdict),
         tables=(Table("Metrics", ("", "value", "unit", "meaning"), tuple(rows)),),
@@ -165,7 +166,7 @@ def _summary(metrics: Mapping[str, Any]) -> str:
     return f"the impacts change the velocity by up to {jump} (m/s and rad/s), with forces of up to {force} N"
 
 
-def _comparison_content(document: Document, view: RunView) -> Content:
+def _comparison_content(folder: Path, document: Document, view: RunView) -> Content:
     rows = document["rows"]
     labels = [str(row["controller"]) for row in rows]
     table = [("status", *(str(row["status"]) for row in rows), "", "")]
@@ -180,15 +181,14 @@ def _comparison_content(document: Document, view: RunView) -> Content:
         f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
     )
     seeds = str(len(document["seeds"]))
+    means = f"Means of {seeds} seeds, with 95 % intervals" if seeds != "1" else "One seed"
     command = ["impact-posture", "compare", view.scenario, "--controllers", ",".join(labels), "--seeds", seeds]
     return Content(
         title=f"{document['scenario']}: {', '.join(labels)}",
-        command=shlex.join(command),
+        command=typed_command(folder) or shlex.join(command),
         facts=tuple(run_header([view])[1]),
         verdict=(line, *(f"{row['controller']}: {reason}" for row in rows for reason in row["failed"])),
-        tables=(
-            Table(f"Means of {seeds} seeds, with 95 % intervals", ("", *labels, "unit", "meaning"), tuple(table)),
-        ),
+        tables=(Table(means, ("", *labels, "unit", "meaning"), tuple(table)),),
         moves=f"{_MOVES} The runs are those of the first seed.",
         notes=(),
     )

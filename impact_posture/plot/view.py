@@ -29,8 +29,12 @@ if TYPE_CHECKING:
     from impact_posture.posture.global_search import SelfMotionMap
     from impact_posture.posture.null_space_path import NullSpacePath
 
-# Separator of the facts in a header line.
+ALONE = "numbers and ellipsoids"
+"""Begin of the fact that says which of several contacts the figures show."""
+
 SEPARATOR = "  ·  "
+"""Separator of the facts in a header line."""
+
 _UNITS = {"H": "‖Δν‖²/(N·s)²", "G": "1/kg", "V": "‖Δν‖²/(m/s)²", "S": "‖Δν‖²/(m/s)²", "E": "kg"}
 
 
@@ -190,7 +194,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
         f"armature {_armature(robot)}",
     ]
     if view.objective.others:
-        facts.insert(0, f"numbers and ellipsoids: {contact.frame} alone; objective: all contacts together")
+        facts.insert(0, f"{ALONE}: {contact.frame} alone; objective: all contacts together")
     if count := len(view.objective.model_variants):
         facts.insert(0, f"drawn and in numbers: the model as it stands; objective the worst of {count}")
     feet = [s.frame for s in view.objective.supports]

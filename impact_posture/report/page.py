@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from impact_posture.escape import printable
+from impact_posture.option_names import as_options
 from impact_posture.output_folder import write_whole
 from impact_posture.plot.view import number
 from impact_posture.report import REPORT
-from impact_posture.report.scene import Scene, Track
+from impact_posture.report.scene import Scene, Track, zipped
 from impact_posture.version import __version__
 
 _VIEWER = Path(__file__).parent / "viewer"
@@ -82,13 +83,15 @@ def write_page(folder: Path, content: Content, scene: Scene) -> Path:
 def render(content: Content, scene: Scene, pictures: Sequence[tuple[str, str]]) -> str:
     """Return the page.  Each text of it is escaped, and it may load nothing and run nothing but its own viewer."""
     packed, arrays = scene.pack()
-    viewer, style = ((_VIEWER / name).read_text(encoding="utf-8") for name in ("viewer.min.js", "page.css"))
+    names = ("viewer.min.js", "loader.js", "page.css")
+    viewer, loader, style = ((_VIEWER / name).read_text(encoding="utf-8") for name in names)
     # Scripts end at "</", wherever it stands.
     data = packed.replace("<", "\\u003c")
     text: str = _template().render(
-        content=content, scene=scene, pictures=pictures, data=data, arrays=arrays, viewer=viewer, style=style,
+        content=content, scene=scene, pictures=pictures, data=data, arrays=arrays, style=style, loader=loader,
+        viewer=zipped(viewer.encode()), license=viewer.partition("*/")[0].partition("/*!")[2].strip(),
         version=__version__, charts=[_charts(track) for track in scene.tracks],
-        hashes={"script": _hash(viewer), "style": _hash(style)},
+        hashes={"viewer": _hash(viewer), "loader": _hash(loader), "style": _hash(style)},
     )  # fmt: skip
     return text
 
@@ -126,10 +129,13 @@ def _template() -> Any:
         return printable(value, keep="\n\t") if isinstance(value, str) and not isinstance(value, Markup) else value
 
     # Every text is escaped, and stripped of what turns the direction of writing.
-    return Environment(
+    environment = Environment(
         loader=FileSystemLoader(_VIEWER), autoescape=True, undefined=StrictUndefined, finalize=shown,
         trim_blocks=True, lstrip_blocks=True,
-    ).get_template("page.html.jinja")  # fmt: skip
+    )  # fmt: skip
+    # The page names the command that makes it, so messages name its options.
+    environment.filters["options"] = as_options
+    return environment.get_template("page.html.jinja")
 
 
 def _charts(track: Track) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,13 @@ import numpy as np
 from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
-from impact_posture.impact.coulomb_contacts import coulomb_jump
-from impact_posture.impact.quantity_table import quantity_rows
-from impact_posture.plot.view import SEPARATOR, ResultView, header_lines, number
+from impact_posture.impact.coulomb_contacts import coulomb_jump, coulomb_jumps
+from impact_posture.impact.quantity_table import QuantityRow, quantities, quantity_rows
+from impact_posture.output_folder import typed_command
+from impact_posture.plot.view import ALONE, SEPARATOR, ResultView, header_lines, number
 from impact_posture.posture.problem_settings import Prepared
 from impact_posture.report.page import Content, Table, write_page
-from impact_posture.report.scene import Scene, Track, impact_curves
+from impact_posture.report.scene import Curve, Scene, Track, impact_curves
 from impact_posture.report.shapes import draw_robot
 
 # Most frames of a way: more are not seen.
@@ -61,17 +63,44 @@ def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> 
 
 def _track(prepared: Prepared, view: ResultView) -> Track:
     times, unit, q = _way(view)
-    rebound, stiffness = (1 + view.restitution) * view.speed, prepared.impact.contact_stiffness
-    found, jumps, impulses = [view.objective.oracle.quantities(one) for one in q], [], []
-    for one, at in zip(found, q, strict=True):
-        jump = coulomb_jump(view.objective, at, rebound)
-        smooth = rebound / one.G if one.G > 0 else 0.0
-        jumps.append(smooth * one.jump if jump is None else jump.velocity)
-        impulses.append(smooth if jump is None else jump.impulse_size)
-    curves = [*impact_curves(found, prepared.impact.metric), ("impulse", "N·s", np.array(impulses))]
-    if stiffness is not None:
-        curves.append(("peak force", "N", np.array([stiffness.peak_force(one.G, view.speed) for one in found])))
-    return Track("", times, unit, q, found, np.array(jumps), tuple(curves))
+    objective, stiffness = view.objective, prepared.impact.contact_stiffness
+    found = [[single.oracle.quantities(at) for at in q] for single in objective.singles]
+    jumps, impulses = _jumps(view, q)
+    curves: list[Curve] = []
+    for contact, own, sizes in zip(objective.contacts, found, impulses.T, strict=True):
+        where = f" at {contact.frame}" if objective.others else ""
+        curves += [*impact_curves(own, prepared.impact.metric, where), (f"impulse{where}", "N·s", sizes)]
+        if stiffness is not None:
+            peaks = np.array([stiffness.peak_force(one.G, view.speed) for one in own])
+            curves.append((f"peak force{where}", "N", peaks))
+    return Track("", times, unit, q, found, jumps, tuple(curves))
+
+
+def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
+    """Return the jumps at postures, shape (n, nv), and the impulse of each contact, N·s, shape (n, contacts).
+
+    They are those of all contacts at once, or else of the leading contact alone.  What is unknown is a jump of zero
+    and an impulse of NaN.
+    """
+    objective, rebound, together = view.objective, (1 + view.restitution) * view.speed, _together(view)
+    jumps = np.zeros((len(postures), objective.robot.nv))
+    impulses = np.full((len(postures), len(objective.contacts)), np.nan)
+    for k, q in enumerate(postures):
+        if together:
+            several = coulomb_jumps(objective, q, view.speed) or ()
+            for i, one in enumerate(several):
+                jumps[k], impulses[k, i] = one.velocity, one.impulse_size
+        elif (jump := coulomb_jump(objective, q, rebound)) is not None:
+            jumps[k], impulses[k, 0] = jump.velocity, jump.impulse_size
+        elif (alone := objective.oracle.quantities(q)).G > 0:
+            jumps[k], impulses[k, 0] = rebound / alone.G * alone.jump, rebound / alone.G
+    return jumps, impulses
+
+
+def _together(view: ResultView) -> bool:
+    """Tell whether the jump of several contacts at once is known at the first and the last posture."""
+    ends = (view.q_initial, view.q_optimal)
+    return bool(view.objective.others) and all(coulomb_jumps(view.objective, q, view.speed) for q in ends)
 
 
 def _way(view: ResultView) -> tuple[Array, str, Array]:
@@ -88,7 +117,7 @@ def _way(view: ResultView) -> tuple[Array, str, Array]:
 
 def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[str, Any]) -> Content:
     title, small = header_lines(view)
-    rows = quantity_rows(prepared.impact, document["initial"], document["optimal"])
+    facts = [fact for fact in small[0].split(SEPARATOR) if not fact.startswith(ALONE)]
     certificate, solver = document["certificate"], document["solver"]
     checks = [
         ("stationarity", certificate["stationarity"], ""),
@@ -100,15 +129,11 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
     active = [f"active: {one['constraint']}, {one['side']}" for one in document["active"]]
     return Content(
         title=title,
-        command="impact-posture optimize problem.toml",
-        facts=tuple(small[0].split(SEPARATOR)),
+        command=typed_command(folder) or "impact-posture optimize problem.toml",
+        facts=tuple(facts),
         verdict=(document["verdict"]["line"], *document["verdict"]["advice"]),
         tables=(
-            Table(
-                "Before and after",
-                ("", "before", "after", "unit", "meaning"),
-                tuple((row.key, number(row.before), number(row.after), row.unit, row.meaning) for row in rows),
-            ),
+            *_before_and_after(prepared, document),
             Table(
                 f"Certificate, recomputed with {certificate['recomputed_with']}",
                 ("", "value", "unit"),
@@ -125,10 +150,28 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
     )  # fmt: skip
 
 
+def _before_and_after(prepared: Prepared, document: dict[str, Any]) -> Iterator[Table]:
+    """Yield the table of the impact, and that of each further contact."""
+    blocks, contacts = [document[key] for key in ("initial", "optimal")], prepared.impact.objective.contacts
+    for k, contact in enumerate(contacts):
+        if k == 0:
+            rows = quantity_rows(prepared.impact, *blocks)
+        else:
+            own = [block["by_contact"][k] for block in blocks]
+            named = quantities(prepared.impact.metric)
+            rows = [QuantityRow(key, own[0][key], own[1][key], unit, words) for key, unit, words in named]
+        yield Table(
+            f"Before and after{f', at {contact.frame}' if len(contacts) > 1 else ''}",
+            ("", "before", "after", "unit", "meaning"),
+            tuple((row.key, number(row.before), number(row.after), row.unit, row.meaning) for row in rows),
+        )
+
+
 def _moves(view: ResultView, document: dict[str, Any]) -> str:
     arrows = "The orange arrows show the predicted velocity jump at the stated speed and friction"
     if view.objective.others:
-        arrows += f", of the impact at {view.objective.contact.frame} alone"
+        alone = f"of the impact at {view.objective.contact.frame} alone"
+        arrows += f", {'of the plastic impact at all contacts at once' if _together(view) else alone}"
     if view.motion is not None and len(view.motion.t) > 1:
         end = "the optimum" if document["path"]["found"] else "the best posture that was reached"
         return f"The slider follows the motion of --path from the initial posture to {end}, over time. {arrows}."

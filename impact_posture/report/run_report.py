@@ -79,4 +79,4 @@ def _track(view: RunView, objective: ImpactObjective) -> Track:
     found = [objective.oracle.quantities(q) for q in view.q]
     force = ("largest normal force", "N", view.peak)
     curves = (*impact_curves(found, objective.metric), force)
-    return Track(view.name, view.t, "s", view.q, found, jumps, curves, view.force)
+    return Track(view.name, view.t, "s", view.q, [found], jumps, curves, view.force)

@@ -42,7 +42,7 @@ class Track:
         times: Times, s, or the way along a path, rad mixed with m, increasing, shape (frames,).
         unit: ``s`` for times; empty for a way.
         q: Configurations, shape (frames, nq).
-        found: Quantities of the impact at each frame.
+        found: Quantities of the impact at each frame, for each contact.
         jumps: Velocity jump ``Δν``, shape (frames, nv).
         curves: Curves, NaN where undefined.
         forces: Contact force on the robot, world, N, shape (frames, 3); ``None`` to show none.
@@ -52,7 +52,7 @@ class Track:
     times: Array
     unit: str
     q: Array
-    found: Sequence[ImpactQuantities]
+    found: Sequence[Sequence[ImpactQuantities]]
     jumps: Array
     curves: tuple[Curve, ...]
     forces: Array | None = None
@@ -87,8 +87,10 @@ class Scene:
         for kind, point, n in self.planes:
             at = center + n * ((point - center) @ n) if kind == "ground" else point
             walls.append({"kind": kind, "point": at, "normal": n, "size": 0.75 * size})
-        slants = np.abs(_EYES @ self.tracks[0].found[0].normal / np.linalg.norm(_EYES[0]) - _SLANT)
-        axes = (float(np.linalg.norm(one.ellipsoid, 2)) ** 0.5 for track in self.tracks for one in track.found)
+        slants = np.abs(_EYES @ self.tracks[0].found[0][0].normal / np.linalg.norm(_EYES[0]) - _SLANT)
+        each = (one for track in self.tracks for found in track.found for one in found)
+        axes = (float(np.linalg.norm(one.ellipsoid, 2)) ** 0.5 for one in each)
+        feet = [point_on(self.objective.robot, foot.frame, foot.offset) for foot in self.objective.supports]
         joints = zip(model.parents, model.inertias, strict=True)
         content = {
             "joints": [{"parent": int(parent), "center": inertia.lever} for parent, inertia in joints],
@@ -97,6 +99,8 @@ class Scene:
                 for joint, solid, at, color in self.drawn.parts
             ],
             "shapes": [_solid(solid) for solid in (*self.drawn.solids, *map(hull_of, self.bodies))],
+            "contacts": len(self.objective.contacts),
+            "feet": [{"joint": foot.joint, "point": foot.position} for foot in feet],
             "walls": walls,
             "tracks": tracks,
             "ghost": self.ghost,
@@ -112,14 +116,14 @@ class Scene:
         return _packed(content)
 
     def _track(self, track: Track) -> dict[str, Any]:
-        robot, contact, frames = self.objective.robot, self.objective.contact, len(track.q)
-        data, point = robot.model.createData(), point_on(robot, contact.frame, contact.offset)
-        poses, at = np.empty((frames, robot.model.njoints - 1, 7)), np.empty((frames, 3))
+        robot, frames, data = self.objective.robot, len(track.q), self.objective.robot.model.createData()
+        points = [point_on(robot, contact.frame, contact.offset) for contact in self.objective.contacts]
+        poses, at = np.empty((frames, robot.model.njoints - 1, 7)), np.empty((frames, len(points), 3))
         arrows = np.zeros((frames, robot.model.njoints, 3))
         for k, (q, jump) in enumerate(zip(track.q, track.jumps, strict=True)):
             pin.forwardKinematics(robot.model, data, q, jump)
             poses[k] = [pin.SE3ToXYZQUAT(placement) for placement in list(data.liMi)[1:]]
-            at[k] = data.oMi[point.joint].act(point.position)
+            at[k] = [data.oMi[point.joint].act(point.position) for point in points]
             for j in range(1, robot.model.njoints):
                 twist, lever = data.v[j], robot.model.inertias[j].lever
                 arrows[k, j] = data.oMi[j].rotation @ (twist.linear + np.cross(twist.angular, lever))
@@ -130,9 +134,11 @@ class Scene:
             "unit": track.unit,
             "times": track.times.astype(np.float32),
             "poses": _levels(poses.reshape(frames, -1)),
-            "points": _levels(at),
-            "normals": _levels(np.array([one.normal for one in track.found])),
-            "ellipsoids": _levels(np.array([root(one.ellipsoid)[np.triu_indices(3)] for one in track.found])),
+            "points": _levels(at.reshape(frames, -1)),
+            "normals": _rows([one.normal for one in found] for found in zip(*track.found, strict=True)),
+            "ellipsoids": _rows(
+                [root(one.ellipsoid)[np.triu_indices(3)] for one in found] for found in zip(*track.found, strict=True)
+            ),
             "jumps": _levels(arrows.reshape(frames, -1)),
             "largest_jump": _norm(arrows),
             "forces": None if track.forces is None else _levels(track.forces),
@@ -152,10 +158,11 @@ class Scene:
         return np.min(found, axis=0), np.max(found, axis=0)
 
 
-def impact_curves(found: Sequence[ImpactQuantities], metric: Metric) -> list[Curve]:
-    """Return the curves of H, V and S."""
+def impact_curves(found: Sequence[ImpactQuantities], metric: Metric, where: str = "") -> list[Curve]:
+    """Return the curves of H, V and S of a contact, with ``where`` behind their names."""
     units = {key: unit for key, unit, _ in quantities(metric)}
-    return [(name, units[name], np.array([getattr(one, name) for one in found], dtype=float)) for name in "HVS"]
+    columns = {name: np.array([getattr(one, name) for one in found], dtype=float) for name in "HVS"}
+    return [(name + where, units[name], values) for name, values in columns.items()]
 
 
 def _norm(vectors: Array) -> float:
@@ -172,6 +179,11 @@ def _solid(solid: Solid) -> dict[str, Any]:
     kind = np.uint16 if len(solid.corners) <= 65536 else np.uint32
     corners = {"values": _differences(solid.corners), "low": solid.low, "step": [solid.step] * 3}
     return {"corners": corners, "faces": _differences(solid.faces.astype(kind).reshape(-1, 1))}
+
+
+def _rows(frames: Iterable[list[Array]]) -> dict[str, Any]:
+    """Return the arrays of all contacts, a row for each frame, as :func:`_levels` does."""
+    return _levels(np.array([np.concatenate(each) for each in frames]))
 
 
 def _levels(columns: Array) -> dict[str, Any]:
@@ -200,6 +212,10 @@ def _packed(content: dict[str, Any]) -> tuple[str, str]:
         buffer.extend(array.tobytes())
         return [_TYPES[array.dtype.name], at, array.size]
 
-    # NaN is no JSON.  No time of day is in the buffer, so that the same result has the same page.
-    text = json.dumps(content, default=place, allow_nan=False)
-    return text, base64.b64encode(gzip.compress(bytes(buffer), 6, mtime=0)).decode("ascii")
+    # NaN is no JSON.
+    return json.dumps(content, default=place, allow_nan=False), zipped(bytes(buffer))
+
+
+def zipped(content: bytes) -> str:
+    """Return base64 of gzip, which the page unpacks; without the time, so that equal results have equal pages."""
+    return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode("ascii")

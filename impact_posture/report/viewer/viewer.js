@@ -16,8 +16,7 @@ const summed = (array, width) => { for (let i = width; i < array.length; i++) ar
 const levels = ({ values, low, step }) => Float32Array.from(summed(plain(values), low.length), (v, i) => low[i % low.length] + step[i % low.length] * v);
 
 async function load() {
-  const bytes = Uint8Array.from(atob($('arrays').textContent), (c) => c.charCodeAt(0));
-  buffer = await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'))).arrayBuffer();
+  buffer = await unpacked('arrays').arrayBuffer();
   data = JSON.parse($('scene').textContent);
   for (const t of data.tracks) {
     for (const key of ['poses', 'points', 'normals', 'ellipsoids', 'jumps', 'forces']) t[key] = t[key] && levels(t[key]);
@@ -81,11 +80,12 @@ function arrow(color, radius) {
   return group;
 }
 
-function ellipsoid(color, opacity, wireframe) {
+// The ellipsoid of contact i.
+function ellipsoid(i, color, opacity, wireframe) {
   const mesh = new Mesh(new SphereGeometry(1, ...(wireframe ? [14, 10] : [40, 24])), paint(color, opacity, { wireframe }));
   mesh.matrixAutoUpdate = false;
   mesh.place = () => {
-    const [a, b, c, d, e, f] = row(track.ellipsoids, 6).map((v) => v * data.scale.ellipsoid), [x, y, z] = row(track.points, 3);
+    const [a, b, c, d, e, f] = row(track.ellipsoids, 6, 6 * i).map((v) => v * data.scale.ellipsoid), [x, y, z] = row(track.points, 3, 3 * i);
     mesh.matrix.set(a, b, c, x, b, d, e, y, c, e, f, z, 0, 0, 0, 1);
   };
   return mesh;
@@ -104,9 +104,15 @@ function stage(renderer) {
   const scene = new Scene(), camera = new PerspectiveCamera(35, 1, 0.01 * data.size, 50 * data.size), canvas = $('view');
   scene.background = new Color(0xf4f6f8); camera.up.set(0, 0, 1);
   const shapes = data.shapes.map(geometry), body = robot(shapes, false), ghost = robot(shapes, true), walls = data.walls.map((one) => wall(one, shapes));
-  const normal = arrow(0x000000, 0.004 * data.size), force = arrow(0x0046a0, 0.008 * data.size), jumps = body.map(() => arrow(0xc24a00, 0.004 * data.size));
-  const now = ellipsoid(0x0072b2, 0.35, false), first = ellipsoid(0x883300, 0.45, true);
-  scene.add(body[0], ghost[0], ...walls, normal, force, ...jumps, now, first, new AmbientLight(0xffffff, 1.1));
+  const contacts = [...Array(data.contacts).keys()], normals = contacts.map(() => arrow(0x000000, 0.004 * data.size));
+  const force = arrow(0x0046a0, 0.008 * data.size), jumps = body.map(() => arrow(0xc24a00, 0.004 * data.size));
+  const now = contacts.map((i) => ellipsoid(i, 0x0072b2, 0.35, false)), first = contacts.map((i) => ellipsoid(i, 0x883300, 0.45, true));
+  const feet = data.feet.map(({ joint, point }) => {
+    const ball = new Mesh(new SphereGeometry(0.012 * data.size, 16, 12), paint(0x1b7f3b, 1, { depthTest: false }));
+    ball.position.set(...point); ball.renderOrder = 1; body[joint].add(ball);
+    return ball;
+  });
+  scene.add(body[0], ghost[0], ...walls, ...normals, force, ...jumps, ...now, ...first, new AmbientLight(0xffffff, 1.1));
   for (const [x, y, z, power] of [[3, -4, 6, 1.5], [-4, 3, 2, 0.8]]) { const sun = new DirectionalLight(0xffffff, power); sun.position.set(x, y, z); scene.add(sun); }
 
   const controls = new OrbitControls(camera, canvas);
@@ -129,22 +135,24 @@ function stage(renderer) {
   const on = (name) => $('layers').querySelector(`[name=${name}]`)?.checked ?? false;
   return () => {
     const moved = at > 0.02 * track.last, here = at;
-    if (data.ghost) { at = 0; pose(ghost); first.place(); at = here; }
-    pose(body); now.place();
-    const contact = vector(track.points);
-    normal.span(contact, vector(track.normals).multiplyScalar(0.25 * data.size));
+    if (data.ghost) { at = 0; pose(ghost); for (const one of first) one.place(); at = here; }
+    pose(body); for (const one of now) one.place();
+    normals.forEach((one, i) => one.span(vector(track.points, 3 * i), vector(track.normals, 3 * i).multiplyScalar(0.25 * data.size)));
     jumps.forEach((one, k) => {
       one.span(body[k].localToWorld(new Vector3(...data.joints[k].center)), vector(track.jumps, 3 * k).multiplyScalar(data.scale.jump));
       one.visible &&= on('jumps');
     });
     if (track.forces) { // The length grows with the root, so that a contact that is held is seen beside an impact.
       const f = vector(track.forces), along = f.clone().multiplyScalar(data.scale.force / Math.sqrt(f.length() || 1));
-      force.span(contact.sub(along), along);
+      force.span(vector(track.points).sub(along), along);
     }
-    force.visible &&= !!track.forces && on('force'); normal.visible = on('surface'); body[0].visible = on('robot'); now.visible = on('ellipsoids');
+    force.visible &&= !!track.forces && on('force'); body[0].visible = on('robot');
     // At the first frame the robot before and the robot now are the same, and would flicker.
-    ghost[0].visible = data.ghost && moved && on('ghost'); first.visible = data.ghost && moved && on('ellipsoids');
-    for (const one of walls) one.visible = on('surface');
+    ghost[0].visible = data.ghost && moved && on('ghost');
+    for (const one of first) one.visible = data.ghost && moved && on('ellipsoids');
+    for (const one of now) one.visible = on('ellipsoids');
+    for (const one of [...walls, ...normals]) one.visible = on('surface');
+    for (const one of feet) one.visible = on('feet');
     renderer.render(scene, camera); document.documentElement.dataset.ready = 'drawn';
   };
 }
