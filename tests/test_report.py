@@ -19,10 +19,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import impact_posture as ip
+from impact_posture.experiment.run_reports import thin
 from impact_posture.impact.coulomb_contacts import coulomb_jump, coulomb_jumps
 from impact_posture.report.page import Content, Table, render
 from impact_posture.report.result_report import result_scene
-from impact_posture.report.run_report import thin
 from impact_posture.report.scene import Scene
 from impact_posture.report.shapes import draw_robot
 from impact_posture.result_view import load_result, rewrite_report

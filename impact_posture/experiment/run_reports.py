@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from impact_posture.errors import ImpactPostureError, SpecError, one_line
+import numpy as np
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import ImpactPostureError, InputError, SpecError, one_line
 from impact_posture.escape import file_name
 from impact_posture.experiment.batch import Document, Store
 from impact_posture.experiment.figures import run_view
 from impact_posture.experiment.jobs import Job, controller_factory
+from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.output_folder import typed_command
-from impact_posture.plot.run_view import RunView, run_header
+from impact_posture.plot.run_view import RunView, Span, run_header
 from impact_posture.plot.view import number
 from impact_posture.report.page import Content, Table, write_page
-from impact_posture.report.run_report import run_scene, thin
+from impact_posture.report.scene import Scene, Track, impact_curves
+from impact_posture.report.shapes import draw_robot
 from impact_posture.simulation.scenario_file import known_scenarios, scenario_path
 from impact_posture.simulation.series import Series, Window
 
@@ -34,6 +39,10 @@ _METRICS = (
     ("peak_force", "N", "largest normal force in the impact windows"),
     ("slip", "m", "way that the contact slid in the impact windows"),
 )
+# Time between frames in impact windows and elsewhere, s.
+_FINE, _COARSE = 0.001, 0.025
+# No position of a robot that is under control is larger, m or rad.
+_AWAY = 1e3
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, RecursionError)
 _MOVES = (
     "The slider goes through time: every millisecond within the impact windows, every 25 ms elsewhere. Within a "
@@ -97,6 +106,66 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
     except _BROKEN as error:
         what = f"holds no whole run or comparison ({type(error).__name__}: {error})"
         raise SpecError(what, where=str(folder), hint="run simulate or compare again") from None
+
+
+def thin(series: Series, windows: Iterable[Window | Span]) -> Series:
+    """Return the ticks of a run that a report shows; a force is the largest since the last of them.
+
+    The ticks end where the state runs away.
+
+    Args:
+        series: All ticks.
+        windows: Windows of the run, of which those of kind ``impact`` are shown finely.
+    """
+    gone = np.flatnonzero(~(np.abs(series.q).max(axis=1) < _AWAY))
+    t = series.t[: gone[0]] if len(gone) else series.t
+    if len(t) < 2:
+        raise InputError("runs away at once", where="report", hint="there is nothing to show")
+    step = float(t[1] - t[0])
+    inside = np.zeros(len(t), dtype=bool)
+    for window in windows:
+        if window.kind == "impact":
+            inside |= (t >= window.begin - _FINE) & (t <= window.end)
+    # Counted in ticks, because a sum of times is not exact.
+    each = np.where(inside, max(round(_FINE / step), 1), max(round(_COARSE / step), 1))
+    kept = np.flatnonzero((np.arange(len(t)) % each == 0) | (np.arange(len(t)) == len(t) - 1))
+    size = np.linalg.norm(series.force[: len(t)], axis=1)
+    begins = np.concatenate([[0], kept[:-1] + 1])
+    strongest = [a + int(np.argmax(size[a : b + 1])) for a, b in zip(begins, kept, strict=True)]
+    peaks = np.array([series.peak[a : b + 1].max() for a, b in zip(begins, kept, strict=True)])
+    columns = {name: column[kept] for name, column in vars(series).items()}
+    return Series(**columns | {"force": series.force[strongest], "peak": peaks})
+
+
+def run_scene(runs: Sequence[tuple[RunView, ImpactObjective]], *, meshes: bool = False) -> Scene:
+    """Return the scene of runs of one scenario.
+
+    Args:
+        runs: The runs, with the ticks of :func:`thin`, and the impact that each is about.
+        meshes: Pass on the meshes of the user's own URDF, too.
+    """
+    first, objective = runs[0]
+    planes = []
+    if first.surface is not None:
+        planes.append(("surface", first.surface, np.array(first.contact.normal)))
+    if first.supports:
+        numeric = Numeric(first.robot.model).at(first.q[0])
+        feet = [numeric.placement(point_on(first.robot, s.frame, s.offset)).translation for s in first.supports]
+        planes.append(("ground", min(feet, key=lambda foot: float(foot[2])), np.array([0.0, 0.0, 1.0])))
+    tracks = tuple(_track(view, one) for view, one in runs)
+    return Scene(draw_robot(first.robot, meshes), objective, tracks, tuple(planes), (), False)
+
+
+def _track(view: RunView, objective: ImpactObjective) -> Track:
+    jumps = np.zeros_like(view.v)
+    for window in view.impacts:
+        within = (view.t >= window.begin) & (view.t <= window.end)
+        if within.any():
+            jumps[within] = view.v[within] - view.v[max(int(np.argmax(within)) - 1, 0)]
+    found = [objective.oracle.quantities(q) for q in view.q]
+    force = ("largest normal force", "N", view.peak)
+    curves = (*impact_curves(found, objective.metric), force)
+    return Track(view.name, view.t, "s", view.q, [found], jumps, curves, view.force)
 
 
 def _read(path: Path) -> Document:

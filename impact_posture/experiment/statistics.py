@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.outcome import Outcome, gravest
@@ -35,7 +35,7 @@ class Interval:
     def of(values: Sequence[float]) -> Interval:
         """Return the interval of at least one sample."""
         n = len(values)
-        half_width = float(stats.t.ppf(0.975, n - 1) * stats.sem(values)) if n > 1 else None
+        half_width = float(stdtrit(n - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else None
         return Interval(float(np.mean(values)), half_width, n)
 
 

@@ -25,7 +25,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from scipy.interpolate import CubicHermiteSpline
 
 from impact_posture.arrays import Array
 from impact_posture.errors import ContactError, InputError
@@ -285,5 +284,8 @@ class _Compression:
 
 def _peak(times: Array, values: Array, slopes: Array) -> float:
     """Return the largest size of the piecewise cubic through values and slopes."""
+    # Imported here, because that takes a quarter of a second and few robots have elastic joints.
+    from scipy.interpolate import CubicHermiteSpline
+
     cubic = CubicHermiteSpline(times, values, slopes)
     return float(np.nanmax(np.abs([*values, *cubic(cubic.derivative().roots(extrapolate=False))])))

@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -111,16 +112,19 @@ def framed(
 
 def wrap(line: str, separator: str) -> list[str]:
     """Break a line of small print at separators so that it fits the page, by the widths of the font."""
-    parts, room = [""], 72 * WIDTH * 0.975
+    parts, room, used = [""], 72 * WIDTH * 0.975, 0.0
     for piece in line.split(separator):
-        longer = f"{parts[-1]}{separator}{piece}" if parts[-1] else piece
-        if text_width(longer.replace("$", ""), _SMALL) <= room:
-            parts[-1] = longer
-        else:
-            parts.append(piece)
+        # Pieces are measured one by one, because most of them come again.
+        width = text_width(f"{separator}{piece}".replace("$", ""), _SMALL)
+        if parts[-1] and used + width > room:
+            parts.append("")
+            used = 0.0
+        parts[-1] += f"{separator}{piece}" if parts[-1] else piece
+        used += width
     return [part for part in parts if part]
 
 
+@lru_cache(maxsize=4096)
 def text_width(text: str, size: float) -> float:
     """Return the width of a text, points."""
     font = FontProperties(family="DejaVu Sans", size=size)
