@@ -47,9 +47,11 @@ def goal_of(r: Robot, key: object, size: float) -> Vector:
     return np.array(pin.integrate(r.model, r.posture(), way))
 
 
-def flow_of(r: Robot, function: Well, **options: float) -> ReferenceFlow:
-    formulation = formulation_for(r, JointPosture(r))
-    flow = ReferenceFlow(r, function, formulation, Actuators(r), FlowOptions(**options))
+def flow_of(r: Robot, function: Well, weaker: float = 1.0, **options: float) -> ReferenceFlow:
+    formulation, actuators = formulation_for(r, JointPosture(r)), Actuators(r)
+    actuators.upper[actuators.rotors :] *= weaker
+    actuators.lower[actuators.rotors :] *= weaker
+    flow = ReferenceFlow(r, function, formulation, actuators, FlowOptions(**options))
     flow.reset(r.posture())
     return flow
 
@@ -84,6 +86,59 @@ def test_no_limit_is_crossed_wherever_the_goal_is(name: str, seed: int) -> None:
         bounded = np.isfinite(now)
         margin = np.minimum(options.joint_margin, (room[0] + room[1])[bounded] / 8)
         assert (now[bounded] > np.minimum(margin, at_start[bounded]) - 5e-3).all()
+
+
+def valley(r: Robot, key: object) -> Well:
+    """A steep valley with a bend: the flow has to turn while it is fast."""
+    base = 6 if r.floating else 0
+    along, across = rng(r.name, key).normal(size=(2, r.nv - base)) / np.sqrt(r.nv - base)
+
+    def function(q: Vector) -> tuple[float, Vector]:
+        x = np.array(pin.difference(r.model, r.posture(), q))[base:]
+        a = float(along @ x)
+        off = float(across @ x) - 2 * a**2
+        slope = np.zeros(r.nv)
+        slope[base:] = (a - 1) * along + 20 * off * (across - 4 * a * along)
+        return 0.1 + 0.5 * ((a - 1) ** 2 + 20 * off**2), slope
+
+    return function
+
+
+@pytest.mark.parametrize("name", ["talos", "g1"])
+def test_it_does_not_climb_where_it_turns(name: str) -> None:
+    """Without looking ahead it climbs by 2e-2 and more."""
+    r = robot(name)
+    found = course(flow_of(r, valley(r, 3)), r.posture(), 4.0)
+    assert (found.values - np.minimum.accumulate(found.values)).max() < 1e-3
+    assert found.values[-1] < 0.3
+
+
+@pytest.mark.parametrize(("name", "weaker"), [("panda", 0.5), ("talos", 1.0)])
+def test_haste_takes_its_share_of_what_rest_leaves_of_the_motors(name: str, weaker: float) -> None:
+    """Pinocchio's recursive Newton-Euler algorithm and a least-norm division of the base's wrench are the oracle."""
+    r = robot(name)
+    flow = flow_of(r, well(r, goal_of(r, "haste", 2.0)), weaker, speed=20.0, acceleration=100.0)
+    data, none, base = r.model.createData(), np.zeros(r.nv), 6 if r.floating else 0
+    effort = weaker * r.model.effortLimit[base:]
+    limited = effort > 0
+    eased = np.sqrt(np.tile([1.0] * 3 + [100.0] * 3, 2))
+
+    def torques(acceleration: Vector) -> Vector:
+        force = pin.rnea(r.model, data, flow.q, none, acceleration)
+        if base:
+            feet = flow._J[:12] / eased[:, None]
+            force = force - feet.T @ np.linalg.lstsq(feet[:, :6].T, force[:6], rcond=None)[0]
+        return np.array(force[base:][limited] / effort[limited])
+
+    flow.on = True
+    ratios = []
+    for k in range(600):
+        flow.advance(DT, flow.q)
+        if k % len(PHASES) == len(PHASES) - 1:
+            static, whole = torques(none), torques(flow.acceleration)
+            taken = whole - static
+            ratios.append(float((taken / (np.sign(taken) - static)).max()))
+    assert 0.9 * flow.options.haste < max(ratios) < 1.1 * flow.options.haste
 
 
 def test_the_rest_is_an_optimum_under_the_constraints() -> None:

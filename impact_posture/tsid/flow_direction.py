@@ -152,6 +152,20 @@ class FlowDirection:
         """Return the step nearest to ``way``, shape (nv,), on the constraints and within the limits."""
         return self._solve(Z, -Z.T @ way)
 
+    def downhill(self, Z: Array, gradient: Array, flow: Array, stop: Array, step: Array) -> Array:
+        """Return a step of the flow without the part of it by which ``H`` would rise where the flow can stop.
+
+        Args:
+            Z: Basis of the redundancy, shape (nv, r).
+            gradient: ``∇H/H₀``, shape (nv,).
+            flow: ``u``, shape (nv,).
+            stop: Way on which it stops if it brakes now, shape (nv,).
+            step: Change of ``u``, shape (nv,).
+        """
+        uphill = Z @ (Z.T @ (gradient + self.B @ stop))
+        climb = float(uphill @ (flow + step))
+        return step - uphill * (climb / float(uphill @ uphill)) if climb > 0 else step
+
     def _solve(self, way: Array, slope: Array) -> Array:
         """Return ``δ = way·y`` for the least ``½‖y‖² + slope·y``; zero if the solver fails."""
         qp, r = self._qp, way.shape[1]
@@ -167,3 +181,9 @@ class FlowDirection:
         y = solved.z[:r]
         self.gain = -float(slope @ y + y @ y / 2)
         return np.asarray(way @ y)
+
+
+def limited(vector: Array, largest: float) -> Array:
+    """Return the vector, shortened so that no entry exceeds ``largest``."""
+    size = float(np.abs(vector).max(initial=0.0))
+    return vector * (largest / size) if size > largest else vector

@@ -14,7 +14,7 @@ from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
-from impact_posture.tsid.flow_direction import FlowDirection, Redundancy
+from impact_posture.tsid.flow_direction import FlowDirection, Redundancy, limited
 from impact_posture.tsid.frame_tasks import FramePose, FramePosition
 from impact_posture.tsid.qp import stacked_rows
 from impact_posture.tsid.state import State
@@ -49,6 +49,7 @@ class FlowOptions:
         joint_margin: Distance from the joint limits, rad (m).
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
         share: Share of the actuators' limits that holding ``q_r`` may take.
+        haste: Share that accelerating may take of what is then left of the actuators' limits.
         tracking: Error of the joints at which the flow waits for the robot, rad (m).
     """
 
@@ -60,12 +61,14 @@ class FlowOptions:
     joint_margin: float = 0.1
     com_margin: float = 0.05
     share: float = 0.8
+    haste: float = 0.5
     tracking: float = 0.3
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
-        positive = (self.speed, self.acceleration, self.mu, self.epsilon, self.share, self.tracking)
-        if not (min(positive) > 0 and min(self.rho, self.joint_margin, self.com_margin) >= 0 and self.share <= 1):
+        positive = (self.speed, self.acceleration, self.mu, self.epsilon, self.share, self.haste, self.tracking)
+        rest = (self.rho, self.joint_margin, self.com_margin)
+        if not (min(positive) > 0 and min(rest) >= 0 and max(self.share, self.haste) <= 1):
             raise InputError("a number is out of range", where="flow options", hint="see the docstring")
 
 
@@ -248,9 +251,6 @@ class ReferenceFlow:
         if not self.on or self.resting:
             fastest = 0.0
         most = options.acceleration * period
-        # Each joint brakes as fast as it can, and then all stay on the constraints.
-        step = np.clip(limited(wanted, fastest) - self._flow, -most, most)
-        self._flow = Z @ (Z.T @ (self._flow + limited(Z @ (Z.T @ step), most)))
         rate = self.error / _RETURN
         for task, rows in zip(self._held, self._places, strict=True):
             rate[rows] += task.target_velocity
@@ -261,7 +261,16 @@ class ReferenceFlow:
             square = joints.T @ joints
             square.flat[:: square.shape[0] + 1] += _IDLE
             back -= Z @ np.linalg.solve(square, joints.T @ back[self._base :])
-        self.acceleration[:] = (self._flow + back - self.velocity) / period
+        self._flow = Z @ (Z.T @ self._flow)
+        # Each joint turns as fast as it can, and then all stay on the constraints.
+        step = limited(Z @ (Z.T @ np.clip(limited(wanted, fastest) - self._flow, -most, most)), most)
+        if fastest > 0 and self._visited == len(self._path):
+            stop = self._flow * (np.abs(self._flow).max() / (2 * options.acceleration))
+            step = limited(self.direction.downhill(Z, self._slope, self._flow, stop, step), most)
+        known = (self._flow + back - self.velocity) / period
+        step *= self._static.permitted(self._state, self._J, known, step / period, self.shares, options.haste)
+        self._flow += step
+        self.acceleration[:] = known + step / period
 
     def _place(self, q: Array) -> None:
         """Evaluate the Jacobian of the constraints at a posture."""
@@ -288,9 +297,3 @@ PHASES: tuple[Callable[[ReferenceFlow], None], ...] = (
     ReferenceFlow._direct,
     ReferenceFlow._govern,
 )
-
-
-def limited(vector: Array, largest: float) -> Array:
-    """Return the vector, shortened so that no entry exceeds ``largest``."""
-    size = float(np.abs(vector).max(initial=0.0))
-    return vector * (largest / size) if size > largest else vector

@@ -14,6 +14,8 @@ from impact_posture.tsid.state import State
 
 # Weight of a moment (N·m) relative to that of a force (N) in the choice of contact wrenches.
 _MOMENT = 100.0
+# Least share of the half range of a control that counts as left.
+_LEFT = 0.1
 # Share of the trace that makes the balance of the base solvable where the feet cannot carry it.
 _TINY = 1e-12
 
@@ -33,6 +35,8 @@ class StaticControls:
         self.limited = np.flatnonzero(np.isfinite(actuators.upper) & np.isfinite(actuators.lower))
         lower, upper = actuators.lower[self.limited], actuators.upper[self.limited]
         self._middle, self._half = (upper + lower) / 2, share * (upper - lower) / 2
+        # The limits, and the least that counts as left where the start itself needs more than its share.
+        self._whole, self._least = 1.0 / share, _LEFT / share
         wrench = np.array([1.0] * 3 + [_MOMENT] * 3)
         self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
         self._count, self._base = self._ease.size, base
@@ -49,7 +53,27 @@ class StaticControls:
             state: The state, whose ``h`` is gravity.
             J: Jacobian whose first rows are those of the contacts, shape (≥ contact rows, nv).
         """
-        force = np.array(state.h)
+        return np.asarray(self._needed(state.h, J) - self._middle / self._half)
+
+    def permitted(self, state: State, J: Array, known: Array, more: Array, shares: Array, most: float) -> float:
+        """Return the share of ``more``, 0 to 1, that accelerations permit which take ``most`` of what rest leaves.
+
+        Args:
+            state: The state, whose ``M`` is taken.
+            J: As for :meth:`shares`.
+            known: Acceleration that is not to change, shape (nv,).
+            more: Acceleration to add, shape (nv,).
+            shares: Static controls at the state, shape (m,).
+            most: Share of what the static controls leave of the limits.
+        """
+        taken, added = self._needed(state.M @ np.stack([known, more], axis=1), J).T
+        side = np.sign(added)
+        left = most * np.maximum(self._whole - side * shares, self._least) - side * taken
+        return float(np.clip(left / np.maximum(np.abs(added), _TINY), 0.0, 1.0).min(initial=1.0))
+
+    def _needed(self, force: Array, J: Array) -> Array:
+        """Return the shares that make generalized forces, shape (m,) for (nv,) or (m, k) for (nv, k)."""
+        force = np.array(force)
         if self._count:
             J = J[: self._count]
             A = J[:, : self._base].T
@@ -58,7 +82,7 @@ class StaticControls:
             # Feet on a line carry no moment about it.
             square.flat[:: self._base + 1] += _TINY * square.trace()
             force -= J.T @ (eased.T @ np.linalg.solve(square, force[: self._base]))
-        return np.asarray(self._inverse @ force - self._middle / self._half)
+        return np.asarray(self._inverse @ force)
 
 
 def polygon_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -190,6 +191,11 @@ def test_what_is_known_of_the_paper_fits_the_scenarios() -> None:
         assert row.reduction == pytest.approx(1 - row.robust / row.nominal, abs=6e-3)
         assert controllers_of(name, False)[:2] == ("nominal", "robust")
         assert set(CONTROLLERS) < set(controllers_of(name, True))
+
+
+def test_what_is_recommended_is_what_the_page_of_the_envelope_says() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "generated" / "envelope.md").read_text(encoding="utf-8")
+    assert dict(re.findall(r"^- \*\*([\w-]+)\*\*: .*?(?:take|At best) `([\w-]+)`", page, re.M)) == RECOMMENDED
 
 
 def test_metrics_of_both_signs() -> None:

@@ -43,7 +43,7 @@ _HEAD = (
 def page(records: Records) -> Iterator[str]:
     """All of it, as lines of Markdown."""
     yield from ("### What to choose", "")
-    yield from (_choice(name, own) for name, own in records.items() if tried(own))
+    yield from (choice(name, own) for name, own in records.items() if tried(own))
     yield from (_tuned(name, own) for name, own in records.items() if sum(bool(r.draw.name) for r in tried(own)) > 1)
     yield ""
     yield from _counts(records)
@@ -67,7 +67,7 @@ def spread(values: Sequence[float]) -> str:
     return f"{middle} [{low}, {high}]"
 
 
-def _choice(name: str, own: Sequence[Record]) -> str:
+def choice(name: str, own: Sequence[Record]) -> str:
     """What to take: what keeps every target most often, then what moves least."""
     found = [summarize(own, c) for c in COMPARED if c != NOMINAL]
     best = min(found, key=lambda s: (-s.kept, s.motion[1]))

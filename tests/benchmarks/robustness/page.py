@@ -9,12 +9,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from impact_posture.simulation.offline import SHARE
 from tests.benchmarks.core import table
 from tests.benchmarks.robustness.draws import PATIENCE
-from tests.benchmarks.robustness.envelope import percent, spread
+from tests.benchmarks.robustness.envelope import choice, percent, spread
 from tests.benchmarks.robustness.outcomes import COMPARED, NOMINAL, SATURATED, Record
 from tests.benchmarks.robustness.statistics import (
     PREDICTORS,
     Split,
-    Summary,
     agreement,
     change,
     fall,
@@ -32,8 +31,6 @@ from tests.benchmarks.robustness.variations import RANGES
 Records = Mapping[str, Sequence[Record]]
 # The page of the documentation takes what is before and what is after.
 MARK = "<!-- tables -->"
-# A controller that helps less often than this, or at the median by less, is no advice.
-_OFTEN, _MUCH = 2 / 3, 0.05
 # M: a shoulder that is less than this ahead of or behind the base's center is under it.
 _UNDER = 0.04
 # Drawn values whose rank correlation is shown.
@@ -42,18 +39,13 @@ _OVERVIEW = (
     "scenario|controller|less motion|lower jump|motion: median [quartiles]|jump: median|saturated, s: inside + "
     "outside|failed"
 ).split("|")
-_WORDS = {
-    "aerial-vertical": "An arm that comes down on a floor",
-    "aerial-lateral": "An arm that runs against a wall",
-    "solo8-push": "A quadruped that is pushed",
-    "talos-push": "A humanoid that is pushed",
-}
 
 
 def page(records: Records, seed: int) -> Iterator[str]:
     """All of it, as lines of Markdown."""
     records = {name: own for name, own in records.items() if tried(own)}
-    yield from (*_choices(records), *_stiffness(records), *_failed(records), *_predictors(records))
+    yield from (choice(name, own) for name, own in records.items())
+    yield from (*_stiffness(records), *_failed(records), *_predictors(records))
     yield from ("", MARK, "", "### How often each controller helps", "")
     yield from table(_OVERVIEW, [_overview(name, own, c) for name, own in records.items() for c in COMPARED])
     yield from ("", "### What predicts the jump", "", *_jump_ranks(records))
@@ -71,31 +63,6 @@ def _is_contact(name: str) -> bool:
 
 
 # ---- what to choose -----------------------------------------------------------------------------------------------
-
-
-def _choices(records: Records) -> Iterator[str]:
-    """What to take, scenario by scenario, led by what helped most among what helped often."""
-    for name, own in records.items():
-        found = [summarize(own, c) for c in COMPARED if c != NOMINAL]
-        # Of those that help often, the one that helps most at the median.
-        found.sort(key=lambda s: (s.helps < _OFTEN * s.count, s.motion[1]))
-        best = found[0]
-        good = best.helps >= _OFTEN * best.count and best.motion[1] <= -_MUCH
-        lead = f"take `{best.controller}`: it" if good else f"nothing helps reliably; at best `{best.controller}`"
-        others = "; ".join(f"`{s.controller}` in {s.helps} ({percent(s.motion[1])})" for s in found[1:])
-        fails = sum(best.failures.values())
-        low, middle, high = (percent(v) for v in best.motion)
-        yield (
-            f"- **{_WORDS[name]}** (`{name}`): {lead} moved the robot less than the nominal controller at "
-            f"{best.helps} of {best.count} points (median {middle}, quartiles {low} and {high}), with a "
-            f"lower jump at {best.gentler}{f', and failed at {fails}' if fails else ''}. At a control limit in all, "
-            f"in the windows + outside: {_limits(best)} s, nominal {_limits(summarize(own, NOMINAL))} s. The others: "
-            f"{others}."
-        )
-
-
-def _limits(summary: Summary) -> str:
-    return " + ".join(f"{seconds:.1f}" for seconds in summary.saturation)
 
 
 def _stiffness(records: Records) -> list[str]:
