@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 RUN = "Where it runs"
 
 Target = Annotated[
-    str, typer.Argument(metavar="SWEEP.toml|show", help="What to solve, or the word show for a folder that sweep wrote.")
+    str,
+    typer.Argument(metavar="SWEEP.toml|show", help="What to solve, or the word show for a folder that sweep wrote."),
 ]
 Shown = Annotated[str | None, typer.Argument(metavar="DIR", help="With show: the folder.")]
 Workers = Annotated[int, options.option("--workers", panel=RUN, min=1, help="Processes on this machine.")]
@@ -33,7 +34,9 @@ Slurm = Annotated[
     list[str] | None,
     options.option("--slurm", metavar="KEY=VALUE", panel=RUN, help="Slurm job arrays by submitit; repeatable."),
 ]
-Out = Annotated[str | None, options.out_option("Folder of the sweep; with show, of the maps.", "./SWEEP, or DIR/maps")]
+Out = Annotated[
+    str | None, options.out_option("Folder of the sweep; with show, of the maps.", "./SWEEP, or DIR/maps")
+]
 MapAxes = Annotated[
     str | None,
     options.option("--axes", metavar="A,B", panel="Maps", show_default="the two longest", help="Axes of the maps."),

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import builtins
 import fcntl
-import hashlib
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -81,7 +79,9 @@ class Atlas:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise OutputError(
-                    "is in use by another process", where=str(self.folder), hint="wait for it, or choose another --out"
+                    "is in use by another process",
+                    where=str(self.folder),
+                    hint="wait for it, or choose another --out",
                 ) from None
             except OSError:
                 # This file system knows no locks.
@@ -123,7 +123,10 @@ class Atlas:
             found = parquet.read_metadata(path)
         except (OSError, ArrowException):
             return False
-        return found.num_rows == len(self._sweep.span(shard)[1]) and (found.metadata or {}).get(b"sweep") == self._key.encode()
+        return (
+            found.num_rows == len(self._sweep.span(shard)[1])
+            and (found.metadata or {}).get(b"sweep") == self._key.encode()
+        )
 
     def _manifest(self) -> dict[str, Any]:
         sweep = self._sweep

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
@@ -12,16 +12,18 @@ import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.errors import ImpactPostureError, Infeasible, InputError, SolverFailed
+from impact_posture.errors import ImpactPostureError, Infeasible, InputError
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.resolved_impact import resolve
 from impact_posture.posture.build_problem import retarget
 from impact_posture.posture.certificate import Certificate, certify
-from impact_posture.posture.nlp import PostureNLP, build_nlp
+from impact_posture.posture.elastic import elastic
+from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, build_nlp
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.problem_settings import Prepared, prepare
-from impact_posture.posture.solve import distinct, solve
-from impact_posture.posture.starts import feasible_start
+from impact_posture.posture.search import FEASIBLE, HIGH_PRICE
+from impact_posture.posture.solve import distinct
+from impact_posture.posture.starts import Projector, random_posture
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.sweep.grid import Grid
 from impact_posture.sweep.sweep_file import OFFSETS, Case, at_point
@@ -30,37 +32,19 @@ from impact_posture.sweep.sweep_file import OFFSETS, Case, at_point
 _TEMPLATES, _PROGRAMS = 64, 16
 # Most rounds in which the program of a point grows.
 _ROUNDS = 8
+# Postures from which the constraints are relaxed, and random starts where a neighbor is infeasible already.
+_TRIES, _FEW = 4, 3
 # An optimum is better than another if its objective is lower by this share.
 _BETTER = 1e-4
 
 _Value = TypeVar("_Value")
 
 
-@dataclass(frozen=True, eq=False)
-class PointResult:
-    """The answer to one problem.
+class PointResult(NamedTuple):
+    """The answer to one problem: its columns in the table, and its posture, shape (nq,), if there is one."""
 
-    Attributes:
-        status: ``certified``, ``infeasible``, ``uncertified`` or ``undefined``.
-        reason: Why there is no posture, in one line; ``None`` if there is.
-        q: The posture, shape (nq,).
-        objective: The objective at ``q``.
-        quantities: H, G, V, S and E at ``q``, by name.
-        stationarity: See :class:`~impact_posture.posture.certificate.Certificate`.
-        violation: Largest violation of a constraint.
-        optima: Number of distinct optima that the runs ended at.
-        runs: Number of runs of the solver.
-    """
-
-    status: str
-    reason: str | None = None
+    row: dict[str, Any]
     q: Array | None = None
-    objective: float | None = None
-    quantities: Mapping[str, float | None] = field(default_factory=dict)
-    stationarity: float | None = None
-    violation: float | None = None
-    optima: int = 0
-    runs: int = 0
 
 
 class CaseSolver:
@@ -72,13 +56,14 @@ class CaseSolver:
     Attributes:
         solver_s: Processor time within IPOPT and the functions that it calls, s.
         robot: The robot.
+        seed: Seed of the random starts.
 
     Raises:
         ImpactPostureError: A setting is wrong.
     """
 
     def __init__(self, case: Case) -> None:
-        self._case, self.solver_s = case, 0.0
+        self._case, self.solver_s, self.seed = case, 0.0, case.settings.seed
         self._loaded = load_robot(case.settings.robot, case.settings)
         self.template = lru_cache(_TEMPLATES)(self._template)
         self._programs: OrderedDict[str, PostureNLP] = OrderedDict()
@@ -136,71 +121,116 @@ class CaseSolver:
         made = kept(self._programs, key, lambda: build_nlp(problem, compile="never"), _PROGRAMS)
         return replace(made, problem=problem)
 
-    def search(self, walk: Walk, place: tuple[Any, Any], guesses: Sequence[Array]) -> PointResult:
+    def search(
+        self, walk: Walk, place: tuple[Any, Any], guesses: Sequence[Array], *, few: bool = False
+    ) -> PointResult:
         """Solve one point: from the guesses and the given posture, and from many starts where they disagree.
 
         Args:
             walk: Problem and program as the points before have left them.
             place: Target position and orientation.
             guesses: Optima of neighbors.
+            few: Whether few starts are enough, because a neighbor is infeasible and none has an optimum.
         """
-        settings, runs = self._case.settings, 0
-        problem = retarget(walk.problem, *place)
+        attempt = _Attempt(self, walk, place, _FEW if few else self._case.settings.starts - 1)
         try:
-            for _ in range(_ROUNDS):
-                nlp = replace(walk.nlp, problem=problem)
-                scale = problem.objective.value(guesses[0] if len(guesses) else problem.given)
-                ends = [self._run(nlp, start, scale) for start in [*guesses, problem.given]]
-                if not _agree(problem, ends[:-1], ends[-1]):
-                    starts = (feasible_start(problem, k, settings.seed) for k in range(1, settings.starts))
-                    ends += [self._run(nlp, start, scale) for start in starts if start is not None]
-                runs += len(ends)
-                found = _optima(problem, ends)
-                for end in found:
-                    certificate = certify(problem, end.q, scale, end.auxiliaries)
-                    if certificate.holds() and self._clear(problem, end.q):
-                        return self._answer(problem, end.value, end.q, certificate, len(found), runs)
-                grown = problem.grown([end.q for end in found])
-                if grown is problem:
-                    break
-                walk.grow(self, grown)
-                problem, guesses = grown, [end.q for end in found]
-            return self._thorough(problem, guesses, runs)
-        except Infeasible as error:
-            return PointResult("infeasible", error.what, runs=runs)
-        except SolverFailed as error:
-            return PointResult("uncertified", error.line, runs=runs)
+            if (found := attempt.certified(guesses)) is not None:
+                return found
+            # Either this finds the constraints that conflict, or a posture to start from.
+            relaxed = elastic(attempt.problem, self._case.settings.seed, 1 if few else _TRIES)
+            if relaxed.conflicts:
+                return attempt.without("infeasible", Infeasible(relaxed.conflicts).what)
+            if (found := attempt.certified([relaxed.q])) is not None:
+                return found
+            return attempt.without("uncertified", attempt.fault)
         except ImpactPostureError as error:
-            return PointResult("undefined", error.line, runs=runs)
+            return attempt.without("undefined", error.line)
 
-    def _run(self, nlp: PostureNLP, start: Array, scale: float) -> _End:
-        record = nlp.solve(start, scale=scale)
-        self.solver_s += record.cpu_s
-        value = nlp.problem.objective.value(record.q) if record.converged else np.inf
+
+class _Attempt:
+    """The runs at one point.
+
+    Args:
+        solver: The solver of the case.
+        walk: Problem and program of the template, which this grows.
+        place: Target position and orientation.
+        others: Number of random starts where the first ones disagree.
+
+    Attributes:
+        problem: The problem at this point.
+        runs: Number of runs.
+        fault: What the last posture that failed its certificate lacks.
+    """
+
+    def __init__(self, solver: CaseSolver, walk: Walk, place: tuple[Any, Any], others: int) -> None:
+        self.problem, self.runs, self.fault = retarget(walk.problem, *place), 0, "no run converged"
+        self._solver, self._walk, self._others = solver, walk, others
+
+    def certified(self, guesses: Sequence[Array]) -> PointResult | None:
+        """Return the best certified posture, with parts added to the program as its ends need them."""
+        price = SLACK_PRICE
+        for _ in range(_ROUNDS):
+            problem = self.problem
+            nlp = replace(self._walk.nlp, problem=problem)
+            scale = problem.objective.value(guesses[0] if len(guesses) else problem.given)
+            ends = [self._run(nlp, start, scale, price) for start in [*guesses, problem.given]]
+            if not _agree(problem, ends[:-1], ends[-1]):
+                ends += [self._run(nlp, start, scale, price) for start in self._random_starts()]
+            found = _optima(problem, ends)
+            for end in found:
+                certificate = certify(problem, end.q, scale, end.auxiliaries)
+                if certificate.holds() and self._is_clear(end.q):
+                    return self._answer(end, certificate, len(found))
+                self.fault = f"stationarity {certificate.stationarity:.1e}, violation {certificate.primal:.1e}"
+            if not found:
+                return None
+            self.problem, guesses = problem.grown([end.q for end in found]), [end.q for end in found]
+            if self.problem is not problem:
+                self._walk.grow(self._solver, self.problem)
+            elif price == SLACK_PRICE:
+                # An end that lacks nothing and still violates something is a trap.
+                price = HIGH_PRICE
+            else:
+                return None
+        return None
+
+    def _random_starts(self) -> Iterator[Array]:
+        """Yield random postures that one projection takes to the constraints."""
+        projector = Projector(self.problem)
+        for k in range(1, self._others + 1):
+            rng = np.random.default_rng([self._solver.seed, k])
+            found = projector.project(random_posture(self.problem, projector.chart, rng, near=k % 2 == 1))
+            if found.violation <= FEASIBLE:
+                yield found.q
+
+    def _run(self, nlp: PostureNLP, start: Array, scale: float, price: float) -> _End:
+        record = nlp.solve(start, scale=scale, price=price)
+        self.runs += 1
+        self._solver.solver_s += record.cpu_s
+        value = scale * record.minimized if record.converged else np.inf
         return _End(record.q, value, record.auxiliaries)
 
-    def _thorough(self, problem: PostureProblem, guesses: Sequence[Array], runs: int) -> PointResult:
-        """Search as ``optimize`` does, which finds the reason as well if there is no posture."""
-        settings = self._case.settings
-        found = solve(
-            problem, starts=settings.starts, seed=settings.seed, jobs=1, compile="never", guesses=guesses[: settings.starts - 1]
-        )
-        value = problem.objective.value(found.q)
-        return self._answer(problem, value, found.q, found.certificate, len(found.optima), runs + found.starts)
+    def _is_clear(self, q: Array) -> bool:
+        around = self.problem.surroundings
+        return self.problem.objective.movable(q) and not (around and around.collisions(q))
 
-    @staticmethod
-    def _clear(problem: PostureProblem, q: Array) -> bool:
-        return problem.objective.movable(q) and not (problem.surroundings and problem.surroundings.collisions(q))
+    def _answer(self, end: _End, certificate: Certificate, optima: int) -> PointResult:
+        found = self.problem.impact.oracle.quantities(end.q)
+        row = {
+            "status": "certified",
+            "q": end.q.tolist(),
+            "objective": self.problem.objective.value(end.q),
+            **{key: getattr(found, key) for key in "HGVSE"},
+            "stationarity": certificate.stationarity,
+            "violation": certificate.primal,
+            "optima": optima,
+            "runs": self.runs,
+        }
+        return PointResult(row, end.q)
 
-    @staticmethod
-    def _answer(
-        problem: PostureProblem, value: float, q: Array, certificate: Certificate, optima: int, runs: int
-    ) -> PointResult:
-        found = problem.impact.oracle.quantities(q)
-        return PointResult(
-            "certified", None, q, value, {key: getattr(found, key) for key in "HGVSE"},
-            certificate.stationarity, certificate.primal, optima, runs,
-        )  # fmt: skip
+    def without(self, status: str, reason: str) -> PointResult:
+        """Return the answer that there is no posture."""
+        return PointResult({"status": status, "reason": reason, "optima": 0, "runs": self.runs})
 
 
 class Walk:
@@ -222,7 +252,7 @@ class Walk:
 
 
 class _End(NamedTuple):
-    """End of a run; the value is infinite if the run did not converge."""
+    """End of a run; the value, with what the program adds to the objective, is infinite if it did not converge."""
 
     q: Array
     value: float

@@ -47,7 +47,9 @@ def dask_cluster(address: str) -> Iterator[Executor]:
         client = Client(address, timeout="10s")
     except (OSError, ValueError) as error:
         raise InputError(
-            f"no Dask scheduler answers ({error})", where=f"--scheduler {address}", hint="start one, or correct the address"
+            f"no Dask scheduler answers ({error})",
+            where=f"--scheduler {address}",
+            hint="start one, or correct the address",
         ) from None
     with client:
         yield client.get_executor()

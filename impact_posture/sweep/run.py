@@ -39,7 +39,12 @@ class SweepRun:
 
 
 def run_sweep(
-    sweep: Sweep, folder: Path, executor: Executor | None = None, *, progress: Progress | None = None, in_hand: int = IN_HAND
+    sweep: Sweep,
+    folder: Path,
+    executor: Executor | None = None,
+    *,
+    progress: Progress | None = None,
+    in_hand: int = IN_HAND,
 ) -> SweepRun:
     """Solve all shards that the folder lacks, and write them.
 
@@ -91,8 +96,11 @@ def _results(
     left, pending = iter(waiting), set[Future[ShardResult]]()
     submit_all = getattr(executor, "submit_all", None)
     while True:
-        calls = [(solve_shard, sweep, key, shard) for _, shard in zip(range(in_hand - len(pending)), left, strict=False)]
-        pending |= set(submit_all(calls) if submit_all and calls else [executor.submit(*call) for call in calls])
+        next_ones = [shard for _, shard in zip(range(in_hand - len(pending)), left, strict=False)]
+        if submit_all and next_ones:
+            pending |= set(submit_all([(solve_shard, sweep, key, shard) for shard in next_ones]))
+        else:
+            pending |= {executor.submit(solve_shard, sweep, key, shard) for shard in next_ones}
         if not pending:
             return
         finished, pending = wait(pending, return_when=FIRST_COMPLETED)

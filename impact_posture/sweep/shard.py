@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from impact_posture.arrays import Array
 from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.sweep.case_solver import CaseSolver, PointResult, Walk, kept
 from impact_posture.sweep.grid import Axis
@@ -26,6 +25,7 @@ _KEPT_WALKS = 64
 _SOLVERS: OrderedDict[tuple[str, int], CaseSolver] = OrderedDict()
 
 STATUS = ("certified", "infeasible", "uncertified", "undefined")
+NUMBERS = ("objective", *"HGVSE", "impulse", "jump", "stationarity", "violation")
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
         solver.solver_s = 0.0
         results = _walk(sweep, solver, points)
         content = _parquet(sweep, key, case, points, results, solver)
-        counts = {status: sum(one.status == status for one in results) for status in STATUS}
+        counts = {status: sum(one.row["status"] == status for one in results) for status in STATUS}
         return ShardResult(index, content, counts, solver.solver_s, time.process_time() - began)
 
 
@@ -86,8 +86,10 @@ def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
             # Only the speed differs, and the problem does not see it.
             results.append(results[-1])
             continue
-        before = [results[k - points.start].q for k in sweep.grid.neighbors(point, points.start)]
-        results.append(solver.search(walk, target, [q for q in before if q is not None]))
+        before = [results[k - points.start] for k in sweep.grid.neighbors(point, points.start)]
+        guesses = [one.q for one in before if one.q is not None]
+        few = not guesses and any(one.row["status"] == "infeasible" for one in before)
+        results.append(solver.search(walk, target, guesses, few=few))
         last = walk, target
     return results
 
@@ -99,42 +101,36 @@ def _parquet(
     import pyarrow as pa
     from pyarrow import parquet
 
-    numbers = pa.float64()
-    columns: dict[str, Any] = {"point": pa.array([case * sweep.grid.size + k for k in points], pa.int64())}
-    places = [sweep.grid.values(k) for k in points]
-    for axis in (*sweep.outer, *sweep.grid.axes):
-        kind, plain = _kind(axis)
-        at = [(values | sweep.cases[case].values)[axis.name] for values in places]
-        columns[axis.name] = pa.array(at if plain else [json.dumps(value) for value in at], kind)
-    for name in ("status", "reason"):
-        columns[name] = pa.array([getattr(one, name) for one in results], pa.string())
-    columns["q"] = pa.array([_list(one.q) for one in results], pa.list_(numbers))
-    columns["objective"] = pa.array([one.objective for one in results], numbers)
-    for name in "HGVSE":
-        columns[name] = pa.array([one.quantities.get(name) for one in results], numbers)
-    impacts = [solver.template(*solver.normal_and_speed(values)).impact for values in places]
-    approach = [(1 + impact.restitution) * impact.speed for impact in impacts]
-    pairs = list(zip(results, approach, strict=True))
-    columns["impulse"] = pa.array([v / one.quantities["G"] if one.q is not None else None for one, v in pairs], numbers)
-    columns["jump"] = pa.array([v * one.quantities["V"] ** 0.5 if one.q is not None else None for one, v in pairs], numbers)
-    for name, kind in (("stationarity", numbers), ("violation", numbers), ("optima", pa.int32()), ("runs", pa.int32())):
-        columns[name] = pa.array([getattr(one, name) for one in results], kind)
-    table = pa.table(columns).replace_schema_metadata({"sweep": key})
+    axes = (*sweep.outer, *sweep.grid.axes)
+    kinds = {axis.name: _kind(axis) for axis in axes}
+    number, text, count = pa.float64(), pa.string(), pa.int32()
+    own = [("status", text), ("reason", text), ("q", pa.list_(number)), *[(name, number) for name in NUMBERS]]
+    columns = [("point", pa.int64()), *kinds.items(), *own, ("optima", count), ("runs", count)]
+    rows = []
+    for point, result in zip(points, results, strict=True):
+        values = {**sweep.grid.values(point), **sweep.cases[case].values}
+        # A value that Arrow has no plain type for is JSON.
+        plain = {
+            name: json.dumps(v) if kinds[name] == text and not isinstance(v, str) else v for name, v in values.items()
+        }
+        rows.append({"point": case * sweep.grid.size + point, **values, **odd, **result.row})
+        if result.q is not None:
+            impact = solver.template(*solver.normal_and_speed(values)).impact
+            approach = (1 + impact.restitution) * impact.speed
+            rows[-1] |= {"impulse": approach / result.row["G"], "jump": approach * result.row["V"] ** 0.5}
+    table = pa.Table.from_pylist(rows, pa.schema(columns, metadata={"sweep": key}))
     sink = pa.BufferOutputStream()
     parquet.write_table(table, sink, compression="zstd")
     return bytes(sink.getvalue())
 
 
-def _kind(axis: Axis) -> tuple[Any, bool]:
-    """Return the Arrow type of the column of an axis, and whether it holds the values as they are, not as JSON."""
+def _kind(axis: Axis) -> Any:
+    """Return the Arrow type of the column of an axis."""
     import pyarrow as pa
 
-    for kind, python in ((pa.bool_(), (bool,)), (pa.float64(), (int, float)), (pa.string(), (str,))):
-        if all(isinstance(value, python) and (bool in python or value is not True) for value in axis.values):
-            return kind, True
+    if all(isinstance(value, bool) for value in axis.values):
+        return pa.bool_()
+    if all(isinstance(value, int | float) for value in axis.values):
+        return pa.float64()
     vectors = all(isinstance(v, list | tuple) and all(isinstance(x, float | int) for x in v) for v in axis.values)
-    return (pa.list_(pa.float64()), True) if vectors else (pa.string(), False)
-
-
-def _list(q: Array | None) -> list[float] | None:
-    return None if q is None else q.tolist()
+    return pa.list_(pa.float64()) if vectors else pa.string()

@@ -136,11 +136,9 @@ def read_sweep(path: Path) -> Sweep:
 def _values(name: str, given: Any, where: str) -> tuple[Any, ...]:
     """Return the values of an axis, from a list or from ``{from, to, count}``."""
     if isinstance(given, dict):
-        try:
-            low, high, count = float(given["from"]), float(given["to"]), given["count"]
-        except (KeyError, TypeError, ValueError):
-            low = high = count = None
-        if set(given) != {"from", "to", "count"} or type(count) is not int or not 2 <= count <= 10**6:
+        low, high, count = (given.get(key, "") for key in ("from", "to", "count"))
+        ends = all(isinstance(v, int | float) and abs(v) < float("inf") for v in (low, high))
+        if not ends or set(given) != {"from", "to", "count"} or type(count) is not int or not 2 <= count <= 10**6:
             raise SpecError("is no range", where=where, hint="give from, to and count (2 to 1e6), or a list")
         return tuple(low + (high - low) * k / (count - 1) for k in range(count))
     if not isinstance(given, list) or not given:
@@ -155,7 +153,9 @@ def _check_names(names: Sequence[str], where: str) -> None:
             raise SpecError(f"'{name}' cannot vary", where=where, hint="set it in the problem")
         if name not in known:
             close = ", ".join(nearest(name, known))
-            raise SpecError(f"unknown axis '{printable(name, longest=60)}'", where=where, hint=f"did you mean {close}?")
+            raise SpecError(
+                f"unknown axis '{printable(name, longest=60)}'", where=where, hint=f"did you mean {close}?"
+            )
 
 
 def _checked(name: str, values: Sequence[Any], problem: dict[str, Any], where: str) -> tuple[Any, ...]:
@@ -167,7 +167,9 @@ def _checked(name: str, values: Sequence[Any], problem: dict[str, Any], where: s
         try:
             made = getattr(validate(ProblemSettings, problem | {key: wrap(value)}, where), key)
         except SpecError as error:
-            raise SpecError(error.what.replace(f"'{key}", f"'{name}"), where=f"{where}.{name}[{k}]", hint=error.hint) from None
+            raise SpecError(
+                error.what.replace(f"'{key}", f"'{name}"), where=f"{where}.{name}[{k}]", hint=error.hint
+            ) from None
         found.append(made[0] if name in OFFSETS else made)
     if len(set(map(repr, found))) < len(found):
         raise SpecError("has a value twice", where=f"{where}.{name}", hint="leave one of them out")
