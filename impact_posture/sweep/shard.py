@@ -110,9 +110,7 @@ def _parquet(
     for point, result in zip(points, results, strict=True):
         values = {**sweep.grid.values(point), **sweep.cases[case].values}
         # A value that Arrow has no plain type for is JSON.
-        plain = {
-            name: json.dumps(v) if kinds[name] == text and not isinstance(v, str) else v for name, v in values.items()
-        }
+        odd = {name: json.dumps(v) for name, v in values.items() if kinds[name] == text and not isinstance(v, str)}
         rows.append({"point": case * sweep.grid.size + point, **values, **odd, **result.row})
         if result.q is not None:
             impact = solver.template(*solver.normal_and_speed(values)).impact
