@@ -219,7 +219,7 @@ class _Attempt:
         row = {
             "status": "certified",
             "q": end.q.tolist(),
-            "objective": self.problem.objective.value(end.q),
+            "value": self.problem.objective.value(end.q),
             **{key: getattr(found, key) for key in "HGVSE"},
             "stationarity": certificate.stationarity,
             "violation": certificate.primal,

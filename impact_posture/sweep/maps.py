@@ -146,7 +146,7 @@ class _Slice:
 
     Attributes:
         status: Status of each point; empty where none is solved yet, shape (rows, columns).
-        objective: Objectives, NaN where there is none, shape (rows, columns).
+        value: Objectives, NaN where there is none, shape (rows, columns).
         switches: Pairs of neighbors ``(row, column), (row, column)`` between which the best posture switches.
     """
 
@@ -154,12 +154,12 @@ class _Slice:
         from pyarrow import compute
 
         wanted = compute.field("point").isin(points.ravel().tolist())
-        rows = data.to_table(columns=["point", "status", "objective", "q"], filter=wanted).to_pylist()
+        rows = data.to_table(columns=["point", "status", "value", "q"], filter=wanted).to_pylist()
         known = {row["point"]: row for row in rows}
-        none = {"status": "", "objective": None, "q": None}
+        none = {"status": "", "value": None, "q": None}
         at = [[known.get(int(point), none) for point in line] for line in points]
         self.status = np.array([[row["status"] for row in line] for line in at])
-        self.objective = np.array([[row["objective"] for row in line] for line in at], dtype=float)
+        self.value = np.array([[row["value"] for row in line] for line in at], dtype=float)
         postures = [[row["q"] and np.array(row["q"]) for row in line] for line in at]
         self.switches = _switches(postures, problem)
 
@@ -186,15 +186,15 @@ def _best(data: Any, grid: Grid, number: int, values: dict[str, Any]) -> list[di
 
     least = (np.inf, -1)
     in_case = (compute.field("case") == number) & (compute.field("status") == "certified")
-    for batch in data.to_batches(columns=["point", "objective"], filter=in_case):
+    for batch in data.to_batches(columns=["point", "value"], filter=in_case):
         if batch.num_rows:
-            objective = batch["objective"].to_numpy()
+            objective = batch["value"].to_numpy()
             k = int(objective.argmin())
             least = min(least, (float(objective[k]), int(batch["point"][k].as_py())))
     if least[1] < 0:
         return []
     point = least[1] - number * grid.size
-    return [{**values, **grid.values(point), "objective": float(f"{least[0]:.6g}"), "point": least[1]}]
+    return [{**values, **grid.values(point), "value": float(f"{least[0]:.6g}"), "point": least[1]}]
 
 
 def _draw(
@@ -207,7 +207,7 @@ def _draw(
     formats: Sequence[str],
 ) -> list[Path]:
     across, upwards = axes
-    rows, columns = table.objective.shape
+    rows, columns = table.value.shape
     others = [f"{a.name} {a.values[len(a.values) // 2]}" for k, a in enumerate(grid.axes) if k not in axes]
     facts = " · ".join([f"{key} {value}" for key, value in values.items()] + others)
     notes = [f"{len(table.switches)} steps between neighbors switch to another optimum."]
@@ -216,10 +216,10 @@ def _draw(
         notes.append(f"{missing} points are not solved yet.")
     with framed("Objective of the best posture", [facts], 1.4 + min(3.4, 0.45 * rows), notes) as (figure, body):
         panel = body.subplots()
-        found = table.objective[np.isfinite(table.objective)]
+        found = table.value[np.isfinite(table.value)]
         wide = found.size > 0 and found.min() > 0 and found.max() > _WIDE * found.min()
         edges = np.arange(columns + 1) - 0.5, np.arange(rows + 1) - 0.5
-        drawn = panel.pcolormesh(*edges, np.ma.masked_invalid(table.objective), norm=LogNorm() if wide else None)
+        drawn = panel.pcolormesh(*edges, np.ma.masked_invalid(table.value), norm=LogNorm() if wide else None)
         if found.size:
             body.colorbar(drawn, ax=panel, label="objective")
         handles: list[Any] = []
@@ -235,7 +235,7 @@ def _draw(
             panel.add_collection(LineCollection(lines, colors=VERMILLION, linewidths=1.8))
             handles.append(Line2D([], [], color=VERMILLION, linewidth=1.8, label="switch to another optimum"))
         if found.size:
-            row, column = np.unravel_index(np.nanargmin(table.objective), table.objective.shape)
+            row, column = np.unravel_index(np.nanargmin(table.value), table.value.shape)
             handles += panel.plot(
                 column, row, marker="*", markersize=9, color="white", markeredgecolor=INK, linestyle="none",
                 label="least objective",

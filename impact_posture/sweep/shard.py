@@ -25,7 +25,7 @@ _KEPT_WALKS = 64
 _SOLVERS: OrderedDict[tuple[str, int], CaseSolver] = OrderedDict()
 
 STATUS = ("certified", "infeasible", "uncertified", "undefined")
-NUMBERS = ("objective", *"HGVSE", "impulse", "jump", "stationarity", "violation")
+NUMBERS = ("value", *"HGVSE", "predicted_impulse", "predicted_jump", "stationarity", "violation")
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,10 @@ def _parquet(
         if result.q is not None:
             impact = solver.template(*solver.normal_and_speed(values)).impact
             approach = (1 + impact.restitution) * impact.speed
-            rows[-1] |= {"impulse": approach / result.row["G"], "jump": approach * result.row["V"] ** 0.5}
+            rows[-1] |= {
+                "predicted_impulse": approach / result.row["G"],
+                "predicted_jump": approach * result.row["V"] ** 0.5,
+            }
     table = pa.Table.from_pylist(rows, pa.schema(columns, metadata={"sweep": key}))
     sink = pa.BufferOutputStream()
     parquet.write_table(table, sink, compression="zstd")
