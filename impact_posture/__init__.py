@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from impact_posture.version import __version__
 
 if TYPE_CHECKING:
-    from impact_posture import tsid
+    from impact_posture import sweep, tsid
     from impact_posture.codegen.export import Export
     from impact_posture.codegen.impact_gradient import ImpactGradient
     from impact_posture.errors import ImpactPostureError
@@ -46,6 +46,7 @@ _HOMES = {
     "known_robots": "robot.robot_loader",
     "load_robot": "robot.robot_loader",
     "optimize": "front_door",
+    "sweep": "",
     "tsid": "",
 }
 
@@ -64,6 +65,7 @@ __all__ = [
     "known_robots",
     "load_robot",
     "optimize",
+    "sweep",
     "tsid",
 ]
 

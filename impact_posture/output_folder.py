@@ -32,7 +32,7 @@ _SCRATCH = ".impact-posture-"
 _SHOWN = 3
 _PROGRAM = "impact-posture"
 
-Kind = Literal["result", "export", "run", "comparison", "reproduction", "runs"]
+Kind = Literal["result", "export", "run", "comparison", "reproduction", "runs", "sweep"]
 
 
 def check_output(out: Path, *, force: bool, kind: Kind) -> None:
@@ -144,7 +144,7 @@ def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
     write_whole(folder / RECORD, json.dumps(content, indent=1) + "\n")
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file that appears whole or not at all.
 
     Raises:
@@ -158,7 +158,7 @@ def write_whole(path: Path, text: str) -> None:
 
     try:
         with undone(remove):
-            beside.write_text(text, encoding="utf-8", newline="\n")
+            beside.write_bytes(content.encode() if isinstance(content, str) else content)
             os.replace(beside, path)
     except OSError as error:
         hint = "check the disk and permissions"

@@ -110,7 +110,7 @@ def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Itera
         return
     _WORK["function"] = function
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(min(jobs, count), multiprocessing.get_context("fork"), _depend, (os.getpid(),))
+    pool = ProcessPoolExecutor(min(jobs, count), multiprocessing.get_context("fork"), depend, (os.getpid(),))
     try:
         # The workers are forked here.  A signal reaches every process of the terminal.  No worker may act on it, not
         # even at its start.
@@ -168,7 +168,7 @@ def fork_server(
         parent, child = os.getpid(), os.fork()
         if child == 0:
             ours.close()
-            _depend(parent)
+            depend(parent)
             _serve(begin, theirs)
     theirs.close()
     running = [child]
@@ -213,7 +213,7 @@ def _serve(begin: Callable[[], Callable[[Any], Iterable[Any]]], channel: Any) ->
         os._exit(0)
 
 
-def _depend(parent: int) -> None:
+def depend(parent: int) -> None:
     """Ignore signals except SIGTERM, by which a pool ends its workers; end when the parent ends."""
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else signal.SIG_IGN)

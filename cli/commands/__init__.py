@@ -23,5 +23,6 @@ COMMANDS: Final[dict[str, str]] = {
     "reproduce": (
         "Run the paper's experiments: its table beside ours, figures, a summary. Goes on where it was interrupted."
     ),
+    "sweep": "Solve a grid of problems on whatever machines there are; 'sweep show DIR' draws maps of the results.",
 }
 """Name and help text of each subcommand, in the order of the help page."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -32,6 +33,7 @@ from impact_posture.posture.regular import pin_undetermined, regularize
 from impact_posture.posture.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
 from impact_posture.setting import tilt_of
+from impact_posture.settings import Vector3
 
 
 def build_problem(robot: Robot, objective: Objective, given: Array, requirements: Requirements) -> PostureProblem:
@@ -88,6 +90,30 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
         notes=(*decided, *notes), surroundings=around,
     )  # fmt: skip
     return regularize(problem)
+
+
+def retarget(
+    problem: PostureProblem, position: Vector3 | None, quaternion: tuple[float, float, float, float] | None
+) -> PostureProblem:
+    """Return the problem with another target of its only contact; all else stays, so its program fits as it is.
+
+    Args:
+        problem: A problem with one contact.
+        position: Position of the contact frame, world, meters; ``None`` for its initial position.
+        quaternion: Its orientation, x y z w; ``None`` for its initial orientation.
+
+    Raises:
+        InputError: The contact pose takes no target, or the quaternion has no unit length.
+    """
+    requirements = replace(problem.requirements, target_position=position, target_quaternion=quaternion)
+    _check(problem.robot, requirements)
+    (contact,) = problem.objective.contacts
+    numeric = Numeric(problem.robot.model).at(problem.given)
+    made = _contact_constraints(problem.robot, contact, numeric, requirements, requirements.contact_pose)
+    # The constraints of the contact follow those of the feet.
+    first = len(problem.objective.supports)
+    kept = problem.constraints[:first], problem.constraints[first + len(made) :]
+    return replace(problem, requirements=requirements, constraints=(*kept[0], *made, *kept[1]))
 
 
 def _surroundings(

@@ -76,6 +76,7 @@ class SolveRecord:
         time_s: Wall time of the call.
         cpu_s: Processor time of the call, all threads together.
         auxiliaries: Final auxiliaries of the constraints, shape (k,).
+        minimized: Value that the solver minimized, in units of the scale.
     """
 
     q: Array
@@ -84,6 +85,7 @@ class SolveRecord:
     time_s: float
     cpu_s: float
     auxiliaries: Array
+    minimized: float
 
     @property
     def converged(self) -> bool:
@@ -135,7 +137,7 @@ class PostureNLP:
         x = np.clip(self.chart.to_x(start), problem.lower, problem.upper)
         scale = scale or problem.objective.value(self.chart.to_q(x))
         guess = problem.objective.guess(self.chart.to_q(x), scale, attempt)
-        own = problem.guess(Numeric(problem.robot.model).at(self.chart.to_q(x)))
+        own = problem.guess(self.program.numeric.at(self.chart.to_q(x)))
         lower = np.concatenate([problem.lower, guess.lower, own.lower])
         upper = np.concatenate([problem.upper, np.full(guess.values.size, np.inf), own.upper])
         began, busy = time.perf_counter(), time.process_time()
@@ -152,6 +154,7 @@ class PostureNLP:
             time_s=elapsed,
             cpu_s=busy,
             auxiliaries=found[nx + guess.values.size :],
+            minimized=float(answer["f"]),
         )
 
 
@@ -218,11 +221,13 @@ class Program:
 
     Attributes:
         chart: Coordinates of the robot.
+        numeric: The model in numbers, made once for all runs.
         bounded: Number of last rows that are inequalities ``≤ 0`` of the objective.
     """
 
     def __init__(self, problem: PostureProblem) -> None:
         self.chart = chart = Chart(problem.robot.model)
+        self.numeric = Numeric(problem.robot.model)
         self._x = x = ca.SX.sym("x", chart.nx)
         own = ca.SX.sym("own", len(problem.objective.parameters))
         scale, weight, self._price = ca.SX.sym("scale"), ca.SX.sym("weight"), ca.SX.sym("price")

@@ -25,7 +25,7 @@ FEASIBLE = 1e-8
 # Starts that run before the others, and most rounds in which the program grows.
 _FIRST, _ROUNDS = 2, 8
 # Price of a meter of slack for runs that ended in a trap.
-_HIGH_PRICE = 20 * SLACK_PRICE
+HIGH_PRICE = 20 * SLACK_PRICE
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class Search:
         if start is None:
             return Run()
         try:
-            record, certificate = run_start(nlp, start, scale, _HIGH_PRICE if index in self._trapped else SLACK_PRICE)
+            record, certificate = run_start(nlp, start, scale, HIGH_PRICE if index in self._trapped else SLACK_PRICE)
             objective = problem.objective.value(record.q)
         except MetricError:
             # This start led to a posture where the objective does not exist.  The other starts go on.

@@ -1,0 +1,139 @@
+"""``impact-posture sweep SWEEP.toml`` and ``impact-posture sweep show DIR``."""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from impact_posture_cli import options
+from impact_posture_cli.error_boundary import UsageError
+from impact_posture_cli.output import Page, number, print_json
+from impact_posture_cli.progress import progress
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+RUN = "Where it runs"
+
+Target = Annotated[
+    str,
+    typer.Argument(metavar="SWEEP.toml|show", help="What to solve, or the word show for a folder that sweep wrote."),
+]
+Shown = Annotated[str | None, typer.Argument(metavar="DIR", help="With show: the folder.")]
+Workers = Annotated[int, options.option("--workers", panel=RUN, min=1, help="Processes on this machine.")]
+Scheduler = Annotated[
+    str | None,
+    options.option("--scheduler", metavar="ADDRESS", panel=RUN, help="A Dask cluster, such as tcp://host:8786."),
+]
+Mpi = Annotated[bool, options.option("--mpi", panel=RUN, help="The ranks of mpiexec … -m mpi4py.futures.")]
+Slurm = Annotated[
+    list[str] | None,
+    options.option("--slurm", metavar="KEY=VALUE", panel=RUN, help="Slurm job arrays by submitit; repeatable."),
+]
+Out = Annotated[
+    str | None, options.out_option("Folder of the sweep; with show, of the maps.", "./SWEEP, or DIR/maps")
+]
+MapAxes = Annotated[
+    str | None,
+    options.option("--axes", metavar="A,B", panel="Maps", show_default="the two longest", help="Axes of the maps."),
+]
+
+
+def sweep(
+    target: Target,
+    folder: Shown = None,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    mpi: Mpi = False,
+    slurm: Slurm = None,
+    axes: MapAxes = None,
+    out: Out = None,
+    format: options.Formats = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Run ``impact-posture sweep``."""
+    if target == "show":
+        if folder is None:
+            raise UsageError("Missing argument 'DIR': the folder that sweep wrote.")
+        _show(Path(folder), axes, out, format, json=json, quiet=quiet)
+        return
+    if folder is not None:
+        raise UsageError("DIR goes with show alone: give --out to name the folder.")
+    if sum((scheduler is not None, mpi, slurm is not None)) > 1:
+        raise UsageError("--scheduler, --mpi and --slurm exclude each other: give one of them.")
+    from impact_posture.escape import file_name
+    from impact_posture.sweep.run import run_sweep
+    from impact_posture.sweep.sweep_file import read_sweep
+
+    path = Path(target)
+    asked = read_sweep(path)
+    place = Path(out) if out else Path(file_name(path.stem))
+    began = time.perf_counter()
+    where = _executor(workers, scheduler, slurm, place, mpi=mpi)
+    with where as executor, progress("solving", "problems", shown=not (quiet or json), first="checking") as advance:
+        done = run_sweep(asked, place, executor, progress=advance)
+    found: dict[str, Any] = {
+        "schema": "impact-posture/sweep-run/1",
+        "folder": str(place),
+        "points": done.points,
+        "solved": done.counts,
+        "shards_written": done.shards,
+        "solver_s": done.solver_s,
+        "total_s": done.total_s,
+        "wall_s": time.perf_counter() - began,
+    }
+    if json:
+        print_json(found)
+        return
+    page = Page(quiet=quiet)
+    solved = sum(done.counts.values())
+    page.title(path.name, f"{done.points} problems, {solved} solved now")
+    page.table(("status", "problems"), [(k, str(v)) for k, v in done.counts.items() if v], right=(1,))
+    if solved:
+        page.line(
+            f"{number(1e3 * done.total_s / solved, 'ms')} of processor time a problem, "
+            f"{100 * done.solver_s / max(done.total_s, 1e-9):.0f} % of it in the solver"
+        )
+    page.line(f"written to {place}")
+
+
+def _executor(
+    workers: int, scheduler: str | None, slurm: list[str] | None, out: Path, *, mpi: bool
+) -> AbstractContextManager[Executor | None]:
+    """Return what runs the shards."""
+    from impact_posture.sweep import executors
+
+    if scheduler is not None:
+        return executors.dask_cluster(scheduler)
+    if mpi:
+        return executors.mpi_ranks()
+    if slurm is not None:
+        return executors.SlurmJobs(out.with_name(f"{out.name}-slurm"), executors.parse_options(slurm))
+    return executors.process_pool(workers) if workers > 1 else nullcontext()
+
+
+def _show(
+    folder: Path, axes: str | None, out: str | None, format: list[Any] | None, *, json: bool, quiet: bool
+) -> None:
+    """Draw the maps of a sweep folder, and print its best point and its switches."""
+    from impact_posture.sweep.maps import draw_maps
+
+    wanted = tuple(name.strip() for name in axes.split(",")) if axes else None
+    with progress("drawing", shown=not (quiet or json)):
+        shown = draw_maps(folder, Path(out) if out else folder / "maps", wanted, format or ("png",))
+    if json:
+        print_json(shown.to_dict())
+        return
+    page = Page(quiet=quiet)
+    page.title(folder.name, f"{sum(shown.counts.values())} of {shown.points} problems solved")
+    page.table(("status", "problems"), [(k, str(v)) for k, v in shown.counts.items() if v], right=(1,))
+    page.line(f"{shown.switches} steps between neighbors switch to another optimum")
+    for best in shown.best:
+        page.line("best: " + ", ".join(f"{key} {value}" for key, value in best.items()))
+    for path in shown.files:
+        page.line(str(path))

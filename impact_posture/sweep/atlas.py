@@ -1,0 +1,194 @@
+"""The folder of a sweep: a manifest, and one Parquet file for each shard, written whole."""
+
+from __future__ import annotations
+
+import builtins
+import fcntl
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from impact_posture.errors import InputError, OutputError, SpecError
+from impact_posture.libraries import source_key
+from impact_posture.output_folder import check_output, write_record, write_whole
+from impact_posture.posture.problem_settings import dump_settings
+from impact_posture.sweep.case_solver import CaseSolver
+from impact_posture.sweep.sweep_file import Sweep
+from impact_posture.version import __version__
+
+if TYPE_CHECKING:
+    from pyarrow.dataset import Dataset
+
+SCHEMA = "impact-posture/sweep-folder/1"
+MANIFEST, _DATA = "manifest.json", "data"
+# Packages whose formulas decide the numbers.
+_PACKAGES = ("robot", "dynamics", "collision", "impact", "posture", "sweep")
+
+
+def sweep_key(sweep: Sweep) -> str:
+    """Return a hash of everything that the results of a sweep depend on; it loads the robot of every case.
+
+    Raises:
+        ImpactPostureError: A setting does not fit its robot; the first fault, in one line.
+    """
+    content = [repr((sweep.outer, sweep.grid, sweep.shard))]
+    for case in sweep.cases:
+        solver = CaseSolver(case)
+        solver.check(sweep.grid)
+        content += [dump_settings(case.settings), solver.robot.model_sha256]
+    return source_key(content, *_PACKAGES)
+
+
+class Atlas:
+    """The folder that a sweep writes.
+
+    Args:
+        folder: The folder.
+        sweep: The sweep.
+        key: Its :func:`sweep_key`.
+    """
+
+    def __init__(self, folder: Path, sweep: Sweep, key: str) -> None:
+        self.folder, self._sweep, self._key = folder, sweep, key
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Make the folder, or go on with it; no other process writes it within the block.
+
+        Raises:
+            OutputError: It holds something else, another sweep or version, or another process works in it.
+        """
+        manifest = self.folder / MANIFEST
+        if not manifest.is_file():
+            check_output(self.folder, force=False, kind="sweep")
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                write_record(self.folder, "sweep")
+            except OSError as error:
+                words = f"cannot be written ({error.strerror or error})"
+                raise OutputError(words, where=str(self.folder), hint="free space or choose another --out") from None
+            write_whole(manifest, json.dumps(self._manifest(), indent=1) + "\n")
+        known = read_manifest(self.folder)
+        if known["key"] != self._key:
+            other = "another version" if known["version"] != __version__ else "another sweep, or other code or robots"
+            raise OutputError(f"holds results of {other}", where=str(self.folder), hint="choose another --out")
+        with builtins.open(manifest, "rb") as held:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise OutputError(
+                    "is in use by another process",
+                    where=str(self.folder),
+                    hint="wait for it, or choose another --out",
+                ) from None
+            except OSError:
+                # This file system knows no locks.
+                pass
+            for part in (self.folder / _DATA).glob("case=*/.shard-*.parquet.*.part"):
+                with suppress(OSError):
+                    part.unlink()
+            yield
+
+    def waiting(self) -> list[int]:
+        """Return the shards without a whole file of this sweep."""
+        return [shard for shard in range(self._sweep.shards) if not self._is_done(shard)]
+
+    def write(self, shard: int, content: bytes) -> None:
+        """Write the file of a shard, whole or not at all.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        path = self._path(shard)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            words = f"cannot be made ({error.strerror or error})"
+            raise OutputError(words, where=str(path.parent), hint="check the disk and permissions") from None
+        write_whole(path, content)
+
+    def _path(self, shard: int) -> Path:
+        case, part = divmod(shard, self._sweep.shards_of_case)
+        return self.folder / _DATA / f"case={case}" / f"shard-{part:06d}.parquet"
+
+    def _is_done(self, shard: int) -> bool:
+        from pyarrow import ArrowException, parquet
+
+        path = self._path(shard)
+        if not path.exists():
+            return False
+        try:
+            found = parquet.read_metadata(path)
+        except (OSError, ArrowException):
+            return False
+        return (
+            found.num_rows == len(self._sweep.span(shard)[1])
+            and (found.metadata or {}).get(b"sweep") == self._key.encode()
+        )
+
+    def _manifest(self) -> dict[str, Any]:
+        sweep = self._sweep
+        return {
+            "schema": SCHEMA,
+            "version": __version__,
+            "key": self._key,
+            "points": sweep.points,
+            "shards": sweep.shards,
+            "shard": sweep.shard,
+            "cases": [{"values": dict(case.values), "problem": dump_settings(case.settings)} for case in sweep.cases],
+            "axes": [{"name": axis.name, "values": list(axis.values)} for axis in sweep.grid.axes],
+        }
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest of a sweep folder.
+
+    Raises:
+        SpecError: There is none, or it cannot be read.
+    """
+    path = folder / MANIFEST
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if found["schema"] != SCHEMA:
+            raise ValueError(f"schema {found['schema']}")
+        return {**found, "key": str(found["key"]), "version": str(found["version"])}
+    except FileNotFoundError:
+        raise SpecError("holds no manifest.json", where=str(folder), hint="name a folder that sweep wrote") from None
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        what = f"is no manifest of a sweep ({type(error).__name__}: {error})"
+        raise SpecError(what, where=str(path), hint="name a folder that sweep wrote") from None
+
+
+def open_atlas(folder: str | Path) -> Dataset:
+    """Open the table of a sweep, finished or not, as a ``pyarrow.dataset.Dataset``.
+
+    Raises:
+        InputError: pyarrow is not installed.
+        SpecError: The folder is none of a sweep, or has no finished shard.
+    """
+    check_package("pyarrow", "sweep")
+    from pyarrow import ArrowException, dataset
+
+    read_manifest(Path(folder))
+    place = Path(folder) / _DATA
+    if next(place.glob("case=*/*.parquet"), None) is None:
+        raise SpecError("has no finished shard", where=str(folder), hint="run sweep again, which goes on")
+    try:
+        return dataset.dataset(place, format="parquet", partitioning="hive")
+    except (OSError, ArrowException) as error:
+        raise SpecError(f"cannot be read ({error})", where=str(folder), hint="run sweep again") from None
+
+
+def check_package(name: str, extra: str) -> None:
+    """Check that the package of an extra is installed.
+
+    Raises:
+        InputError: It is not.
+    """
+    from importlib.util import find_spec
+
+    if find_spec(name) is None:
+        what = f"needs the package {name}"
+        raise InputError(what, where="sweep", hint=f"pip install 'impact-posture[{extra}]'")

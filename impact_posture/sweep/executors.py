@@ -1,0 +1,121 @@
+"""Where shards run: processes of this machine, a Dask cluster, MPI ranks, or Slurm jobs."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from impact_posture.errors import InputError
+from impact_posture.processes import depend
+from impact_posture.sweep.atlas import check_package
+
+
+@contextmanager
+def process_pool(workers: int) -> Iterator[Executor]:
+    """Yield a pool of processes on this machine; none outlives the block."""
+    # Spawned and not forked: a fork of a process with threads, such as those of pyarrow, may hang.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, context, depend, (os.getpid(),))
+    others = set(multiprocessing.active_children())
+    try:
+        yield pool
+    finally:
+        for child in set(multiprocessing.active_children()) - others:
+            child.kill()
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def dask_cluster(address: str) -> Iterator[Executor]:
+    """Yield the executor of a Dask cluster.
+
+    Args:
+        address: Address of its scheduler, such as ``tcp://host:8786``.
+
+    Raises:
+        InputError: The package is missing, or no scheduler answers there.
+    """
+    check_package("distributed", "dask")
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout="10s")
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"no Dask scheduler answers ({error})",
+            where=f"--scheduler {address}",
+            hint="start one, or correct the address",
+        ) from None
+    with client:
+        yield client.get_executor()
+
+
+@contextmanager
+def mpi_ranks() -> Iterator[Executor]:
+    """Yield the executor over the ranks of ``mpiexec -n N python -m mpi4py.futures -m impact_posture_cli …``.
+
+    Raises:
+        InputError: The package or an MPI library is missing.
+    """
+    check_package("mpi4py", "mpi")
+    try:
+        from mpi4py.futures import MPIPoolExecutor
+    except (ImportError, RuntimeError) as error:
+        raise InputError(f"MPI cannot be loaded ({error})", where="--mpi", hint="install an MPI library") from None
+    with MPIPoolExecutor() as pool:
+        yield pool
+
+
+class SlurmJobs(Executor):
+    """Shards as elements of Slurm job arrays, by submitit.
+
+    Args:
+        folder: Folder of its logs, which every node sees.
+        options: Parameters of ``submitit.AutoExecutor``, such as ``timeout_min`` or ``slurm_partition``.
+        cluster: Cluster of submitit: ``slurm``, or ``local`` for processes of this machine; ``None`` to decide.
+    """
+
+    def __init__(self, folder: Path, options: dict[str, Any], cluster: str | None = None) -> None:
+        check_package("submitit", "slurm")
+        import submitit
+
+        self._jobs = submitit.AutoExecutor(folder, cluster=cluster)
+        try:
+            self._jobs.update_parameters(**options)
+        except (NameError, TypeError, ValueError, AssertionError) as error:
+            raise InputError(str(error), where="--slurm", hint="name parameters of submitit.AutoExecutor") from None
+        self._waiting = ThreadPoolExecutor(1 << 10)
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        """Submit one call as a job."""
+        return self._waiting.submit(self._jobs.submit(function, *arguments, **named).result)
+
+    def submit_all(self, calls: Sequence[tuple[Any, ...]]) -> list[Future[Any]]:
+        """Submit calls ``(function, *arguments)`` as one job array."""
+        with self._jobs.batch():
+            jobs = [self._jobs.submit(*call) for call in calls]
+        return [self._waiting.submit(job.result) for job in jobs]
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """See ``Executor``."""
+        self._waiting.shutdown(wait=wait, cancel_futures=cancel_futures)
+
+
+def parse_options(texts: Sequence[str]) -> dict[str, Any]:
+    """Return ``KEY=VALUE`` texts as options; a value that is an integer becomes one.
+
+    Raises:
+        InputError: A text has no key or no value.
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        key, _, value = text.partition("=")
+        if not (key.isidentifier() and value):
+            raise InputError(f"'{text}' is no KEY=VALUE", where="--slurm", hint="give for example timeout_min=60")
+        found[key] = int(value) if value.isdecimal() else value
+    return found

@@ -1,0 +1,182 @@
+"""``SWEEP.toml``: one posture problem, and the values that vary over a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from impact_posture.errors import SpecError, nearest
+from impact_posture.escape import printable
+from impact_posture.robot.robot_loader import from_folder
+from impact_posture.setting import Setting, between
+from impact_posture.settings import ProblemSettings
+from impact_posture.sweep.grid import Axis, Grid
+from impact_posture.tables import STRICT, read_toml, validate
+
+# Axes that one program serves, from the slowest to the fastest.  ``x``, ``y`` and ``z`` are offsets of the target.
+OFFSETS = ("x", "y", "z")
+_INNER = ("normal", "target_quaternion", "target_position", *OFFSETS, "speed")
+# Settings that belong to one optimization, to its search or to its output.
+_NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "path", "search", "contact")
+_FILES = ("srdf", "config", "weights", "armature", "posture")
+# Most points of a grid, which keeps every index a 64-bit integer.
+_MOST = 10**15
+
+
+@dataclass(frozen=True)
+class SweepSettings:
+    """Content of a ``SWEEP.toml``.
+
+    Attributes:
+        problem: A table with the keys of a ``problem.toml``, or the path of one.
+        grid: Values of each axis.
+        shard: Points of a shard, which is solved and written as one.
+        schema: Name of this format.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+
+    problem: str | dict[str, Any]
+    grid: dict[str, Any]
+    shard: Annotated[int, Setting("Points of a shard.", **between(1, 1e6, "points"))] = 256
+    schema: Literal["impact-posture/sweep/1"] = "impact-posture/sweep/1"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One combination of the values that need a program of their own.
+
+    Attributes:
+        settings: The problem at the first point of the grid.
+        values: Value of each such axis.
+    """
+
+    settings: ProblemSettings
+    values: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """All problems of a ``SWEEP.toml``.
+
+    Attributes:
+        cases: Combinations of robot parameters, objectives and other settings.
+        outer: The axes of these settings.
+        grid: Targets, normals and speeds, the same for every case.
+        shard: Points of a shard.
+    """
+
+    cases: tuple[Case, ...]
+    outer: tuple[Axis, ...]
+    grid: Grid
+    shard: int
+
+    @property
+    def points(self) -> int:
+        """Number of problems."""
+        return len(self.cases) * self.grid.size
+
+    @property
+    def shards(self) -> int:
+        """Number of shards; no shard has points of two cases."""
+        return len(self.cases) * self.shards_of_case
+
+    @property
+    def shards_of_case(self) -> int:
+        """Number of shards of each case."""
+        return -(-self.grid.size // self.shard)
+
+    def span(self, shard: int) -> tuple[int, range]:
+        """Return the case of a shard, and its points as indices of the grid."""
+        case, part = divmod(shard, self.shards_of_case)
+        first = part * self.shard
+        return case, range(first, min(first + self.shard, self.grid.size))
+
+
+def read_sweep(path: Path) -> Sweep:
+    """Read a ``SWEEP.toml``, whose paths are relative to its folder.
+
+    Raises:
+        SpecError: A key is unknown or missing, or a value does not fit; the first fault, in one line.
+    """
+    settings, folder = validate(SweepSettings, read_toml(path), str(path)), path.resolve().parent
+    if isinstance(settings.problem, str):
+        at = folder / settings.problem
+        where, problem = str(at), from_folder(read_toml(at), at.parent, _FILES)
+    else:
+        where, problem = f"{path}: problem", from_folder(settings.problem, folder, _FILES)
+    values = {name: _values(name, given, f"{path}: grid.{name}") for name, given in settings.grid.items()}
+    outer = [name for name in values if name not in _INNER]
+    inner = [name for name in _INNER if name in values]
+    _check_names([*outer, *inner], f"{path}: grid")
+    if "normal" in inner and "contact" in problem:
+        what = "varies, but `contact` states the normal of each contact"
+        raise SpecError(what, where=f"{path}: grid.normal", hint="use `frame` and `normal` in the problem")
+    first = {name: values[name][0] for name in inner if name not in OFFSETS}
+    made = validate(ProblemSettings, problem | first | {name: values[name][0] for name in outer}, where)
+    axes = tuple(Axis(name, _checked(name, values[name], problem | first, f"{path}: grid")) for name in inner)
+    for name in outer:
+        _checked(name, values[name], problem | first, f"{path}: grid")
+    if made.tradeoff or made.path or made.search != "multistart":
+        raise SpecError("`tradeoff`, `path` and `search` are for one optimum", where=where, hint="leave them out")
+    cases = []
+    for chosen in product(*(values[name] for name in outer)):
+        of_case = dict(zip(outer, chosen, strict=True))
+        own = from_folder(problem | first | of_case, folder, [name for name in _FILES if name in outer])
+        cases.append(Case(validate(ProblemSettings, own, str(path)), of_case))
+    sweep = Sweep(tuple(cases), tuple(Axis(name, values[name]) for name in outer), Grid(axes), settings.shard)
+    if sweep.points > _MOST:
+        raise SpecError(f"has {sweep.points} points", where=f"{path}: grid", hint=f"give at most {_MOST:.0e}")
+    return sweep
+
+
+def _values(name: str, given: Any, where: str) -> tuple[Any, ...]:
+    """Return the values of an axis, from a list or from ``{from, to, count}``."""
+    if isinstance(given, dict):
+        low, high, count = (given.get(key, "") for key in ("from", "to", "count"))
+        ends = all(isinstance(v, int | float) and abs(v) < float("inf") for v in (low, high))
+        if not ends or set(given) != {"from", "to", "count"} or type(count) is not int or not 2 <= count <= 10**6:
+            raise SpecError("is no range", where=where, hint="give from, to and count (2 to 1e6), or a list")
+        return tuple(low + (high - low) * k / (count - 1) for k in range(count))
+    if not isinstance(given, list) or not given:
+        raise SpecError("is no axis", where=where, hint="give a list of values, or { from, to, count }")
+    return tuple(float(v) if name in _INNER and type(v) is int else v for v in given)
+
+
+def _check_names(names: Sequence[str], where: str) -> None:
+    known = [*OFFSETS, *(field.name for field in fields(ProblemSettings) if field.name not in _NO_AXIS)]
+    for name in names:
+        if name in _NO_AXIS:
+            raise SpecError(f"'{name}' cannot vary", where=where, hint="set it in the problem")
+        if name not in known:
+            close = ", ".join(nearest(name, known))
+            raise SpecError(
+                f"unknown axis '{printable(name, longest=60)}'", where=where, hint=f"did you mean {close}?"
+            )
+
+
+def _checked(name: str, values: Sequence[Any], problem: dict[str, Any], where: str) -> tuple[Any, ...]:
+    """Return the values as the settings hold them; those of offsets are finite numbers."""
+    # An offset has the demand of one entry of a position.
+    key, wrap = ("target_position", lambda v: [v, 0.0, 0.0]) if name in OFFSETS else (name, lambda v: v)
+    found = []
+    for k, value in enumerate(values):
+        try:
+            made = getattr(validate(ProblemSettings, problem | {key: wrap(value)}, where), key)
+        except SpecError as error:
+            raise SpecError(
+                error.what.replace(f"'{key}", f"'{name}"), where=f"{where}.{name}[{k}]", hint=error.hint
+            ) from None
+        found.append(made[0] if name in OFFSETS else made)
+    if len(set(map(repr, found))) < len(found):
+        raise SpecError("has a value twice", where=f"{where}.{name}", hint="leave one of them out")
+    return tuple(found)
+
+
+def at_point(case: Case, values: Mapping[str, Any]) -> ProblemSettings:
+    """Return the problem of a case at values of the grid, without its target."""
+    own = {name: values[name] for name in ("normal", "speed") if name in values}
+    return replace(case.settings, **own) if own else case.settings
