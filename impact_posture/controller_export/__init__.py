@@ -1,1 +1,1 @@
-"""The online controller as C: one library without an interpreter, with the answers of ``impact_posture.tsid``."""
+"""Export of a whole controller as C code (``codegen --controller``)."""
