@@ -70,6 +70,15 @@ static void ip_shortest(const double *to, double *e)
   }
 }
 
+/* Rows of a task that never change. */
+static void ip_constant_rows(ip_context *c, int k)
+{
+  int row;
+  for (row = ip_task_row[k]; row < ip_task_row[k + 1] && ip_task_kind[k] <= IP_BASE_TURN; ++row) {
+    c->J[row][3 + row - ip_task_row[k]] = 1.0;
+  }
+}
+
 /* Target that is the present output. */
 static void ip_present(const ip_context *c, int k, ip_target *target)
 {

@@ -192,6 +192,7 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   c->pushed = 0;
   ip_read_state(c, q, v);
   for (k = 0; k < IP_TASKS; ++k) {
+    ip_constant_rows(c, k);
     if (c->target[k].set <= 0.0) {
       ip_present(c, k, &c->target[k]);
     }
