@@ -50,10 +50,11 @@ class CompiledController:
         bytes_ = ctypes.c_ulong.in_dll(library, f"{prefix}_context_bytes").value
         self._context = ctypes.create_string_buffer(bytes_)
         tasks = len(manifest.tasks)
-        targets = np.frombuffer(self._context, dtype=float, count=_TARGET * tasks).reshape(tasks, _TARGET)
+        memory = memoryview(self._context)
+        targets = np.frombuffer(memory, dtype=float, count=_TARGET * tasks).reshape(tasks, _TARGET)
         self._targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         start = _TARGET * room("TASKS") * 8
-        motion = np.frombuffer(self._context, dtype=float, count=2 * sizes["NV"], offset=start)
+        motion = np.frombuffer(memory, dtype=float, count=2 * sizes["NV"], offset=start)
         self.posture_velocity, self.posture_acceleration = np.split(motion, 2)
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
         doubles = ctypes.POINTER(ctypes.c_double)
@@ -114,7 +115,9 @@ class CompiledController:
         self._q[:], self._v[:] = q, v
         code = self._call("reset", *self._pointers[:2], ctypes.byref(self._command))
         if code == 1:
-            raise PostureError("no state of the robot", where="reset", hint="give finite numbers and unit quaternions")
+            raise PostureError(
+                "no state of the robot", where="reset", hint="give finite numbers and unit quaternions"
+            )
         if code:
             raise MetricError("the objective vanishes with its curvature", where="reset", hint="start elsewhere")
         self._ready = True
@@ -163,8 +166,9 @@ class CompiledController:
             for k, (name, multiplier) in enumerate(zip(checked.bounds, found["multipliers"], strict=True)):
                 if multiplier and k not in equations:
                     active.append((name, "upper" if multiplier > 0 else "lower"))
-        numbers = (float(found[name][0]) for name in ("dynamics", "level", "value"))
-        return Report(status, (), (), residuals, tuple(active), *numbers, int(self._report.iterations))
+        dynamics, level, value = (float(found[name][0]) for name in ("dynamics", "level", "value"))
+        iterations = int(self._report.iterations)
+        return Report(status, (), (), residuals, tuple(active), dynamics, level, value, iterations)
 
     # ---- targets and phases ------------------------------------------------------------------------------------
 
@@ -223,13 +227,16 @@ class CompiledController:
 
     def _enter(self, phase: str) -> None:
         if self._call(phase):
-            raise InputError(f"'{phase}' does not follow the present phase", where="controller", hint="reset it first")
+            raise InputError(
+                f"'{phase}' does not follow the present phase", where="controller", hint="reset it first"
+            )
 
     def _target(self, task: str) -> Array:
         if task not in self._targets:
             known = ", ".join(self._targets) or "none"
             raise InputError(f"there is no task '{task}'", where="controller", hint=f"one of: {known}")
-        return self._targets[task]
+        row: Array = self._targets[task]
+        return row
 
     def _call(self, name: str, *arguments: Any) -> int:
         return int(self._functions[name](self._context, *arguments))

@@ -14,13 +14,13 @@ import casadi as ca
 from impact_posture.codegen.export import export as export_gradient
 from impact_posture.codegen.manifest import configuration_names
 from impact_posture.codegen.naming import c_identifier, check_prefix
+from impact_posture.codegen.reader import identity
 from impact_posture.controller_export.compiled_controller import CompiledController
 from impact_posture.controller_export.daqp_sources import FILES, SOURCES, VERSION, daqp_sources
 from impact_posture.controller_export.manifest import SCHEMA, build_controller
 from impact_posture.controller_export.parameters import Field, parameters
 from impact_posture.controller_export.render import render
 from impact_posture.controller_export.structure import Structure, structure_of
-from impact_posture.codegen.reader import identity
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import library_path
@@ -95,7 +95,9 @@ def export_controller(
     prefix = c_identifier(robot.name, "controller") if prefix is None else check_prefix(prefix)
     structure = structure_of(robot, formulation)
     if (structure.robust is None) != (objective is None):
-        what = "the impact-robust posture task has no objective" if objective is None else "no task uses the objective"
+        what = (
+            "the impact-robust posture task has no objective" if objective is None else "no task uses the objective"
+        )
         hint = "give the objective of its gradient" if objective is None else "give an impact-robust posture task"
         raise InputError(what, where="controller export", hint=hint)
     sources = daqp_sources(daqp)

@@ -59,7 +59,9 @@ def _fields(s: Structure, period: float) -> Iterator[Field]:
     yield field("period", "positive", "expected time between ticks, s", period)
     for name, text in (("kp", "stiffness, 1/s2"), ("kd", "damping, 1/s"), ("weight", "weight in the cost")):
         rows = [getattr(task, name) for task in s.tasks]
-        yield field(f"task_{name}", "nonnegative", f"{text}, of each row of the tasks", np.hstack([np.zeros(0), *rows]))
+        yield field(
+            f"task_{name}", "nonnegative", f"{text}, of each row of the tasks", np.hstack([np.zeros(0), *rows])
+        )
     soft = [t._soften if isinstance(t, FrameTask) and t._soften is not None else np.zeros(6) for t in s.tasks]
     yield field("task_softness", "nonnegative", "inverse apparent inertia of each task, 1/kg and 1/(kg m2)", soft)
     for name, text in (("kp", "stiffness, 1/s2"), ("kd", "damping, 1/s"), ("weight", "weight in the cost")):
@@ -69,7 +71,9 @@ def _fields(s: Structure, period: float) -> Iterator[Field]:
         yield field("stiffness", "finite", "K_p of the posture task as a matrix, 1/s2", posture.stiffness)
         yield field("damping", "finite", "K_d that belongs to it, 1/s", posture.damping)
     given = None if posture is None else posture._given
-    yield field("posture_given", "nonnegative", "1: reset takes posture_target; 0: the present posture", given is not None)
+    yield field(
+        "posture_given", "nonnegative", "1: reset takes posture_target; 0: the present posture", given is not None
+    )
     yield field("posture_target", "finite", "q_des at reset", s.robot.posture() if given is None else given)
     for name, rule, text in (
         ("kp", "nonnegative", "stiffness, 1/s2"),
@@ -83,7 +87,9 @@ def _fields(s: Structure, period: float) -> Iterator[Field]:
     weights = [1.0 if c.weight is None else c.weight for c in contacts]
     yield field("contact_weight", "positive", "weight in the cost of each contact that is not hard", weights)
     yield field("force_weight", "positive", "weight of contact forces, 1/N2", formulation.force_weight)
-    yield field("spare_weight", "positive", "weight of the choice of redundant rotors, 1/N2", formulation.spare_weight)
+    yield field(
+        "spare_weight", "positive", "weight of the choice of redundant rotors, 1/N2", formulation.spare_weight
+    )
     for name in ("lower", "upper"):
         yield field(f"control_{name}", "limit", "thrusts, N, and torques, N m", getattr(actuators, name))
     for name in ("lower", "upper"):
@@ -98,7 +104,9 @@ def _fields(s: Structure, period: float) -> Iterator[Field]:
     if robust is not None:
         springs = ("keep", "release", "follow")
         yield field("robust_gain", "nonnegative", "K, 1/s2", robust.K)
-        yield field("robust_scale", "nonnegative", "lambda; 0: measured at reset", 0 if robust._measure else robust.scale)
+        yield field(
+            "robust_scale", "nonnegative", "lambda; 0: measured at reset", 0 if robust._measure else robust.scale
+        )
         yield field("robust_reach", "positive", "bound of the term over K, rad", robust.reach)
         yield field("robust_near", "nonnegative", "distance of each joint where the term is gone", robust._near)
         yield field("robust_band", "positive", "width of the fade of each joint; may be infinite", robust._band)

@@ -1,4 +1,4 @@
-"""C text of a controller: the generated dynamics, the tables of its structure, and the files in ``c/`` around them."""
+"""C text of a controller: generated dynamics, the tables of its structure, and the files of ``c/`` around them."""
 
 from __future__ import annotations
 

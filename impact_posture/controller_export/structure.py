@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
@@ -49,7 +50,7 @@ class Structure:
     tasks: tuple[Task, ...]
     points: tuple[Point, ...]
     sizes: dict[str, int]
-    tables: dict[str, Array]
+    tables: dict[str, NDArray[Any]]
 
     @property
     def robust(self) -> ImpactRobustPosture | None:
@@ -138,7 +139,7 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
         "spare": actuators.spare,
         "task_axis": [_axes(t) for t in tasks],
     }
-    found = {name: np.array(values, dtype=np.int64) for name, values in tables.items()}
+    found: dict[str, NDArray[Any]] = {name: np.array(v, dtype=np.int64) for name, v in tables.items()}
     found |= {name: np.array(values, dtype=float).ravel() for name, values in doubles.items()}
     return Structure(robot, formulation, actuators, tasks, points, sizes, found)
 

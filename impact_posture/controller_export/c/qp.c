@@ -47,7 +47,6 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
   const double shift = ip_dot(row, c->center, IP_NV);
   const int at = IP_SIMPLE + r;
   int j;
-  c->shift[r] = shift;
   /* Finite while all numbers are. */
   c->sum += length + shift + (isnan(lower) || isnan(upper) ? NAN : 0.0);
   scale = length > IP_NOTHING * IP_NOTHING ? 1.0 / sqrt(length) : 1.0;
@@ -55,6 +54,8 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
     row[j] *= scale;
   }
   c->scaling[at] = scale;
+  c->high[at] = upper;
+  c->low[at] = lower;
   c->upper[at] = (upper - shift) * scale;
   c->lower[at] = (lower - shift) * scale;
 }
@@ -130,19 +131,19 @@ static void ip_factorize(ip_context *c)
   ip_whiten(c, g, c->center);
 }
 
-/* One row of the controls or of the unactuated part: s'[M_base v + h_base - J_base'f], or one row of the joints. */
-static void ip_force_row(ip_context *c, const double *s, int first, int count, double *row, double *bias)
+/* The row of s'(M v + h - J'f), of so many entries from the first on; return s'h. */
+static double ip_force_row(ip_context *c, const double *s, int first, int count, double *row)
 {
+  double bias = 0.0;
   int i, j, k;
   memset(row, 0, sizeof(double) * IP_VARIABLES);
-  *bias = 0.0;
   for (i = 0; i < count; ++i) {
     const double t = s[i];
     const double *M = c->m.M + (first + i) * IP_NV;
     if (t == 0.0) {
       continue;
     }
-    *bias += t * c->free_force[first + i];
+    bias += t * c->free_force[first + i];
     for (j = 0; j < IP_NV; ++j) {
       row[j] += t * M[j];
     }
@@ -153,11 +154,13 @@ static void ip_force_row(ip_context *c, const double *s, int first, int count, d
       }
     }
   }
+  return bias;
 }
 
-/* Place a row [v; w; f] in M. */
-static void ip_put(ip_context *c, int r, const double *row, double lower, double upper)
+/* Place the row [v; w; f] in M. */
+static void ip_put(ip_context *c, int r, double lower, double upper)
 {
+  const double *row = c->rows[r];
   int j;
   ip_whiten(c, row, c->M[r]);
   for (j = IP_NV; j < IP_VARIABLES; ++j) {
@@ -188,7 +191,7 @@ static void ip_measure_rank(ip_context *c)
   if (way < c->space) {
     return;
   }
-  memcpy(c->reference, c->rows, sizeof c->rows);
+  memcpy(c->reference, c->rows, sizeof c->reference);
   c->space = 0.0;
   c->independent = 1;
   if (!isfinite(way)) {
@@ -232,7 +235,7 @@ static void ip_measure_rank(ip_context *c)
 /* Fill M and the bounds. */
 static void ip_assemble(ip_context *c)
 {
-  double row[IP_VARIABLES], to[2], one = 1.0, bias;
+  double to[2], one = 1.0, bias;
   int i, j, k, r = 0;
   c->sum = 0.0;
   ip_factorize(c);
@@ -241,35 +244,30 @@ static void ip_assemble(ip_context *c)
     for (j = 0; j < IP_BASE; ++j) {
       s[j] = ip_blind[j * IP_BLIND + i];
     }
-    ip_force_row(c, s, 0, IP_BASE, row, &bias);
-    memcpy(c->rows[r], row, sizeof row);
-    ip_put(c, r++, row, -bias, -bias);
+    bias = ip_force_row(c, s, 0, IP_BASE, c->rows[r]);
+    ip_put(c, r++, -bias, -bias);
   }
   for (k = 0; k < IP_CONTACTS; ++k) {
     for (i = ip_contact_row[k]; ip_contact_hard[k] && i < ip_contact_row[k + 1]; ++i) {
-      memset(row, 0, sizeof row);
-      memcpy(row, c->m.jacobian[ip_contact_point[k]] + (i - ip_contact_row[k]) * IP_NV, sizeof(double) * IP_NV);
-      memcpy(c->rows[r], row, sizeof row);
-      ip_put(c, r++, row, c->contact_a[i], c->contact_a[i]);
+      memcpy(c->rows[r], c->m.jacobian[ip_contact_point[k]] + (i - ip_contact_row[k]) * IP_NV, sizeof(double) * IP_NV);
+      ip_put(c, r++, c->contact_a[i], c->contact_a[i]);
     }
   }
   for (i = 0; i < IP_STRICT; ++i) {
-    memset(row, 0, sizeof row);
-    memcpy(row, c->J[i], sizeof(double) * IP_NV);
-    memcpy(c->rows[r], row, sizeof row);
-    ip_put(c, r++, row, c->a[i], c->a[i]);
+    memcpy(c->rows[r], c->J[i], sizeof(double) * IP_NV);
+    ip_put(c, r++, c->a[i], c->a[i]);
   }
   for (i = 0; i < IP_CONTROLS; ++i) {
     if (i < IP_ROTORS) {
-      ip_force_row(c, ip_inverse + i * IP_BASE, 0, IP_BASE, row, &bias);
+      bias = ip_force_row(c, ip_inverse + i * IP_BASE, 0, IP_BASE, c->rows[r]);
       for (j = 0; j < IP_SPARE; ++j) {
-        row[IP_NV + j] = ip_spare[i * IP_SPARE + j];
+        c->rows[r][IP_NV + j] = ip_spare[i * IP_SPARE + j];
       }
     } else {
-      ip_force_row(c, &one, IP_BASE + i - IP_ROTORS, 1, row, &bias);
+      bias = ip_force_row(c, &one, IP_BASE + i - IP_ROTORS, 1, c->rows[r]);
     }
     c->known[i] = bias;
-    ip_put(c, r++, row, c->p.control_lower[i] - bias, c->p.control_upper[i] - bias);
+    ip_put(c, r++, c->p.control_lower[i] - bias, c->p.control_upper[i] - bias);
   }
   /* The rows of the cones do not change between resets. */
   r += IP_CONES;
@@ -281,6 +279,8 @@ static void ip_assemble(ip_context *c)
       ip_finish(c, r++, -to[1], to[0]);
     } else {
       c->sum += isnan(to[0]) || isnan(to[1]) ? NAN : 0.0;
+      c->high[i] = to[0];
+      c->low[i] = -to[1];
       c->scaling[i] = 1.0 / c->ease[i];
       c->upper[i] = to[0] * c->scaling[i] - c->center[i];
       c->lower[i] = -to[1] * c->scaling[i] - c->center[i];
@@ -322,11 +322,11 @@ static void ip_begin_qp(ip_context *c)
   for (k = 0; k < IP_CONTACTS; ++k) {
     for (i = ip_contact_cone[k]; i < ip_contact_cone[k + 1]; ++i) {
       const int r = IP_EQUATIONS + IP_CONTROLS + i;
-      memset(c->M[r], 0, sizeof c->M[r]);
+      memset(c->rows[r], 0, sizeof c->rows[r]);
       for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
-        c->M[r][IP_NV + IP_SPARE + j] = c->cone[i][j - ip_contact_row[k]] * c->ease[IP_NV + IP_SPARE + j];
+        c->rows[r][IP_NV + IP_SPARE + j] = c->cone[i][j - ip_contact_row[k]];
       }
-      ip_finish(c, r, i == ip_contact_cone[k] ? c->p.contact_least[k] : 0.0, INFINITY);
+      ip_put(c, r, i == ip_contact_cone[k] ? c->p.contact_least[k] : 0.0, INFINITY);
     }
   }
   ip_cool(c);
@@ -359,6 +359,59 @@ static void ip_begin_rank(ip_context *c)
   }
   c->space = -1.0;
   ip_measure_rank(c);
+}
+
+/* out = T x, added to out. */
+static void ip_add_turned(const ip_context *c, const double *x, double *out)
+{
+  int i, j;
+  for (i = 0; i < IP_NV; ++i) {
+#if IP_DENSE
+    double sum = 0.0;
+    for (j = i; j < IP_NV; ++j) {
+      sum += c->factor[i * IP_NV + j] * x[j];
+    }
+    out[ip_entry(i)] += sum;
+#else
+    (void)j;
+    out[ip_entry(i)] += c->ease[i] * x[i];
+#endif
+  }
+  for (i = IP_NV; i < IP_VARIABLES; ++i) {
+    out[i] += c->ease[i] * x[i];
+  }
+}
+
+/* Read z = [v; w; f] from u, and correct it once so that the active rows hold to the last digits: in the variables of
+ * DAQP, the large weights of the cost cost digits. */
+static void ip_decode(ip_context *c, DAQPWorkspace *w)
+{
+  double x[IP_VARIABLES];
+  int i, j;
+  for (i = 0; i < IP_VARIABLES; ++i) {
+    x[i] = c->center[i] + c->u[i];
+    c->z[i] = 0.0;
+  }
+  ip_add_turned(c, x, c->z);
+  for (i = 0; i < w->n_active; ++i) {
+    const int at = w->WS[i], r = at - IP_SIMPLE, joint = IP_DENSE ? r - (IP_GENERAL - IP_JOINTS_V) : at;
+    const int bounds = IP_LAW && (IP_DENSE ? joint >= 0 : r < 0);
+    const double value = bounds ? c->z[IP_BASE + joint] : ip_dot(c->rows[r], c->z, IP_VARIABLES);
+    w->xldl[i] = c->scaling[at] * (value - (c->sense[at] & DAQP_LOWER ? c->low[at] : c->high[at]));
+  }
+  daqp_solve_working_set(w);
+  memset(x, 0, sizeof x);
+  for (i = 0; i < w->n_active; ++i) {
+    const int at = w->WS[i];
+    w->lam_star[i] += w->xldl[i];
+    for (j = 0; at >= IP_SIMPLE && j < IP_VARIABLES; ++j) {
+      x[j] -= c->M[at - IP_SIMPLE][j] * w->xldl[i];
+    }
+    if (at < IP_SIMPLE) {
+      x[at] -= w->xldl[i];
+    }
+  }
+  ip_add_turned(c, x, c->z);
 }
 
 /* Solve from the present active set.  Return the flag of DAQP, positive for a solution. */
@@ -406,15 +459,18 @@ static int ip_solve_warm(ip_context *c)
   w.L = L;
   w.xldl = xldl;
   w.zldl = zldl;
-  w.u = w.x = c->y;
+  w.u = w.x = c->u;
   w.xold = xold;
   w.prox_mask = prox;
   w.outer_iter = 1;
-  memset(c->y, 0, sizeof c->y);
+  memset(c->u, 0, sizeof c->u);
   flag = daqp_reactivate_constraints(&w);
   flag = flag < 0 ? flag : daqp_ldp(&w);
   c->iterations = w.iterations;
   memset(c->multipliers, 0, sizeof c->multipliers);
+  if (flag > 0) {
+    ip_decode(c, &w);
+  }
   for (i = 0; flag > 0 && i < w.n_active; ++i) {
     c->multipliers[WS[i]] = w.lam_star[i] * c->scaling[WS[i]];
   }
@@ -424,27 +480,3 @@ static int ip_solve_warm(ip_context *c)
   return flag;
 }
 
-/* Read z = [v; w; f] from u. */
-static void ip_decode(ip_context *c)
-{
-  int i, j;
-  double y[IP_VARIABLES];
-  for (i = 0; i < IP_VARIABLES; ++i) {
-    y[i] = c->center[i] + c->y[i];
-  }
-  for (i = 0; i < IP_NV; ++i) {
-#if IP_DENSE
-    double sum = 0.0;
-    for (j = i; j < IP_NV; ++j) {
-      sum += c->factor[i * IP_NV + j] * y[j];
-    }
-    c->z[ip_entry(i)] = sum;
-#else
-    (void)j;
-    c->z[ip_entry(i)] = c->ease[i] * y[i];
-#endif
-  }
-  for (i = IP_NV; i < IP_VARIABLES; ++i) {
-    c->z[i] = c->ease[i] * y[i];
-  }
-}

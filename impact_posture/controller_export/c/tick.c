@@ -156,11 +156,10 @@ static void ip_answer(ip_context *c, ip_command *out)
     ip_hold(c, flag == DAQP_EXIT_INFEASIBLE ? IP_INFEASIBLE : IP_UNSOLVED, c->v, out);
     return;
   }
-  ip_decode(c);
   for (i = 0; i < IP_CONTROLS; ++i) {
     const int r = IP_EQUATIONS + i;
     double beyond;
-    u[i] = c->known[i] + c->shift[r] + ip_dot(c->M[r], c->y, IP_VARIABLES) / c->scaling[IP_SIMPLE + r];
+    u[i] = c->known[i] + ip_dot(c->rows[r], c->z, IP_VARIABLES);
     beyond = u[i] - fmin(fmax(u[i], c->p.control_lower[i]), c->p.control_upper[i]);
     over += beyond * beyond;
   }
