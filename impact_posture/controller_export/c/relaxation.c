@@ -33,7 +33,8 @@ typedef struct {
     DAQPSettings settings;
     double *M, *size;            /* normalized rows of a least-distance program, and their former lengths */
     int *entry, count;           /* entries of these rows */
-    double tolerance;
+    int *warm;                   /* levels + 2 times entries: active rows of each program at the last solution */
+    double tolerance, weight;
 } Relaxation;
 
 static double dot(const double *a, const double *b, int n) {
@@ -205,6 +206,7 @@ static void hold(Relaxation *r, int exact, int all) {
  * where the cost has a factor L. */
 static void list_rows(Relaxation *r, int level, const double *L) {
     const int free = r->n - r->fixed;
+    const int *warm = r->warm + (size_t)level * (size_t)r->entries;
     int count = 0;
     double longest = 0;
     for (int i = 0; i < r->entries; i++)
@@ -223,6 +225,7 @@ static void list_rows(Relaxation *r, int level, const double *L) {
         r->daqp.scaling[count] = r->length[i] / size;
         r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * longest * longest / (r->length[i] * r->length[i]);
         r->daqp.sense[count] = (soft ? DAQP_SOFT : 0) | (equal ? DAQP_ACTIVE | DAQP_IMMUTABLE : 0);
+        if (warm[i] & DAQP_ACTIVE) r->daqp.sense[count] |= warm[i];
         r->entry[count++] = i;
     }
     r->count = r->daqp.m = count;
@@ -260,10 +263,16 @@ static int run(Relaxation *r) {
 }
 
 static int start(Relaxation *r) {
-    memset(r->daqp.u, 0, (size_t)(r->n - r->fixed) * sizeof(double));
     reset_daqp_workspace(&r->daqp);
     daqp_activate_constraints(&r->daqp);
     return run(r);
+}
+
+/* Keep the active rows of a program for the next solution. */
+static void keep_active(Relaxation *r, int level) {
+    int *warm = r->warm + (size_t)level * (size_t)r->entries;
+    memset(warm, 0, (size_t)r->entries * sizeof *warm);
+    for (int j = 0; j < r->count; j++) warm[r->entry[j]] = r->daqp.sense[j] & (DAQP_ACTIVE | DAQP_LOWER);
 }
 
 /* Bring the point as near to a level as the levels above permit, then keep it there. */
@@ -289,6 +298,7 @@ static int solve_level(Relaxation *r, int level) {
         if (!k) first = length;
         if (!missed || (k && length <= SMALL_STEP * fmax(1, first))) break;
     }
+    if (flag > 0) keep_active(r, level);
     if (flag <= 0 && !(level > 1 && flag != DAQP_EXIT_ITERLIMIT)) return flag;
     for (int j = 0; j < r->daqp.n_active && missed && flag > 0 && r->count; j++) {
         const int at = r->daqp.WS[j], i = r->entry[at];
@@ -362,6 +372,7 @@ static int solve_cost(Relaxation *r) {
 #endif
         if (flag == DAQP_EXIT_ITERLIMIT) return flag;
         if (flag <= 0) continue;
+        keep_active(r, r->p->levels + 1);
         double *y = r->wanted;
         add(y, unit, r->daqp.u, free);
         for (int i = free - 1; i >= 0; i--) {
@@ -383,7 +394,7 @@ static void *take(char **at, size_t count, size_t size) {
     return found;
 }
 
-static char *place(Relaxation *r, char *at, int n, int m) {
+static char *place(Relaxation *r, char *at, int n, int m, int levels) {
     const size_t e = (size_t)n + (size_t)m, N = (size_t)n, active = N + e + 2;
 #define DOUBLES(name, count) r->name = take(&at, count, sizeof(double))
 #define INTS(name, count) r->name = take(&at, count, sizeof(int))
@@ -396,23 +407,23 @@ static char *place(Relaxation *r, char *at, int n, int m) {
     DOUBLES(daqp.lam, active); DOUBLES(daqp.lam_star, active); DOUBLES(daqp.D, active); DOUBLES(daqp.xldl, active);
     DOUBLES(daqp.zldl, active); DOUBLES(daqp.L, active * (active + 1) / 2); DOUBLES(daqp.u, N); DOUBLES(daqp.xold, N);
     INTS(first, (size_t)m); INTS(last, (size_t)m); INTS(held, e); INTS(rows, e); INTS(entry, e);
-    INTS(daqp.sense, e); INTS(daqp.WS, active); INTS(daqp.prox_mask, N);
+    INTS(warm, (size_t)(levels + 2) * e); INTS(daqp.sense, e); INTS(daqp.WS, active); INTS(daqp.prox_mask, N);
 #undef DOUBLES
 #undef INTS
     return at;
 }
 
-size_t relaxation_bytes(int n, int m) {
+size_t relaxation_bytes(int n, int m, int levels) {
     Relaxation r;
     char none = 0;
-    return (size_t)(place(&r, &none, n, m) - &none);
+    return (size_t)(place(&r, &none, n, m, levels) - &none);
 }
 
 /* Set the point to zero, the bounds to those of the problem, and the coordinates to the scaled variables. */
 static void begin(Relaxation *r, const relaxation_problem *p, char *work, int budget) {
     const int n = p->n;
     memset(r, 0, sizeof *r);
-    place(r, work, n, p->m);
+    place(r, work, n, p->m, p->levels);
     r->p = p, r->n = n, r->entries = n + p->m, r->left = budget;
     memset(r->Z, 0, (size_t)n * (size_t)n * sizeof *r->Z);
     memset(r->z, 0, (size_t)n * sizeof *r->z);
