@@ -5,15 +5,21 @@
 
 #include "daqp.h"
 
-/* DAQP finds the active rows of a level, with this weight of the step (squared) against the violation.  Their exact
- * answer then follows without it, by orthogonal elimination. */
-#define STEP_WEIGHT 1e-6
-/* Most steps of a level, each around the last answer, which undo the weight, and a step that ends them. */
-#define MOST_STEPS 10
-#define SMALL_STEP 1e-8
+/* DAQP finds the active rows of a level, with a weight of the step (squared) against the violation: at first this,
+ * and LIGHTER times as much where steps do not become shorter.  The exact answer of these rows then follows without
+ * it, by orthogonal elimination. */
+#define STEP_WEIGHT 1e-4
+#define LIGHTER 1e-2
+/* Most steps of a level, each around the last answer, which undo the weight.  Relative to the one before, a step that
+ * may be the last one, and one that calls for less weight. */
+#define MOST_STEPS 20
+#define SMALL_STEP 1e-2
+#define FLAT_STEP 0.1
 /* Largest violation of a bound, and the violation that counts, relative to the numbers of the problem. */
-#define EXACT 1e-9
+#define EXACT 1e-10
 #define COUNTS 1e-7
+/* Largest violation of a bound in the program of the cost, relative to its unit. */
+#define ROUNDING 1e-10
 /* Length of a row that cannot move any more, and least pivot of an elimination, relative to the row's own length. */
 #define FLAT 1e-9
 #define PIVOT 1e-6
@@ -50,8 +56,15 @@ static double dot(const double *a, const double *b, int n) {
     return (s0 + s1) + (s2 + s3);
 }
 
-static void add(double *to, double factor, const double *from, int n) {
-    for (int i = 0; i < n; i++) to[i] += factor * from[i];
+static void add(double *restrict to, double factor, const double *restrict from, int n) {
+    int i = 0;
+    for (; i + 3 < n; i += 4) {
+        to[i] += factor * from[i];
+        to[i + 1] += factor * from[i + 1];
+        to[i + 2] += factor * from[i + 2];
+        to[i + 3] += factor * from[i + 3];
+    }
+    for (; i < n; i++) to[i] += factor * from[i];
 }
 
 static double norm(const double *a, int n) { return sqrt(dot(a, a, n)); }
@@ -104,6 +117,12 @@ static double reflector(double *v, const double *x, int count) {
 
 static void reflect(const double *v, double tau, double *x, int count) { add(x, -tau * dot(v, x, count), v, count); }
 
+/* Turn a move from the coordinates of turn() into those of Z. */
+static void turn_back(const Relaxation *r, double *x, int rank) {
+    for (int k = rank - 1; k >= 0; k--)
+        reflect(r->v + (size_t)k * r->n, r->tau[k], x + k, r->n - r->fixed - k);
+}
+
 /* Minimize ||B x - rhs|| for `rows` >= `columns` of full rank; B and rhs are overwritten. */
 static void least_squares(double *B, int stride, int rows, int columns, double *rhs, double *x, double *v) {
     for (int c = 0; c < columns; c++) {
@@ -136,12 +155,13 @@ static void swap_rows(Relaxation *r, int i, int k) {
     r->rhs[i] = r->rhs[k], r->rhs[k] = rhs;
 }
 
-/* Turn the coordinates until the listed rows move by the first ones only, and return the number of these.  r->step is
- * the move along them by which the first `exact` rows change by r->rhs, and the others nearly so (least squares). */
+/* Find coordinates of which the first ones alone move the listed rows, and return their number.  r->step becomes the
+ * move by which the first `exact` rows change by r->rhs, and the others nearly so (least squares). */
 static int turn(Relaxation *r, int exact, int all) {
     const int n = r->n, free = n - r->fixed;
     double *B = r->B, *step = r->step, longest = 0;
     int rank = 0, soft = -1;
+    memset(step, 0, (size_t)n * sizeof *step);
     for (int i = 0; i < all; i++) {
         memcpy(B + (size_t)i * n, motion(r, r->rows[i]), (size_t)free * sizeof *B);
         if (i >= exact) longest = fmax(longest, r->length[r->rows[i]]);
@@ -172,29 +192,50 @@ static int turn(Relaxation *r, int exact, int all) {
         double *at = B + (size_t)exact * n + soft;
         least_squares(at, n, all - exact, rank - soft, r->rhs + exact, step + soft, r->column);
     }
-    for (int i = 0; i < n; i++)
-        for (int k = 0; k < rank; k++)
-            reflect(r->v + (size_t)k * n, r->tau[k], r->Z + (size_t)i * n + r->fixed + k, free - k);
+    turn_back(r, step, rank);
     return rank;
 }
 
-/* Eliminate the listed rows.  Where their exact answer would violate a bound, the point stays. */
-static void hold(Relaxation *r, int exact, int all) {
-    const int n = r->n, rank = turn(r, exact, all);
-    int worse = 0;
+/* Move by r->step unless a row of the program would violate its bounds; return whether none does. */
+static int move(Relaxation *r, int all) {
+    const int n = r->n, free = n - r->fixed;
+    int fits = 1;
     memcpy(r->before, r->z, (size_t)n * sizeof *r->z);
-    for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + (size_t)i * n + r->fixed, r->step, rank);
+    for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + (size_t)i * n + r->fixed, r->step, free);
     for (int i = 0; i < all; i++) r->held[r->rows[i]] = 1;
-    for (int j = 0; j < r->count && !worse; j++) {
+    for (int j = 0; j < r->count && fits; j++) {
         const int i = r->entry[j];
         const double room = r->tolerance * r->length[i], value = value_of(r, i);
-        worse = !r->held[i] && !(value <= fmax(r->upper[i], r->value[i]) + room &&
-                                 value >= fmin(r->lower[i], r->value[i]) - room);
+        fits = r->held[i] || (value <= fmax(r->upper[i], r->value[i]) + room &&
+                              value >= fmin(r->lower[i], r->value[i]) - room);
     }
-    if (worse) memcpy(r->z, r->before, (size_t)n * sizeof *r->z);
-#ifdef RELAXATION_TRACE
-    if (worse) RELAXATION_TRACE("kept", r->fixed, rank, 0.0);
-#endif
+    if (!fits) {
+        memcpy(r->z, r->before, (size_t)n * sizeof *r->z);
+        for (int i = 0; i < all; i++) r->held[r->rows[i]] = 0;
+    }
+    return fits;
+}
+
+/* Leave out the first `rank` of the coordinates of turn(). */
+static void eliminate(Relaxation *r, int rank) {
+    const int n = r->n, free = n - r->fixed, rest = free - rank;
+    if (rest < rank) {
+        /* Few coordinates are left: Z times each of them. */
+        for (int c = 0; c < rest; c++) {
+            double *e = r->B + (size_t)c * n;
+            memset(e, 0, (size_t)free * sizeof *e);
+            e[rank + c] = 1;
+            turn_back(r, e, rank);
+        }
+        for (int i = 0; i < n; i++) {
+            double *z = r->Z + (size_t)i * n + r->fixed;
+            for (int c = 0; c < rest; c++) r->column[c] = dot(z, r->B + (size_t)c * n, free);
+            memcpy(z + rank, r->column, (size_t)rest * sizeof *z);
+        }
+    } else
+        for (int i = 0; i < n; i++)
+            for (int k = 0; k < rank; k++)
+                reflect(r->v + (size_t)k * n, r->tau[k], r->Z + (size_t)i * n + r->fixed + k, free - k);
     r->fixed += rank;
     update_values(r);
     update_rows(r);
@@ -221,9 +262,10 @@ static void list_rows(Relaxation *r, int level, const double *L) {
         for (int k = 0; L && k < free; k++) row[k] = (row[k] - dot(L + (size_t)k * r->n, row, k)) / L[k * r->n + k];
         const double size = r->size[count] = norm(row, free);
         for (int k = 0; k < free; k++) row[k] /= size;
-        /* The tolerance of a row is relative to its length in the units of the problem. */
-        r->daqp.scaling[count] = r->length[i] / size;
-        r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * longest * longest / (r->length[i] * r->length[i]);
+        /* The tolerance of a row is relative to its length in the units of the problem.  That of the cost is what
+         * rounding permits; its active rows are made exact afterwards. */
+        r->daqp.scaling[count] = L ? 1 : r->length[i] / size;
+        r->daqp.rho_ls[count] = r->daqp.rho_us[count] = r->weight * longest * longest / (r->length[i] * r->length[i]);
         r->daqp.sense[count] = (soft ? DAQP_SOFT : 0) | (equal ? DAQP_ACTIVE | DAQP_IMMUTABLE : 0);
         if (warm[i] & DAQP_ACTIVE) r->daqp.sense[count] |= warm[i];
         r->entry[count++] = i;
@@ -245,8 +287,8 @@ static double set_bounds(Relaxation *r, const double *wanted) {
         largest = fmax(largest, fmax(r->daqp.dlower[j], -r->daqp.dupper[j]));
     }
     const double unit = fmax(largest, EXACT * size);
-    r->tolerance = EXACT * fmax(size, unit);
-    r->settings.primal_tol = r->tolerance / unit;
+    r->tolerance = EXACT * (wanted ? size : fmax(size, unit));
+    r->settings.primal_tol = wanted ? ROUNDING : r->tolerance / unit;
     for (int j = 0; j < r->count; j++) {
         r->daqp.dupper[j] /= unit;
         r->daqp.dlower[j] /= unit;
@@ -275,46 +317,76 @@ static void keep_active(Relaxation *r, int level) {
     for (int j = 0; j < r->count; j++) warm[r->entry[j]] = r->daqp.sense[j] & (DAQP_ACTIVE | DAQP_LOWER);
 }
 
+/* Smallest violation of an entry that counts. */
+static double least(const Relaxation *r, int entry) { return COUNTS * (r->tolerance / EXACT) * r->length[entry]; }
+
+/* List what determines the level's answer: the active rows of the levels above, then the level's own equations and
+ * violated rows.  Return the number of the former; `all` is that of both. */
+static int list_held(Relaxation *r, int level, int missed, int *all) {
+    int exact = 0;
+    for (int j = 0; j < r->daqp.n_active && missed; j++) {
+        const int at = r->daqp.WS[j], i = r->entry[at];
+        if ((r->daqp.sense[at] & DAQP_SOFT) || fabs(r->daqp.lam_star[j]) * r->weight <= COUNTS) continue;
+        r->rhs[exact] = ((r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i]) - r->value[i];
+        r->rows[exact++] = i;
+    }
+    *all = exact;
+    for (int i = 0; i < r->entries; i++) {
+        if (r->held[i] || r->p->level[i] != level || !(is_equation(r, i) || violation(r, i) > least(r, i))) continue;
+        r->rhs[*all] = (r->value[i] > r->upper[i] ? r->upper[i] : r->lower[i]) - r->value[i];
+        r->rows[(*all)++] = i;
+    }
+    return exact;
+}
+
 /* Bring the point as near to a level as the levels above permit, then keep it there. */
 static int solve_level(Relaxation *r, int level) {
     const int free = r->n - r->fixed;
+    int flag = 1, missed = 0, all = 0, rank, done = 0;
+    double before = 0;
+    int flat = 0;
+    r->weight = STEP_WEIGHT;
     list_rows(r, level, NULL);
-    int flag = 1, missed = 0, exact = 0, all = 0;
-    double first = 0;
-    for (int k = 0; k < MOST_STEPS && r->count; k++) {
+    for (int k = 0; k < MOST_STEPS && !done; k++) {
         const double unit = set_bounds(r, NULL);
-        if (k) r->daqp.reuse_ind = 0;
-        flag = k ? run(r) : start(r);
-        if (flag <= 0) break;
-        const double length = unit * norm(r->daqp.u, free);
-        for (int i = 0; i < r->n; i++) r->z[i] += unit * dot(r->Z + (size_t)i * r->n + r->fixed, r->daqp.u, free);
-        update_values(r);
-        missed = 0;
-        for (int j = 0; j < r->count; j++)
-            missed |= (r->daqp.sense[j] & DAQP_SOFT) && violation(r, r->entry[j]) > COUNTS * fmax(1, r->tolerance / EXACT) * r->length[r->entry[j]];
+        const int left = r->left;
+        if (r->count) {
+            r->daqp.reuse_ind = 0;
+            for (int j = 0; flat && j < r->count; j++) r->daqp.rho_us[j] = r->daqp.rho_ls[j] *= LIGHTER;
+            if (flat) r->weight *= LIGHTER;
+            flag = k && !flat ? run(r) : start(r);
+            keep_active(r, level);
+            if (flag == DAQP_EXIT_ITERLIMIT || (flag <= 0 && level <= 1 && !k)) return flag;
+            if (flag <= 0) break;
+            const double length = unit * norm(r->daqp.u, free);
+            for (int i = 0; i < r->n; i++) r->z[i] += unit * dot(r->Z + (size_t)i * r->n + r->fixed, r->daqp.u, free);
+            update_values(r);
+            missed = 0;
+            for (int j = 0; j < r->count && !missed; j++)
+                missed = (r->daqp.sense[j] & DAQP_SOFT) && violation(r, r->entry[j]) > least(r, r->entry[j]);
 #ifdef RELAXATION_TRACE
-        RELAXATION_TRACE("step", level, r->daqp.iterations, length);
+            RELAXATION_TRACE("step", level, r->daqp.iterations, length);
 #endif
-        if (!k) first = length;
-        if (!missed || (k && length <= SMALL_STEP * fmax(1, first))) break;
+            /* The active rows are final only where another step finds the same. */
+            const double ratio = k ? length / fmax(before, 1e-300) : 1;
+            const int same = left - r->left == 1 && k;
+            flat = same && ratio > FLAT_STEP;
+            before = length;
+            if (missed && !(same && ratio <= SMALL_STEP)) continue;
+        }
+        const int exact = list_held(r, level, missed, &all);
+        rank = turn(r, exact, all);
+        done = move(r, all);
     }
-    if (flag > 0) keep_active(r, level);
-    if (flag <= 0 && !(level > 1 && flag != DAQP_EXIT_ITERLIMIT)) return flag;
-    for (int j = 0; j < r->daqp.n_active && missed && flag > 0 && r->count; j++) {
-        const int at = r->daqp.WS[j], i = r->entry[at];
-        if ((r->daqp.sense[at] & DAQP_SOFT) || fabs(r->daqp.lam_star[j]) * STEP_WEIGHT <= COUNTS) continue;
-        r->rhs[all] = ((r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i]) - r->value[i];
-        r->rows[all++] = i;
+    if (!done) {
+        list_held(r, level, missed, &all);
+        rank = turn(r, all, all);
+        for (int i = 0; i < all; i++) r->held[r->rows[i]] = 1;
     }
-    exact = all;
-    for (int i = 0; i < r->entries; i++) {
-        if (r->held[i] || r->p->level[i] != level) continue;
-        const double over = violation(r, i);
-        if (!is_equation(r, i) && !(over > COUNTS * fmax(1, r->tolerance / EXACT) * r->length[i])) continue;
-        r->rhs[all] = (r->value[i] > r->upper[i] ? r->upper[i] : r->lower[i]) - r->value[i];
-        r->rows[all++] = i;
-    }
-    if (all) hold(r, exact, all);
+#ifdef RELAXATION_TRACE
+    RELAXATION_TRACE("done", done, rank, all);
+#endif
+    eliminate(r, rank);
     /* The point is a solution, whatever rounding makes of its rows. */
     for (int i = 0; i < r->entries; i++)
         if (r->p->level[i] <= level) {
@@ -370,9 +442,9 @@ static int solve_cost(Relaxation *r) {
 #ifdef RELAXATION_TRACE
         RELAXATION_TRACE("cost", flag, r->daqp.iterations, PROXIMAL[k]);
 #endif
+        keep_active(r, r->p->levels + 1);
         if (flag == DAQP_EXIT_ITERLIMIT) return flag;
         if (flag <= 0) continue;
-        keep_active(r, r->p->levels + 1);
         double *y = r->wanted;
         add(y, unit, r->daqp.u, free);
         for (int i = free - 1; i >= 0; i--) {
@@ -380,6 +452,15 @@ static int solve_cost(Relaxation *r) {
             add(y, -y[i], r->L + (size_t)i * n, i);
         }
         for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + (size_t)i * n + r->fixed, y, free);
+        update_values(r);
+        int active = 0;
+        for (int j = 0; j < r->daqp.n_active; j++) {
+            const int at = r->daqp.WS[j], i = r->entry[at];
+            r->rhs[active] = ((r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i]) - r->value[i];
+            r->rows[active++] = i;
+        }
+        turn(r, active, active);
+        move(r, active);
         return 1;
     }
     return flag;
@@ -438,9 +519,10 @@ static void begin(Relaxation *r, const relaxation_problem *p, char *work, int bu
         while (first < n && a[first] == 0) first++;
         while (last > first && a[last - 1] == 0) last--;
         r->first[row] = first, r->last[row] = last;
-        double sum = 0;
-        for (int k = first; k < last; k++) sum += a[k] * p->unit[k] * a[k] * p->unit[k];
-        r->length[n + row] = sum > 0 ? sqrt(sum) : 1;
+        double *T = r->T + (size_t)row * n;
+        for (int k = 0; k < n; k++) T[k] = a[k] * p->unit[k];
+        const double length = norm(T, n);
+        r->length[n + row] = length > 0 ? length : 1;
     }
     DAQPWorkspace *d = &r->daqp;
     d->settings = &r->settings;
@@ -456,14 +538,15 @@ int relaxation_solve(const relaxation_problem *p, void *work, int budget, double
     int always = 0, flag = 1;
     begin(&r, p, work, budget);
     update_values(&r);
-    update_rows(&r);
     for (int i = 0; i < r.entries; i++)
         if (!p->level[i] && is_equation(&r, i)) {
             r.rhs[always] = p->lower[i] - r.value[i];
             r.rows[always++] = i;
         }
-    if (always) hold(&r, always, always);
-    for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0; level++) flag = solve_level(&r, level);
+    const int rank = turn(&r, always, always);
+    move(&r, always);
+    eliminate(&r, rank);
+    for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++) flag = solve_level(&r, level);
     memcpy(z, r.z, (size_t)p->n * sizeof *z);
     if (flag > 0) {
         flag = solve_cost(&r);
