@@ -43,8 +43,9 @@ typedef struct {
     double violation;     /* largest violation of level 0, over 1 + the size of its terms */
 } relaxation_report;
 
-/* Bytes of the workspace, which needs the alignment of a double. */
-size_t relaxation_bytes(int n, int m);
+/* Bytes of the workspace, which needs the alignment of a double.  Zero it before the first solution and wherever the
+ * next problem has nothing to do with the last one: it keeps the active rows of each level. */
+size_t relaxation_bytes(int n, int m, int levels);
 
 /* Write z (n numbers) where the result is positive, and return one of the codes above.
  * `budget`: most iterations of all quadratic programs together. */
