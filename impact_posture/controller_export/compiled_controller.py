@@ -18,6 +18,7 @@ from impact_posture.errors import InputError, MetricError, PostureError, SpecErr
 from impact_posture.libraries import library_path, load_library
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.controller import Command, Report, Status
+from impact_posture.tsid.relaxation import Relaxed
 
 # Statuses in the order of their numbers in C.
 _STATUSES = tuple(Status)
@@ -44,7 +45,13 @@ class CompiledController:
         arrays = [("u", "CONTROLS"), ("rotor_speed", "ROTORS"), ("acceleration", "NV"), ("forces", "FORCES")]
         self._command, self._out = _structure([(n, room(s)) for n, s in arrays], ["status", "iterations"])
         rows = [("rows", room("ROWS")), ("contacts", room("FORCES")), ("posture", room("NV"))]
-        rows += [("multipliers", max(1, bounds)), ("dynamics", 1), ("level", 1), ("value", 1)]
+        rows += [
+            ("multipliers", max(1, bounds)),
+            ("relaxed", 1 + len(manifest.levels)),
+            ("dynamics", 1),
+            ("level", 1),
+            ("value", 1),
+        ]
         self._report, self._diagnosis = _structure(rows, ["status", "iterations"])
         self._given, self.parameters = _structure([*manifest.parameters.items()], [])
         bytes_ = ctypes.c_ulong.in_dll(library, f"{prefix}_context_bytes").value
@@ -146,7 +153,7 @@ class CompiledController:
         return self._commanded()
 
     def report(self) -> Report:
-        """Return the diagnosis of the last tick.  ``relaxed`` and ``deficient`` are empty."""
+        """Return the diagnosis of the last tick; ``deficient`` is empty."""
         checked, found = self._checked, self._diagnosis
         self._call("last_report", ctypes.byref(self._report))
         status = _STATUSES[self._report.status]
@@ -168,7 +175,9 @@ class CompiledController:
                     active.append((name, "upper" if multiplier > 0 else "lower"))
         dynamics, level, value = (float(found[name][0]) for name in ("dynamics", "level", "value"))
         iterations = int(self._report.iterations)
-        return Report(status, (), (), residuals, tuple(active), dynamics, level, value, iterations)
+        names = ("joint limits", *(name for name, _ in checked.levels))
+        relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, found["relaxed"], strict=True) if x > 0)
+        return Report(status, relaxed, (), residuals, tuple(active), dynamics, level, value, iterations)
 
     # ---- targets and phases ------------------------------------------------------------------------------------
 

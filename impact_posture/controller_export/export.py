@@ -104,7 +104,8 @@ def export_controller(
     fields = parameters(structure, period)
     manifest = _manifest(structure, fields, prefix)
     metric = f"{prefix}_metric" if objective is not None else None
-    manifest["sources"] = [*([] if metric is None else [f"{metric}.c"]), *(f"daqp/{name}" for name in SOURCES)]
+    own = [f"{prefix}_relaxation.c", *([] if metric is None else [f"{metric}.c"])]
+    manifest["sources"] = [*own, *(f"daqp/{name}" for name in SOURCES)]
     texts = render(structure, fields, prefix, identity(manifest), metric)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     texts["Makefile"] = _makefile(manifest)

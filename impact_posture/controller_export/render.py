@@ -27,7 +27,7 @@ from impact_posture.impact.contact import point_on
 from impact_posture.version import __version__
 
 # Files in c/, in the order in which one source has them.
-_CORE = ("algebra.c", "tasks.c", "posture.c", "qp.c", "tick.c")
+_CORE = ("algebra.c", "tasks.c", "posture.c", "qp.c", "give_way.c", "tick.c")
 # Parameters that init compares with others.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate")
 # Bytes of variables, saved registers and return addresses of all functions below a tick, beside the arrays.
@@ -108,9 +108,13 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
     sizes = s.sizes
     bounds = sizes["SIMPLE"] + sizes["GENERAL"]
     nv, equations = sizes["NV"], sizes["EQUATIONS"]
-    scratch = {"SCRATCH": max(3 * nv * nv, 2 * equations * equations), "BOUNDS": bounds}
-    room = {name: max(1, value) for name, value in (sizes | scratch).items()}
-    n = sizes["VARIABLES"] + 1
+    n, m = sizes["VARIABLES"], sizes["GENERAL"] - sizes["BOUNDED"]
+    more = {
+        "SCRATCH": max(3 * nv * nv, n * n, 2 * equations * equations), "BOUNDS": bounds, "GAVE": 1 + sizes["LEVELS"],
+        "RELAXATION": _relaxation_room(n, m, 1 + sizes["LEVELS"]),
+    }  # fmt: skip
+    room = {name: max(1, value) for name, value in (sizes | more).items()}
+    n += 1
     solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * bounds) + 2048
     tables = [(name, *_table(values)) for name, values in s.tables.items()]
     tables.append(("gravity", *_table(np.array(robot.model.gravity.linear, dtype=float))))
@@ -140,11 +144,25 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
         name: environment.get_template(template).render(context)
         for name, template in ((f"{prefix}.h", "controller.h.jinja"), (f"{prefix}.c", "controller.c.jinja"))
     }
-    return {name: named(text, prefix) for name, text in texts.items()}
+    return {name: named(text, prefix) for name, text in texts.items()} | _relaxation(prefix)
+
+
+def _relaxation_room(n: int, m: int, levels: int) -> int:
+    """Return a bound on the doubles in the memory of the relaxation, which ``init`` compares with the exact number."""
+    entries, active = n + m, 2 * n + m + 2
+    matrices = 4 * n * n + m * n + 2 * entries * n + active * (active + 1) // 2
+    return matrices + 16 * n + 7 * active + (20 + levels) * entries + 64
+
+
+def _relaxation(prefix: str) -> dict[str, str]:
+    """Return the files of the relaxation, with names that another controller in the program does not have."""
+    texts = {f"{prefix}_relaxation.{end}": _own(f"relaxation.{end}") for end in ("h", "c")}
+    return {name: re.sub(r"\brelaxation([_.][a-z])", rf"{prefix}_relaxation\1", text) for name, text in texts.items()}
 
 
 def named(text: str, prefix: str) -> str:
     """Return C text in which all names begin with the prefix."""
+    text = re.sub(r"\brelaxation_([a-z])", rf"{prefix}_relaxation_\1", text)
     return re.sub(r"\bip_", f"{prefix}_", re.sub(r"\bIP_", f"{prefix.upper()}_", text))
 
 

@@ -113,7 +113,11 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     }
     always = sizes["BLIND"] + hard + sizes["STRICT"]
     bounds = joints if law is not None and dense else 0
-    sizes |= {"EQUATIONS": always, "GENERAL": always + actuators.controls + sizes["CONES"] + bounds}
+    sizes |= {
+        "BOUNDED": bounds,
+        "EQUATIONS": always,
+        "GENERAL": always + actuators.controls + sizes["CONES"] + bounds,
+    }
     ranges = JointRanges(robot)
     task_rows = np.cumsum([0, *(t.size for t in tasks)])
     tables = {

@@ -1,21 +1,16 @@
 /* The QP of a tick as DAQP solves it: the least |u|^2 with lower <= M u <= upper, rows of length one.
  *
- * The variables z = [joints, base, w, f] are z = T (center + u), where T makes the cost |T^-1 z|^2/2.  The bounds on joints
- * come first; they are bounds on u where T is diagonal, and rows (the last ones) where it is not. */
+ * The variables z = [v; w; f] are z = T (center + u), where T makes the cost |T^-1 z|^2/2.  Where T is diagonal, joints come
+ * before the base in u, and their bounds are bounds on u.  Where it is not, they are the last rows. */
 
 /* A zero of DAQP. */
 #define IP_NOTHING 1e-11
 #define IP_JOINTS_V (IP_NV - IP_BASE)
 
-/* Place in u of an entry of v. */
-static int ip_place(int i)
-{
-  return i < IP_BASE ? IP_JOINTS_V + i : i - IP_BASE;
-}
-
+/* Entry of v at a place of u. */
 static int ip_entry(int k)
 {
-  return k < IP_JOINTS_V ? k + IP_BASE : k - IP_JOINTS_V;
+  return IP_DENSE ? k : k < IP_JOINTS_V ? k + IP_BASE : k - IP_JOINTS_V;
 }
 
 /* out = row T for a row on the accelerations v. */
@@ -27,7 +22,7 @@ static void ip_whiten(const ip_context *c, const double *row, double *out)
     out[j] = 0.0;
   }
   for (i = 0; i < IP_NV; ++i) {
-    const double s = row[ip_entry(i)], *factor = c->factor + i * IP_NV;
+    const double s = row[i], *factor = c->factor + i * IP_NV;
     for (j = i; j < IP_NV; ++j) {
       out[j] += s * factor[j];
     }
@@ -60,73 +55,66 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
   c->lower[at] = (lower - shift) * scale;
 }
 
-/* Rows of the accelerations in the cost: J and a of the weighted tasks and of the contacts that are not hard. */
-static void ip_factorize(ip_context *c)
+/* Add the cost of the accelerations to the upper triangle of H, whose rows are so long, and to its linear part -g, which
+ * pulls towards g: weighted tasks, contacts that are not hard, and the posture. */
+static void ip_cost(const ip_context *c, double *H, int stride, double *g)
 {
   int i, j, k, r;
-  double g[IP_NV];
-  for (i = 0; i < IP_NV; ++i) {
-    g[i] = c->p.posture_weight[i] * c->wanted[i];
-  }
-#if IP_DENSE
-  {
-    double *H = c->factor, *R = c->scratch, row[IP_NV];
-    memset(H, 0, sizeof c->factor);
-    for (r = IP_STRICT; r < IP_ROWS + IP_FORCES; ++r) {
-      const double *J = NULL;
-      double a = 0.0, weight = 0.0;
-      if (r < IP_ROWS) {
-        J = c->J[r];
-        a = c->a[r];
-        weight = c->p.task_weight[r];
-      } else {
-        for (k = 0; k < IP_CONTACTS; ++k) {
-          const int own = r - IP_ROWS - ip_contact_row[k];
-          if (own >= 0 && r - IP_ROWS < ip_contact_row[k + 1] && !ip_contact_hard[k]) {
-            J = c->m.jacobian[ip_contact_point[k]] + own * IP_NV;
-            a = c->contact_a[r - IP_ROWS];
-            weight = c->p.contact_weight[k];
-          }
-        }
-      }
-      if (weight <= 0.0) {
-        continue;
-      }
-      for (i = 0; i < IP_NV; ++i) {
-        row[i] = J[ip_entry(i)];
-        g[ip_entry(i)] += weight * row[i] * a;
-      }
-      for (i = 0; i < IP_NV; ++i) {
-        const double s = weight * row[i];
-        for (j = i; j < IP_NV; ++j) {
-          H[i * IP_NV + j] += s * row[j];
-        }
+  for (r = IP_STRICT; r < IP_ROWS + IP_FORCES; ++r) {
+    const double *J = r < IP_ROWS ? c->J[r] : NULL;
+    double a = r < IP_ROWS ? c->a[r] : c->contact_a[r - IP_ROWS], weight = r < IP_ROWS ? c->p.task_weight[r] : 0.0;
+    for (k = 0; k < IP_CONTACTS; ++k) {
+      const int own = r - IP_ROWS - ip_contact_row[k];
+      if (own >= 0 && r - IP_ROWS < ip_contact_row[k + 1] && !ip_contact_hard[k]) {
+        J = c->m.jacobian[ip_contact_point[k]] + own * IP_NV;
+        weight = c->p.contact_weight[k];
       }
     }
-    for (i = 0; i < IP_NV; ++i) {
-      H[i * (IP_NV + 1)] += c->added[ip_entry(i)];
-    }
-    if (!ip_cholesky(H, IP_NV)) {
-      c->factor[0] = NAN;
-    }
-    /* The inverse of the triangle, from its last row up. */
-    memcpy(R, H, sizeof c->factor);
-    for (i = IP_NV - 1; i >= 0; --i) {
-      const double inverse = 1.0 / R[i * (IP_NV + 1)];
-      double *out = H + i * IP_NV;
+    for (i = 0; i < IP_NV && weight > 0.0; ++i) {
+      const double s = weight * J[i];
+      g[i] += s * a;
       for (j = i; j < IP_NV; ++j) {
-        out[j] = i == j ? inverse : 0.0;
+        H[i * stride + j] += s * J[j];
       }
-      for (k = i + 1; k < IP_NV; ++k) {
-        const double s = -R[i * IP_NV + k] * inverse;
-        for (j = k; j < IP_NV; ++j) {
-          out[j] += s * H[k * IP_NV + j];
-        }
+    }
+  }
+  for (i = 0; i < IP_NV; ++i) {
+    H[i * (stride + 1)] += c->added[i];
+    g[i] += c->p.posture_weight[i] * c->wanted[i];
+  }
+}
+
+/* Make T, and the center of the cost. */
+static void ip_factorize(ip_context *c)
+{
+  double g[IP_NV] = {0};
+  int i, j, k;
+#if IP_DENSE
+  double *inverse = c->factor, *R = c->scratch;
+  memset(R, 0, sizeof c->factor);
+  ip_cost(c, R, IP_NV, g);
+  if (!ip_cholesky(R, IP_NV)) {
+    c->sum = NAN;
+  }
+  /* The inverse of the triangle, from its last row up. */
+  for (i = IP_NV - 1; i >= 0; --i) {
+    const double pivot = 1.0 / R[i * (IP_NV + 1)];
+    double *out = inverse + i * IP_NV;
+    for (j = i; j < IP_NV; ++j) {
+      out[j] = i == j ? pivot : 0.0;
+    }
+    for (k = i + 1; k < IP_NV; ++k) {
+      const double s = -R[i * IP_NV + k] * pivot;
+      for (j = k; j < IP_NV; ++j) {
+        out[j] += s * inverse[k * IP_NV + j];
       }
     }
   }
 #else
-  (void)j, (void)k, (void)r;
+  (void)j, (void)k;
+  for (i = 0; i < IP_NV; ++i) {
+    g[i] = c->p.posture_weight[i] * c->wanted[i];
+  }
 #endif
   ip_whiten(c, g, c->center);
 }
@@ -275,7 +263,7 @@ static void ip_assemble(ip_context *c)
     ip_bounds(c, IP_BASE + i, to);
     if (IP_DENSE) {
       memset(c->M[r], 0, sizeof c->M[r]);
-      memcpy(c->M[r] + i, c->factor + i * (IP_NV + 1), sizeof(double) * (size_t)(IP_NV - i));
+      memcpy(c->M[r], c->factor + (IP_BASE + i) * IP_NV, sizeof(double) * IP_NV);
       ip_finish(c, r++, -to[1], to[0]);
     } else {
       c->sum += isnan(to[0]) || isnan(to[1]) ? NAN : 0.0;
@@ -305,7 +293,9 @@ static void ip_begin_qp(ip_context *c)
   for (i = 0; i < IP_NV; ++i) {
     /* The cost always needs a minimum. */
     c->added[i] = fmax(c->p.posture_weight[i], 1e-8);
-    c->ease[ip_place(i)] = 1.0 / sqrt(c->added[i]);
+  }
+  for (i = 0; i < IP_NV; ++i) {
+    c->ease[i] = 1.0 / sqrt(c->added[ip_entry(i)]);
   }
   for (i = 0; i < IP_SPARE; ++i) {
     c->ease[IP_NV + i] = 1.0 / sqrt(c->p.spare_weight[0]);
@@ -371,7 +361,7 @@ static void ip_add_turned(const ip_context *c, const double *x, double *out)
     for (j = i; j < IP_NV; ++j) {
       sum += c->factor[i * IP_NV + j] * x[j];
     }
-    out[ip_entry(i)] += sum;
+    out[i] += sum;
 #else
     (void)j;
     out[ip_entry(i)] += c->ease[i] * x[i];

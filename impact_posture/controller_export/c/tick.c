@@ -55,6 +55,9 @@ int ip_init(ip_context *c, const ip_params *p)
   if (!(p->law_rate[0] >= 4.0 * p->law_approach[0])) {
     return IP_AT_LAW_RATE;
   }
+  if (relaxation_bytes(IP_VARIABLES, IP_OTHERS, 1 + IP_LEVELS) > sizeof c->relaxation) {
+    return -1;
+  }
   memset(c, 0, sizeof *c);
   c->p = *p;
   c->excess = 1.0;
@@ -136,7 +139,7 @@ static void ip_build(ip_context *c)
 static void ip_answer(ip_context *c, ip_command *out)
 {
   double u[IP_CONTROLS], over = 0.0;
-  int i, flag;
+  int i, flag, relaxed = 0;
   if (!isfinite(c->sum)) {
     ip_cool(c);
     ip_hold(c, IP_NON_FINITE, c->v, out);
@@ -147,12 +150,13 @@ static void ip_answer(ip_context *c, ip_command *out)
     ip_hold(c, IP_UNSOLVED, c->v, out);
     return;
   }
+  memset(c->gave, 0, sizeof c->gave);
   flag = ip_solve_warm(c);
   if (flag <= 0 && flag != DAQP_EXIT_INFEASIBLE) {
     /* The solver gave up from its warm start.  Try once without. */
     flag = ip_solve_warm(c);
   }
-  if (flag <= 0) {
+  if (flag <= 0 && !ip_relax(c)) {
     ip_hold(c, flag == DAQP_EXIT_INFEASIBLE ? IP_INFEASIBLE : IP_UNSOLVED, c->v, out);
     return;
   }
@@ -168,9 +172,12 @@ static void ip_answer(ip_context *c, ip_command *out)
     ip_hold(c, IP_UNSOLVED, c->v, out);
     return;
   }
+  for (i = 0; i < 1 + IP_LEVELS; ++i) {
+    relaxed |= c->gave[i] > 0.0;
+  }
   c->held_now = 0;
   memcpy(c->held, u, sizeof u);
-  ip_write(c, u, IP_SOLVED, out);
+  ip_write(c, u, relaxed ? IP_RELAXED : IP_SOLVED, out);
 }
 
 /* Whether a measurement can be used. */
@@ -199,6 +206,7 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   ip_reset_posture(c);
   ip_hold_contacts(c);
   ip_begin_qp(c);
+  memset(c->relaxation, 0, sizeof c->relaxation);
   ip_build(c);
 #if IP_ROBUST
   if (!ip_normalize(c)) {
@@ -269,6 +277,7 @@ void ip_last_report(const ip_context *c, ip_report *report)
     return;
   }
   report->iterations = c->iterations;
+  memcpy(report->relaxed, c->gave, sizeof report->relaxed);
   memcpy(report->multipliers, c->multipliers, sizeof report->multipliers);
   for (r = 0; r < IP_ROWS; ++r) {
     report->rows[r] = ip_dot(c->J[r], c->z, IP_NV) - c->a[r];
