@@ -30,6 +30,8 @@ from impact_posture.toolchain import find_compiler
 from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.version import __version__
 
+RUN_SCHEMA = "impact-posture/controller-run/1"
+
 
 @dataclass(frozen=True)
 class ControllerExport:
@@ -53,6 +55,26 @@ class ControllerExport:
     def prefix(self) -> str:
         """Beginning of the C names."""
         return str(self.manifest["prefix"])
+
+    @property
+    def verdict(self) -> str:
+        """The outcome, on one line."""
+        if self.library is not None:
+            return f"{self.library.name}: built"
+        return f"build: make -C {self.out} (or codegen --compile)"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the document of ``codegen --controller --json``."""
+        return {
+            "schema": RUN_SCHEMA,
+            "out": str(self.out),
+            "prefix": self.prefix,
+            "files": [path.relative_to(self.out).as_posix() for path in self.files],
+            "library": None if self.library is None else self.library.name,
+            "tasks": self.manifest["tasks"],
+            "parameters": self.manifest["parameters"],
+            "verdict": self.verdict,
+        }
 
     def load(self) -> CompiledController:
         """Load the library, which runs its code; build it where it is missing."""
