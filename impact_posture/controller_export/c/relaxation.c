@@ -10,14 +10,19 @@
  * it, by orthogonal elimination. */
 #define STEP_WEIGHT 1e-4
 #define LIGHTER 1e-2
+#define LEAST_WEIGHT 1e-6
 /* Most steps of a level, each around the last answer, which undo the weight.  Relative to the one before, a step that
  * may be the last one, and one that calls for less weight. */
-#define MOST_STEPS 20
+#define MOST_STEPS 8
 #define SMALL_STEP 1e-2
 #define FLAT_STEP 0.1
 /* Largest violation of a bound, and the violation that counts, relative to the numbers of the problem. */
 #define EXACT 1e-10
 #define COUNTS 1e-7
+/* Largest violation of level 0 in the end. */
+#define WRONG 1e-7
+/* Rounding of a level's program, times its weight. */
+#define NOISE 3e-14
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
 #define ROUNDING 1e-10
 /* Length of a row that cannot move any more, and least pivot of an elimination, relative to the row's own length. */
@@ -32,15 +37,17 @@ typedef struct {
     double *Z, *T;               /* n x n and m x n: z and A z move by the columns from `fixed` on */
     double *z, *before, *value, *lower, *upper, *length; /* the point, [z; A z], opened bounds, lengths in `unit` */
     int *first, *last, *held;    /* range of a row's entries that are not zero; whether an entry is eliminated */
+    double *goal;                /* values that listed rows are to have */
     double *B, *v, *tau, *rhs, *step, *column; /* of an elimination */
-    int *rows;
+    int *rows, *lead;            /* listed rows; those whose reflection is the k-th */
     double *L, *wanted;          /* Cholesky factor of the reduced cost, and its minimum in whitened coordinates */
     DAQPWorkspace daqp;
     DAQPSettings settings;
     double *M, *size;            /* normalized rows of a least-distance program, and their former lengths */
     int *entry, count;           /* entries of these rows */
+    int soft;                    /* coordinates that the exact rows of an elimination take */
     int *warm;                   /* levels + 2 times entries: active rows of each program at the last solution */
-    double tolerance, weight;
+    double tolerance, weight, scale; /* `scale`: size of the point, in `unit` */
 } Relaxation;
 
 static double dot(const double *a, const double *b, int n) {
@@ -71,13 +78,13 @@ static double norm(const double *a, int n) { return sqrt(dot(a, a, n)); }
 
 /* Row of Z or T: how an entry moves in the coordinates that are left. */
 static const double *motion(const Relaxation *r, int entry) {
-    return (entry < r->n ? r->Z + (size_t)entry * r->n : r->T + (size_t)(entry - r->n) * r->n) + r->fixed;
+    return (entry < r->n ? r->Z + entry * r->n : r->T + (entry - r->n) * r->n) + r->fixed;
 }
 
 static double value_of(const Relaxation *r, int entry) {
     if (entry < r->n) return r->z[entry];
     const int row = entry - r->n, first = r->first[row];
-    return dot(r->p->A + (size_t)row * r->n + first, r->z + first, r->last[row] - first);
+    return dot(r->p->A + row * r->n + first, r->z + first, r->last[row] - first);
 }
 
 static int is_equation(const Relaxation *r, int entry) { return r->p->lower[entry] == r->p->upper[entry]; }
@@ -96,11 +103,11 @@ static void update_rows(Relaxation *r) {
     const int n = r->n, free = n - r->fixed;
     for (int row = 0; row < r->p->m; row++) {
         if (r->held[n + row]) continue;
-        double *T = r->T + (size_t)row * n + r->fixed;
+        double *T = r->T + row * n + r->fixed;
         memset(T, 0, (size_t)free * sizeof *T);
         for (int k = r->first[row]; k < r->last[row]; k++) {
-            const double a = r->p->A[(size_t)row * n + k];
-            if (a != 0) add(T, a, r->Z + (size_t)k * n + r->fixed, free);
+            const double a = r->p->A[row * n + k];
+            if (a != 0) add(T, a, r->Z + k * n + r->fixed, free);
         }
     }
 }
@@ -120,30 +127,30 @@ static void reflect(const double *v, double tau, double *x, int count) { add(x, 
 /* Turn a move from the coordinates of turn() into those of Z. */
 static void turn_back(const Relaxation *r, double *x, int rank) {
     for (int k = rank - 1; k >= 0; k--)
-        reflect(r->v + (size_t)k * r->n, r->tau[k], x + k, r->n - r->fixed - k);
+        reflect(r->v + k * r->n, r->tau[k], x + k, r->n - r->fixed - k);
 }
 
 /* Minimize ||B x - rhs|| for `rows` >= `columns` of full rank; B and rhs are overwritten. */
 static void least_squares(double *B, int stride, int rows, int columns, double *rhs, double *x, double *v) {
     for (int c = 0; c < columns; c++) {
         const int count = rows - c;
-        for (int i = 0; i < count; i++) v[i] = B[(size_t)(c + i) * stride + c];
+        for (int i = 0; i < count; i++) v[i] = B[(c + i) * stride + c];
         const double tau = reflector(v, v, count);
         for (int j = c; j <= columns; j++) {
-            double sum = 0, *to = j < columns ? B + (size_t)c * stride + j : rhs + c;
+            double sum = 0, *to = j < columns ? B + c * stride + j : rhs + c;
             const int next = j < columns ? stride : 1;
-            for (int i = 0; i < count; i++) sum += v[i] * to[(size_t)i * next];
-            for (int i = 0; i < count; i++) to[(size_t)i * next] -= tau * sum * v[i];
+            for (int i = 0; i < count; i++) sum += v[i] * to[i * next];
+            for (int i = 0; i < count; i++) to[i * next] -= tau * sum * v[i];
         }
     }
     for (int c = columns - 1; c >= 0; c--) {
-        const double *b = B + (size_t)c * stride;
+        const double *b = B + c * stride;
         x[c] = (rhs[c] - dot(b + c + 1, x + c + 1, columns - c - 1)) / b[c];
     }
 }
 
 static void swap_rows(Relaxation *r, int i, int k) {
-    double *a = r->B + (size_t)i * r->n, *b = r->B + (size_t)k * r->n;
+    double *a = r->B + i * r->n, *b = r->B + k * r->n;
     for (int j = 0; j < r->n; j++) {
         const double x = a[j];
         a[j] = b[j];
@@ -156,40 +163,44 @@ static void swap_rows(Relaxation *r, int i, int k) {
 }
 
 /* Find coordinates of which the first ones alone move the listed rows, and return their number.  r->step becomes the
- * move by which the first `exact` rows change by r->rhs, and the others nearly so (least squares). */
+ * move by which the first `exact` rows reach their goals, and the others come near theirs (least squares). */
 static int turn(Relaxation *r, int exact, int all) {
     const int n = r->n, free = n - r->fixed;
     double *B = r->B, *step = r->step, longest = 0;
-    int rank = 0, soft = -1;
+    int rank = 0;
     memset(step, 0, (size_t)n * sizeof *step);
     for (int i = 0; i < all; i++) {
-        memcpy(B + (size_t)i * n, motion(r, r->rows[i]), (size_t)free * sizeof *B);
+        memcpy(B + i * n, motion(r, r->rows[i]), (size_t)free * sizeof *B);
+        r->rhs[i] = r->goal[r->rows[i]] - r->value[r->rows[i]];
         if (i >= exact) longest = fmax(longest, r->length[r->rows[i]]);
     }
+    r->soft = -1;
     for (int k = 0; k < all && rank < free; k++) {
         if (k >= exact) {
             int best = k;
             double most = -1;
             for (int i = k; i < all; i++) {
-                const double s = norm(B + (size_t)i * n + rank, free - rank);
+                const double s = norm(B + i * n + rank, free - rank);
                 if (s > most) most = s, best = i;
             }
             if (best != k) swap_rows(r, k, best);
-            if (soft < 0) soft = rank;
+            if (r->soft < 0) r->soft = rank;
         }
-        double *b = B + (size_t)k * n, *v = r->v + (size_t)rank * n;
+        double *b = B + k * n, *v = r->v + rank * n;
         if (norm(b + rank, free - rank) <= PIVOT * (k < exact ? r->length[r->rows[k]] : longest)) {
             if (k < exact) continue;
             break;
         }
         r->tau[rank] = reflector(v, b + rank, free - rank);
-        for (int i = k; i < all; i++) reflect(v, r->tau[rank], B + (size_t)i * n + rank, free - rank);
+        for (int i = k; i < all; i++) reflect(v, r->tau[rank], B + i * n + rank, free - rank);
         if (k < exact) step[rank] = (r->rhs[k] - dot(b, step, rank)) / b[rank];
-        rank++;
+        r->lead[rank++] = k;
     }
-    if (soft >= 0 && rank > soft) {
-        for (int i = exact; i < all; i++) r->rhs[i] -= dot(B + (size_t)i * n, step, soft);
-        double *at = B + (size_t)exact * n + soft;
+    if (r->soft < 0) r->soft = rank;
+    const int soft = r->soft;
+    if (rank > soft) {
+        for (int i = exact; i < all; i++) r->rhs[i] -= dot(B + i * n, step, soft);
+        double *at = B + exact * n + soft;
         least_squares(at, n, all - exact, rank - soft, r->rhs + exact, step + soft, r->column);
     }
     turn_back(r, step, rank);
@@ -201,7 +212,7 @@ static int move(Relaxation *r, int all) {
     const int n = r->n, free = n - r->fixed;
     int fits = 1;
     memcpy(r->before, r->z, (size_t)n * sizeof *r->z);
-    for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + (size_t)i * n + r->fixed, r->step, free);
+    for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + i * n + r->fixed, r->step, free);
     for (int i = 0; i < all; i++) r->held[r->rows[i]] = 1;
     for (int j = 0; j < r->count && fits; j++) {
         const int i = r->entry[j];
@@ -216,26 +227,53 @@ static int move(Relaxation *r, int all) {
     return fits;
 }
 
+/* Drop the exact rows without a multiplier, or with one of the wrong sign, from the list of turn(), after its move.
+ * Return how many are left, as a negative number where none was dropped. */
+static int drop_rows(Relaxation *r, int exact, int all) {
+    double *force = r->column, most = 0;
+    int kept = 0, changed = 0;
+    for (int k = 0; k < r->soft; k++) force[k] = 0;
+    for (int i = exact; i < all; i++)
+        add(force, r->goal[r->rows[i]] - value_of(r, r->rows[i]), r->B + i * r->n, r->soft);
+    for (int i = 0; i < exact; i++) r->rhs[i] = 0;
+    for (int k = r->soft - 1; k >= 0; k--) {
+        const double *b = r->B + r->lead[k] * r->n, multiplier = force[k] / b[k];
+        add(force, -multiplier, b, k);
+        r->rhs[r->lead[k]] = multiplier * r->length[r->rows[r->lead[k]]];
+        most = fmax(most, fabs(r->rhs[r->lead[k]]));
+    }
+    for (int i = 0; i < all; i++) {
+        const int row = r->rows[i];
+        const double pushes = r->goal[row] == r->upper[row] ? r->rhs[i] : -r->rhs[i];
+        if (i < exact && !(pushes > COUNTS * most)) {
+            r->held[row] = 0;
+            changed++;
+        } else
+            r->rows[kept++] = row;
+    }
+    return changed ? kept : -kept;
+}
+
 /* Leave out the first `rank` of the coordinates of turn(). */
 static void eliminate(Relaxation *r, int rank) {
     const int n = r->n, free = n - r->fixed, rest = free - rank;
     if (rest < rank) {
         /* Few coordinates are left: Z times each of them. */
         for (int c = 0; c < rest; c++) {
-            double *e = r->B + (size_t)c * n;
+            double *e = r->B + c * n;
             memset(e, 0, (size_t)free * sizeof *e);
             e[rank + c] = 1;
             turn_back(r, e, rank);
         }
         for (int i = 0; i < n; i++) {
-            double *z = r->Z + (size_t)i * n + r->fixed;
-            for (int c = 0; c < rest; c++) r->column[c] = dot(z, r->B + (size_t)c * n, free);
+            double *z = r->Z + i * n + r->fixed;
+            for (int c = 0; c < rest; c++) r->column[c] = dot(z, r->B + c * n, free);
             memcpy(z + rank, r->column, (size_t)rest * sizeof *z);
         }
     } else
         for (int i = 0; i < n; i++)
             for (int k = 0; k < rank; k++)
-                reflect(r->v + (size_t)k * n, r->tau[k], r->Z + (size_t)i * n + r->fixed + k, free - k);
+                reflect(r->v + k * n, r->tau[k], r->Z + i * n + r->fixed + k, free - k);
     r->fixed += rank;
     update_values(r);
     update_rows(r);
@@ -247,7 +285,7 @@ static void eliminate(Relaxation *r, int rank) {
  * where the cost has a factor L. */
 static void list_rows(Relaxation *r, int level, const double *L) {
     const int free = r->n - r->fixed;
-    const int *warm = r->warm + (size_t)level * (size_t)r->entries;
+    const int *warm = r->warm + level * r->entries;
     int count = 0;
     double longest = 0;
     for (int i = 0; i < r->entries; i++)
@@ -256,10 +294,10 @@ static void list_rows(Relaxation *r, int level, const double *L) {
         const int own = r->p->level[i], soft = own == level && level > 0, equal = is_equation(r, i);
         if (r->held[i] || own > level || (equal && !soft)) continue;
         if (r->lower[i] <= -RELAXATION_NONE && r->upper[i] >= RELAXATION_NONE) continue;
-        double *row = r->M + (size_t)count * (size_t)free;
+        double *row = r->M + count * free;
         memcpy(row, motion(r, i), (size_t)free * sizeof *row);
         if (norm(row, free) <= FLAT * r->length[i]) continue;
-        for (int k = 0; L && k < free; k++) row[k] = (row[k] - dot(L + (size_t)k * r->n, row, k)) / L[k * r->n + k];
+        for (int k = 0; L && k < free; k++) row[k] = (row[k] - dot(L + k * r->n, row, k)) / L[k * r->n + k];
         const double size = r->size[count] = norm(row, free);
         for (int k = 0; k < free; k++) row[k] /= size;
         /* The tolerance of a row is relative to its length in the units of the problem.  That of the cost is what
@@ -281,13 +319,14 @@ static double set_bounds(Relaxation *r, const double *wanted) {
     for (int i = 0; i < r->n; i++) size = fmax(size, fabs(r->z[i]) / r->length[i]);
     for (int j = 0; j < r->count; j++) {
         const int i = r->entry[j];
-        const double at = r->value[i] / r->size[j] + (wanted ? dot(r->M + (size_t)j * free, wanted, free) : 0);
+        const double at = r->value[i] / r->size[j] + (wanted ? dot(r->M + j * free, wanted, free) : 0);
         r->daqp.dupper[j] = r->upper[i] / r->size[j] - at;
         r->daqp.dlower[j] = r->lower[i] / r->size[j] - at;
         largest = fmax(largest, fmax(r->daqp.dlower[j], -r->daqp.dupper[j]));
     }
     const double unit = fmax(largest, EXACT * size);
-    r->tolerance = EXACT * (wanted ? size : fmax(size, unit));
+    r->scale = size;
+    r->tolerance = fmax(EXACT, NOISE / r->weight) * (wanted ? size : fmax(size, unit));
     r->settings.primal_tol = wanted ? ROUNDING : r->tolerance / unit;
     for (int j = 0; j < r->count; j++) {
         r->daqp.dupper[j] /= unit;
@@ -312,13 +351,13 @@ static int start(Relaxation *r) {
 
 /* Keep the active rows of a program for the next solution. */
 static void keep_active(Relaxation *r, int level) {
-    int *warm = r->warm + (size_t)level * (size_t)r->entries;
+    int *warm = r->warm + level * r->entries;
     memset(warm, 0, (size_t)r->entries * sizeof *warm);
     for (int j = 0; j < r->count; j++) warm[r->entry[j]] = r->daqp.sense[j] & (DAQP_ACTIVE | DAQP_LOWER);
 }
 
 /* Smallest violation of an entry that counts. */
-static double least(const Relaxation *r, int entry) { return COUNTS * (r->tolerance / EXACT) * r->length[entry]; }
+static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
 
 /* List what determines the level's answer: the active rows of the levels above, then the level's own equations and
  * violated rows.  Return the number of the former; `all` is that of both. */
@@ -326,14 +365,14 @@ static int list_held(Relaxation *r, int level, int missed, int *all) {
     int exact = 0;
     for (int j = 0; j < r->daqp.n_active && missed; j++) {
         const int at = r->daqp.WS[j], i = r->entry[at];
-        if ((r->daqp.sense[at] & DAQP_SOFT) || fabs(r->daqp.lam_star[j]) * r->weight <= COUNTS) continue;
-        r->rhs[exact] = ((r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i]) - r->value[i];
+        if (r->daqp.sense[at] & DAQP_SOFT) continue;
+        r->goal[i] = (r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i];
         r->rows[exact++] = i;
     }
     *all = exact;
     for (int i = 0; i < r->entries; i++) {
         if (r->held[i] || r->p->level[i] != level || !(is_equation(r, i) || violation(r, i) > least(r, i))) continue;
-        r->rhs[*all] = (r->value[i] > r->upper[i] ? r->upper[i] : r->lower[i]) - r->value[i];
+        r->goal[i] = r->value[i] > r->upper[i] ? r->upper[i] : r->lower[i];
         r->rows[(*all)++] = i;
     }
     return exact;
@@ -359,7 +398,7 @@ static int solve_level(Relaxation *r, int level) {
             if (flag == DAQP_EXIT_ITERLIMIT || (flag <= 0 && level <= 1 && !k)) return flag;
             if (flag <= 0) break;
             const double length = unit * norm(r->daqp.u, free);
-            for (int i = 0; i < r->n; i++) r->z[i] += unit * dot(r->Z + (size_t)i * r->n + r->fixed, r->daqp.u, free);
+            for (int i = 0; i < r->n; i++) r->z[i] += unit * dot(r->Z + i * r->n + r->fixed, r->daqp.u, free);
             update_values(r);
             missed = 0;
             for (int j = 0; j < r->count && !missed; j++)
@@ -368,19 +407,28 @@ static int solve_level(Relaxation *r, int level) {
             RELAXATION_TRACE("step", level, r->daqp.iterations, length);
 #endif
             /* The active rows are final only where another step finds the same. */
-            const double ratio = k ? length / fmax(before, 1e-300) : 1;
             const int same = left - r->left == 1 && k;
-            flat = same && ratio > FLAT_STEP;
+            flat = same && length > FLAT_STEP * before && r->weight > 1.001 * LEAST_WEIGHT;
             before = length;
-            if (missed && !(same && ratio <= SMALL_STEP)) continue;
+            /* The active rows are final only where another step finds the same. */
+            if (missed && !same) continue;
         }
-        const int exact = list_held(r, level, missed, &all);
-        rank = turn(r, exact, all);
-        done = move(r, all);
+        int exact = list_held(r, level, missed, &all), left_over;
+        do {
+            rank = turn(r, exact, all);
+            done = move(r, all);
+            left_over = done && exact ? drop_rows(r, exact, all) : -all;
+            if (left_over > 0) {
+                memcpy(r->z, r->before, (size_t)r->n * sizeof *r->z);
+                exact -= all - left_over;
+                all = left_over;
+            }
+        } while (left_over > 0);
     }
     if (!done) {
         list_held(r, level, missed, &all);
-        rank = turn(r, all, all);
+        for (int i = 0; i < all; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
+        rank = turn(r, 0, all);
         for (int i = 0; i < all; i++) r->held[r->rows[i]] = 1;
     }
 #ifdef RELAXATION_TRACE
@@ -401,26 +449,26 @@ static int factorize(Relaxation *r, double share) {
     const int n = r->n, free = n - r->fixed;
     double *HZ = r->B, largest = 0;
     for (int i = 0; i < n; i++) {
-        double *row = HZ + (size_t)i * n;
+        double *row = HZ + i * n;
         memset(row, 0, (size_t)free * sizeof *row);
         for (int k = 0; k < n; k++) {
-            const double h = r->p->H[(size_t)(i > k ? i : k) * n + (i > k ? k : i)];
-            if (h != 0) add(row, h, r->Z + (size_t)k * n + r->fixed, free);
+            const double h = r->p->H[(i > k ? i : k) * n + (i > k ? k : i)];
+            if (h != 0) add(row, h, r->Z + k * n + r->fixed, free);
         }
     }
     memset(r->wanted, 0, (size_t)free * sizeof *r->wanted);
-    for (int i = 0; i < free; i++) memset(r->L + (size_t)i * n, 0, (size_t)free * sizeof *r->L);
+    for (int i = 0; i < free; i++) memset(r->L + i * n, 0, (size_t)free * sizeof *r->L);
     for (int k = 0; k < n; k++) {
-        const double *z = r->Z + (size_t)k * n + r->fixed, *h = HZ + (size_t)k * n;
-        for (int i = 0; i < free; i++) add(r->L + (size_t)i * n, z[i], h, i + 1);
+        const double *z = r->Z + k * n + r->fixed, *h = HZ + k * n;
+        for (int i = 0; i < free; i++) add(r->L + i * n, z[i], h, i + 1);
         add(r->wanted, -r->p->g[k], z, free);
         add(r->wanted, -r->z[k], h, free);
     }
-    for (int i = 0; i < free; i++) largest = fmax(largest, r->L[(size_t)i * n + i]);
+    for (int i = 0; i < free; i++) largest = fmax(largest, r->L[i * n + i]);
     for (int i = 0; i < free; i++) {
-        double *row = r->L + (size_t)i * n;
+        double *row = r->L + i * n;
         row[i] += share * largest;
-        for (int k = 0; k < i; k++) row[k] = (row[k] - dot(row, r->L + (size_t)k * n, k)) / r->L[(size_t)k * n + k];
+        for (int k = 0; k < i; k++) row[k] = (row[k] - dot(row, r->L + k * n, k)) / r->L[k * n + k];
         const double d = row[i] - dot(row, row, i);
         if (!(d > 1e-14 * largest)) return 0;
         row[i] = sqrt(d);
@@ -448,15 +496,15 @@ static int solve_cost(Relaxation *r) {
         double *y = r->wanted;
         add(y, unit, r->daqp.u, free);
         for (int i = free - 1; i >= 0; i--) {
-            y[i] /= r->L[(size_t)i * n + i];
-            add(y, -y[i], r->L + (size_t)i * n, i);
+            y[i] /= r->L[i * n + i];
+            add(y, -y[i], r->L + i * n, i);
         }
-        for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + (size_t)i * n + r->fixed, y, free);
+        for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + i * n + r->fixed, y, free);
         update_values(r);
         int active = 0;
         for (int j = 0; j < r->daqp.n_active; j++) {
             const int at = r->daqp.WS[j], i = r->entry[at];
-            r->rhs[active] = ((r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i]) - r->value[i];
+            r->goal[i] = (r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i];
             r->rows[active++] = i;
         }
         turn(r, active, active);
@@ -468,43 +516,46 @@ static int solve_cost(Relaxation *r) {
 
 /* ---- the whole ------------------------------------------------------------------------------------------------ */
 
-/* Take `count` numbers of `size` bytes; the first call counts only. */
-static void *take(char **at, size_t count, size_t size) {
-    void *found = *at;
-    *at += (count * size + sizeof(double) - 1) / sizeof(double) * sizeof(double);
+/* Place an array after the others; without a base, count only. */
+static void *take(char *base, size_t *used, size_t count, size_t size) {
+    char *found = base ? base + *used : NULL;
+    *used += (count * size + sizeof(double) - 1) / sizeof(double) * sizeof(double);
     return found;
 }
 
-static char *place(Relaxation *r, char *at, int n, int m, int levels) {
-    const size_t e = (size_t)n + (size_t)m, N = (size_t)n, active = N + e + 2;
-#define DOUBLES(name, count) r->name = take(&at, count, sizeof(double))
-#define INTS(name, count) r->name = take(&at, count, sizeof(int))
-    DOUBLES(Z, N * N); DOUBLES(T, (size_t)m * N); DOUBLES(z, N); DOUBLES(before, N); DOUBLES(value, e);
-    DOUBLES(lower, e); DOUBLES(upper, e); DOUBLES(length, e); DOUBLES(B, e * N); DOUBLES(v, N * N); DOUBLES(tau, N);
-    DOUBLES(rhs, e); DOUBLES(step, N); DOUBLES(column, e); DOUBLES(L, N * N); DOUBLES(wanted, N);
-    DOUBLES(M, e * N); DOUBLES(size, e);
-    DOUBLES(daqp.dupper, e); DOUBLES(daqp.dlower, e); DOUBLES(daqp.scaling, e); DOUBLES(daqp.Mu, e);
-    DOUBLES(daqp.rho_ls, e); DOUBLES(daqp.rho_us, e); DOUBLES(daqp.w_ls, e);
-    DOUBLES(daqp.lam, active); DOUBLES(daqp.lam_star, active); DOUBLES(daqp.D, active); DOUBLES(daqp.xldl, active);
-    DOUBLES(daqp.zldl, active); DOUBLES(daqp.L, active * (active + 1) / 2); DOUBLES(daqp.u, N); DOUBLES(daqp.xold, N);
-    INTS(first, (size_t)m); INTS(last, (size_t)m); INTS(held, e); INTS(rows, e); INTS(entry, e);
-    INTS(warm, (size_t)(levels + 2) * e); INTS(daqp.sense, e); INTS(daqp.WS, active); INTS(daqp.prox_mask, N);
-#undef DOUBLES
-#undef INTS
-    return at;
+static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels) {
+    const size_t e = n + m, active = n + e + 2;
+    size_t used = 0;
+    const struct { double **array; size_t count; } doubles[] = {
+        {&r->Z, n * n}, {&r->T, m * n}, {&r->z, n}, {&r->before, n}, {&r->value, e}, {&r->lower, e}, {&r->upper, e},
+        {&r->length, e}, {&r->B, e * n}, {&r->v, n * n}, {&r->tau, n}, {&r->rhs, e}, {&r->goal, e}, {&r->step, n}, {&r->column, e},
+        {&r->L, n * n}, {&r->wanted, n}, {&r->M, e * n}, {&r->size, e}, {&r->daqp.dupper, e}, {&r->daqp.dlower, e},
+        {&r->daqp.scaling, e}, {&r->daqp.Mu, e}, {&r->daqp.rho_ls, e}, {&r->daqp.rho_us, e}, {&r->daqp.w_ls, e},
+        {&r->daqp.lam, active}, {&r->daqp.lam_star, active}, {&r->daqp.D, active}, {&r->daqp.xldl, active},
+        {&r->daqp.zldl, active}, {&r->daqp.L, active * (active + 1) / 2}, {&r->daqp.u, n}, {&r->daqp.xold, n},
+    };
+    const struct { int **array; size_t count; } ints[] = {
+        {&r->warm, (levels + 2) * e}, {&r->first, m}, {&r->last, m}, {&r->held, e}, {&r->rows, e}, {&r->lead, n}, {&r->entry, e},
+        {&r->daqp.sense, e}, {&r->daqp.WS, active}, {&r->daqp.prox_mask, n},
+    };
+    /* The active rows, which outlive a solution, come first. */
+    for (size_t k = 0; k < sizeof ints / sizeof *ints; k++)
+        *ints[k].array = take(base, &used, ints[k].count, sizeof(int));
+    for (size_t k = 0; k < sizeof doubles / sizeof *doubles; k++)
+        *doubles[k].array = take(base, &used, doubles[k].count, sizeof(double));
+    return used;
 }
 
 size_t relaxation_bytes(int n, int m, int levels) {
     Relaxation r;
-    char none = 0;
-    return (size_t)(place(&r, &none, n, m, levels) - &none);
+    return place(&r, NULL, (size_t)n, (size_t)m, (size_t)levels);
 }
 
 /* Set the point to zero, the bounds to those of the problem, and the coordinates to the scaled variables. */
 static void begin(Relaxation *r, const relaxation_problem *p, char *work, int budget) {
     const int n = p->n;
     memset(r, 0, sizeof *r);
-    place(r, work, n, p->m, p->levels);
+    place(r, work, (size_t)n, (size_t)p->m, (size_t)p->levels);
     r->p = p, r->n = n, r->entries = n + p->m, r->left = budget;
     memset(r->Z, 0, (size_t)n * (size_t)n * sizeof *r->Z);
     memset(r->z, 0, (size_t)n * sizeof *r->z);
@@ -512,14 +563,14 @@ static void begin(Relaxation *r, const relaxation_problem *p, char *work, int bu
     memset(r->daqp.w_ls, 0, (size_t)r->entries * sizeof(double));
     memcpy(r->lower, p->lower, (size_t)r->entries * sizeof *r->lower);
     memcpy(r->upper, p->upper, (size_t)r->entries * sizeof *r->upper);
-    for (int i = 0; i < n; i++) r->Z[(size_t)i * n + i] = r->length[i] = p->unit[i];
+    for (int i = 0; i < n; i++) r->Z[i * n + i] = r->length[i] = p->unit[i];
     for (int row = 0; row < p->m; row++) {
-        const double *a = p->A + (size_t)row * n;
+        const double *a = p->A + row * n;
         int first = 0, last = n;
         while (first < n && a[first] == 0) first++;
         while (last > first && a[last - 1] == 0) last--;
         r->first[row] = first, r->last[row] = last;
-        double *T = r->T + (size_t)row * n;
+        double *T = r->T + row * n;
         for (int k = 0; k < n; k++) T[k] = a[k] * p->unit[k];
         const double length = norm(T, n);
         r->length[n + row] = length > 0 ? length : 1;
@@ -540,31 +591,27 @@ int relaxation_solve(const relaxation_problem *p, void *work, int budget, double
     update_values(&r);
     for (int i = 0; i < r.entries; i++)
         if (!p->level[i] && is_equation(&r, i)) {
-            r.rhs[always] = p->lower[i] - r.value[i];
+            r.goal[i] = p->lower[i];
             r.rows[always++] = i;
         }
     const int rank = turn(&r, always, always);
     move(&r, always);
     eliminate(&r, rank);
     for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++) flag = solve_level(&r, level);
-    memcpy(z, r.z, (size_t)p->n * sizeof *z);
     if (flag > 0) {
         flag = solve_cost(&r);
-        memcpy(z, r.z, (size_t)p->n * sizeof *z);
         if (flag != DAQP_EXIT_ITERLIMIT) flag = flag > 0 ? RELAXATION_SOLVED : RELAXATION_WITHOUT_COST;
     } else if (flag != DAQP_EXIT_ITERLIMIT)
         flag = RELAXATION_INFEASIBLE;
     if (flag == DAQP_EXIT_ITERLIMIT) flag = RELAXATION_BUDGET;
+    memcpy(z, r.z, (size_t)p->n * sizeof *z);
     report->iterations = budget - r.left;
     report->violation = 0;
     for (int i = 0; i < r.entries; i++) {
-        double size = 1;
-        if (p->level[i]) continue;
-        if (i >= r.n)
-            for (int k = 0; k < r.n; k++) size += fabs(p->A[(size_t)(i - r.n) * r.n + k] * r.z[k]);
-        const double value = value_of(&r, i), over = fmax(p->lower[i] - value, value - p->upper[i]) / size;
-        if (!(over <= report->violation)) report->violation = over;
+        const double value = value_of(&r, i), over = fmax(p->lower[i] - value, value - p->upper[i]);
+        if (!p->level[i] && !(over <= report->violation * r.scale * r.length[i]))
+            report->violation = over / (r.scale * r.length[i]);
     }
-    if (flag > 0 && !(report->violation <= 1e-6)) flag = RELAXATION_UNSOLVED;
+    if (flag > 0 && !(report->violation <= WRONG)) flag = RELAXATION_UNSOLVED;
     return flag;
 }

@@ -40,7 +40,7 @@ typedef struct {
 
 typedef struct {
     int iterations;       /* of all quadratic programs */
-    double violation;     /* largest violation of level 0, over 1 + the size of its terms */
+    double violation;     /* largest of level 0, relative to the length of its row times the size of z, in `unit` */
 } relaxation_report;
 
 /* Bytes of the workspace, which needs the alignment of a double.  Zero it before the first solution and wherever the
