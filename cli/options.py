@@ -64,6 +64,25 @@ Portable = Annotated[
 CompileLibrary = Annotated[
     bool, option("--compile", panel=OUTPUT, help="Build the shared library and compare it with other libraries.")
 ]
+ControllerKind = Annotated[
+    Literal["aerial", "legged", "arm"] | None,
+    option(
+        "--controller", panel=OUTPUT, show_default="the gradient alone",
+        help="Write the whole online controller of such a robot; with --normal, the impact-robust one.",
+    ),
+]  # fmt: skip
+ControllerScenario = Annotated[
+    str | None,
+    option(
+        "--scenario", metavar="SCENARIO", panel=OUTPUT, help="Tasks and gains of the controller, from a scenario."
+    ),
+]
+Daqp = Annotated[
+    str | None,
+    option(
+        "--daqp", metavar="DIR", panel=OUTPUT, help="Sources of DAQP for --controller, where there is no network."
+    ),
+]
 NoCodegen = Annotated[bool, option("--no-codegen", panel=OUTPUT, help="Leave the C export out.")]
 NoReport = Annotated[bool, option("--no-report", panel=OUTPUT, help="Leave report.html out.")]
 Meshes = Annotated[

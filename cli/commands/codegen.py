@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 from impact_posture.settings import ImpactSettings
 from impact_posture_cli import options
+from impact_posture_cli.controller_code import write_controller
+from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, print_json
 from impact_posture_cli.progress import progress
 from impact_posture_cli.settings_options import Given, with_settings
@@ -26,12 +28,25 @@ def codegen(
     float_: options.Float = False,
     portable: options.Portable = False,
     compile: options.CompileLibrary = False,
+    controller: options.ControllerKind = None,
+    scenario: options.ControllerScenario = None,
+    daqp: options.Daqp = None,
     force: options.Force = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Run ``impact-posture codegen``."""
     from_result = given.is_result(robot, {"prefix", "out", "float_", "portable", "compile", "force"})
+    if controller is not None:
+        if float_ or portable:
+            raise UsageError("--controller is double and plain C99: leave --float and --portable out.")
+        write_controller(
+            given, robot, controller, scenario=scenario, daqp=daqp, prefix=prefix, out=out, build=compile,
+            force=force, json=json, quiet=quiet,
+        )  # fmt: skip
+        return
+    if scenario is not None or daqp is not None:
+        raise UsageError("--scenario and --daqp belong to --controller: give aerial, legged or arm.")
     if not from_result:
         given.check_contact()
     from impact_posture.codegen.export import write_export

@@ -1,0 +1,94 @@
+/* The answer to a tick whose strict levels cannot hold (relaxation.h). */
+
+/* Rows of the program without those of the bounds on joints. */
+#define IP_OTHERS (IP_GENERAL - (IP_DENSE ? IP_BOUNDED : 0))
+/* Miss that counts, relative to the terms of a row. */
+#define IP_OFF 1e-6
+
+/* Write what gave way: the largest violation of a bound on a joint, then the norm of the miss of each level. */
+static void ip_list_gave_way(ip_context *c, const double *lower, const double *upper)
+{
+  double most = 0.0, size = 1.0;
+  int i, j, k, r = IP_BLIND;
+  memset(c->gave, 0, sizeof c->gave);
+  for (i = IP_BASE; IP_LAW && i < IP_NV; ++i) {
+    most = fmax(most, fmax(lower[i] - c->z[i], c->z[i] - upper[i]));
+    size = fmax(size, 1.0 + fabs(c->z[i]));
+  }
+  c->gave[0] = most > IP_OFF * size ? most : 0.0;
+  for (k = 0; k < IP_LEVELS; ++k) {
+    double square = 0.0;
+    most = 0.0;
+    size = 0.0;
+    for (i = r; i < r + ip_level_rows[k]; ++i) {
+      const double off = ip_dot(c->rows[i], c->z, IP_VARIABLES) - c->low[IP_SIMPLE + i];
+      double terms = 0.0;
+      for (j = 0; j < IP_VARIABLES; ++j) {
+        terms += fabs(c->rows[i][j] * c->z[j]);
+      }
+      square += off * off;
+      most = fmax(most, fabs(off));
+      size = fmax(size, terms);
+    }
+    c->gave[1 + k] = most > IP_OFF * (1.0 + size) ? sqrt(square) : 0.0;
+    r += ip_level_rows[k];
+  }
+}
+
+/* Write z.  Return whether there is an answer. */
+static int ip_relax(ip_context *c)
+{
+  enum { N = IP_VARIABLES, M = IP_OTHERS };
+  double g[N] = {0}, unit[N], lower[N + M], upper[N + M], *H = c->scratch;
+  int level[N + M], i, j, k, r, flag;
+  relaxation_problem problem = {0};
+  relaxation_report report;
+  memset(H, 0, sizeof(double) * N * N);
+  ip_cost(c, H, N, g);
+  for (i = 0; i < N; ++i) {
+    unit[i] = i < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
+    level[i] = 0;
+    lower[i] = -INFINITY;
+    upper[i] = INFINITY;
+    g[i] = -g[i];
+    for (j = 0; j < i; ++j) {
+      H[i * N + j] = H[j * N + i];
+    }
+    if (i >= IP_NV) {
+      H[i * (N + 1)] = 1.0 / (c->ease[i] * c->ease[i]);
+    }
+  }
+  for (i = 0; IP_LAW && i < IP_JOINTS_V; ++i) {
+    const int at = IP_DENSE ? IP_SIMPLE + M + i : i;
+    level[IP_BASE + i] = 1;
+    lower[IP_BASE + i] = c->low[at];
+    upper[IP_BASE + i] = c->high[at];
+  }
+  for (r = 0; r < M; ++r) {
+    level[N + r] = 0;
+    lower[N + r] = c->low[IP_SIMPLE + r];
+    upper[N + r] = c->high[IP_SIMPLE + r];
+  }
+  for (k = 0, r = IP_BLIND; k < IP_LEVELS; r += ip_level_rows[k++]) {
+    for (i = r; i < r + ip_level_rows[k]; ++i) {
+      level[N + i] = 2 + k;
+    }
+  }
+  problem.n = N;
+  problem.m = M;
+  problem.levels = 1 + IP_LEVELS;
+  problem.A = c->rows[0];
+  problem.lower = lower;
+  problem.upper = upper;
+  problem.level = level;
+  problem.H = H;
+  problem.g = g;
+  problem.unit = unit;
+  flag = relaxation_solve(&problem, c->relaxation, IP_RELAXED_ITERATIONS, c->z, &report);
+  c->iterations = report.iterations;
+  memset(c->multipliers, 0, sizeof c->multipliers);
+  if (flag > 0) {
+    ip_list_gave_way(c, lower, upper);
+  }
+  return flag > 0;
+}

@@ -1,0 +1,79 @@
+"""Exported controllers for tests, each built once a run, without optimization for the time it takes."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.arrays import Array
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.reader import read_manifest
+from impact_posture.controller_export.builtin import ControllerKind, default_formulation
+from impact_posture.controller_export.compiled_controller import CompiledController
+from impact_posture.controller_export.export import export_controller
+from impact_posture.impact.contact import ImpactContact
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.libraries import library_path, load_library
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.tsid.task_formulation import TaskFormulation
+from tests.daqp import sources_or_skip
+
+KINDS: dict[str, ControllerKind] = {
+    "tilthex_arm": "aerial", "hextilt": "aerial", "panda": "arm", "solo8": "legged", "talos": "legged", "g1": "legged",
+}  # fmt: skip
+_KEPT = TemporaryDirectory()
+
+
+def exported(name: str, objective: ImpactObjective | None = None, flags: str = "-O0") -> Path:
+    """Return the folder of a robot's controller with default gains and a library."""
+    sources_or_skip()
+    return _exported(name, objective, flags)
+
+
+@cache
+def _exported(name: str, objective: ImpactObjective | None, flags: str) -> Path:
+    out = Path(_KEPT.name) / f"{name}-{len(os.listdir(_KEPT.name))}"
+    robot = load_robot(name)
+    formulation = default_formulation(robot, KINDS[name], objective)
+    given = os.environ.get("DAQP_SOURCES")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CFLAGS", flags)
+        export_controller(
+            robot, formulation, out, objective=objective, prefix="ctl", daqp=Path(given) if given else None, build=True
+        )
+    return out
+
+
+def formulation_of(name: str) -> tuple[Robot, TaskFormulation]:
+    """Return a robot and its formulation with default gains."""
+    robot = load_robot(name)
+    return robot, default_formulation(robot, KINDS[name])
+
+
+def compiled(name: str, objective: ImpactObjective | None = None) -> CompiledController:
+    """Return the controller of a robot."""
+    return CompiledController.load(exported(name, objective), robot=load_robot(name))
+
+
+def gradient_beside(name: str, objective: ImpactObjective) -> ImpactGradient:
+    """Return the gradient in the library of a controller."""
+    folder = exported(name, objective)
+    return ImpactGradient(load_library(library_path(folder, "ctl")), read_manifest(folder / "ctl_metric.json")[0])
+
+
+def impact_of(robot: Robot, frame: str, normal: tuple[float, float, float]) -> ImpactObjective:
+    """Return the default objective of an impact."""
+    return ImpactObjective(robot, ImpactContact(frame, normal))
+
+
+def random_state(robot: Robot, rng: np.random.Generator, size: float) -> tuple[Array, Array]:
+    """Return a state around the default posture."""
+    q = np.asarray(pin.integrate(robot.model, robot.posture(), size * rng.normal(size=robot.nv)))
+    return q, size * rng.normal(size=robot.nv)
