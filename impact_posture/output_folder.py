@@ -29,7 +29,7 @@ SCHEMA = "impact-posture/folder/1"
 _SCRATCH = ".impact-posture-"
 _SHOWN = 3
 
-Kind = Literal["result", "export", "run", "comparison", "reproduction", "runs"]
+Kind = Literal["result", "export", "run", "comparison", "reproduction", "runs", "world"]
 
 
 def check_output(out: Path, *, force: bool, kind: Kind) -> None:
