@@ -1,0 +1,1 @@
+"""Export of a whole controller as C code (``codegen --controller``)."""

@@ -1,0 +1,280 @@
+/* Rotations, the configuration manifold, and small dense factorizations.  Matrices are row-major. */
+
+/* Families of joints in ip_joint_family. */
+enum { IP_DIRECT, IP_CONTINUOUS, IP_FREE_FLYER, IP_SPHERICAL };
+
+static double ip_dot(const double *a, const double *b, int n)
+{
+  double s = 0.0;
+  int i;
+  for (i = 0; i < n; ++i) {
+    s += a[i] * b[i];
+  }
+  return s;
+}
+
+static void ip_cross(const double *a, const double *b, double *out)
+{
+  out[0] = a[1] * b[2] - a[2] * b[1];
+  out[1] = a[2] * b[0] - a[0] * b[2];
+  out[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* out = R x, or R'x. */
+static void ip_turn(const double *R, const double *x, int transposed, double *out)
+{
+  int i;
+  for (i = 0; i < 3; ++i) {
+    out[i] = transposed ? R[i] * x[0] + R[3 + i] * x[1] + R[6 + i] * x[2] : ip_dot(R + 3 * i, x, 3);
+  }
+}
+
+/* out = A'B of rotations. */
+static void ip_relative(const double *A, const double *B, double *out)
+{
+  int i, j;
+  for (i = 0; i < 3; ++i) {
+    for (j = 0; j < 3; ++j) {
+      out[3 * i + j] = A[i] * B[j] + A[3 + i] * B[3 + j] + A[6 + i] * B[6 + j];
+    }
+  }
+}
+
+/* Quaternion x y z w of a rotation, by its largest component. */
+static void ip_quaternion(const double *R, double *x)
+{
+  const double trace = R[0] + R[4] + R[8];
+  int i = R[4] > R[0] ? 1 : 0, j, k;
+  double root;
+  i = R[8] > R[4 * i] ? 2 : i;
+  if (trace > 0.0) {
+    root = sqrt(1.0 + trace);
+    x[3] = 0.5 * root;
+    x[0] = (R[7] - R[5]) * 0.5 / root;
+    x[1] = (R[2] - R[6]) * 0.5 / root;
+    x[2] = (R[3] - R[1]) * 0.5 / root;
+    return;
+  }
+  j = (i + 1) % 3;
+  k = (i + 2) % 3;
+  root = sqrt(1.0 + R[4 * i] - R[4 * j] - R[4 * k]);
+  x[i] = 0.5 * root;
+  x[3] = (R[3 * k + j] - R[3 * j + k]) * 0.5 / root;
+  x[j] = (R[3 * j + i] + R[3 * i + j]) * 0.5 / root;
+  x[k] = (R[3 * k + i] + R[3 * i + k]) * 0.5 / root;
+}
+
+/* Angle times axis of a unit quaternion. */
+static void ip_log_quaternion(const double *x, double *w)
+{
+  const double sine = sqrt(ip_dot(x, x, 3)), sign = x[3] < 0.0 ? -1.0 : 1.0;
+  const double scale = sine < 1e-8 ? 2.0 : 2.0 * atan2(sine, sign * x[3]) / sine;
+  int i;
+  for (i = 0; i < 3; ++i) {
+    w[i] = sign * scale * x[i];
+  }
+}
+
+static void ip_log3(const double *R, double *w)
+{
+  double x[4];
+  ip_quaternion(R, x);
+  ip_log_quaternion(x, w);
+}
+
+/* Linear part of log6 for the rotation vector w and the translation p. */
+static void ip_log6_linear(const double *w, const double *p, double *out)
+{
+  const double t2 = ip_dot(w, w, 3), t = sqrt(t2);
+  const double b = t < 1e-2 ? 1.0 / 12.0 + t2 * (1.0 / 720.0 + t2 / 30240.0)
+                            : 1.0 / t2 - cos(0.5 * t) / (2.0 * t * sin(0.5 * t));
+  double once[3], twice[3];
+  int i;
+  ip_cross(w, p, once);
+  ip_cross(w, once, twice);
+  for (i = 0; i < 3; ++i) {
+    out[i] = p[i] - 0.5 * once[i] + b * twice[i];
+  }
+}
+
+static void ip_matrix(const double *x, double *R)
+{
+  R[0] = 1.0 - 2.0 * (x[1] * x[1] + x[2] * x[2]);
+  R[1] = 2.0 * (x[0] * x[1] - x[2] * x[3]);
+  R[2] = 2.0 * (x[0] * x[2] + x[1] * x[3]);
+  R[3] = 2.0 * (x[0] * x[1] + x[2] * x[3]);
+  R[4] = 1.0 - 2.0 * (x[0] * x[0] + x[2] * x[2]);
+  R[5] = 2.0 * (x[1] * x[2] - x[0] * x[3]);
+  R[6] = 2.0 * (x[0] * x[2] - x[1] * x[3]);
+  R[7] = 2.0 * (x[1] * x[2] + x[0] * x[3]);
+  R[8] = 1.0 - 2.0 * (x[0] * x[0] + x[1] * x[1]);
+}
+
+/* out = conj(a) b, or a b. */
+static void ip_product(const double *a, const double *b, int conjugate, double *out)
+{
+  const double s = conjugate ? -1.0 : 1.0;
+  double found[4];
+  found[0] = a[3] * b[0] + s * (b[3] * a[0] + a[1] * b[2] - a[2] * b[1]);
+  found[1] = a[3] * b[1] + s * (b[3] * a[1] + a[2] * b[0] - a[0] * b[2]);
+  found[2] = a[3] * b[2] + s * (b[3] * a[2] + a[0] * b[1] - a[1] * b[0]);
+  found[3] = a[3] * b[3] - s * ip_dot(a, b, 3);
+  memcpy(out, found, sizeof found);
+}
+
+/* v = b - a on the manifold, in the tangent space at a (NV numbers). */
+static void ip_difference(const double *a, const double *b, double *v)
+{
+  double x[4], R[9], way[3], p[3];
+  int k, i;
+  for (k = 0; k < IP_JOINTS; ++k) {
+    const double *from = a + ip_joint_q[k], *to = b + ip_joint_q[k];
+    double *out = v + ip_joint_v[k];
+    if (ip_joint_family[k] == IP_FREE_FLYER) {
+      ip_product(from + 3, to + 3, 1, x);
+      ip_log_quaternion(x, out + 3);
+      ip_matrix(from + 3, R);
+      for (i = 0; i < 3; ++i) {
+        way[i] = to[i] - from[i];
+      }
+      ip_turn(R, way, 1, p);
+      ip_log6_linear(out + 3, p, out);
+    } else if (ip_joint_family[k] == IP_SPHERICAL) {
+      ip_product(from, to, 1, x);
+      ip_log_quaternion(x, out);
+    } else if (ip_joint_family[k] == IP_CONTINUOUS) {
+      out[0] = atan2(from[0] * to[1] - from[1] * to[0], from[0] * to[0] + from[1] * to[1]);
+    } else {
+      out[0] = to[0] - from[0];
+    }
+  }
+}
+
+/* Unit quaternion of the rotation vector w. */
+static void ip_exponential(const double *w, double *x)
+{
+  const double t2 = ip_dot(w, w, 3), t = sqrt(t2);
+  const double scale = t < 1e-4 ? 0.5 - t2 / 48.0 : sin(0.5 * t) / t;
+  int i;
+  for (i = 0; i < 3; ++i) {
+    x[i] = scale * w[i];
+  }
+  x[3] = cos(0.5 * t);
+}
+
+/* out = q + step v on the manifold. */
+static void ip_integrate(const double *q, const double *v, double step, double *out)
+{
+  double R[9], x[4], w[3], p[3], once[3], twice[3], far[3];
+  int k, i;
+  for (k = 0; k < IP_JOINTS; ++k) {
+    const double *from = q + ip_joint_q[k], *way = v + ip_joint_v[k];
+    double *to = out + ip_joint_q[k];
+    const int turns = ip_joint_family[k] == IP_FREE_FLYER ? 3 : 0;
+    if (ip_joint_family[k] == IP_FREE_FLYER || ip_joint_family[k] == IP_SPHERICAL) {
+      for (i = 0; i < 3; ++i) {
+        w[i] = step * way[turns + i];
+      }
+      if (turns) {
+        const double t2 = ip_dot(w, w, 3), t = sqrt(t2);
+        const double b = t < 1e-2 ? 0.5 - t2 * (1.0 / 24.0 - t2 / 720.0) : (1.0 - cos(t)) / t2;
+        const double c = t < 1e-2 ? 1.0 / 6.0 - t2 * (1.0 / 120.0 - t2 / 5040.0) : (t - sin(t)) / (t2 * t);
+        for (i = 0; i < 3; ++i) {
+          p[i] = step * way[i];
+        }
+        ip_cross(w, p, once);
+        ip_cross(w, once, twice);
+        for (i = 0; i < 3; ++i) {
+          p[i] += b * once[i] + c * twice[i];
+        }
+        ip_matrix(from + 3, R);
+        ip_turn(R, p, 0, far);
+        for (i = 0; i < 3; ++i) {
+          to[i] = from[i] + far[i];
+        }
+      }
+      ip_exponential(w, x);
+      ip_product(from + turns, x, 0, to + turns);
+    } else if (ip_joint_family[k] == IP_CONTINUOUS) {
+      const double c = cos(step * way[0]), s = sin(step * way[0]), was = from[0];
+      to[0] = c * was - s * from[1];
+      to[1] = s * was + c * from[1];
+    } else {
+      to[0] = from[0] + step * way[0];
+    }
+  }
+}
+
+/* Upper R with A = R'R in place of the upper triangle of the n x n matrix A; 0 where A is not positive definite. */
+static int ip_cholesky(double *A, int n)
+{
+  int i, j, k;
+  for (i = 0; i < n; ++i) {
+    double *row = A + i * n, s;
+    /* Not "<=", which is false for a NaN. */
+    if (!(row[i] > 0.0)) {
+      return 0;
+    }
+    s = 1.0 / sqrt(row[i]);
+    for (j = i; j < n; ++j) {
+      row[j] *= s;
+    }
+    for (k = i + 1; k < n; ++k) {
+      const double c = row[k];
+      double *below = A + k * n;
+      for (j = k; j < n; ++j) {
+        below[j] -= c * row[j];
+      }
+    }
+  }
+  return 1;
+}
+
+#if IP_ROBUST
+/* Eigenvalues of the symmetric n x n matrix A on its diagonal and eigenvectors in the columns of V, by the cyclic
+ * method of Jacobi (Golub and Van Loan, Matrix Computations, section 8.5). */
+static void ip_eigen(double *A, double *V, int n)
+{
+  int i, j, k, sweep;
+  for (i = 0; i < n * n; ++i) {
+    V[i] = i % (n + 1) == 0 ? 1.0 : 0.0;
+  }
+  for (sweep = 0; sweep < 30; ++sweep) {
+    double off = 0.0, all = 0.0;
+    for (i = 0; i < n; ++i) {
+      for (j = 0; j < n; ++j) {
+        all += A[i * n + j] * A[i * n + j];
+        off += i == j ? 0.0 : A[i * n + j] * A[i * n + j];
+      }
+    }
+    if (!(off > 1e-32 * all)) {
+      return;
+    }
+    for (i = 0; i < n; ++i) {
+      for (j = i + 1; j < n; ++j) {
+        const double a = A[i * n + j], half = 0.5 * (A[j * n + j] - A[i * n + i]);
+        double t, c, s;
+        if (a == 0.0) {
+          continue;
+        }
+        t = (half < 0.0 ? -1.0 : 1.0) * fabs(a) / (fabs(half) + sqrt(half * half + a * a));
+        t = a < 0.0 ? -t : t;
+        c = 1.0 / sqrt(1.0 + t * t);
+        s = t * c;
+        for (k = 0; k < n; ++k) {
+          const double x = A[k * n + i], y = A[k * n + j];
+          A[k * n + i] = c * x - s * y;
+          A[k * n + j] = s * x + c * y;
+        }
+        for (k = 0; k < n; ++k) {
+          const double x = A[i * n + k], y = A[j * n + k], u = V[k * n + i], w = V[k * n + j];
+          A[i * n + k] = c * x - s * y;
+          A[j * n + k] = s * x + c * y;
+          V[k * n + i] = c * u - s * w;
+          V[k * n + j] = s * u + c * w;
+        }
+      }
+    }
+  }
+}
+#endif

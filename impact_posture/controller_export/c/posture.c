@@ -1,0 +1,255 @@
+/* The posture task: fades of q_des, and the impact-robust term with its phases. */
+
+static void ip_fade_to(ip_context *c, const double *q, double over)
+{
+  double way[IP_NV];
+  if (c->blend < 1.0) {
+    ip_difference(c->posture, c->next, way);
+    ip_integrate(c->posture, way, ip_smooth(c->blend), c->posture);
+  }
+  memcpy(c->next, q, sizeof c->next);
+  c->blend = 0.0;
+  c->over = over;
+}
+
+#if IP_ROBUST
+/* Evaluate the term at q; keep the previous one where the gradient does not exist. */
+static void ip_evaluate(ip_context *c)
+{
+  double term[IP_NV], value, square = 0.0;
+  const double bound = c->p.robust_gain[0] * c->p.robust_reach[0];
+  int i, s;
+  c->failed = 1;
+  if (IP_GRADIENT(c->q, &value, term) != 0) {
+    return;
+  }
+  for (i = 0; i < IP_NV; ++i) {
+    term[i] *= -c->p.robust_gain[0] / c->scale;
+    square += term[i] * term[i];
+  }
+  if (!isfinite(square)) {
+    return;
+  }
+  for (i = 0; i < IP_NV && square > bound * bound; ++i) {
+    term[i] *= bound / sqrt(square);
+  }
+  for (i = 0; i < IP_NV && c->least_room < c->p.robust_far[0]; ++i) {
+    for (s = 0; s < 2; ++s) {
+      const double distance = c->room[s][i] - c->p.robust_near[i];
+      if (c->room[s][i] < c->p.robust_far[0] && (s ? term[i] < 0.0 : term[i] > 0.0)
+          && distance < c->p.robust_band[i]) {
+        term[i] = distance > 0.0 ? term[i] * ip_smooth(distance / c->p.robust_band[i]) : 0.0;
+      }
+    }
+  }
+  memcpy(c->term, term, sizeof term);
+  c->value = value;
+  c->failed = 0;
+}
+
+/* Advance the level of the activation by dt seconds. */
+static void ip_activate(ip_context *c, double dt)
+{
+  const double step = dt / c->p.robust_ramp[0];
+  if (c->x != c->goal) {
+    c->x = c->goal > c->x ? fmin(c->goal, c->x + step) : fmax(c->goal, c->x - step);
+    c->level = ip_smooth(c->x);
+  }
+  if (c->phase == IP_RELEASE && c->x == 0.0) {
+    c->phase = IP_FREE;
+  }
+}
+
+/* Measure lambda, the largest curvature of H along the redundancy.  Return 0 where there is none. */
+static int ip_normalize(ip_context *c)
+{
+  enum { N = IP_NV };
+  double *A = c->scratch, *V = A + N * N, *B = V + N * N, q[IP_NQ], g[2][N], value, largest = 0.0;
+  int all, i, j, k, free_count = 0, at[N];
+  c->scale = c->p.robust_scale[0];
+  if (c->scale > 0.0) {
+    return 1;
+  }
+  /* What weighted tasks leave; if that is nothing, what contacts and strict levels leave; else everything. */
+  for (all = 1; all >= 0 && free_count == 0; --all) {
+    double most = 0.0;
+    memset(A, 0, sizeof(double) * N * N);
+    for (k = 0; k < IP_FORCES + (all ? IP_ROWS : IP_STRICT); ++k) {
+      const double *row = k < IP_FORCES ? NULL : c->J[k - IP_FORCES];
+      for (i = 0; i < IP_CONTACTS && !row; ++i) {
+        row = k < ip_contact_row[i + 1] ? c->m.jacobian[ip_contact_point[i]] + (k - ip_contact_row[i]) * N : NULL;
+      }
+      for (i = 0; i < N; ++i) {
+        for (j = 0; j < N; ++j) {
+          A[i * N + j] += row[i] * row[j];
+        }
+      }
+    }
+    ip_eigen(A, V, N);
+    for (i = 0; i < N; ++i) {
+      most = fmax(most, A[i * (N + 1)]);
+    }
+    for (i = 0; i < N; ++i) {
+      if (!(A[i * (N + 1)] > 1e-12 * fmax(most, 1e-24))) {
+        at[free_count++] = i;
+      }
+    }
+  }
+  if (free_count == 0) {
+    for (i = 0; i < N * N; ++i) {
+      V[i] = i % (N + 1) == 0 ? 1.0 : 0.0;
+    }
+    for (i = 0; i < N; ++i) {
+      at[free_count++] = i;
+    }
+  }
+  for (k = 0; k < free_count; ++k) {
+    double z[N];
+    for (i = 0; i < N; ++i) {
+      z[i] = V[i * N + at[k]];
+    }
+    for (j = 0; j < 2; ++j) {
+      ip_integrate(c->q, z, j ? -1e-5 : 1e-5, q);
+      if (IP_GRADIENT(q, &value, g[j]) != 0) {
+        return 0;
+      }
+    }
+    for (i = 0; i < free_count; ++i) {
+      double sum = 0.0;
+      for (j = 0; j < N; ++j) {
+        sum += V[j * N + at[i]] * (g[0][j] - g[1][j]) / 2e-5;
+      }
+      B[i * free_count + k] = sum;
+    }
+  }
+  /* The spectral norm of B. */
+  for (i = 0; i < free_count; ++i) {
+    for (j = 0; j < free_count; ++j) {
+      double sum = 0.0;
+      for (k = 0; k < free_count; ++k) {
+        sum += B[k * free_count + i] * B[k * free_count + j];
+      }
+      A[i * free_count + j] = sum;
+    }
+  }
+  ip_eigen(A, V, free_count);
+  for (i = 0; i < free_count; ++i) {
+    largest = fmax(largest, A[i * (free_count + 1)]);
+  }
+  if (IP_GRADIENT(c->q, &value, g[0]) != 0) {
+    return 0;
+  }
+  c->scale = fmax(sqrt(largest), 1e-3 * fabs(value));
+  return isfinite(c->scale) && c->scale > 0.0;
+}
+#endif
+
+static void ip_reset_posture(ip_context *c)
+{
+#if IP_POSTURE
+  memcpy(c->posture, c->p.posture_given[0] > 0.0 ? c->p.posture_target : c->q, sizeof c->posture);
+#endif
+  c->blend = 1.0;
+  c->x = c->level = c->goal = 0.0;
+  c->phase = IP_FREE;
+  c->count = c->hold = c->failed = 0;
+  c->value = NAN;
+  memset(c->term, 0, sizeof c->term);
+#if IP_ROBUST
+  {
+    double gradient[IP_NV];
+    if (IP_GRADIENT(c->q, &c->value, gradient) != 0) {
+      c->value = NAN;
+    }
+  }
+#endif
+}
+
+/* Advance ramps, fades and the gradient by dt seconds. */
+static void ip_advance(ip_context *c, double dt)
+{
+#if IP_ROBUST
+  if (c->hold) {
+    c->hold = 0;
+    ip_fade_to(c, c->q, c->p.robust_ramp[0]);
+  }
+#endif
+  if (c->blend < 1.0) {
+    c->blend += dt / c->over;
+    if (c->blend >= 1.0) {
+      memcpy(c->posture, c->next, sizeof c->posture);
+      c->blend = 1.0;
+    }
+  }
+#if IP_ROBUST
+  ip_activate(c, dt);
+  if (c->level <= 0.0) {
+    return;
+  }
+  if (c->p.robust_spring[0] == 2.0 && c->blend >= 1.0) {
+    double way[IP_NV];
+    ip_difference(c->posture, c->q, way);
+    ip_integrate(c->posture, way, c->level * (1.0 - exp(-dt / c->p.robust_follow[0])), c->posture);
+  }
+  if (--c->count <= 0) {
+    c->count = (int)c->p.robust_every[0];
+    ip_evaluate(c);
+  }
+#endif
+}
+
+/* The wanted accelerations of the posture task. */
+static void ip_posture_wanted(ip_context *c)
+{
+  int i;
+#if IP_POSTURE
+  double e[IP_NV], slow[IP_NV], pull = 1.0;
+  ip_difference(c->q, c->posture, e);
+  if (c->blend < 1.0) {
+    const double share = ip_smooth(c->blend);
+    double ahead[IP_NV];
+    ip_difference(c->q, c->next, ahead);
+    for (i = 0; i < IP_NV; ++i) {
+      e[i] = (1.0 - share) * e[i] + share * ahead[i];
+    }
+  }
+#if IP_ROBUST
+  pull = c->p.robust_spring[0] == 1.0 ? 1.0 - c->level : 1.0;
+#endif
+  for (i = 0; i < IP_NV; ++i) {
+    slow[i] = c->posture_velocity[i] - c->v[i];
+  }
+  for (i = 0; i < IP_NV; ++i) {
+#if IP_STIFF
+    c->wanted[i] = pull * ip_dot(c->p.stiffness + i * IP_NV, e, IP_NV) + ip_dot(c->p.damping + i * IP_NV, slow, IP_NV);
+#else
+    c->wanted[i] = pull * c->p.posture_kp[i] * e[i] + c->p.posture_kd[i] * slow[i];
+#endif
+    c->wanted[i] += c->posture_acceleration[i] + c->level * c->term[i];
+  }
+#else
+  for (i = 0; i < IP_NV; ++i) {
+    c->wanted[i] = 0.0;
+  }
+#endif
+}
+
+static int ip_enter(ip_context *c, int phase)
+{
+  const int fits = phase == IP_BRACE ? c->phase == IP_FREE || c->phase == IP_RELEASE
+                   : phase == IP_CONTACT ? c->phase == IP_BRACE : c->phase == IP_BRACE || c->phase == IP_CONTACT;
+  const double was = c->goal;
+  if (!c->ready || !IP_ROBUST || !fits) {
+    return 1;
+  }
+#if IP_ROBUST
+  {
+    const int live = c->p.robust_live[0] > 0.0;
+    c->goal = phase == IP_BRACE || (phase == IP_CONTACT && live) ? 1.0 : 0.0;
+    c->hold = phase == IP_CONTACT ? !live : phase == IP_RELEASE ? c->hold || was > 0.0 : c->hold;
+  }
+#endif
+  (void)was;
+  c->phase = phase;
+  return 0;
+}

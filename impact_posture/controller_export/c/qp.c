@@ -1,0 +1,450 @@
+/* The QP of a tick as DAQP solves it: the least |u|^2 with lower <= M u <= upper, rows of length one.
+ *
+ * The variables z = [joints, base, w, f] are z = T (center + u), where T makes the cost |T^-1 z|^2/2.  The bounds on joints
+ * come first; they are bounds on u where T is diagonal, and rows (the last ones) where it is not. */
+
+/* A zero of DAQP. */
+#define IP_NOTHING 1e-11
+#define IP_JOINTS_V (IP_NV - IP_BASE)
+
+/* Place in u of an entry of v. */
+static int ip_place(int i)
+{
+  return i < IP_BASE ? IP_JOINTS_V + i : i - IP_BASE;
+}
+
+static int ip_entry(int k)
+{
+  return k < IP_JOINTS_V ? k + IP_BASE : k - IP_JOINTS_V;
+}
+
+/* out = row T for a row on the accelerations v. */
+static void ip_whiten(const ip_context *c, const double *row, double *out)
+{
+  int i, j;
+#if IP_DENSE
+  for (j = 0; j < IP_NV; ++j) {
+    out[j] = 0.0;
+  }
+  for (i = 0; i < IP_NV; ++i) {
+    const double s = row[ip_entry(i)], *factor = c->factor + i * IP_NV;
+    for (j = i; j < IP_NV; ++j) {
+      out[j] += s * factor[j];
+    }
+  }
+#else
+  (void)j;
+  for (i = 0; i < IP_NV; ++i) {
+    out[i] = row[ip_entry(i)] * c->ease[i];
+  }
+#endif
+}
+
+/* Set the bounds of one row of M in place, and make it a unit vector. */
+static void ip_finish(ip_context *c, int r, double lower, double upper)
+{
+  double *row = c->M[r], length = ip_dot(row, row, IP_VARIABLES), scale;
+  const double shift = ip_dot(row, c->center, IP_NV);
+  const int at = IP_SIMPLE + r;
+  int j;
+  c->shift[r] = shift;
+  /* Finite while all numbers are. */
+  c->sum += length + shift + (isnan(lower) || isnan(upper) ? NAN : 0.0);
+  scale = length > IP_NOTHING * IP_NOTHING ? 1.0 / sqrt(length) : 1.0;
+  for (j = 0; j < IP_VARIABLES; ++j) {
+    row[j] *= scale;
+  }
+  c->scaling[at] = scale;
+  c->upper[at] = (upper - shift) * scale;
+  c->lower[at] = (lower - shift) * scale;
+}
+
+/* Rows of the accelerations in the cost: J and a of the weighted tasks and of the contacts that are not hard. */
+static void ip_factorize(ip_context *c)
+{
+  int i, j, k, r;
+  double g[IP_NV];
+  for (i = 0; i < IP_NV; ++i) {
+    g[i] = c->p.posture_weight[i] * c->wanted[i];
+  }
+#if IP_DENSE
+  {
+    double *H = c->factor, *R = c->scratch, row[IP_NV];
+    memset(H, 0, sizeof c->factor);
+    for (r = IP_STRICT; r < IP_ROWS + IP_FORCES; ++r) {
+      const double *J = NULL;
+      double a = 0.0, weight = 0.0;
+      if (r < IP_ROWS) {
+        J = c->J[r];
+        a = c->a[r];
+        weight = c->p.task_weight[r];
+      } else {
+        for (k = 0; k < IP_CONTACTS; ++k) {
+          const int own = r - IP_ROWS - ip_contact_row[k];
+          if (own >= 0 && r - IP_ROWS < ip_contact_row[k + 1] && !ip_contact_hard[k]) {
+            J = c->m.jacobian[ip_contact_point[k]] + own * IP_NV;
+            a = c->contact_a[r - IP_ROWS];
+            weight = c->p.contact_weight[k];
+          }
+        }
+      }
+      if (weight <= 0.0) {
+        continue;
+      }
+      for (i = 0; i < IP_NV; ++i) {
+        row[i] = J[ip_entry(i)];
+        g[ip_entry(i)] += weight * row[i] * a;
+      }
+      for (i = 0; i < IP_NV; ++i) {
+        const double s = weight * row[i];
+        for (j = i; j < IP_NV; ++j) {
+          H[i * IP_NV + j] += s * row[j];
+        }
+      }
+    }
+    for (i = 0; i < IP_NV; ++i) {
+      H[i * (IP_NV + 1)] += c->added[ip_entry(i)];
+    }
+    if (!ip_cholesky(H, IP_NV)) {
+      c->factor[0] = NAN;
+    }
+    /* The inverse of the triangle, from its last row up. */
+    memcpy(R, H, sizeof c->factor);
+    for (i = IP_NV - 1; i >= 0; --i) {
+      const double inverse = 1.0 / R[i * (IP_NV + 1)];
+      double *out = H + i * IP_NV;
+      for (j = i; j < IP_NV; ++j) {
+        out[j] = i == j ? inverse : 0.0;
+      }
+      for (k = i + 1; k < IP_NV; ++k) {
+        const double s = -R[i * IP_NV + k] * inverse;
+        for (j = k; j < IP_NV; ++j) {
+          out[j] += s * H[k * IP_NV + j];
+        }
+      }
+    }
+  }
+#else
+  (void)j, (void)k, (void)r;
+#endif
+  ip_whiten(c, g, c->center);
+}
+
+/* One row of the controls or of the unactuated part: s'[M_base v + h_base - J_base'f], or one row of the joints. */
+static void ip_force_row(ip_context *c, const double *s, int first, int count, double *row, double *bias)
+{
+  int i, j, k;
+  memset(row, 0, sizeof(double) * IP_VARIABLES);
+  *bias = 0.0;
+  for (i = 0; i < count; ++i) {
+    const double t = s[i];
+    const double *M = c->m.M + (first + i) * IP_NV;
+    if (t == 0.0) {
+      continue;
+    }
+    *bias += t * c->free_force[first + i];
+    for (j = 0; j < IP_NV; ++j) {
+      row[j] += t * M[j];
+    }
+    for (k = 0; k < IP_CONTACTS; ++k) {
+      const double *J = c->m.jacobian[ip_contact_point[k]] + first + i;
+      for (j = 0; j < ip_contact_row[k + 1] - ip_contact_row[k]; ++j) {
+        row[IP_NV + IP_SPARE + ip_contact_row[k] + j] -= t * J[j * IP_NV];
+      }
+    }
+  }
+}
+
+/* Place a row [v; w; f] in M. */
+static void ip_put(ip_context *c, int r, const double *row, double lower, double upper)
+{
+  int j;
+  ip_whiten(c, row, c->M[r]);
+  for (j = IP_NV; j < IP_VARIABLES; ++j) {
+    c->M[r][j] = row[j] * c->ease[j];
+  }
+  ip_finish(c, r, lower, upper);
+}
+
+/* Whether the equations are independent, as LevelRank decides: no singular value of the scaled rows is below 0.02.  No
+ * singular value moves further than the matrix does, so most ticks need no decomposition. */
+static void ip_measure_rank(ip_context *c)
+{
+#if IP_LEVELS
+  enum { N = IP_EQUATIONS };
+  const double least = 2e-2;
+  double *G = c->scratch, *S = c->scratch + N * N, way = 0.0, low, high, trace = 0.0;
+  int i, j, k;
+  for (i = 0; i < N; ++i) {
+    const double s = 1.0 / c->length[i];
+    double sum = 0.0;
+    for (j = 0; j < IP_VARIABLES; ++j) {
+      const double unit = j < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
+      const double d = (c->rows[i][j] - c->reference[i][j]) * s * unit;
+      sum += d * d;
+    }
+    way += sum;
+  }
+  if (way < c->space) {
+    return;
+  }
+  memcpy(c->reference, c->rows, sizeof c->rows);
+  c->space = 0.0;
+  c->independent = 1;
+  if (!isfinite(way)) {
+    return;
+  }
+  for (i = 0; i < N; ++i) {
+    for (j = 0; j <= i; ++j) {
+      double sum = 0.0;
+      for (k = 0; k < IP_VARIABLES; ++k) {
+        const double unit = k < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
+        sum += c->rows[i][k] * c->rows[j][k] * unit * unit;
+      }
+      G[i * N + j] = G[j * N + i] = sum / (c->length[i] * c->length[j]);
+    }
+    trace += G[i * (N + 1)];
+  }
+  /* Squares of a lower and an upper bound on the least singular value. */
+  low = least * least;
+  high = trace / N;
+  for (k = 0; k < 7; ++k) {
+    const double middle = k ? sqrt(low * high) : low;
+    memcpy(S, G, sizeof(double) * N * N);
+    for (i = 0; i < N; ++i) {
+      S[i * (N + 1)] -= middle;
+    }
+    if (ip_cholesky(S, N)) {
+      low = middle;
+    } else if (k) {
+      high = middle;
+    } else {
+      c->independent = 0;
+      return;
+    }
+  }
+  c->space = (sqrt(low) - least) * (sqrt(low) - least);
+#else
+  c->independent = 1;
+#endif
+}
+
+/* Fill M and the bounds. */
+static void ip_assemble(ip_context *c)
+{
+  double row[IP_VARIABLES], to[2], one = 1.0, bias;
+  int i, j, k, r = 0;
+  c->sum = 0.0;
+  ip_factorize(c);
+  for (i = 0; i < IP_BLIND; ++i) {
+    double s[6] = {0};
+    for (j = 0; j < IP_BASE; ++j) {
+      s[j] = ip_blind[j * IP_BLIND + i];
+    }
+    ip_force_row(c, s, 0, IP_BASE, row, &bias);
+    memcpy(c->rows[r], row, sizeof row);
+    ip_put(c, r++, row, -bias, -bias);
+  }
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    for (i = ip_contact_row[k]; ip_contact_hard[k] && i < ip_contact_row[k + 1]; ++i) {
+      memset(row, 0, sizeof row);
+      memcpy(row, c->m.jacobian[ip_contact_point[k]] + (i - ip_contact_row[k]) * IP_NV, sizeof(double) * IP_NV);
+      memcpy(c->rows[r], row, sizeof row);
+      ip_put(c, r++, row, c->contact_a[i], c->contact_a[i]);
+    }
+  }
+  for (i = 0; i < IP_STRICT; ++i) {
+    memset(row, 0, sizeof row);
+    memcpy(row, c->J[i], sizeof(double) * IP_NV);
+    memcpy(c->rows[r], row, sizeof row);
+    ip_put(c, r++, row, c->a[i], c->a[i]);
+  }
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    if (i < IP_ROTORS) {
+      ip_force_row(c, ip_inverse + i * IP_BASE, 0, IP_BASE, row, &bias);
+      for (j = 0; j < IP_SPARE; ++j) {
+        row[IP_NV + j] = ip_spare[i * IP_SPARE + j];
+      }
+    } else {
+      ip_force_row(c, &one, IP_BASE + i - IP_ROTORS, 1, row, &bias);
+    }
+    c->known[i] = bias;
+    ip_put(c, r++, row, c->p.control_lower[i] - bias, c->p.control_upper[i] - bias);
+  }
+  /* The rows of the cones do not change between resets. */
+  r += IP_CONES;
+  for (i = 0; IP_LAW && i < IP_JOINTS_V; ++i) {
+    ip_bounds(c, IP_BASE + i, to);
+    if (IP_DENSE) {
+      memset(c->M[r], 0, sizeof c->M[r]);
+      memcpy(c->M[r] + i, c->factor + i * (IP_NV + 1), sizeof(double) * (size_t)(IP_NV - i));
+      ip_finish(c, r++, -to[1], to[0]);
+    } else {
+      c->sum += isnan(to[0]) || isnan(to[1]) ? NAN : 0.0;
+      c->scaling[i] = 1.0 / c->ease[i];
+      c->upper[i] = to[0] * c->scaling[i] - c->center[i];
+      c->lower[i] = -to[1] * c->scaling[i] - c->center[i];
+    }
+  }
+  ip_measure_rank(c);
+}
+
+/* The types of the bounds before any is active. */
+static void ip_cool(ip_context *c)
+{
+  int i;
+  for (i = 0; i < IP_SIMPLE + IP_GENERAL; ++i) {
+    c->sense[i] = i >= IP_SIMPLE && i < IP_SIMPLE + IP_EQUATIONS ? DAQP_ACTIVE + DAQP_IMMUTABLE : 0;
+  }
+}
+
+/* Weights that a reset reads, and the rows of the cones. */
+static void ip_begin_qp(ip_context *c)
+{
+  int i, j, k;
+  for (i = 0; i < IP_NV; ++i) {
+    /* The cost always needs a minimum. */
+    c->added[i] = fmax(c->p.posture_weight[i], 1e-8);
+    c->ease[ip_place(i)] = 1.0 / sqrt(c->added[i]);
+  }
+  for (i = 0; i < IP_SPARE; ++i) {
+    c->ease[IP_NV + i] = 1.0 / sqrt(c->p.spare_weight[0]);
+  }
+  for (i = 0; i < IP_FORCES; ++i) {
+    int own = 0;
+    for (k = 0; k < IP_CONTACTS; ++k) {
+      own = i >= ip_contact_row[k] ? i - ip_contact_row[k] : own;
+    }
+    /* A moment in N m counts like a force of 10 N. */
+    c->ease[IP_NV + IP_SPARE + i] = 1.0 / sqrt(c->p.force_weight[0] * (own < 3 ? 1.0 : 100.0));
+  }
+  memset(c->center, 0, sizeof c->center);
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    for (i = ip_contact_cone[k]; i < ip_contact_cone[k + 1]; ++i) {
+      const int r = IP_EQUATIONS + IP_CONTROLS + i;
+      memset(c->M[r], 0, sizeof c->M[r]);
+      for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
+        c->M[r][IP_NV + IP_SPARE + j] = c->cone[i][j - ip_contact_row[k]] * c->ease[IP_NV + IP_SPARE + j];
+      }
+      ip_finish(c, r, i == ip_contact_cone[k] ? c->p.contact_least[k] : 0.0, INFINITY);
+    }
+  }
+  ip_cool(c);
+}
+
+/* Lengths of the equations, by which their rank is measured: the longest row of a level. */
+static void ip_begin_rank(ip_context *c)
+{
+  int r = IP_BLIND, i, j, k;
+  for (i = 0; i < IP_EQUATIONS; ++i) {
+    double sum = 0.0;
+    for (j = 0; j < IP_VARIABLES; ++j) {
+      const double x = c->rows[i][j] * (j < IP_NV + IP_SPARE ? 1.0 : c->m.M[0]);
+      sum += x * x;
+    }
+    c->length[i] = sqrt(sum);
+  }
+  for (k = 0; k < IP_LEVELS; ++k) {
+    double most = 0.0;
+    for (i = r; i < r + ip_level_rows[k]; ++i) {
+      most = fmax(most, c->length[i]);
+    }
+    for (i = r; i < r + ip_level_rows[k]; ++i) {
+      c->length[i] = most;
+    }
+    r += ip_level_rows[k];
+  }
+  for (i = 0; i < IP_EQUATIONS; ++i) {
+    c->length[i] = c->length[i] == 0.0 ? 1.0 : c->length[i];
+  }
+  c->space = -1.0;
+  ip_measure_rank(c);
+}
+
+/* Solve from the present active set.  Return the flag of DAQP, positive for a solution. */
+static int ip_solve_warm(ip_context *c)
+{
+  enum { N = IP_VARIABLES, M = IP_SIMPLE + IP_GENERAL };
+  double lam[N + 1], lam_star[N + 1], xldl[N + 1], zldl[N + 1], D[N + 1], L[(N + 1) * (N + 2) / 2], xold[N], Mu[IP_GENERAL];
+  int WS[N + 1], prox[N], i, flag;
+  DAQPSettings settings;
+  DAQPWorkspace w;
+  for (i = 0; i < M; ++i) {
+    if (c->upper[i] - c->lower[i] < -1e-9 * c->scaling[i]) {
+      return DAQP_EXIT_INFEASIBLE;
+    }
+  }
+  memset(&w, 0, sizeof w);
+  memset(prox, 0, sizeof prox);
+  memset(&settings, 0, sizeof settings);
+  settings.primal_tol = 1e-9;
+  settings.dual_tol = DAQP_DEFAULT_DUAL_TOL;
+  settings.zero_tol = DAQP_DEFAULT_ZERO_TOL;
+  settings.pivot_tol = DAQP_DEFAULT_PIVOT_TOL;
+  settings.progress_tol = DAQP_DEFAULT_PROG_TOL;
+  settings.cycle_tol = DAQP_DEFAULT_CYCLE_TOL;
+  settings.iter_limit = IP_ITERATIONS;
+  settings.fval_bound = DAQP_INF;
+  settings.rho_soft = DAQP_DEFAULT_RHO_SOFT;
+  settings.sing_tol = DAQP_DEFAULT_SING_TOL;
+  settings.refactor_tol = DAQP_DEFAULT_REFACTOR_TOL;
+  settings.eq_reduction = DAQP_EQ_REDUCTION_OFF;
+  w.settings = &settings;
+  w.n = N;
+  w.m = M;
+  w.ms = IP_SIMPLE;
+  w.M = c->M[0];
+  w.dupper = c->upper;
+  w.dlower = c->lower;
+  w.scaling = c->scaling;
+  w.sense = c->sense;
+  w.Mu = Mu;
+  w.lam = lam;
+  w.lam_star = lam_star;
+  w.WS = WS;
+  w.D = D;
+  w.L = L;
+  w.xldl = xldl;
+  w.zldl = zldl;
+  w.u = w.x = c->y;
+  w.xold = xold;
+  w.prox_mask = prox;
+  w.outer_iter = 1;
+  memset(c->y, 0, sizeof c->y);
+  flag = daqp_reactivate_constraints(&w);
+  flag = flag < 0 ? flag : daqp_ldp(&w);
+  c->iterations = w.iterations;
+  memset(c->multipliers, 0, sizeof c->multipliers);
+  for (i = 0; flag > 0 && i < w.n_active; ++i) {
+    c->multipliers[WS[i]] = w.lam_star[i] * c->scaling[WS[i]];
+  }
+  if (flag <= 0) {
+    ip_cool(c);
+  }
+  return flag;
+}
+
+/* Read z = [v; w; f] from u. */
+static void ip_decode(ip_context *c)
+{
+  int i, j;
+  double y[IP_VARIABLES];
+  for (i = 0; i < IP_VARIABLES; ++i) {
+    y[i] = c->center[i] + c->y[i];
+  }
+  for (i = 0; i < IP_NV; ++i) {
+#if IP_DENSE
+    double sum = 0.0;
+    for (j = i; j < IP_NV; ++j) {
+      sum += c->factor[i * IP_NV + j] * y[j];
+    }
+    c->z[ip_entry(i)] = sum;
+#else
+    (void)j;
+    c->z[ip_entry(i)] = c->ease[i] * y[i];
+#endif
+  }
+  for (i = IP_NV; i < IP_VARIABLES; ++i) {
+    c->z[i] = c->ease[i] * y[i];
+  }
+}

@@ -1,0 +1,285 @@
+/* Tasks, contacts, and joint limits at the state in the context. */
+
+/* Kinds of tasks in ip_task_kind. */
+enum { IP_TILT, IP_BASE_TURN, IP_MASS_CENTER, IP_POSITION, IP_POSE, IP_ALIGNED };
+/* Phases in c->phase. */
+enum { IP_FREE, IP_BRACE, IP_CONTACT, IP_RELEASE };
+
+static double ip_smooth(double x)
+{
+  return x * x * (3.0 - 2.0 * x);
+}
+
+static void ip_read_state(ip_context *c, const double *q, const double *v)
+{
+  int i, k;
+  memcpy(c->q, q, sizeof(double) * IP_NQ);
+  memcpy(c->v, v, sizeof(double) * IP_NV);
+  for (k = 0; k < IP_UNITS; ++k) {
+    double *unit = c->q + ip_unit[2 * k];
+    const double square = ip_dot(unit, unit, ip_unit[2 * k + 1]);
+    if (fabs(square - 1.0) > 1e-12) {
+      for (i = 0; i < ip_unit[2 * k + 1]; ++i) {
+        unit[i] /= sqrt(square);
+      }
+    }
+  }
+  c->least_room = INFINITY;
+  for (i = 0; i < IP_NV; ++i) {
+    const double at = c->q[ip_limit_q[i]];
+    c->room[0][i] = c->p.joint_upper[i] - at;
+    c->room[1][i] = at - c->p.joint_lower[i];
+    c->least_room = fmin(c->least_room, fmin(c->room[0][i], c->room[1][i]));
+  }
+  ip_dynamics(c->q, c->v, &c->m);
+}
+
+/* Position, Jacobian (rows of NV) and drift of the center of mass, from the rows of the base in M and h. */
+static void ip_center_of_mass(const ip_context *c, double *position, double *J, double *drift)
+{
+#if IP_BASE == 6
+  const double *M = c->m.M, *R = c->m.base;
+  const double mass = M[0], lever[3] = {M[IP_NV + 5], -M[5], M[4]};
+  int i, j;
+  ip_turn(R, lever, 0, position);
+  ip_turn(R, c->m.h, 0, drift);
+  for (i = 0; i < 3; ++i) {
+    position[i] = c->q[i] + position[i] / mass;
+    drift[i] = drift[i] / mass + ip_gravity[i];
+    for (j = 0; J && j < IP_NV; ++j) {
+      J[i * IP_NV + j] = (R[3 * i] * M[j] + R[3 * i + 1] * M[IP_NV + j] + R[3 * i + 2] * M[2 * IP_NV + j]) / mass;
+    }
+  }
+#else
+  (void)c, (void)position, (void)J, (void)drift, (void)ip_gravity;
+#endif
+}
+
+/* Angle times axis, components x and y, of the shortest rotation that takes the z axis to a unit vector. */
+static void ip_shortest(const double *to, double *e)
+{
+  const double sine = hypot(to[0], to[1]);
+  if (sine < 1e-12) {
+    /* Upside down, all rotations about horizontal axes are equally short. */
+    e[0] = to[2] > 0.0 ? 0.0 : IP_PI;
+    e[1] = 0.0;
+  } else {
+    const double scale = atan2(sine, to[2]) / sine;
+    e[0] = -scale * to[1];
+    e[1] = scale * to[0];
+  }
+}
+
+/* Rows of a task that never change. */
+static void ip_constant_rows(ip_context *c, int k)
+{
+  int row;
+  for (row = ip_task_row[k]; row < ip_task_row[k + 1] && ip_task_kind[k] <= IP_BASE_TURN; ++row) {
+    c->J[row][3 + row - ip_task_row[k]] = 1.0;
+  }
+}
+
+/* Target that is the present output. */
+static void ip_present(const ip_context *c, int k, ip_target *target)
+{
+  const int point = ip_task_point[k];
+  double drift[3];
+  switch (ip_task_kind[k]) {
+  case IP_TILT:
+    target->position[0] = target->position[1] = 0.0;
+    target->position[2] = 1.0;
+    break;
+  case IP_BASE_TURN:
+    memcpy(target->rotation, c->m.base, sizeof target->rotation);
+    break;
+  case IP_MASS_CENTER:
+    ip_center_of_mass(c, target->position, NULL, drift);
+    break;
+  default:
+    memcpy(target->position, c->m.position[point], sizeof target->position);
+    memcpy(target->rotation, c->m.rotation[point], sizeof target->rotation);
+  }
+  target->set = 1.0;
+}
+
+/* Rows J and right-hand sides a of one task, with a = y''* - J'v. */
+static void ip_task_rows(ip_context *c, int k)
+{
+  const int row = ip_task_row[k], size = ip_task_row[k + 1] - row, point = ip_task_point[k];
+  const ip_target *target = &c->target[k];
+  const double *axis = ip_task_axis + 9 * k;
+  double e[6], drift[6] = {0}, more[6] = {0}, R[9], w[3], p[3], *J = c->J[row];
+  int i, j;
+  switch (ip_task_kind[k]) {
+  case IP_TILT:
+    ip_turn(c->m.base, target->position, 1, w);
+    ip_shortest(w, e);
+    break;
+  case IP_BASE_TURN:
+    ip_relative(c->m.base, target->rotation, R);
+    ip_log3(R, e);
+    break;
+  case IP_MASS_CENTER:
+    ip_center_of_mass(c, p, J, drift);
+    for (i = 0; i < 3; ++i) {
+      e[i] = target->position[i] - p[i];
+    }
+    break;
+  default:
+    for (i = 0; i < 3; ++i) {
+      e[i] = target->position[i] - c->m.position[point][i];
+    }
+    memcpy(J, c->m.jacobian[point], sizeof(double) * 3 * IP_NV);
+    memcpy(drift, c->m.drift[point], sizeof drift);
+    if (c->pushed && ip_task_impedance[k]) {
+      for (i = 0; i < 6; ++i) {
+        more[i] = c->p.task_softness[6 * k + i] * c->force[i];
+      }
+    }
+  }
+  if (ip_task_kind[k] == IP_POSE) {
+    double linear[3];
+    const double *turned = c->m.rotation[point];
+    ip_relative(turned, target->rotation, R);
+    ip_log3(R, w);
+    ip_turn(turned, e, 1, p);
+    ip_log6_linear(w, p, linear);
+    ip_turn(turned, linear, 0, e);
+    ip_turn(turned, w, 0, e + 3);
+    memcpy(J + 3 * IP_NV, c->m.jacobian[point] + 3 * IP_NV, sizeof(double) * 3 * IP_NV);
+    memcpy(drift, c->m.spatial[point], sizeof drift);
+  } else if (ip_task_kind[k] == IP_ALIGNED) {
+    const double *turned = c->m.rotation[point];
+    double wanted[3], across[2][3], cross[3], sine, cosine;
+    ip_turn(target->rotation, axis, 0, p);
+    ip_turn(turned, p, 1, wanted);
+    ip_cross(axis, wanted, cross);
+    for (i = 0; i < 2; ++i) {
+      e[3 + i] = ip_dot(axis + 3 + 3 * i, cross, 3);
+      ip_turn(turned, axis + 3 + 3 * i, 0, across[i]);
+    }
+    sine = hypot(e[3], e[4]);
+    cosine = ip_dot(axis, wanted, 3);
+    if (sine >= 1e-12) {
+      const double scale = atan2(sine, cosine) / sine;
+      e[3] *= scale;
+      e[4] *= scale;
+    } else if (cosine < 0.0) {
+      e[3] = IP_PI;
+    }
+    for (i = 0; i < 2; ++i) {
+      w[i] = ip_dot(across[i], drift + 3, 3);
+      p[i] = ip_dot(across[i], more + 3, 3);
+      for (j = 0; j < IP_NV; ++j) {
+        const double *angular = c->m.jacobian[point] + 3 * IP_NV + j;
+        J[(3 + i) * IP_NV + j] = across[i][0] * angular[0] + across[i][1] * angular[IP_NV]
+                                 + across[i][2] * angular[2 * IP_NV];
+      }
+    }
+    for (i = 0; i < 2; ++i) {
+      drift[3 + i] = w[i];
+      more[3 + i] = p[i];
+    }
+  }
+  for (i = 0; i < size; ++i) {
+    const double rate = ip_dot(J + i * IP_NV, c->v, IP_NV);
+    c->a[row + i] = c->p.task_kp[row + i] * e[i] + c->p.task_kd[row + i] * (target->velocity[i] - rate)
+                    + target->acceleration[i] - drift[i] + more[i];
+  }
+}
+
+/* Right-hand sides of the contacts; their rows are those of their points. */
+static void ip_contact_rows(ip_context *c)
+{
+  int k, i;
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    const int point = ip_contact_point[k], row = ip_contact_row[k], size = ip_contact_row[k + 1] - row;
+    double e[6], R[9], w[3];
+    for (i = 0; i < 3; ++i) {
+      e[i] = c->home_position[k][i] - c->m.position[point][i];
+    }
+    if (size == 6) {
+      ip_relative(c->m.rotation[point], c->home_rotation[k], R);
+      ip_log3(R, w);
+      ip_turn(c->m.rotation[point], w, 0, e + 3);
+    }
+    for (i = 0; i < size; ++i) {
+      c->contact_a[row + i] = c->p.contact_kp[k] * e[i] - c->p.contact_kd[k] * c->m.velocity[point][i]
+                              - c->m.drift[point][i];
+    }
+  }
+}
+
+/* Hold the contacts where they are, with friction cones in world axes (friction.py has the formulas). */
+static void ip_hold_contacts(ip_context *c)
+{
+  int k, i, j, b;
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    const int point = ip_contact_point[k], size = ip_contact_row[k + 1] - ip_contact_row[k];
+    const double *n = c->p.contact_normal + 3 * k, *R = c->m.rotation[point];
+    const double mu = c->p.contact_friction[k] / sqrt(2.0), X = c->p.contact_half[2 * k], Y = c->p.contact_half[2 * k + 1];
+    double heading[3] = {1.0, 0.0, 0.0}, axes[9], along, length, local[17][6] = {{0}};
+    memcpy(c->home_position[k], c->m.position[point], sizeof c->home_position[k]);
+    memcpy(c->home_rotation[k], R, sizeof c->home_rotation[k]);
+    for (i = 0; size == 6 && i < 3; ++i) {
+      heading[i] = R[3 * i];
+    }
+    for (b = 0; b < 2; ++b) {
+      along = ip_dot(n, heading, 3);
+      for (i = 0; i < 3; ++i) {
+        axes[i] = heading[i] - n[i] * along;
+      }
+      length = sqrt(ip_dot(axes, axes, 3));
+      if (!(length < 1e-6)) {
+        break;
+      }
+      /* The heading points along the normal: take the world axis that is least so. */
+      j = fabs(n[1]) < fabs(n[0]) ? 1 : 0;
+      j = fabs(n[2]) < fabs(n[j]) ? 2 : j;
+      for (i = 0; i < 3; ++i) {
+        heading[i] = i == j ? 1.0 : 0.0;
+      }
+    }
+    for (i = 0; i < 3; ++i) {
+      axes[i] /= length;
+      axes[6 + i] = n[i];
+    }
+    ip_cross(n, axes, axes + 3);
+    local[0][2] = 1.0;
+    for (i = 0; i < 4; ++i) {
+      local[1 + i][i / 2] = i % 2 ? 1.0 : -1.0;
+      local[1 + i][2] = mu;
+      local[5 + i][2] = i < 2 ? Y : X;
+      local[5 + i][3 + i / 2] = i % 2 ? -1.0 : 1.0;
+    }
+    for (i = 0; i < 8; ++i) {
+      const double s = (i / 2) % 2 ? -1.0 : 1.0, t = i % 2 ? -1.0 : 1.0, sign = i < 4 ? 1.0 : -1.0;
+      double *row = local[9 + i];
+      row[0] = -s * Y;
+      row[1] = -t * X;
+      row[2] = mu * (X + Y);
+      row[3] = sign * s * mu;
+      row[4] = sign * t * mu;
+      row[5] = sign;
+    }
+    for (i = 0; i < ip_contact_cone[k + 1] - ip_contact_cone[k]; ++i) {
+      for (b = 0; b < size; b += 3) {
+        ip_turn(axes, local[i] + b, 1, c->cone[ip_contact_cone[k] + i] + b);
+      }
+    }
+  }
+}
+
+/* Bounds on one joint's acceleration: to[0] to the upper, to[1] to the lower limit (LimitLaw has the formulas). */
+static void ip_bounds(const ip_context *c, int i, double *to)
+{
+  const ip_params *p = &c->p;
+  const double margin = fmin(p->law_margin[0], (p->joint_upper[i] - p->joint_lower[i]) / 4.0);
+  int s;
+  for (s = 0; s < 2; ++s) {
+    const double way = c->room[s][i] - margin, room = fabs(way);
+    double speed = fmin(fmin(p->law_approach[0] * room, sqrt(2.0 * p->law_deceleration[0] * room)), p->joint_velocity[i]);
+    speed = copysign(speed, way) * p->law_rate[0] + (s ? 1.0 : -1.0) * p->law_rate[0] * c->v[i];
+    to[s] = i < IP_BASE ? speed : fmin(fmax(speed, -p->law_acceleration[0]), p->law_acceleration[0]);
+  }
+}

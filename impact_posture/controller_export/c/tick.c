@@ -1,0 +1,322 @@
+/* The functions of the controller. */
+
+#define IP_LONGEST 10.0
+/* Largest sum of squares of a measurement (1e8 m, rad/s or N). */
+#define IP_ABSURD 1e16
+
+const unsigned long ip_context_bytes = (unsigned long)sizeof(ip_context);
+
+void ip_default_params(ip_params *params)
+{
+  *params = ip_defaults;
+}
+
+/* Whether x and y of a rule of ip_rules hold. */
+static int ip_holds(int rule, double x)
+{
+  switch (rule) {
+  case 0:
+    return isfinite(x);
+  case 1:
+    return isfinite(x) && x >= 0.0;
+  case 2:
+    return x > 0.0;
+  default:
+    return !isnan(x);
+  }
+}
+
+int ip_init(ip_context *c, const ip_params *p)
+{
+  const double *value = (const double *)p;
+  int k, i;
+  for (k = 0; k < IP_PARAMETERS; ++k) {
+    for (i = 0; i < ip_rules[2 * k]; ++i) {
+      if (!ip_holds(ip_rules[2 * k + 1], *value++)) {
+        return k + 1;
+      }
+    }
+  }
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    if (!(p->control_lower[i] <= p->control_upper[i]) || p->control_lower[i] == INFINITY || p->control_upper[i] == -INFINITY) {
+      return IP_AT_CONTROL_UPPER;
+    }
+  }
+  for (i = IP_BASE; i < IP_NV; ++i) {
+    if (!(p->joint_lower[i] <= p->joint_upper[i])) {
+      return IP_AT_JOINT_UPPER;
+    }
+  }
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    if (!(fabs(sqrt(ip_dot(p->contact_normal + 3 * k, p->contact_normal + 3 * k, 3)) - 1.0) < 1e-9)) {
+      return IP_AT_CONTACT_NORMAL;
+    }
+  }
+  if (!(p->law_rate[0] >= 4.0 * p->law_approach[0])) {
+    return IP_AT_LAW_RATE;
+  }
+  memset(c, 0, sizeof *c);
+  c->p = *p;
+  c->excess = 1.0;
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    c->excess = isfinite(p->control_lower[i]) ? fmax(c->excess, fabs(p->control_lower[i])) : c->excess;
+    c->excess = isfinite(p->control_upper[i]) ? fmax(c->excess, fabs(p->control_upper[i])) : c->excess;
+  }
+  c->excess *= 1e-6;
+  ip_dynamics_constants(&c->m);
+  return 0;
+}
+
+/* Whether a quaternion, or a cosine with its sine, is far from unit length. */
+static int ip_turned_wrong(const double *q)
+{
+  int k;
+  for (k = 0; k < IP_UNITS; ++k) {
+    const double *unit = q + ip_unit[2 * k];
+    if (!(fabs(ip_dot(unit, unit, ip_unit[2 * k + 1]) - 1.0) <= 1e-2)) {
+      return 1;
+    }
+  }
+  return 0;
+}
+
+static void ip_write(ip_context *c, const double *u, int status, ip_command *out)
+{
+  int i;
+  c->status = status;
+  memcpy(out->u, u, sizeof(double) * IP_CONTROLS);
+  for (i = 0; i < IP_ROTORS; ++i) {
+    out->rotor_speed[i] = sqrt(fmax(u[i], 0.0) / c->p.thrust_coefficient[0]);
+  }
+  for (i = 0; i < IP_NV; ++i) {
+    out->acceleration[i] = c->held_now ? 0.0 : c->z[i];
+  }
+  for (i = 0; i < IP_FORCES; ++i) {
+    out->forces[i] = c->held_now ? 0.0 : c->z[IP_NV + IP_SPARE + i];
+  }
+  out->status = status;
+  out->iterations = c->held_now ? 0 : c->iterations;
+}
+
+/* Give the previous command, with damping of the joints whose rates are finite. */
+static void ip_hold(ip_context *c, int status, const double *v, ip_command *out)
+{
+  double u[IP_CONTROLS];
+  int i;
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    const double rate = i < IP_ROTORS ? 0.0 : v[IP_BASE + i - IP_ROTORS];
+    u[i] = c->held[i] - (i < IP_ROTORS || !isfinite(rate) ? 0.0 : c->damping[IP_BASE + i - IP_ROTORS] * rate);
+    u[i] = fmin(fmax(u[i], c->p.control_lower[i]), c->p.control_upper[i]);
+  }
+  c->held_now = 1;
+  ip_write(c, u, status, out);
+}
+
+static void ip_build(ip_context *c)
+{
+  int k, i, j;
+  for (k = 0; k < IP_TASKS; ++k) {
+    ip_task_rows(c, k);
+  }
+  ip_contact_rows(c);
+  ip_posture_wanted(c);
+  memcpy(c->free_force, c->m.h, sizeof(double) * IP_NV);
+#if IP_FORCE_POINT >= 0
+  for (i = 0; i < 6 && c->pushed; ++i) {
+    for (j = 0; j < IP_NV; ++j) {
+      c->free_force[j] -= c->force[i] * c->m.jacobian[IP_FORCE_POINT][i * IP_NV + j];
+    }
+  }
+#else
+  (void)i, (void)j;
+#endif
+}
+
+/* Solve the QP in the context and write the command. */
+static void ip_answer(ip_context *c, ip_command *out)
+{
+  double u[IP_CONTROLS], over = 0.0;
+  int i, flag;
+  if (!isfinite(c->sum)) {
+    ip_cool(c);
+    ip_hold(c, IP_NON_FINITE, c->v, out);
+    return;
+  }
+  if (!c->independent) {
+    ip_cool(c);
+    ip_hold(c, IP_UNSOLVED, c->v, out);
+    return;
+  }
+  flag = ip_solve_warm(c);
+  if (flag <= 0 && flag != DAQP_EXIT_INFEASIBLE) {
+    /* The solver gave up from its warm start.  Try once without. */
+    flag = ip_solve_warm(c);
+  }
+  if (flag <= 0) {
+    ip_hold(c, flag == DAQP_EXIT_INFEASIBLE ? IP_INFEASIBLE : IP_UNSOLVED, c->v, out);
+    return;
+  }
+  ip_decode(c);
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    const int r = IP_EQUATIONS + i;
+    double beyond;
+    u[i] = c->known[i] + c->shift[r] + ip_dot(c->M[r], c->y, IP_VARIABLES) / c->scaling[IP_SIMPLE + r];
+    beyond = u[i] - fmin(fmax(u[i], c->p.control_lower[i]), c->p.control_upper[i]);
+    over += beyond * beyond;
+  }
+  /* Not ">", which is false for a NaN. */
+  if (!(over <= c->excess * c->excess)) {
+    ip_hold(c, IP_UNSOLVED, c->v, out);
+    return;
+  }
+  c->held_now = 0;
+  memcpy(c->held, u, sizeof u);
+  ip_write(c, u, IP_SOLVED, out);
+}
+
+/* Whether a measurement can be used. */
+static int ip_measured(const double *q, const double *v, const double *force)
+{
+  double total = ip_dot(q, q, IP_NQ) + ip_dot(v, v, IP_NV);
+  total += force ? ip_dot(force, force, 6) : 0.0;
+  /* A sum of squares is finite and below a bound only if all numbers are. */
+  return total < IP_ABSURD && !ip_turned_wrong(q);
+}
+
+int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_command *out)
+{
+  int i, j, k;
+  if (!ip_measured(q, v, NULL)) {
+    return 1;
+  }
+  c->pushed = 0;
+  ip_read_state(c, q, v);
+  for (k = 0; k < IP_TASKS; ++k) {
+    ip_constant_rows(c, k);
+    if (c->target[k].set <= 0.0) {
+      ip_present(c, k, &c->target[k]);
+    }
+  }
+  ip_reset_posture(c);
+  ip_hold_contacts(c);
+  ip_begin_qp(c);
+  ip_build(c);
+#if IP_ROBUST
+  if (!ip_normalize(c)) {
+    return 2;
+  }
+#endif
+  for (i = 0; i < IP_EQUATIONS; ++i) {
+    c->length[i] = 1.0;
+  }
+  ip_assemble(c);
+  ip_begin_rank(c);
+  for (i = 0; i < IP_NV; ++i) {
+    c->damping[i] = 10.0 * c->m.M[i * (IP_NV + 1)];
+  }
+  /* The command that is held first carries the robot against gravity. */
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    double force = 0.0;
+    for (j = 0; i < IP_ROTORS && j < IP_BASE; ++j) {
+      force += ip_inverse[i * IP_BASE + j] * c->m.h[j];
+    }
+    force = i < IP_ROTORS ? force : c->m.h[IP_BASE + i - IP_ROTORS];
+    c->held[i] = fmin(fmax(force, c->p.control_lower[i]), c->p.control_upper[i]);
+  }
+  ip_answer(c, out);
+  ip_cool(c);
+  c->last = NAN;
+  c->ready = 1;
+  return 0;
+}
+
+int ip_tick(ip_context *c, double t, const double q[IP_NQ], const double v[IP_NV], const double *force,
+            ip_command *out)
+{
+  const double longest = IP_LONGEST * c->p.period[0];
+  double dt;
+  if (!c->ready) {
+    memset(out, 0, sizeof *out);
+    out->status = IP_UNSOLVED;
+    return IP_UNSOLVED;
+  }
+  if (!isfinite(t) || !ip_measured(q, v, force)) {
+    ip_hold(c, IP_NON_FINITE, v, out);
+    return out->status;
+  }
+  dt = isnan(c->last) ? c->p.period[0] : fmin(fmax(t - c->last, 0.0), longest);
+  c->last = t;
+  c->pushed = force != NULL;
+  if (force) {
+    memcpy(c->force, force, sizeof c->force);
+  }
+  ip_read_state(c, q, v);
+  ip_advance(c, dt);
+  ip_build(c);
+  ip_assemble(c);
+  ip_answer(c, out);
+  return out->status;
+}
+
+void ip_last_report(const ip_context *c, ip_report *report)
+{
+  int r, i, k, j;
+  memset(report, 0, sizeof *report);
+  report->status = c->status;
+  report->level = c->level;
+  report->value = c->value;
+  report->dynamics = NAN;
+  if (c->held_now) {
+    return;
+  }
+  report->iterations = c->iterations;
+  memcpy(report->multipliers, c->multipliers, sizeof report->multipliers);
+  for (r = 0; r < IP_ROWS; ++r) {
+    report->rows[r] = ip_dot(c->J[r], c->z, IP_NV) - c->a[r];
+  }
+  report->dynamics = 0.0;
+  for (i = 0; i < IP_NV; ++i) {
+    double error = ip_dot(c->m.M + i * IP_NV, c->z, IP_NV) + c->free_force[i];
+    report->posture[i] = c->z[i] - c->wanted[i];
+    for (k = 0; k < IP_CONTACTS; ++k) {
+      for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
+        error -= c->m.jacobian[ip_contact_point[k]][(j - ip_contact_row[k]) * IP_NV + i] * c->z[IP_NV + IP_SPARE + j];
+      }
+    }
+    for (j = 0; j < IP_ROTORS && i < IP_BASE; ++j) {
+      error -= ip_allocation[i * IP_ROTORS + j] * c->held[j];
+    }
+    error -= i < IP_BASE ? 0.0 : c->held[IP_ROTORS + i - IP_BASE];
+    report->dynamics = fmax(report->dynamics, fabs(error));
+  }
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
+      const double *J = c->m.jacobian[ip_contact_point[k]] + (j - ip_contact_row[k]) * IP_NV;
+      report->contacts[j] = ip_dot(J, c->z, IP_NV) - c->contact_a[j];
+    }
+  }
+}
+
+int ip_move_to(ip_context *c, const double q[IP_NQ], double over)
+{
+  if (!c->ready || !(over > 0.0) || !(ip_dot(q, q, IP_NQ) < IP_ABSURD) || ip_turned_wrong(q)) {
+    return 1;
+  }
+  ip_fade_to(c, q, over);
+  return 0;
+}
+
+int ip_brace(ip_context *c)
+{
+  return ip_enter(c, IP_BRACE);
+}
+
+int ip_contact(ip_context *c)
+{
+  return ip_enter(c, IP_CONTACT);
+}
+
+int ip_release(ip_context *c)
+{
+  return ip_enter(c, IP_RELEASE);
+}

@@ -1,0 +1,250 @@
+"""An exported controller in Python, with the interface of ``tsid.Controller``.  This module needs no CasADi."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from impact_posture.arrays import Array
+from impact_posture.codegen.reader import check_library, check_robot
+from impact_posture.controller_export.manifest import Manifest, build_controller, read_controller
+from impact_posture.errors import InputError, MetricError, PostureError, SpecError
+from impact_posture.libraries import library_path, load_library
+from impact_posture.robot.robot import Robot
+from impact_posture.tsid.controller import Command, Report, Status
+
+# Statuses in the order of their numbers in C.
+_STATUSES = tuple(Status)
+# Numbers of a target: set, position, rotation, velocity, acceleration.
+_TARGET = 25
+
+
+class CompiledController:
+    """Controller in a shared library: state in, commands out.
+
+    Attributes:
+        manifest: The content of ``<prefix>.json``.
+        parameters: Name → values, shape (size,), which the next :meth:`reset` reads.
+    """
+
+    def __init__(self, library: ctypes.CDLL, document: Mapping[str, Any], manifest: Manifest) -> None:
+        """Bind a loaded library; use :meth:`load`."""
+        self.manifest, self._checked = document, manifest
+        sizes, bounds, prefix = manifest.sizes, len(manifest.bounds), manifest.prefix
+
+        def room(name: str) -> int:
+            return max(1, sizes[name])
+
+        arrays = [("u", "CONTROLS"), ("rotor_speed", "ROTORS"), ("acceleration", "NV"), ("forces", "FORCES")]
+        self._command, self._out = _structure([(n, room(s)) for n, s in arrays], ["status", "iterations"])
+        rows = [("rows", room("ROWS")), ("contacts", room("FORCES")), ("posture", room("NV"))]
+        rows += [("multipliers", max(1, bounds)), ("dynamics", 1), ("level", 1), ("value", 1)]
+        self._report, self._diagnosis = _structure(rows, ["status", "iterations"])
+        self._given, self.parameters = _structure([*manifest.parameters.items()], [])
+        bytes_ = ctypes.c_ulong.in_dll(library, f"{prefix}_context_bytes").value
+        self._context = ctypes.create_string_buffer(bytes_)
+        tasks = len(manifest.tasks)
+        targets = np.frombuffer(self._context, dtype=float, count=_TARGET * tasks).reshape(tasks, _TARGET)
+        self._targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
+        start = _TARGET * room("TASKS") * 8
+        motion = np.frombuffer(self._context, dtype=float, count=2 * sizes["NV"], offset=start)
+        self.posture_velocity, self.posture_acceleration = np.split(motion, 2)
+        self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
+        doubles = ctypes.POINTER(ctypes.c_double)
+        self._pointers = [x.ctypes.data_as(doubles) for x in (self._q, self._v, self._force)]
+        self._functions = {
+            name: getattr(library, f"{prefix}_{name}")
+            for name in ("init", "reset", "tick", "last_report", "move_to", "brace", "contact", "release")
+        }
+        getattr(library, f"{prefix}_default_params")(ctypes.byref(self._given))
+        self._ready = False
+
+    @classmethod
+    def load(cls, path: str | Path, *, robot: Robot | None = None) -> CompiledController:
+        """Load an exported controller.  **This runs its code**, so load only what you would run as a program.
+
+        Where ``lib<prefix>.so`` is missing, the method builds it there.  It must name this manifest.
+
+        Args:
+            path: The folder of the export, or its ``<prefix>.json``.
+            robot: The robot in hand; the export must be of this model.
+
+        Raises:
+            SpecError: There is no export, or it is broken.
+            ManifestMismatch: The export is of another robot, or the library belongs to another manifest.
+            CompilerError: There is no library, and none can be built.
+        """
+        document, manifest, folder = read_controller(Path(path))
+        if robot is not None:
+            check_robot(document, robot, where=str(path))
+        target = library_path(folder, manifest.prefix)
+        if not target.is_file():
+            build_controller(folder, document)
+        library = load_library(target)
+        check_library(library, document, where=str(target))
+        try:
+            return cls(library, document, manifest)
+        except (AttributeError, ValueError) as error:
+            raise SpecError(f"lacks a function ({error})", where=str(target), hint="run codegen again") from None
+
+    # ---- the interface of tsid.Controller ----------------------------------------------------------------------
+
+    def reset(self, q: ArrayLike, v: ArrayLike) -> Command:
+        """Start again at ``(q, ν)`` with the present parameters.  Targets that are set stay.
+
+        Raises:
+            InputError: A parameter is out of range; names it.
+            PostureError: ``q`` is no configuration of the robot, or ``v`` is no velocity.
+            MetricError: The gradient of the impact-robust term does not exist there, or vanishes.
+        """
+        targets = {name: row.copy() for name, row in self._targets.items()}
+        refused = self._call("init", ctypes.byref(self._given))
+        if refused:
+            name = list(self.parameters)[refused - 1]
+            values = ", ".join(f"{x:g}" for x in self.parameters[name][:8])
+            raise InputError(f"is out of range ({values})", where=f"parameter {name}", hint="see the header")
+        for name, row in targets.items():
+            self._targets[name][:] = row
+        self._q[:], self._v[:] = q, v
+        code = self._call("reset", *self._pointers[:2], ctypes.byref(self._command))
+        if code == 1:
+            raise PostureError("no state of the robot", where="reset", hint="give finite numbers and unit quaternions")
+        if code:
+            raise MetricError("the objective vanishes with its curvature", where="reset", hint="start elsewhere")
+        self._ready = True
+        return self._commanded()
+
+    def tick(self, t: float, q: ArrayLike, v: ArrayLike, force: ArrayLike | None = None) -> Command:
+        """Return the command at ``(q, ν)``; arguments as of ``tsid.Controller.tick``.
+
+        Raises:
+            InputError: ``reset`` has not been called.
+            ValueError: An array has another shape.
+        """
+        if not self._ready:
+            raise InputError("has not been reset", where="controller", hint="call reset(q, v) first")
+        self._q[:], self._v[:] = q, v
+        pushed = None
+        if force is not None:
+            given = np.asarray(force, dtype=float)
+            if given.shape not in ((3,), (6,)):
+                raise ValueError(f"a measured force has 3 or 6 numbers, not shape {given.shape}")
+            self._force[:] = 0.0
+            self._force[: given.size] = given
+            pushed = self._pointers[2]
+        q_at, v_at, _ = self._pointers
+        self._call("tick", ctypes.c_double(t), q_at, v_at, pushed, ctypes.byref(self._command))
+        return self._commanded()
+
+    def report(self) -> Report:
+        """Return the diagnosis of the last tick.  ``relaxed`` and ``deficient`` are empty."""
+        checked, found = self._checked, self._diagnosis
+        self._call("last_report", ctypes.byref(self._report))
+        status = _STATUSES[self._report.status]
+        residuals: dict[str, Array] = {}
+        active: list[tuple[str, str]] = []
+        if status in (Status.SOLVED, Status.RELAXED):
+            start = 0
+            for task in checked.tasks:
+                residuals[task.name] = found["rows"][start : start + task.rows].copy()
+                start += task.rows
+            if checked.posture is not None:
+                residuals[checked.posture] = found["posture"].copy()
+            if checked.sizes["FORCES"]:
+                residuals["contacts"] = found["contacts"].copy()
+            first = checked.sizes["SIMPLE"]
+            equations = range(first, first + checked.sizes["EQUATIONS"])
+            for k, (name, multiplier) in enumerate(zip(checked.bounds, found["multipliers"], strict=True)):
+                if multiplier and k not in equations:
+                    active.append((name, "upper" if multiplier > 0 else "lower"))
+        numbers = (float(found[name][0]) for name in ("dynamics", "level", "value"))
+        return Report(status, (), (), residuals, tuple(active), *numbers, int(self._report.iterations))
+
+    # ---- targets and phases ------------------------------------------------------------------------------------
+
+    def set_target(
+        self,
+        task: str,
+        target: pin.SE3 | ArrayLike,
+        velocity: ArrayLike = 0.0,
+        acceleration: ArrayLike = 0.0,
+    ) -> None:
+        """Set the target of a task by name, as its class in ``tsid`` takes it, between ticks.
+
+        Raises:
+            InputError: There is no such task.
+        """
+        row = self._target(task)
+        if isinstance(target, pin.SE3):
+            row[1:4], row[4:13] = target.translation, target.rotation.ravel()
+        else:
+            given = np.asarray(target, dtype=float)
+            row[slice(1, 4) if given.size == 3 else slice(4, 13)] = given.ravel()
+        rows = next(t.rows for t in self._checked.tasks if t.name == task)
+        row[0], row[13 : 13 + rows], row[19 : 19 + rows] = 1.0, velocity, acceleration
+
+    def forget_target(self, task: str) -> None:
+        """Let the next :meth:`reset` take the present output as the target of a task.
+
+        Raises:
+            InputError: There is no such task.
+        """
+        self._target(task)[:] = 0.0
+
+    def move_to(self, q: ArrayLike, over: float = 0.5) -> None:
+        """Fade the posture task to ``q``, shape (nq,), within ``over`` seconds.
+
+        Raises:
+            InputError: The posture or the time is invalid, or ``reset`` has not been called.
+        """
+        self._q[:] = q
+        if self._call("move_to", self._pointers[0], ctypes.c_double(over)):
+            raise InputError("is no posture or no time", where="move_to", hint="give finite numbers, seconds above 0")
+
+    def brace(self) -> None:
+        """Switch the impact-robust term on."""
+        self._enter("brace")
+
+    def contact(self) -> None:
+        """Hold the reached posture during the impact, or keep the term on if it is live."""
+        self._enter("contact")
+
+    def release(self) -> None:
+        """Switch the impact-robust term off and hold the reached posture."""
+        self._enter("release")
+
+    # ---- parts --------------------------------------------------------------------------------------------------
+
+    def _enter(self, phase: str) -> None:
+        if self._call(phase):
+            raise InputError(f"'{phase}' does not follow the present phase", where="controller", hint="reset it first")
+
+    def _target(self, task: str) -> Array:
+        if task not in self._targets:
+            known = ", ".join(self._targets) or "none"
+            raise InputError(f"there is no task '{task}'", where="controller", hint=f"one of: {known}")
+        return self._targets[task]
+
+    def _call(self, name: str, *arguments: Any) -> int:
+        return int(self._functions[name](self._context, *arguments))
+
+    def _commanded(self) -> Command:
+        sizes, out = self._checked.sizes, self._out
+        u, rotors = out["u"][: sizes["CONTROLS"]].copy(), sizes["ROTORS"]
+        status = _STATUSES[self._command.status]
+        speeds, forces = out["rotor_speed"][:rotors].copy(), out["forces"][: sizes["FORCES"]].copy()
+        return Command(u, u[rotors:], speeds, status, out["acceleration"].copy(), forces)
+
+
+def _structure(arrays: list[tuple[str, int]], integers: list[str]) -> tuple[Any, dict[str, Array]]:
+    """Return a C structure of arrays of doubles and integers, and views of its arrays."""
+    fields = [(name, ctypes.c_double * size) for name, size in arrays]
+    kind = type("Block", (ctypes.Structure,), {"_fields_": [*fields, *((name, ctypes.c_int) for name in integers)]})
+    block = kind()
+    return block, {name: np.frombuffer(getattr(block, name), dtype=float) for name, _ in arrays}

@@ -1,0 +1,132 @@
+"""Sources of DAQP in C, the QP solver of an exported controller: one version, whose content is checked.
+
+They come from the source distribution, which pip downloads once.  Nothing of it is built or run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import subprocess
+import sys
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+
+from impact_posture.errors import InputError
+from impact_posture.libraries import building, cache_folder, is_cached
+
+VERSION = "0.11.0"
+SOURCES = ("auxiliary.c", "daqp.c", "factorization.c")
+_HEADERS = ("auxiliary.h", "constants.h", "daqp.h", "factorization.h", "types.h")
+# SHA-256 of the distribution, which pip compares, and of the contents of the needed files, in the order of FILES.
+_ARCHIVE_SHA256 = "2f27baf18d2acca14186498e651b34e0bed455627e777d3fd8ba655e7e40f920"
+_CONTENT_SHA256 = "7cce7844f7cf515e8c1fe9208e3996b0569c954ef641ad5b3478657ee23a6e9d"
+# Where a file is in the distribution.  In the folder of an exported controller all lie side by side.
+FILES = {
+    **{name: f"csrc/src/{name}" for name in SOURCES},
+    **{name: f"csrc/include/{name}" for name in _HEADERS},
+    "LICENSE": "LICENSE",
+}
+# None of the files is larger, B.
+_LARGEST = 1 << 20
+# A build backend for pip, which always asks for metadata.  It keeps pip from installing the real one and from running
+# the code of the distribution, which takes minutes.
+_BACKEND = f"""
+import pathlib
+def prepare_metadata_for_build_wheel(folder, settings=None):
+    made = pathlib.Path(folder, "daqp-{VERSION}.dist-info")
+    made.mkdir()
+    (made / "METADATA").write_text("Metadata-Version: 2.1\\nName: daqp\\nVersion: {VERSION}\\n")
+    return made.name
+"""
+_GIVE_FOLDER = f"give the folder of DAQP {VERSION}'s sources with --daqp"
+
+
+def daqp_sources(given: Path | None = None) -> dict[str, bytes]:
+    """Return the content of each of :data:`FILES`.
+
+    Args:
+        given: Unpacked source distribution, or a folder that has the files side by side; by default, the distribution
+            in the cache, which pip downloads if it is missing.
+
+    Raises:
+        InputError: The sources cannot be had, or differ from those of :data:`VERSION`.
+        OutputError: The cache cannot be written, or others may write it.
+    """
+    if given is not None:
+        return _checked(lambda name: _from_folder(given, name), str(given), _GIVE_FOLDER)
+    archive, again = cache_folder() / f"daqp-{VERSION}.tar.gz", "delete it: it is loaded again"
+    if not is_cached(archive):
+        with building(archive) as folder:
+            _download(folder)
+    try:
+        with tarfile.open(archive) as tar:
+            return _checked(lambda name: _from_archive(tar, name), str(archive), again)
+    except (OSError, EOFError, tarfile.TarError) as error:
+        raise InputError(f"cannot be read ({error})", where=str(archive), hint=again) from None
+
+
+def _checked(read: Callable[[str], bytes | None], where: str, hint: str) -> dict[str, bytes]:
+    """Read all files, and refuse other contents than those of the version."""
+    found, digest = dict[str, bytes](), hashlib.sha256()
+    for name in FILES:
+        content = read(name)
+        if content is None:
+            raise InputError(f"has no file {FILES[name]}", where=where, hint=hint)
+        found[name] = content
+        digest.update(content)
+    if digest.hexdigest() != _CONTENT_SHA256:
+        raise InputError(f"is not DAQP {VERSION} (another SHA-256 of its sources)", where=where, hint=hint)
+    return found
+
+
+def _from_folder(folder: Path, name: str) -> bytes | None:
+    for path in (folder / FILES[name], folder / name):
+        try:
+            if path.is_file() and path.stat().st_size <= _LARGEST:
+                return path.read_bytes()
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", where=str(path), hint=_GIVE_FOLDER) from None
+    return None
+
+
+def _from_archive(tar: tarfile.TarFile, name: str) -> bytes | None:
+    """Return a plain member.  Nothing is unpacked, so that no name or link in the archive reaches the disk."""
+    try:
+        member = tar.getmember(f"daqp-{VERSION}/{FILES[name]}")
+    except KeyError:
+        return None
+    file = tar.extractfile(member) if member.isreg() and member.size <= _LARGEST else None
+    return None if file is None else file.read()
+
+
+def _download(folder: Path) -> None:
+    """Put the distribution into a folder.
+
+    Raises:
+        InputError: There is no pip, or it failed; with its last error.
+    """
+    if importlib.util.find_spec("pip") is None:
+        raise InputError("pip is missing", where=f"DAQP {VERSION}", hint=f"install pip, or {_GIVE_FOLDER}")
+    backend, wanted = folder / "backend" / "setuptools", folder / "wanted.txt"
+    backend.mkdir(parents=True)
+    (backend / "__init__.py").touch()
+    (backend / "build_meta.py").write_text(_BACKEND, encoding="utf-8")
+    wanted.write_text(f"daqp=={VERSION} --hash=sha256:{_ARCHIVE_SHA256}\n", encoding="utf-8")
+    options = ["--no-deps", "--no-build-isolation", "--no-binary", "daqp", "--require-hashes"]
+    run = subprocess.run(
+        [sys.executable, "-m", "pip", "download", *options, "-r", str(wanted), "-d", str(folder)],
+        env=os.environ | {"PYTHONPATH": str(backend.parent), "PIP_RETRIES": "1", "PIP_TIMEOUT": "20"},
+        capture_output=True,
+        text=True,
+        errors="replace",
+    )
+    if run.returncode:
+        lines = [line for line in run.stderr.splitlines() if line.startswith("ERROR")] or ["ERROR: it said nothing"]
+        raise InputError(
+            f"its sources cannot be downloaded ({lines[-1].removeprefix('ERROR: ')})",
+            where=f"DAQP {VERSION}",
+            hint=f"connect to the network once, or {_GIVE_FOLDER}",
+        )

@@ -1,0 +1,204 @@
+"""Write the C of a controller into a folder: source, header, DAQP, the gradient it needs, and a manifest."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+
+from impact_posture.codegen.export import export as export_gradient
+from impact_posture.codegen.manifest import configuration_names
+from impact_posture.codegen.naming import c_identifier, check_prefix
+from impact_posture.controller_export.compiled_controller import CompiledController
+from impact_posture.controller_export.daqp_sources import FILES, SOURCES, VERSION, daqp_sources
+from impact_posture.controller_export.manifest import SCHEMA, build_controller
+from impact_posture.controller_export.parameters import Field, parameters
+from impact_posture.controller_export.render import render
+from impact_posture.controller_export.structure import Structure, structure_of
+from impact_posture.codegen.reader import identity
+from impact_posture.errors import InputError
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.libraries import library_path
+from impact_posture.output_folder import whole_folder, write_whole
+from impact_posture.robot.robot import Robot
+from impact_posture.toolchain import find_compiler
+from impact_posture.tsid.task_formulation import TaskFormulation
+from impact_posture.version import __version__
+
+
+@dataclass(frozen=True)
+class ControllerExport:
+    """Written C of a controller.
+
+    Attributes:
+        out: The folder of the files.
+        robot: The robot.
+        files: The files.
+        manifest: The content of ``<prefix>.json``.
+        library: The shared library, where one was built.
+    """
+
+    out: Path
+    robot: Robot
+    files: tuple[Path, ...]
+    manifest: dict[str, Any]
+    library: Path | None = None
+
+    @property
+    def prefix(self) -> str:
+        """Beginning of the C names."""
+        return str(self.manifest["prefix"])
+
+    def load(self) -> CompiledController:
+        """Load the library, which runs its code; build it where it is missing."""
+        return CompiledController.load(self.out, robot=self.robot)
+
+
+def export_controller(
+    robot: Robot,
+    formulation: TaskFormulation,
+    out: Path | None = None,
+    *,
+    objective: ImpactObjective | None = None,
+    prefix: str | None = None,
+    period: float = 1e-3,
+    daqp: Path | None = None,
+    build: bool = False,
+    force: bool = False,
+) -> ControllerExport:
+    """Write the controller of a formulation as C99 into a folder, whole or not at all.
+
+    The structure of the formulation is compiled in.  Its gains, weights, limits and targets are the defaults of
+    parameters that a program can set.
+
+    Args:
+        robot: The robot.
+        formulation: Tasks of this package, contacts and limits.
+        out: The folder; ``./<prefix>-c`` by default.
+        objective: The objective whose gradient an impact-robust posture task follows.
+        prefix: Beginning of the C names; by default, the robot and ``controller``.
+        period: Expected time between ticks, s.
+        daqp: Folder of the sources of DAQP, where they cannot be downloaded.
+        build: Leave ``lib<prefix>.so`` in the folder.
+        force: Replace an earlier export.
+
+    Raises:
+        InputError: A task or joint has no C code, the gradient is missing, or there are no sources of DAQP.
+        OutputError: The folder exists without ``force``, is no export, or cannot be written.
+        CompilerError: The compiler failed.
+    """
+    prefix = c_identifier(robot.name, "controller") if prefix is None else check_prefix(prefix)
+    structure = structure_of(robot, formulation)
+    if (structure.robust is None) != (objective is None):
+        what = "the impact-robust posture task has no objective" if objective is None else "no task uses the objective"
+        hint = "give the objective of its gradient" if objective is None else "give an impact-robust posture task"
+        raise InputError(what, where="controller export", hint=hint)
+    sources = daqp_sources(daqp)
+    fields = parameters(structure, period)
+    manifest = _manifest(structure, fields, prefix)
+    metric = f"{prefix}_metric" if objective is not None else None
+    manifest["sources"] = [*([] if metric is None else [f"{metric}.c"]), *(f"daqp/{name}" for name in SOURCES)]
+    texts = render(structure, fields, prefix, identity(manifest), metric)
+    texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
+    texts["Makefile"] = _makefile(manifest)
+    out = Path(f"{prefix}-c") if out is None else out
+    library = library_path(out, prefix)
+    products = (library.name, f"{library.name}.sha256")
+    with whole_folder(out, force=force, kind="export", products=products) as folder:
+        for name, text in texts.items():
+            write_whole(folder / name, text)
+        (folder / "daqp").mkdir()
+        for name in FILES:
+            (folder / "daqp" / name).write_bytes(sources[name])
+        if objective is not None and metric is not None:
+            _write_metric(objective, folder, metric)
+        if build and find_compiler() is not None:
+            build_controller(folder, manifest)
+        names = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    built = library if library.is_file() else None
+    return ControllerExport(out, robot, tuple(out / name for name in names), manifest, built)
+
+
+def _write_metric(objective: ImpactObjective, folder: Path, prefix: str) -> None:
+    """Write the gradient beside the controller, without the examples that a gradient alone has."""
+    beside = folder / "metric"
+    beside.mkdir()
+    export_gradient(objective, beside, prefix=prefix, check=False)
+    for name in (f"{prefix}.c", f"{prefix}.h", f"{prefix}.json"):
+        (beside / name).replace(folder / name)
+    shutil.rmtree(beside)
+
+
+def _manifest(s: Structure, fields: Sequence[Field], prefix: str) -> dict[str, Any]:
+    """Return all that a loader needs to size buffers and to name what is in them."""
+    robot = s.robot
+    return {
+        "schema": SCHEMA,
+        "prefix": prefix,
+        "real": "double",
+        "robot": robot.name,
+        "model_sha256": robot.model_sha256,
+        "joint_names": list(robot.joint_names),
+        "convention": robot.convention,
+        "armature": robot.armature.tolist(),
+        "nq": robot.nq,
+        "nv": robot.nv,
+        "q_names": configuration_names(robot),
+        "v_names": list(robot.tangent_names),
+        "u_names": list(s.actuators.names),
+        "sizes": s.sizes,
+        "parameters": {f.name: int(f.value.size) for f in fields},
+        "tasks": [{"name": t.name, "rows": t.size} for t in s.tasks],
+        "levels": [list(names) for names in _level_names(s)],
+        "posture": None if s.formulation.posture is None else s.formulation.posture.name,
+        "bounds": list(_bound_names(s)),
+        "versions": {"impact_posture": __version__, "casadi": str(ca.CasadiMeta.version()), "daqp": VERSION},
+    }
+
+
+def _level_names(s: Structure) -> Iterator[tuple[str, int]]:
+    if s.sizes["HARD"]:
+        yield "contacts", s.sizes["HARD"]
+    for level in s.formulation.levels:
+        yield ", ".join(task.name for task in level), sum(task.size for task in level)
+
+
+def _bound_names(s: Structure) -> Iterator[str]:
+    """Return the name of each bound, in the order of the multipliers in a report."""
+    sizes, joints = s.sizes, s.robot.tangent_names[s.sizes["BASE"] :]
+    if sizes["SIMPLE"]:
+        yield from joints
+    yield from (f"dynamics {k}" for k in range(sizes["BLIND"]))
+    yield from (f"contact motion {k}" for k in range(sizes["HARD"]))
+    yield from (f"{t.name}[{k}]" for level in s.formulation.levels for t in level for k in range(t.size))
+    yield from s.actuators.names
+    for contact, start, stop in zip(
+        s.formulation.contacts, s.tables["contact_cone"][:-1], s.tables["contact_cone"][1:], strict=True
+    ):
+        yield from (f"cone of {contact.point.frame}[{k}]" for k in range(stop - start))
+    if s.sizes["LAW"] and not sizes["SIMPLE"]:
+        yield from joints
+
+
+def _makefile(manifest: dict[str, Any]) -> str:
+    prefix = manifest["prefix"]
+    return f"""# make: a library to link or to load at run time.
+CC ?= cc
+CFLAGS ?= -O2
+# Strict C forbids fused multiply-adds by default.  For this very machine: CFLAGS="-O3 -march=native".
+ALL_CFLAGS = -std=c99 -ffp-contract=fast -fPIC -isystem daqp $(CFLAGS)
+
+lib{prefix}.so: {prefix}.c {prefix}.h
+\trm -f $@.sha256
+\t$(CC) $(ALL_CFLAGS) -shared {prefix}.c {" ".join(manifest["sources"])} -o $@ -lm
+
+clean:
+\trm -f lib{prefix}.so lib{prefix}.so.sha256
+
+.PHONY: clean
+"""

@@ -1,0 +1,178 @@
+"""C text of a controller: the generated dynamics, the tables of its structure, and the files in ``c/`` around them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from impact_posture.arrays import Array
+from impact_posture.codegen.emitter import DOUBLE, BlockText, Constants, Emitter, c_double
+from impact_posture.codegen.graph import graph_of
+from impact_posture.codegen.layout import lay_out
+from impact_posture.codegen.manifest import configuration_names
+from impact_posture.codegen.render import wrapped
+from impact_posture.codegen.sums import rebuilt
+from impact_posture.controller_export.parameters import RULES, Field
+from impact_posture.controller_export.rigid_body import MovingTree
+from impact_posture.controller_export.structure import Structure
+from impact_posture.escape import c_comment
+from impact_posture.impact.contact import point_on
+from impact_posture.version import __version__
+
+# Files in c/, in the order in which one source has them.
+_CORE = ("algebra.c", "tasks.c", "posture.c", "qp.c", "tick.c")
+# Parameters that init compares with others.
+_NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate")
+# Bytes of variables, saved registers and return addresses of all functions below a tick, beside the arrays.
+_FRAMES = 4096
+
+
+@dataclass(frozen=True)
+class DynamicsCode:
+    """C of the quantities in ``ip_model``.
+
+    Attributes:
+        constants: Tables of numbers.
+        blocks: Functions that compute parts.
+        angles: Entries of ``q`` whose sine and cosine are taken.
+        work: Length of the work array.
+        outputs: Assignments after the blocks, target and value.
+        constant_outputs: Assignments that do not depend on the state.
+        stack_bytes: Upper bound on the stack.
+    """
+
+    constants: str
+    blocks: Sequence[BlockText]
+    angles: tuple[int, ...]
+    work: int
+    outputs: list[tuple[str, str]]
+    constant_outputs: list[tuple[str, str]]
+    stack_bytes: int
+
+
+def dynamics_code(s: Structure) -> DynamicsCode:
+    """Generate the dynamics that a structure needs."""
+    q, v = ca.SX.sym("q", s.robot.nq), ca.SX.sym("v", s.robot.nv)
+    tree = MovingTree(s.robot.model, q, v)
+    found: dict[str, ca.SX] = {"M": tree.mass_matrix(), "h": tree.bias()}
+    if s.robot.floating:
+        found["base"] = tree.rotations[1]
+    for k, point in enumerate(s.points):
+        on, rows = point_on(s.robot, point.frame, point.offset), 6 if point in s.turning else 3
+        spatial, velocity = tree.spatial_drift(on), tree.velocity(on)
+        drift = spatial + ca.vertcat(ca.cross(velocity[3:], velocity[:3]), ca.SX(3, 1))
+        found[f"position[{k}]"] = tree.position(on)
+        found[f"jacobian[{k}]"] = tree.jacobian(on)[:rows, :]
+        found[f"velocity[{k}]"], found[f"drift[{k}]"] = velocity[:rows], drift[:rows]
+        if rows == 6:
+            found[f"rotation[{k}]"], found[f"spatial[{k}]"] = tree.rotation(on), spatial
+    # C has matrices row by row, and CasADi column by column.
+    names = [f"o{k}" for k in range(len(found))]
+    function = ca.Function("dynamics", [q, v], [x.T for x in found.values()], ["q", "v"], names, {"cse": True})
+    graph = rebuilt(graph_of(function))
+    layout = lay_out(graph, [names])
+    constants = Constants("ip", DOUBLE)
+    emitter = Emitter(layout, "ip", DOUBLE, {1: "double"}, constants)
+    outputs: list[tuple[str, str]] = []
+    fixed: list[tuple[str, str]] = []
+    for name, target in zip(names, found, strict=True):
+        for k, node in enumerate(graph.outputs[name]):
+            known = graph.nodes[node].op == "const"
+            (fixed if known else outputs).append((f"d->{target}[{k}]", emitter.output(node)))
+    angles = tuple(graph.nodes[k].args[1] for k in layout.angles)
+    work = layout.sizes.get(1, 1)
+    largest = max((block.local_bytes for block in emitter.blocks), default=0)
+    stack = 8 * (work + 2 * len(angles)) + largest
+    text = constants.text({1: "double"})
+    return DynamicsCode(text, emitter.blocks, angles or (0,), work, outputs, fixed, stack)
+
+
+def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, metric: str | None) -> dict[str, str]:
+    """Return file name → text of the header and the source.
+
+    Args:
+        s: Structure of the controller.
+        fields: Parameters.
+        prefix: Beginning of the C names.
+        identity: Words of the library about its manifest.
+        metric: Prefix of the export of the gradient, if the controller has one.
+    """
+    code, robot = dynamics_code(s), s.robot
+    sizes = s.sizes
+    bounds = sizes["SIMPLE"] + sizes["GENERAL"]
+    nv, equations = sizes["NV"], sizes["EQUATIONS"]
+    scratch = {"SCRATCH": max(3 * nv * nv, 2 * equations * equations), "BOUNDS": bounds}
+    room = {name: max(1, value) for name, value in (sizes | scratch).items()}
+    n = sizes["VARIABLES"] + 1
+    solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * bounds) + 2048
+    tables = [(name, *_table(values)) for name, values in s.tables.items()]
+    tables.append(("gravity", *_table(np.array(robot.model.gravity.linear, dtype=float))))
+    allocation = s.actuators.G[: sizes["BASE"], : sizes["ROTORS"]]
+    tables.append(("allocation", *_table(allocation)))
+    context: dict[str, Any] = {
+        "robot": robot.name, "version": __version__, "prefix": prefix, "sizes": sizes, "room": room, "fields": fields,
+        "q_names": configuration_names(robot), "v_names": robot.tangent_names, "u_names": s.actuators.names,
+        "convention": robot.convention, "tasks": [t.name for t in s.tasks] or ["none"], "metric": metric,
+        "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
+        "identity": identity, "tables": tables, "named": _NAMED, "literals": _initializer,
+        "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
+        "constants": code.constants, "blocks": code.blocks, "angles": code.angles, "work": code.work,
+        "places": _braced(map(str, code.angles)), "outputs": code.outputs, "constant_outputs": code.constant_outputs,
+        "core": "\n".join(_own(name) for name in _CORE),
+    }  # fmt: skip
+    environment = Environment(
+        loader=PackageLoader("impact_posture.controller_export"), undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True, keep_trailing_newline=True, finalize=_insert,
+    )  # fmt: skip
+    environment.filters |= {
+        "verbatim": _Verbatim,
+        "wrapped": lambda words, indent: _Verbatim(wrapped(map(c_comment, words), indent)),
+        "lines": lambda parts, between: _Verbatim(between.join(map(c_comment, parts))),
+    }
+    texts = {
+        name: environment.get_template(template).render(context)
+        for name, template in ((f"{prefix}.h", "controller.h.jinja"), (f"{prefix}.c", "controller.c.jinja"))
+    }
+    return {name: named(text, prefix) for name, text in texts.items()}
+
+
+def named(text: str, prefix: str) -> str:
+    """Return C text in which all names begin with the prefix."""
+    return re.sub(r"\bip_", f"{prefix}_", re.sub(r"\bIP_", f"{prefix.upper()}_", text))
+
+
+class _Verbatim(str):
+    """Text that a template inserts as it is."""
+
+    __slots__ = ()
+
+
+def _insert(value: object) -> object:
+    return c_comment(value) if isinstance(value, str) and not isinstance(value, _Verbatim) else value
+
+
+def _own(name: str) -> str:
+    return (resources.files(__package__) / "c" / name).read_text(encoding="utf-8")
+
+
+def _braced(texts: Any) -> str:
+    return "{" + ", ".join(texts) + "}"
+
+
+def _initializer(values: Array) -> str:
+    return _braced(c_double(float(x)).strip("()") for x in values)
+
+
+def _table(values: Array) -> tuple[str, str, str]:
+    """Return C type, initializer with at least one number, and length."""
+    values = values.ravel() if values.size else np.zeros(1, dtype=values.dtype)
+    if values.dtype == np.int64:
+        return "int", str(values.size), _braced(str(x) for x in values.tolist())
+    return "double", str(values.size), _initializer(values)

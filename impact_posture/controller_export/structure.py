@@ -1,0 +1,174 @@
+"""Structure of a controller that its C code compiles in: sizes, tasks, contacts and the order of the rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from impact_posture.arrays import Array
+from impact_posture.dynamics.chart import Chart
+from impact_posture.errors import InputError
+from impact_posture.robot.robot import Robot
+from impact_posture.tsid.actuators import Actuators
+from impact_posture.tsid.assembly import Assembly
+from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
+from impact_posture.tsid.frame_tasks import FrameAligned, FramePose, FramePosition, FrameTask
+from impact_posture.tsid.impact_robust import ImpactRobustPosture
+from impact_posture.tsid.points import Point
+from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.ranges import JointRanges
+from impact_posture.tsid.task import Task
+from impact_posture.tsid.task_formulation import TaskFormulation
+
+# Kinds of tasks in the order of their numbers in C.
+_KINDS: tuple[type[Task], ...] = (Tilt, BaseOrientation, CenterOfMass, FramePosition, FramePose, FrameAligned)
+_POSTURES = (JointPosture, ImpactRobustPosture)
+# Families of joints in the order of their numbers in C.
+_FAMILIES = {"revolute": 0, "prismatic": 0, "continuous": 1, "free-flyer": 2, "spherical": 3}
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """A formulation, and the numbers and tables of it that C code needs.
+
+    Attributes:
+        robot: The robot.
+        formulation: The formulation.
+        actuators: Rotors and motors.
+        tasks: Tasks of the strict levels, then the weighted tasks.
+        points: Points whose kinematics a tick needs.
+        sizes: Name → number, of every size that the code fixes.
+        tables: Name → constant integers or doubles.
+    """
+
+    robot: Robot
+    formulation: TaskFormulation
+    actuators: Actuators
+    tasks: tuple[Task, ...]
+    points: tuple[Point, ...]
+    sizes: dict[str, int]
+    tables: dict[str, Array]
+
+    @property
+    def robust(self) -> ImpactRobustPosture | None:
+        """The impact-robust posture task, if it is one."""
+        posture = self.formulation.posture
+        return posture if isinstance(posture, ImpactRobustPosture) else None
+
+    @property
+    def turning(self) -> frozenset[Point]:
+        """Points whose rotation a task or a sole needs."""
+        tasks = [t.point for t in self.tasks if isinstance(t, FramePose | FrameAligned)]
+        soles = [c.point for c in self.formulation.contacts if c.kind == "surface"]
+        pushed = [] if self.formulation.force_point is None else [self.formulation.force_point]
+        return frozenset([*tasks, *soles, *pushed])
+
+
+def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
+    """Return the structure of a formulation.
+
+    Raises:
+        InputError: A task, a posture task, a limit or a joint has no C code; names it.
+    """
+    _check(robot, formulation)
+    actuators = Actuators(robot)
+    strict = tuple(task for level in formulation.levels for task in level)
+    tasks, contacts, points = (*strict, *formulation.weighted), formulation.contacts, formulation.points
+    assembly = Assembly(robot, formulation, actuators)
+    nv, rotors, spare = robot.nv, actuators.rotors, actuators.spare.shape[1]
+    law, posture = formulation.law, formulation.posture
+    dense = bool(formulation.weighted) or not assembly.contacts.hard.all()
+    forces, hard = assembly.contacts.size, int(assembly.contacts.hard.sum())
+    joints = nv - actuators.base
+    slots = Chart(robot.model).slots
+    sizes = {
+        "NQ": robot.nq,
+        "NV": nv,
+        "BASE": actuators.base,
+        "JOINTS": len(slots),
+        "ROTORS": rotors,
+        "CONTROLS": actuators.controls,
+        "SPARE": spare,
+        "BLIND": actuators.blind.shape[1],
+        "CONTACTS": len(contacts),
+        "FORCES": forces,
+        "HARD": hard,
+        "SOFT": forces - hard,
+        "STRICT": sum(t.size for t in strict),
+        "ROWS": sum(t.size for t in tasks),
+        "CONES": assembly.contacts.cone.shape[0],
+        "TASKS": len(tasks),
+        "POINTS": len(points),
+        "FORCE_POINT": -1 if formulation.force_point is None else points.index(formulation.force_point),
+        "POSTURE": int(posture is not None),
+        "ROBUST": int(isinstance(posture, ImpactRobustPosture)),
+        "STIFF": int(posture is not None and posture.stiffness is not None),
+        "LAW": int(law is not None),
+        "DENSE": int(dense),
+        "SIMPLE": joints if law is not None and not dense else 0,
+        "VARIABLES": nv + spare + forces,
+    }
+    always = sizes["BLIND"] + hard + sizes["STRICT"]
+    bounds = joints if law is not None and dense else 0
+    sizes |= {"EQUATIONS": always, "GENERAL": always + actuators.controls + sizes["CONES"] + bounds}
+    ranges = JointRanges(robot)
+    task_rows = np.cumsum([0, *(t.size for t in tasks)])
+    tables = {
+        "joint_family": [_FAMILIES[s.kind.family] for s in slots],
+        "joint_q": [s.q.start for s in slots],
+        "joint_v": [s.v.start for s in slots],
+        "limit_q": ranges.index.tolist(),
+        "unit": [x for part in _units(slots) for x in part],
+        "task_kind": [_KINDS.index(type(t)) for t in tasks],
+        "task_point": [points.index(t.point) if isinstance(t, FrameTask) else -1 for t in tasks],
+        "task_row": task_rows.tolist(),
+        "task_impedance": [int(isinstance(t, FrameTask) and t._soften is not None) for t in tasks],
+        "contact_point": [points.index(c.point) for c in contacts],
+        "contact_row": np.cumsum([0, *(c.size for c in contacts)]).tolist(),
+        "contact_cone": np.cumsum([0, *(c.cone(np.eye(3)).shape[0] for c in contacts)]).tolist(),
+        "contact_hard": [int(c.weight is None) for c in contacts],
+        "level_rows": [rows.stop - rows.start for _, rows in assembly.levels],
+    }
+    sizes |= {"UNITS": len(tables["unit"]) // 2, "LEVELS": len(tables["level_rows"])}
+    doubles: dict[str, Any] = {
+        "inverse": actuators.inverse,
+        "blind": actuators.blind if rotors else np.eye(actuators.base),
+        "spare": actuators.spare,
+        "task_axis": [_axes(t) for t in tasks],
+    }
+    found = {name: np.array(values, dtype=np.int64) for name, values in tables.items()}
+    found |= {name: np.array(values, dtype=float).ravel() for name, values in doubles.items()}
+    return Structure(robot, formulation, actuators, tasks, points, sizes, found)
+
+
+def _check(robot: Robot, formulation: TaskFormulation) -> None:
+    """Refuse what has no C code."""
+
+    def refuse(what: str) -> InputError:
+        return InputError(what, where="controller export", hint="run it in Python, or use tasks of this package")
+
+    for task in formulation.tasks:
+        known = _POSTURES if task is formulation.posture else _KINDS
+        if type(task) not in known:
+            raise refuse(f"task '{task.name}' ({type(task).__name__}) has no C code")
+    if formulation.row_limits:
+        raise refuse(f"'{formulation.row_limits[0].name}' ({type(formulation.row_limits[0]).__name__}) has no C code")
+    for slot in Chart(robot.model).slots:
+        if slot.kind.family not in _FAMILIES:
+            raise refuse(f"joint '{slot.name}' ({slot.kind.family}) has no C code")
+
+
+def _units(slots: list[Any]) -> list[tuple[int, int]]:
+    """Return start and length of each quaternion and cosine-sine pair in ``q``."""
+    widths = {"free-flyer": 4, "spherical": 4, "continuous": 2}
+    found = [(s.q.stop - widths[s.kind.family], widths[s.kind.family]) for s in slots if s.kind.family in widths]
+    return found
+
+
+def _axes(task: Task) -> Array:
+    """Return the axis of an alignment and two directions across it, shape (9,); zeros for another task."""
+    if not isinstance(task, FrameAligned):
+        return np.zeros(9)
+    return np.concatenate([task._axis, *task._across])
