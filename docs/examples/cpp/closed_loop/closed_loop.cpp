@@ -117,7 +117,9 @@ public:
     };
     std::printf("q_total_impact %.17g\n", way);
     std::printf("peak_jump %.17g\n", made ? jumps / made : 0.0);
-    std::printf("peak_force %.17g\n", force);
+    if (!push) {
+      std::printf("peak_force %.17g\n", force);
+    }
     std::printf("contacts %d of %zu\n", made, windows.size());
     std::printf("ticks %zu relaxed %d held %d missed %d\n", took_.size(), relaxed_, held_, missed_);
     std::printf("tick_us median %.2f p99 %.2f max %.2f\n", microseconds(0.5), microseconds(0.99), microseconds(1.0));
