@@ -41,13 +41,17 @@ def quiet(name: str) -> Setup:
 
 @pytest.mark.parametrize(("name", "leads", "band"), [("aerial-vertical", "1", 1e-3), ("talos-push", "", 1e-6)])
 def test_the_program_measures_what_simulate_does(name: str, leads: str, band: float, tmp_path: Path) -> None:
-    need("g++"), need("make")
+    need("g++")
+    need("make")
     setup = quiet(name)
     export_world(setup, tmp_path / "world")
     formulation = Driver(setup, nominal_posture(setup)).controller.formulation
     export_controller(setup.robot, formulation, tmp_path / "controller", prefix="controller")
     program = tmp_path / "closed_loop"
-    made = [f"CONTROLLER={tmp_path / 'controller'}", f"MUJOCO={Path(find_spec("mujoco").origin).parent}", f"OUT={program}"]
+    mujoco = find_spec("mujoco")
+    assert mujoco is not None
+    assert mujoco.origin is not None
+    made = [f"CONTROLLER={tmp_path / 'controller'}", f"MUJOCO={Path(mujoco.origin).parent}", f"OUT={program}"]
     strict = "CXXFLAGS=-O1 -Wall -Wextra -Wpedantic -Werror"
     subprocess.run(["make", "-s", "-C", EXAMPLE, *made, f"LEADS={leads}", strict], check=True)
     found = subprocess.run([program, tmp_path / "world"], check=True, capture_output=True, text=True).stdout
@@ -57,7 +61,9 @@ def test_the_program_measures_what_simulate_does(name: str, leads: str, band: fl
     for key in ("q_total_impact", "peak_jump", *(["peak_force"] if setup.scenario.contacts else [])):
         assert float(printed[key]) == pytest.approx(getattr(wanted, key), rel=band), key
     assert printed["contacts"] == "1 of 1"
-    assert printed["ticks"].startswith(f"{one.series.t.size} relaxed {wanted.relaxed_ticks} held {wanted.failed_ticks}")
+    assert printed["ticks"].startswith(
+        f"{one.series.t.size} relaxed {wanted.relaxed_ticks} held {wanted.failed_ticks}"
+    )
 
 
 def test_a_world_that_cannot_be_exported_is_refused(tmp_path: Path) -> None:
