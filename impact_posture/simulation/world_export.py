@@ -1,8 +1,8 @@
 """Export of the world of a scenario for programs in other languages: the MuJoCo model and its parameters.
 
 ``world.xml`` is the model to read, with six digits.  ``world.mjb`` is the model to run, in MuJoCo's binary form,
-which is exact and fits the version of MuJoCo that wrote it.  ``world.txt`` has one line for each parameter, a key and its
-numbers.  ``docs/examples/cpp/closed_loop`` reads both.  The exported sensors have a delay and the filter of the
+which is exact and fits the version of MuJoCo that wrote it.  ``world.txt`` has one line for each parameter, a key and
+its numbers.  ``docs/examples/cpp/closed_loop`` reads both.  The exported sensors have a delay and the filter of the
 force, but no noise.
 """
 
