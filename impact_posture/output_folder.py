@@ -32,7 +32,7 @@ _SCRATCH = ".impact-posture-"
 _SHOWN = 3
 _PROGRAM = "impact-posture"
 
-Kind = Literal["result", "export", "run", "comparison", "reproduction", "runs", "sweep"]
+Kind = Literal["result", "export", "run", "comparison", "reproduction", "runs", "sweep", "world"]
 
 
 def check_output(out: Path, *, force: bool, kind: Kind) -> None:

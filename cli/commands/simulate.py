@@ -47,6 +47,13 @@ Sign = Annotated[
     Literal["+1", "1", "-1"] | None,
     typer.Option("--sign", rich_help_panel=RUN, show_default="both", help="Which way a robot is pushed."),
 ]
+ExportWorld = Annotated[
+    str | None,
+    typer.Option(
+        "--export-world", metavar="DIR", rich_help_panel=RUN,
+        help="Write MuJoCo's model and the parameters of the scenario for a program in C++, and run nothing.",
+    ),
+]  # fmt: skip
 Out = Annotated[
     str | None,
     options.out_option("Folder for run.json, the time series and the figures.", "./SCENARIO-CONTROLLER"),
@@ -61,6 +68,7 @@ def simulate(
     free: Free = False,
     gain: Gain = None,
     sign: Sign = None,
+    export_world: ExportWorld = None,
     out: Out = None,
     force: options.Force = False,
     format: options.Formats = None,
@@ -78,6 +86,9 @@ def simulate(
     from impact_posture.posture.nlp import one_blas_thread
     from impact_posture.simulation.scenario_file import read_scenario
 
+    if export_world is not None:
+        _export_world(Page(quiet=quiet or json), scenario, Path(export_world), force)
+        return
     name = read_scenario(scenario).name
     job = Job(scenario, controller, seed, mode, free, gain, None if sign is None else int(sign))
     folder = Path(out) if out else Path(file_name(f"{name}-{job.label.replace(':', '-')}"))
@@ -99,6 +110,18 @@ def simulate(
         sys.stdout.flush()
         complain(f"error: {name}, {job.label}: {fate(document)}; its numbers are no result")
         raise typer.Exit(_FAILED)
+
+
+def _export_world(page: Page, scenario: str, out: Path, force: bool) -> None:
+    from impact_posture.output_folder import check_output
+    from impact_posture.simulation.scenario import set_up
+    from impact_posture.simulation.scenario_file import read_scenario
+    from impact_posture.simulation.world_export import export_world
+
+    given = read_scenario(scenario)
+    check_output(out, force=force, kind="world")
+    export_world(set_up(given), out, force=force)
+    page.line(f"written: {out}; its sensors have no noise")
 
 
 def _rigid(prediction: dict[str, Any]) -> str:

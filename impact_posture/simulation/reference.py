@@ -37,6 +37,7 @@ class Reference:
         inward: Time of the way in, s.
         cycle: Time from one approach to the next, s.
         total: Time of the whole run, s.
+        legs: Duration, acceleration, distance and speed at the begin of each leg of constant acceleration.
 
     Args:
         task: The contacts.
@@ -68,8 +69,8 @@ class Reference:
             (top / a, a, top**2 / (2 * a), -top),
             (task.pause, 0.0, 0.0, 0.0),
         ]
-        self.task, self._legs = task, (*inward, *rest)
-        self._ends = np.cumsum([leg[0] for leg in self._legs])
+        self.task, self.legs = task, (*inward, *rest)
+        self._ends = np.cumsum([leg[0] for leg in self.legs])
         self.inward, self.cycle = float(self._ends[len(inward) - 1]), float(self._ends[-1])
         self.total = task.settle + task.count * self.cycle
 
@@ -82,8 +83,8 @@ class Reference:
         contact = min(max(int((t - self.task.settle) // self.cycle), 0), self.task.count - 1)
         since = t - self.start(contact)
         k = int(np.searchsorted(self._ends, since, side="right"))
-        if since < 0 or k == len(self._legs):
+        if since < 0 or k == len(self.legs):
             return ReferencePoint(0.0, 0.0, 0.0)
-        duration, acceleration, distance, speed = self._legs[k]
+        duration, acceleration, distance, speed = self.legs[k]
         s = float(since - (self._ends[k] - duration))
         return ReferencePoint(distance + speed * s + acceleration * s**2 / 2, speed + acceleration * s, acceleration)

@@ -22,7 +22,7 @@ from impact_posture.simulation.series import RECOVERY, Series, Window
 from impact_posture.simulation.throw import FLIGHT, Throw
 
 # Time when controllers begin to prepare, after the first reaction of sensors and motors, s.
-_BRACE = 0.1
+BRACE = 0.1
 # Ticks from one message about the progress to the next.
 _TELL = 100
 
@@ -129,9 +129,9 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     # The way in crosses the surface here, and brakes behind it.
     crossing = reference.inward - 2 * task.beyond / task.speed
     starts = [reference.start(k) for k in range(task.count)]
-    events = [(_BRACE, driver.brace)]
+    events = [(BRACE, driver.brace)]
     if mode == "held":
-        events.append((max(_BRACE, starts[0] - 2 * loop.ramp), driver.hold))
+        events.append((max(BRACE, starts[0] - 2 * loop.ramp), driver.hold))
     # From the begin of the way in, the next impact is the expected one.
     events += [(start, partial(driver.expect, start + crossing)) for start in starts]
     events.sort(key=lambda event: event[0])
@@ -155,7 +155,7 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
 def _pushes(loop: _Loop, task: SinglePush | Throw, signs: Sequence[int], mode: Mode) -> tuple[Run, ...]:
     """Settle once and push with each sign from there, the other signs in forked processes."""
     # All controllers begin to prepare before a push, whatever the patience of the scenario is.
-    rested = _settle(loop, task, max(task.settle, _BRACE + loop.period), [loop.driver.brace])
+    rested = _settle(loop, task, max(task.settle, BRACE + loop.period), [loop.driver.brace])
     if mode == "held":
         # The posture that was reached is held, and comes to rest again without the term.
         loop.driver.hold()
@@ -194,7 +194,7 @@ def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Cal
     while loop.t < least - 1e-9 or still < task.still - 1e-9:
         if loop.t > end or loop.away is not None:
             return False
-        if brace and loop.t >= _BRACE - 1e-9:
+        if brace and loop.t >= BRACE - 1e-9:
             brace.pop()()
         loop.tick()
         still = still + loop.period if loop.recorder.speed < task.quiet else 0.0

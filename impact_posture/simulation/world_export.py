@@ -1,0 +1,110 @@
+"""Export of the world of a scenario for programs in other languages: the MuJoCo model and its parameters.
+
+``world.xml`` is the model to read, with six digits.  ``world.mjb`` is the model to run, in MuJoCo's binary form,
+which is exact and fits the version of MuJoCo that wrote it.  ``world.txt`` has one line for each parameter, a key and
+its numbers.  ``docs/examples/cpp/closed_loop`` reads both.  The exported sensors have a delay and the filter of the
+force, but no noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from impact_posture.dynamics.mjcf import import_mujoco
+from impact_posture.errors import InputError
+from impact_posture.impact.contact import point_on
+from impact_posture.output_folder import whole_folder
+from impact_posture.simulation.metrics import JUMP
+from impact_posture.simulation.reference import Reference
+from impact_posture.simulation.run import BRACE
+from impact_posture.simulation.scenario import RepeatedContacts, Scenario, Setup, SinglePush
+from impact_posture.simulation.throw import Throw
+
+MODEL, PARAMETERS = "world.mjb", "world.txt"
+# Families of joints in the file, whose places in q and qpos differ in nothing, or as a floating base.
+_PLAIN = ("revolute", "prismatic")
+_BASE = "free-flyer"
+
+
+def export_world(setup: Setup, out: Path, *, force: bool = False) -> None:
+    """Write ``world.xml``, ``world.mjb`` and ``world.txt`` of a scenario.
+
+    Args:
+        setup: The experiment.
+        out: The folder.
+        force: Whether an earlier export there may be replaced.
+
+    Raises:
+        InputError: The scenario throws a ball, or a joint is neither revolute, prismatic nor a floating base.
+        OutputError: The folder exists without ``force``, is not ours, or cannot be written.
+    """
+    lines = [" ".join([key, *map(repr, map(float, values))]) for key, values in _parameters(setup)]
+    mjcf = setup.world.built.mjcf
+    with whole_folder(out, force=force, kind="world") as folder:
+        model = mjcf.compile()
+        (folder / "world.xml").write_text(mjcf.spec.to_xml(), encoding="utf-8")
+        import_mujoco().mj_saveModel(model, str(folder / MODEL))
+        (folder / PARAMETERS).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _parameters(setup: Setup) -> Iterable[tuple[str, Iterable[float]]]:
+    scenario, robot, built = setup.scenario, setup.robot, setup.world.built
+    sensors, step, control = scenario.sensors, scenario.physics.timestep, scenario.control
+    model = built.mjcf.compile()
+    yield "timestep", [step]
+    yield "period", [control.period]
+    yield "brace", [BRACE]
+    yield "jump", [JUMP]
+    yield "q", setup.q
+    yield from _joints(setup)
+    effort = np.asarray(robot.model.effortLimit)[6 if robot.floating else 0 :]
+    yield "effort", np.where(effort > 0, effort, np.inf)
+    yield "shapes", [model.geom(name).id for name in built.shape_geoms]
+    propulsion = robot.spec.propulsion
+    if propulsion is not None:
+        shares = -np.expm1(-step / np.array([propulsion.time_constant_up, propulsion.time_constant_down]))
+        yield "rotors", [len(propulsion.rotors)]
+        yield "rotor_law", [*shares, propulsion.thrust_coefficient, propulsion.speed_min, propulsion.speed_max]
+    yield "delay", [round(sensors.delay / step)]
+    if sensors.force_frame is not None:
+        frames = [shape.frame for shape in scenario.shapes]
+        yield "force_shape", [frames.index(sensors.force_frame)]
+        yield "force_smoothing", [-np.expm1(-2 * np.pi * sensors.force_cutoff * step)]
+    yield from _task(setup, scenario)
+
+
+def _joints(setup: Setup) -> Iterable[tuple[str, Iterable[float]]]:
+    """Yield the places of the joints: ``joint q qpos v qvel``, and ``base`` before them for a floating base."""
+    for slot in setup.world.built.mjcf.layout.slots:
+        family = slot.joint.kind.family
+        places = [slot.joint.q.start, slot.qpos.start, slot.joint.v.start, slot.qvel.start]
+        if family == _BASE and not slot.moved and slot.qpos.stop - slot.qpos.start == 7:
+            yield "base", places
+        elif family in _PLAIN:
+            yield "joint", places
+        else:
+            what = f"joint '{slot.joint.name}' is of the family {family}"
+            raise InputError(what, where="world export", hint="lock it (lock = [...] in the scenario)")
+
+
+def _task(setup: Setup, scenario: Scenario) -> Iterable[tuple[str, Iterable[float]]]:
+    task = scenario.task
+    if isinstance(task, Throw):
+        raise InputError("a thrown ball cannot be exported", where=scenario.source, hint="take contacts or a push")
+    if isinstance(task, RepeatedContacts):
+        reference = Reference(task, setup.gap)
+        yield "touching", [[shape.frame for shape in scenario.shapes].index(task.frame)]
+        yield "inward", -scenario.normal
+        yield "contacts", [task.count, task.settle, task.dwell, task.window, reference.inward, reference.cycle]
+        yield "crossing", [reference.inward - 2 * task.beyond / task.speed]
+        for leg in reference.legs:
+            yield "leg", leg
+    elif isinstance(task, SinglePush):
+        point = point_on(setup.robot, task.frame)
+        body = setup.world.built.mjcf.compile().body(setup.world.built.mjcf.bodies[point.joint]).id
+        yield "push", [body, *point.position, *task.force, task.duration]
+        yield "rest", [max(task.settle, BRACE + scenario.control.period), task.quiet, task.still, task.patience]
+        yield "after", [task.after]
