@@ -97,8 +97,9 @@ def violations(tick: RelaxedTick, z: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Return the signed violation of each entry of ``[z; A z]``, and the violation that counts."""
     values = np.concatenate([z, tick.A @ z])
     rows = np.vstack([np.diag(tick.unit), tick.A * tick.unit])
-    size = max(1.0, float(np.max(np.abs(z) / tick.unit)))
-    return values - np.clip(values, tick.lower, tick.upper), COUNTS * size * np.linalg.norm(rows, axis=1)
+    size, lengths = max(1.0, float(np.max(np.abs(z) / tick.unit))), np.linalg.norm(rows, axis=1)
+    # No point changes what a vanishing row misses.
+    return np.where(lengths > 0, values - np.clip(values, tick.lower, tick.upper), 0.0), COUNTS * size * lengths
 
 
 def missed(tick: RelaxedTick, z: np.ndarray) -> list[float]:
@@ -112,8 +113,8 @@ def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
     """Return how far the gradient of each level's sum of squares, and last of the cost, is from its constraints.
 
     At the lexicographic answer, the negative gradient is a combination of the rows above: of any sign for equations
-    and missed rows, non-negative for active bounds.  The distance is relative to the gradient; it is 0 for a level
-    that holds.  Nothing here is shared with the code in C.
+    and missed rows, non-negative for active bounds.  The distance is relative to the terms of the gradient; it is 0
+    for a level that holds.  Nothing here is shared with the code in C.
     """
     rows = np.vstack([np.diag(tick.unit), tick.A * tick.unit])
     lengths = np.linalg.norm(rows, axis=1)
@@ -125,7 +126,11 @@ def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
         if k <= levels and (np.abs(over) <= counts)[own].all():
             found.append(0.0)
             continue
-        gradient = rows[own].T @ over[own] if k <= levels else (tick.H @ z + tick.g) * tick.unit
+        if k <= levels:
+            gradient, terms = rows[own].T @ over[own], float(np.abs(over[own]) @ lengths[own])
+        else:
+            gradient = (tick.H @ z + tick.g) * tick.unit
+            terms = float(np.linalg.norm((np.abs(tick.H) @ np.abs(z) + np.abs(tick.g)) * tick.unit))
         above = tick.level < k
         fixed = above & ((tick.lower == tick.upper) | ((np.abs(over) > counts) & (tick.level > 0)))
         upper = above & ~fixed & (values >= tick.upper - counts)
@@ -135,7 +140,7 @@ def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
         normals = kept @ np.vstack([unit[upper], -unit[lower]]).T
         left = kept @ -gradient
         rest = scipy.optimize.nnls(normals, left, maxiter=10_000)[1] if normals.size else np.linalg.norm(left)
-        found.append(float(rest) / max(float(np.linalg.norm(gradient)), 1e-300))
+        found.append(float(rest) / max(terms, 1e-300))
     return found
 
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import itertools
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +12,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 
 from impact_posture.simulation.actuator_command import Push
 from impact_posture.simulation.controller_factory import ControllerFactory
@@ -104,7 +102,9 @@ def pushed(name: str) -> list[RelaxedTick]:
             before = len(found)
             command = driver.tick(world.read(), None)
             for i in range(before, len(found)):
-                found[i] = RelaxedTick(**{f.name: getattr(found[i], f.name) for f in fields(RelaxedTick)} | {"tick": np.array(k)})
+                found[i] = RelaxedTick(
+                    **{f.name: getattr(found[i], f.name) for f in fields(RelaxedTick)} | {"tick": np.array(k)}
+                )
             try:
                 world.step(command, count)
             except Exception as error:
@@ -128,6 +128,12 @@ def load(path: Path) -> list[RelaxedTick]:
 if __name__ == "__main__":
     for robot_name in sys.argv[2:] or RUNS:
         recorded_ticks = pushed(robot_name)
-        print(robot_name, len(recorded_ticks), "relaxed", [int(t.tick) for t in recorded_ticks[:: max(1, len(recorded_ticks) // 20)]], flush=True)
+        print(
+            robot_name,
+            len(recorded_ticks),
+            "relaxed",
+            [int(t.tick) for t in recorded_ticks[:: max(1, len(recorded_ticks) // 20)]],
+            flush=True,
+        )
         if recorded_ticks:
             save(Path(sys.argv[1]) / f"{robot_name}.npz", recorded_ticks)

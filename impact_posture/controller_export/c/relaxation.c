@@ -93,6 +93,9 @@ static double violation(const Relaxation *r, int entry) {
     return fmax(r->lower[entry] - r->value[entry], r->value[entry] - r->upper[entry]);
 }
 
+/* Smallest violation of an entry that counts. */
+static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
+
 /* Compute [z; A z]. */
 static void update_values(Relaxation *r) {
     for (int i = 0; i < r->entries; i++) r->value[i] = value_of(r, i);
@@ -227,31 +230,34 @@ static int move(Relaxation *r, int all) {
     return fits;
 }
 
-/* Drop the exact rows without a multiplier, or with one of the wrong sign, from the list of turn(), after its move.
- * Return how many are left, as a negative number where none was dropped. */
-static int drop_rows(Relaxation *r, int exact, int all) {
+/* Drop the rows that the answer does not need from the list of turn(), after its move: exact rows without a multiplier
+ * or with one of the wrong sign, and inequalities that hold.  Return whether there are any. */
+static int drop_rows(Relaxation *r, int *exact, int *all) {
     double *force = r->column, most = 0;
-    int kept = 0, changed = 0;
-    for (int k = 0; k < r->soft; k++) force[k] = 0;
-    for (int i = exact; i < all; i++)
-        add(force, r->goal[r->rows[i]] - value_of(r, r->rows[i]), r->B + i * r->n, r->soft);
-    for (int i = 0; i < exact; i++) r->rhs[i] = 0;
+    int kept = 0, first = *exact, dropped = 0;
+    memset(force, 0, (size_t)r->soft * sizeof *force);
+    memset(r->rhs, 0, (size_t)first * sizeof *r->rhs);
+    for (int i = first; i < *all; i++) add(force, r->goal[r->rows[i]] - r->value[r->rows[i]], r->B + i * r->n, r->soft);
     for (int k = r->soft - 1; k >= 0; k--) {
-        const double *b = r->B + r->lead[k] * r->n, multiplier = force[k] / b[k];
+        const int i = r->lead[k];
+        const double *b = r->B + i * r->n, multiplier = force[k] / b[k];
         add(force, -multiplier, b, k);
-        r->rhs[r->lead[k]] = multiplier * r->length[r->rows[r->lead[k]]];
-        most = fmax(most, fabs(r->rhs[r->lead[k]]));
+        r->rhs[i] = multiplier * r->length[r->rows[i]];
+        most = fmax(most, fabs(r->rhs[i]));
     }
-    for (int i = 0; i < all; i++) {
+    for (int i = 0; i < *all; i++) {
         const int row = r->rows[i];
         const double pushes = r->goal[row] == r->upper[row] ? r->rhs[i] : -r->rhs[i];
-        if (i < exact && !(pushes > COUNTS * most)) {
+        const int needed = i < first ? pushes > COUNTS * most : is_equation(r, row) || violation(r, row) > least(r, row);
+        if (!needed) {
             r->held[row] = 0;
-            changed++;
+            dropped++;
+            if (i < first) --*exact;
         } else
             r->rows[kept++] = row;
     }
-    return changed ? kept : -kept;
+    *all = kept;
+    return dropped;
 }
 
 /* Leave out the first `rank` of the coordinates of turn(). */
@@ -356,9 +362,6 @@ static void keep_active(Relaxation *r, int level) {
     for (int j = 0; j < r->count; j++) warm[r->entry[j]] = r->daqp.sense[j] & (DAQP_ACTIVE | DAQP_LOWER);
 }
 
-/* Smallest violation of an entry that counts. */
-static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
-
 /* List what determines the level's answer: the active rows of the levels above, then the level's own equations and
  * violated rows.  Return the number of the former; `all` is that of both. */
 static int list_held(Relaxation *r, int level, int missed, int *all) {
@@ -413,17 +416,12 @@ static int solve_level(Relaxation *r, int level) {
             /* The active rows are final only where another step finds the same. */
             if (missed && !same) continue;
         }
-        int exact = list_held(r, level, missed, &all), left_over;
+        int exact = list_held(r, level, missed, &all);
         do {
             rank = turn(r, exact, all);
             done = move(r, all);
-            left_over = done && exact ? drop_rows(r, exact, all) : -all;
-            if (left_over > 0) {
-                memcpy(r->z, r->before, (size_t)r->n * sizeof *r->z);
-                exact -= all - left_over;
-                all = left_over;
-            }
-        } while (left_over > 0);
+            update_values(r);
+        } while (done && drop_rows(r, &exact, &all));
     }
     if (!done) {
         list_held(r, level, missed, &all);
