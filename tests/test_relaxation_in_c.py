@@ -120,8 +120,8 @@ def test_random_stacks(relaxation: Relaxation, seed: int) -> None:
         elif kind == 1:
             A[row] = 0.0
     root = g.normal(size=(n, n)) * 10.0 ** g.uniform(-2, 1, size=n)
-    tick = RelaxedTick(root @ root.T + 1e-6 * np.eye(n), g.normal(size=n), A, lower, upper, level, np.ones(n),
-                       np.zeros(n), np.array(0))  # fmt: skip
+    H = root @ root.T + 1e-6 * np.eye(n)
+    tick = RelaxedTick(H, g.normal(size=n), A, lower, upper, level, np.ones(n), np.zeros(n))
     relaxation.forget()
     answer = relaxation.solve(tick)
     assert answer.code == SOLVED
@@ -135,7 +135,7 @@ def small(**changes: np.ndarray) -> RelaxedTick:
     tick = RelaxedTick(
         H=np.eye(2), g=np.zeros(2), A=np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
         lower=np.array([-inf, -inf, -inf, 2.0, 3.0]), upper=np.array([inf, inf, 1.0, 2.0, 3.0]),
-        level=np.array([1, 1, 0, 2, 2]), unit=np.ones(2), z=np.zeros(2), tick=np.array(0),
+        level=np.array([1, 1, 0, 2, 2]), unit=np.ones(2), z=np.zeros(2),
     )  # fmt: skip
     return replace(tick, **changes)
 
@@ -151,7 +151,7 @@ def test_what_no_level_asks_for_goes_to_the_cost(relaxation: Relaxation) -> None
         root, row = g.normal(size=(3, 3)), g.normal(size=3)
         bounds = np.concatenate([np.full(3, 0.5), [1.0]])
         tick = RelaxedTick(root @ root.T, g.normal(size=3), row[None], np.append(-bounds[:3], 1.0), bounds,
-                           np.array([1, 1, 1, 2]), np.ones(3), np.zeros(3), np.array(0))  # fmt: skip
+                           np.array([1, 1, 1, 2]), np.ones(3), np.zeros(3))  # fmt: skip
         relaxation.forget()
         z = relaxation.solve(tick).z
         best = scipy.optimize.minimize(
