@@ -26,8 +26,8 @@
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
 #define ROUNDING 1e-10
 /* Length of a row that cannot move any more, and least pivot of an elimination, relative to the row's own length. */
-#define FLAT 1e-9
-#define PIVOT 1e-6
+#define FLAT 1e-12
+#define PIVOT 1e-8
 /* Tried in order: added to the reduced cost, relative to its largest entry, where it is too flat. */
 static const double PROXIMAL[] = {0.0, 1e-9, 1e-6, 1e-3};
 
@@ -263,6 +263,7 @@ static int drop_rows(Relaxation *r, int *exact, int *all) {
 /* Leave out the first `rank` of the coordinates of turn(). */
 static void eliminate(Relaxation *r, int rank) {
     const int n = r->n, free = n - r->fixed, rest = free - rank;
+    if (!rank) return;
     if (rest < rank) {
         /* Few coordinates are left: Z times each of them. */
         for (int c = 0; c < rest; c++) {
@@ -281,8 +282,7 @@ static void eliminate(Relaxation *r, int rank) {
             for (int k = 0; k < rank; k++)
                 reflect(r->v + k * n, r->tau[k], r->Z + i * n + r->fixed + k, free - k);
     r->fixed += rank;
-    update_values(r);
-    update_rows(r);
+    if (rest) update_rows(r);
 }
 
 /* ---- least-distance programs ---------------------------------------------------------------------------------- */
@@ -427,8 +427,10 @@ static int solve_level(Relaxation *r, int level) {
         list_held(r, level, missed, &all);
         for (int i = 0; i < all; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
         rank = turn(r, 0, all);
-        for (int i = 0; i < all; i++) r->held[r->rows[i]] = 1;
     }
+    /* A dependent row may still move by rounding: an inequality goes on as one. */
+    for (int i = 0; i < all; i++) r->held[r->rows[i]] = is_equation(r, r->rows[i]);
+    for (int k = 0; k < rank; k++) r->held[r->rows[r->lead[k]]] = 1;
 #ifdef RELAXATION_TRACE
     RELAXATION_TRACE("done", done, rank, all);
 #endif
@@ -594,6 +596,7 @@ int relaxation_solve(const relaxation_problem *p, void *work, int budget, double
         }
     const int rank = turn(&r, always, always);
     move(&r, always);
+    update_values(&r);
     eliminate(&r, rank);
     for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++) flag = solve_level(&r, level);
     if (flag > 0) {
