@@ -223,7 +223,7 @@ static int move(Relaxation *r, int all) {
     for (int i = 0; i < all; i++) r->held[r->rows[i]] = 0;
     for (int i = 0; i < n; i++) r->z[i] += part * dot(r->Z + i * n + r->fixed, r->step, free);
     update_values(r);
-    if (stop >= 0) r->goal[stop] = r->value[stop] > r->upper[stop] - (r->upper[stop] - r->lower[stop]) / 2 ? r->upper[stop] : r->lower[stop];
+    if (stop >= 0) r->goal[stop] = dot(motion(r, stop), r->step, free) > 0 ? r->upper[stop] : r->lower[stop];
     return stop;
 }
 
@@ -234,7 +234,10 @@ static int drop_rows(Relaxation *r, int *exact, int *all) {
     int kept = 0, first = *exact, dropped = 0;
     memset(force, 0, (size_t)r->soft * sizeof *force);
     memset(r->rhs, 0, (size_t)first * sizeof *r->rhs);
-    for (int i = first; i < *all; i++) add(force, r->goal[r->rows[i]] - r->value[r->rows[i]], r->B + i * r->n, r->soft);
+    for (int i = first; i < *all; i++) {
+        const double miss = r->goal[r->rows[i]] - r->value[r->rows[i]];
+        if (fabs(miss) > least(r, r->rows[i])) add(force, miss, r->B + i * r->n, r->soft);
+    }
     for (int k = r->soft - 1; k >= 0; k--) {
         const int i = r->lead[k];
         const double *b = r->B + i * r->n, multiplier = force[k] / b[k];
@@ -245,7 +248,7 @@ static int drop_rows(Relaxation *r, int *exact, int *all) {
     for (int i = 0; i < *all; i++) {
         const int row = r->rows[i];
         const double pushes = r->goal[row] == r->upper[row] ? r->rhs[i] : -r->rhs[i];
-        const int needed = i < first ? pushes > COUNTS * most : is_equation(r, row) || violation(r, row) > least(r, row);
+        const int needed = i < first ? pushes > COUNTS * most && most > 0 : is_equation(r, row) || violation(r, row) > least(r, row);
         if (!needed) {
             dropped++;
             if (i < first) --*exact;
