@@ -8,12 +8,12 @@
 /* DAQP finds the active rows of a level nearly, with this weight of the step (squared) against the violation, by steps
  * that each start at the last answer.  The exact answer then follows by moves with eliminated rows, which a bound may
  * stop, and which count against the budget like so many iterations for each row. */
-#define STEP_WEIGHT 1e-4
+#define STEP_WEIGHT 1e-5
 #define MOST_STEPS 4
-#define MOST_MOVES 12
+#define MOST_MOVES 24
 #define MOVE_COST 0.3
 /* Largest violation of a bound, and the violation that counts, relative to the numbers of the problem. */
-#define EXACT 3e-10
+#define EXACT 1e-9
 #define COUNTS 1e-7
 /* Largest violation of level 0 in the end. */
 #define WRONG 1e-7
@@ -236,14 +236,15 @@ static int drop_rows(Relaxation *r, int *exact, int *all) {
     memset(r->rhs, 0, (size_t)first * sizeof *r->rhs);
     for (int i = first; i < *all; i++) {
         const double miss = r->goal[r->rows[i]] - r->value[r->rows[i]];
-        if (fabs(miss) > least(r, r->rows[i])) add(force, miss, r->B + i * r->n, r->soft);
+        if (fabs(miss) <= least(r, r->rows[i])) continue;
+        add(force, miss, r->B + i * r->n, r->soft);
+        most = fmax(most, fabs(miss) * r->length[r->rows[i]]);
     }
     for (int k = r->soft - 1; k >= 0; k--) {
         const int i = r->lead[k];
         const double *b = r->B + i * r->n, multiplier = force[k] / b[k];
         add(force, -multiplier, b, k);
         r->rhs[i] = multiplier * r->length[r->rows[i]];
-        most = fmax(most, fabs(r->rhs[i]));
     }
     for (int i = 0; i < *all; i++) {
         const int row = r->rows[i];
@@ -415,7 +416,12 @@ static int solve_level(Relaxation *r, int level) {
         const double unit = set_bounds(r, NULL);
         const int left = r->left;
         r->daqp.reuse_ind = 0;
-        const int flag = k ? run(r) : start(r);
+        int flag = k ? run(r) : start(r);
+        if (flag <= 0 && flag != DAQP_EXIT_ITERLIMIT && !k) {
+            /* A larger weight is easier. */
+            for (int j = 0; j < r->count; j++) r->daqp.rho_us[j] = r->daqp.rho_ls[j] *= 100;
+            flag = start(r);
+        }
         keep_active(r, level);
         if (flag == DAQP_EXIT_ITERLIMIT || (flag <= 0 && level <= 1 && !k)) return flag;
         if (flag <= 0) break;
