@@ -29,7 +29,7 @@ typedef struct {
     const relaxation_problem *p;
     int n, entries, fixed, left; /* variables, entries of [z; A z], eliminated coordinates, iterations left */
     double *Z, *T;               /* n x n and m x n: z and A z move by the columns from `fixed` on */
-    double *z, *before, *value, *lower, *upper, *length; /* the point, [z; A z], opened bounds, lengths in `unit` */
+    double *z, *value, *lower, *upper, *length; /* the point, [z; A z], opened bounds, lengths in `unit` */
     int *first, *last, *held;    /* range of a row's entries that are not zero; whether an entry is eliminated */
     double *goal;                /* values that listed rows are to have */
     double *B, *v, *tau, *rhs, *step, *column; /* of an elimination */
@@ -42,7 +42,7 @@ typedef struct {
     int soft;                    /* coordinates that the exact rows of an elimination take */
     int *proximal;               /* the proximal term of the cost that the last solution needed */
     int *warm;                   /* levels + 2 times entries: active rows of each program at the last solution */
-    double tolerance, scale; /* `scale`: size of the point, in `unit` */
+    double tolerance, scale;     /* violation that DAQP may leave; size of the point, in `unit` */
 } Relaxation;
 
 static double dot(const double *a, const double *b, int n) {
@@ -232,7 +232,8 @@ static int move(Relaxation *r, int all) {
  * or with one of the wrong sign, and inequalities that hold.  Return whether there are any. */
 static int drop_rows(Relaxation *r, int *exact, int *all) {
     double *force = r->column, most = 0;
-    int kept = 0, first = *exact, dropped = 0;
+    const int first = *exact;
+    int kept = 0;
     memset(force, 0, (size_t)r->soft * sizeof *force);
     memset(r->rhs, 0, (size_t)first * sizeof *r->rhs);
     for (int i = first; i < *all; i++) {
@@ -250,13 +251,12 @@ static int drop_rows(Relaxation *r, int *exact, int *all) {
     for (int i = 0; i < *all; i++) {
         const int row = r->rows[i];
         const double pushes = r->goal[row] == r->upper[row] ? r->rhs[i] : -r->rhs[i];
-        const int needed = i < first ? pushes > COUNTS * most && most > 0 : is_equation(r, row) || violation(r, row) > least(r, row);
-        if (!needed) {
-            dropped++;
-            if (i < first) --*exact;
-        } else
+        if (i < first ? most > 0 && pushes > COUNTS * most : is_equation(r, row) || violation(r, row) > least(r, row))
             r->rows[kept++] = row;
+        else if (i < first)
+            --*exact;
     }
+    const int dropped = *all - kept;
     *all = kept;
     return dropped;
 }
@@ -310,7 +310,8 @@ static void list_rows(Relaxation *r, int level, const double *L) {
         /* The tolerance of a row is relative to its length in the units of the problem.  That of the cost is what
          * rounding permits; its active rows are made exact afterwards. */
         r->daqp.scaling[count] = L ? 1 : r->length[i] / size;
-        r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * longest * longest / (r->length[i] * r->length[i]);
+        const double ratio = longest / r->length[i];
+        r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * ratio * ratio;
         r->daqp.sense[count] = (soft ? DAQP_SOFT : 0) | (equal ? DAQP_ACTIVE | DAQP_IMMUTABLE : 0);
         if (warm[i] & DAQP_ACTIVE) r->daqp.sense[count] |= warm[i];
         r->entry[count++] = i;
@@ -547,15 +548,17 @@ static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels
     const size_t e = n + m, active = n + e + 2;
     size_t used = 0;
     const struct { double **array; size_t count; } doubles[] = {
-        {&r->Z, n * n}, {&r->T, m * n}, {&r->z, n}, {&r->before, n}, {&r->value, e}, {&r->lower, e}, {&r->upper, e},
-        {&r->length, e}, {&r->B, e * n}, {&r->v, n * n}, {&r->tau, n}, {&r->rhs, e}, {&r->goal, e}, {&r->step, n}, {&r->column, e},
+        {&r->Z, n * n}, {&r->T, m * n}, {&r->z, n}, {&r->value, e}, {&r->lower, e}, {&r->upper, e},
+        {&r->length, e}, {&r->B, e * n}, {&r->v, n * n}, {&r->tau, n}, {&r->rhs, e}, {&r->goal, e}, {&r->step, n},
+        {&r->column, e},
         {&r->L, n * n}, {&r->wanted, n}, {&r->M, e * n}, {&r->size, e}, {&r->daqp.dupper, e}, {&r->daqp.dlower, e},
         {&r->daqp.scaling, e}, {&r->daqp.Mu, e}, {&r->daqp.rho_ls, e}, {&r->daqp.rho_us, e}, {&r->daqp.w_ls, e},
         {&r->daqp.lam, active}, {&r->daqp.lam_star, active}, {&r->daqp.D, active}, {&r->daqp.xldl, active},
         {&r->daqp.zldl, active}, {&r->daqp.L, active * (active + 1) / 2}, {&r->daqp.u, n}, {&r->daqp.xold, n},
     };
     const struct { int **array; size_t count; } ints[] = {
-        {&r->proximal, 1}, {&r->warm, (levels + 2) * e}, {&r->first, m}, {&r->last, m}, {&r->held, e}, {&r->rows, e}, {&r->lead, n}, {&r->entry, e},
+        {&r->proximal, 1}, {&r->warm, (levels + 2) * e}, {&r->first, m}, {&r->last, m}, {&r->held, e}, {&r->rows, e},
+        {&r->lead, n}, {&r->entry, e},
         {&r->daqp.sense, e}, {&r->daqp.WS, active}, {&r->daqp.prox_mask, n},
     };
     /* The active rows, which outlive a solution, come first. */
@@ -618,7 +621,8 @@ int relaxation_solve(const relaxation_problem *p, void *work, int budget, double
     move(&r, always);
     for (int i = 0; i < always; i++) r.held[r.rows[i]] = 1;
     eliminate(&r, rank);
-    for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++) flag = solve_level(&r, level);
+    for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++)
+        flag = solve_level(&r, level);
     if (flag > 0) {
         flag = solve_cost(&r);
         if (flag != DAQP_EXIT_ITERLIMIT) flag = flag > 0 ? RELAXATION_SOLVED : RELAXATION_WITHOUT_COST;
