@@ -161,19 +161,26 @@ static void swap_rows(Relaxation *r, int i, int k) {
 }
 
 /* Find coordinates of which the first ones alone move the listed rows, and return their number.  r->step becomes the
- * move by which the first `exact` rows reach their goals, and the others come near theirs (least squares). */
-static int turn(Relaxation *r, int exact, int all) {
+ * move by which the first `exact` rows reach their goals, and the others come near theirs (least squares).  The first
+ * `kept` rows are those of the last call. */
+static int turn(Relaxation *r, int kept, int exact, int all) {
     const int n = r->n, free = n - r->fixed;
     double *B = r->B, *step = r->step, longest = 0;
-    int rank = 0;
+    int rank = kept ? r->soft : 0;
     memset(step, 0, (size_t)n * sizeof *step);
     for (int i = 0; i < all; i++) {
-        memcpy(B + i * n, motion(r, r->rows[i]), (size_t)free * sizeof *B);
         r->rhs[i] = r->goal[r->rows[i]] - r->value[r->rows[i]];
         if (i >= exact) longest = fmax(longest, r->length[r->rows[i]]);
+        if (i < kept) continue;
+        memcpy(B + i * n, motion(r, r->rows[i]), (size_t)free * sizeof *B);
+        for (int k = 0; k < rank; k++) reflect(r->v + k * n, r->tau[k], B + i * n + k, free - k);
+    }
+    for (int k = 0; k < rank; k++) {
+        const double *b = B + r->lead[k] * n;
+        step[k] = (r->rhs[r->lead[k]] - dot(b, step, k)) / b[k];
     }
     r->soft = -1;
-    for (int k = 0; k < all && rank < free; k++) {
+    for (int k = kept; k < all && rank < free; k++) {
         if (k >= exact) {
             int best = k;
             double most = -1;
@@ -385,11 +392,12 @@ static int list_held(Relaxation *r, int level, int missed, int *all) {
 
 /* Find the exact answer of a level from nearly the right rows, and return how many coordinates they take. */
 static int finish_level(Relaxation *r, int level, int missed, int *all) {
-    int exact = list_held(r, level, missed, all), last = -1;
+    int exact = list_held(r, level, missed, all), last = -1, kept = 0;
     for (int k = 0; k < MOST_MOVES && r->left > 1; k++) {
-        const int rank = turn(r, exact, *all), stop = move(r, *all);
+        const int rank = turn(r, kept, exact, *all), stop = move(r, *all);
         r->left -= (int)(MOVE_COST * *all);
         if (stop < 0 && !drop_rows(r, &exact, all)) return rank;
+        kept = stop < 0 ? 0 : exact;
         if (stop < 0) continue;
         if (stop == last) break;
         last = stop;
@@ -403,7 +411,7 @@ static int finish_level(Relaxation *r, int level, int missed, int *all) {
     /* The point is good, if not the best: its rows stay as they are. */
     list_held(r, level, missed, all);
     for (int i = 0; i < *all; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
-    return turn(r, 0, *all);
+    return turn(r, 0, 0, *all);
 }
 
 /* Bring the point as near to a level as the levels above permit, then keep it there. */
@@ -489,7 +497,7 @@ static void unwhiten(const Relaxation *r, double *y) {
 /* Move to the minimum of the cost with the active rows of its program held, where a proximal term has kept it off. */
 static void finish_cost(Relaxation *r, int active) {
     for (int k = 0; k < MOST_MOVES; k++) {
-        const int rank = turn(r, active, active);
+        const int rank = turn(r, 0, active, active);
         for (int i = 0; i < active; i++) r->held[r->rows[i]] = 1;
         eliminate(r, rank);
         const int free = r->n - r->fixed;
@@ -526,7 +534,7 @@ static int solve_cost(Relaxation *r) {
             r->goal[i] = (r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i];
             r->rows[active] = i;
         }
-        turn(r, active, active);
+        turn(r, 0, active, active);
         move(r, active);
         if (*r->proximal) finish_cost(r, active);
         return 1;
@@ -617,7 +625,7 @@ int relaxation_solve(const relaxation_problem *p, void *work, int budget, double
             r.goal[i] = p->lower[i];
             r.rows[always++] = i;
         }
-    const int rank = turn(&r, always, always);
+    const int rank = turn(&r, 0, always, always);
     move(&r, always);
     for (int i = 0; i < always; i++) r.held[r.rows[i]] = 1;
     eliminate(&r, rank);
