@@ -5,37 +5,31 @@
 
 #include "daqp.h"
 
-/* DAQP finds the active rows of a level, with a weight of the step (squared) against the violation: at first this,
- * and LIGHTER times as much where steps do not become shorter.  The exact answer of these rows then follows without
- * it, by orthogonal elimination. */
-#define STEP_WEIGHT 1e-4
-#define LIGHTER 1e-2
-#define LEAST_WEIGHT 1e-6
-/* Most steps of a level, each around the last answer, which undo the weight.  Relative to the one before, a step that
- * may be the last one, and one that calls for less weight. */
-#define MOST_STEPS 8
-#define SMALL_STEP 1e-2
-#define FLAT_STEP 0.1
+/* DAQP finds the active rows of a level nearly, with this weight of the step (squared) against the violation, by steps
+ * that each start at the last answer.  The exact answer then follows by moves with eliminated rows, which a bound may
+ * stop, and which count against the budget like so many iterations for each row. */
+#define STEP_WEIGHT 1e-5
+#define MOST_STEPS 4
+#define MOST_MOVES 24
+#define MOVE_COST 0.3
 /* Largest violation of a bound, and the violation that counts, relative to the numbers of the problem. */
-#define EXACT 1e-10
+#define EXACT 1e-9
 #define COUNTS 1e-7
 /* Largest violation of level 0 in the end. */
 #define WRONG 1e-7
-/* Rounding of a level's program, times its weight. */
-#define NOISE 3e-14
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
 #define ROUNDING 1e-10
 /* Length of a row that cannot move any more, and least pivot of an elimination, relative to the row's own length. */
-#define FLAT 1e-9
-#define PIVOT 1e-6
+#define FLAT 1e-12
+#define PIVOT 1e-8
 /* Tried in order: added to the reduced cost, relative to its largest entry, where it is too flat. */
-static const double PROXIMAL[] = {0.0, 1e-9, 1e-6, 1e-3};
+static const double PROXIMAL[] = {0.0, 1e-6, 1e-3};
 
 typedef struct {
     const relaxation_problem *p;
     int n, entries, fixed, left; /* variables, entries of [z; A z], eliminated coordinates, iterations left */
     double *Z, *T;               /* n x n and m x n: z and A z move by the columns from `fixed` on */
-    double *z, *before, *value, *lower, *upper, *length; /* the point, [z; A z], opened bounds, lengths in `unit` */
+    double *z, *value, *lower, *upper, *length; /* the point, [z; A z], opened bounds, lengths in `unit` */
     int *first, *last, *held;    /* range of a row's entries that are not zero; whether an entry is eliminated */
     double *goal;                /* values that listed rows are to have */
     double *B, *v, *tau, *rhs, *step, *column; /* of an elimination */
@@ -46,8 +40,9 @@ typedef struct {
     double *M, *size;            /* normalized rows of a least-distance program, and their former lengths */
     int *entry, count;           /* entries of these rows */
     int soft;                    /* coordinates that the exact rows of an elimination take */
+    int *proximal;               /* the proximal term of the cost that the last solution needed */
     int *warm;                   /* levels + 2 times entries: active rows of each program at the last solution */
-    double tolerance, weight, scale; /* `scale`: size of the point, in `unit` */
+    double tolerance, scale;     /* violation that DAQP may leave; size of the point, in `unit` */
 } Relaxation;
 
 static double dot(const double *a, const double *b, int n) {
@@ -92,6 +87,9 @@ static int is_equation(const Relaxation *r, int entry) { return r->p->lower[entr
 static double violation(const Relaxation *r, int entry) {
     return fmax(r->lower[entry] - r->value[entry], r->value[entry] - r->upper[entry]);
 }
+
+/* Smallest violation of an entry that counts. */
+static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
 
 /* Compute [z; A z]. */
 static void update_values(Relaxation *r) {
@@ -163,19 +161,26 @@ static void swap_rows(Relaxation *r, int i, int k) {
 }
 
 /* Find coordinates of which the first ones alone move the listed rows, and return their number.  r->step becomes the
- * move by which the first `exact` rows reach their goals, and the others come near theirs (least squares). */
-static int turn(Relaxation *r, int exact, int all) {
+ * move by which the first `exact` rows reach their goals, and the others come near theirs (least squares).  The first
+ * `kept` rows are those of the last call. */
+static int turn(Relaxation *r, int kept, int exact, int all) {
     const int n = r->n, free = n - r->fixed;
     double *B = r->B, *step = r->step, longest = 0;
-    int rank = 0;
+    int rank = kept ? r->soft : 0;
     memset(step, 0, (size_t)n * sizeof *step);
     for (int i = 0; i < all; i++) {
-        memcpy(B + i * n, motion(r, r->rows[i]), (size_t)free * sizeof *B);
         r->rhs[i] = r->goal[r->rows[i]] - r->value[r->rows[i]];
         if (i >= exact) longest = fmax(longest, r->length[r->rows[i]]);
+        if (i < kept) continue;
+        memcpy(B + i * n, motion(r, r->rows[i]), (size_t)free * sizeof *B);
+        for (int k = 0; k < rank; k++) reflect(r->v + k * n, r->tau[k], B + i * n + k, free - k);
+    }
+    for (int k = 0; k < rank; k++) {
+        const double *b = B + r->lead[k] * n;
+        step[k] = (r->rhs[r->lead[k]] - dot(b, step, k)) / b[k];
     }
     r->soft = -1;
-    for (int k = 0; k < all && rank < free; k++) {
+    for (int k = kept; k < all && rank < free; k++) {
         if (k >= exact) {
             int best = k;
             double most = -1;
@@ -207,56 +212,66 @@ static int turn(Relaxation *r, int exact, int all) {
     return rank;
 }
 
-/* Move by r->step unless a row of the program would violate its bounds; return whether none does. */
+/* Move by r->step until a row of the program stops it.  Return that row's entry, or -1 where none does. */
 static int move(Relaxation *r, int all) {
     const int n = r->n, free = n - r->fixed;
-    int fits = 1;
-    memcpy(r->before, r->z, (size_t)n * sizeof *r->z);
-    for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + i * n + r->fixed, r->step, free);
+    double part = 1;
+    int stop = -1;
     for (int i = 0; i < all; i++) r->held[r->rows[i]] = 1;
-    for (int j = 0; j < r->count && fits; j++) {
+    for (int j = 0; j < r->count; j++) {
         const int i = r->entry[j];
-        const double room = r->tolerance * r->length[i], value = value_of(r, i);
-        fits = r->held[i] || (value <= fmax(r->upper[i], r->value[i]) + room &&
-                              value >= fmin(r->lower[i], r->value[i]) - room);
+        if (r->held[i]) continue;
+        const double by = dot(motion(r, i), r->step, free), room = r->tolerance * r->length[i];
+        const double upper = fmax(r->upper[i], r->value[i]), lower = fmin(r->lower[i], r->value[i]);
+        if (r->value[i] + part * by > upper + room)
+            part = (upper - r->value[i]) / by, stop = i;
+        else if (r->value[i] + part * by < lower - room)
+            part = (lower - r->value[i]) / by, stop = i;
     }
-    if (!fits) {
-        memcpy(r->z, r->before, (size_t)n * sizeof *r->z);
-        for (int i = 0; i < all; i++) r->held[r->rows[i]] = 0;
-    }
-    return fits;
+    for (int i = 0; i < all; i++) r->held[r->rows[i]] = 0;
+    for (int i = 0; i < n; i++) r->z[i] += part * dot(r->Z + i * n + r->fixed, r->step, free);
+    update_values(r);
+    if (stop >= 0) r->goal[stop] = dot(motion(r, stop), r->step, free) > 0 ? r->upper[stop] : r->lower[stop];
+    return stop;
 }
 
-/* Drop the exact rows without a multiplier, or with one of the wrong sign, from the list of turn(), after its move.
- * Return how many are left, as a negative number where none was dropped. */
-static int drop_rows(Relaxation *r, int exact, int all) {
+/* Drop the rows that the answer does not need from the list of turn(), after its move: exact rows without a multiplier
+ * or with one of the wrong sign, and inequalities that hold.  Return whether there are any. */
+static int drop_rows(Relaxation *r, int *exact, int *all) {
     double *force = r->column, most = 0;
-    int kept = 0, changed = 0;
-    for (int k = 0; k < r->soft; k++) force[k] = 0;
-    for (int i = exact; i < all; i++)
-        add(force, r->goal[r->rows[i]] - value_of(r, r->rows[i]), r->B + i * r->n, r->soft);
-    for (int i = 0; i < exact; i++) r->rhs[i] = 0;
-    for (int k = r->soft - 1; k >= 0; k--) {
-        const double *b = r->B + r->lead[k] * r->n, multiplier = force[k] / b[k];
-        add(force, -multiplier, b, k);
-        r->rhs[r->lead[k]] = multiplier * r->length[r->rows[r->lead[k]]];
-        most = fmax(most, fabs(r->rhs[r->lead[k]]));
+    const int first = *exact;
+    int kept = 0;
+    memset(force, 0, (size_t)r->soft * sizeof *force);
+    memset(r->rhs, 0, (size_t)first * sizeof *r->rhs);
+    for (int i = first; i < *all; i++) {
+        const double miss = r->goal[r->rows[i]] - r->value[r->rows[i]];
+        if (fabs(miss) <= least(r, r->rows[i])) continue;
+        add(force, miss, r->B + i * r->n, r->soft);
+        most = fmax(most, fabs(miss) * r->length[r->rows[i]]);
     }
-    for (int i = 0; i < all; i++) {
+    for (int k = r->soft - 1; k >= 0; k--) {
+        const int i = r->lead[k];
+        const double *b = r->B + i * r->n, multiplier = force[k] / b[k];
+        add(force, -multiplier, b, k);
+        r->rhs[i] = multiplier * r->length[r->rows[i]];
+    }
+    for (int i = 0; i < *all; i++) {
         const int row = r->rows[i];
         const double pushes = r->goal[row] == r->upper[row] ? r->rhs[i] : -r->rhs[i];
-        if (i < exact && !(pushes > COUNTS * most)) {
-            r->held[row] = 0;
-            changed++;
-        } else
+        if (i < first ? most > 0 && pushes > COUNTS * most : is_equation(r, row) || violation(r, row) > least(r, row))
             r->rows[kept++] = row;
+        else if (i < first)
+            --*exact;
     }
-    return changed ? kept : -kept;
+    const int dropped = *all - kept;
+    *all = kept;
+    return dropped;
 }
 
 /* Leave out the first `rank` of the coordinates of turn(). */
 static void eliminate(Relaxation *r, int rank) {
     const int n = r->n, free = n - r->fixed, rest = free - rank;
+    if (!rank) return;
     if (rest < rank) {
         /* Few coordinates are left: Z times each of them. */
         for (int c = 0; c < rest; c++) {
@@ -275,8 +290,7 @@ static void eliminate(Relaxation *r, int rank) {
             for (int k = 0; k < rank; k++)
                 reflect(r->v + k * n, r->tau[k], r->Z + i * n + r->fixed + k, free - k);
     r->fixed += rank;
-    update_values(r);
-    update_rows(r);
+    if (rest) update_rows(r);
 }
 
 /* ---- least-distance programs ---------------------------------------------------------------------------------- */
@@ -303,7 +317,8 @@ static void list_rows(Relaxation *r, int level, const double *L) {
         /* The tolerance of a row is relative to its length in the units of the problem.  That of the cost is what
          * rounding permits; its active rows are made exact afterwards. */
         r->daqp.scaling[count] = L ? 1 : r->length[i] / size;
-        r->daqp.rho_ls[count] = r->daqp.rho_us[count] = r->weight * longest * longest / (r->length[i] * r->length[i]);
+        const double ratio = longest / r->length[i];
+        r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * ratio * ratio;
         r->daqp.sense[count] = (soft ? DAQP_SOFT : 0) | (equal ? DAQP_ACTIVE | DAQP_IMMUTABLE : 0);
         if (warm[i] & DAQP_ACTIVE) r->daqp.sense[count] |= warm[i];
         r->entry[count++] = i;
@@ -326,7 +341,7 @@ static double set_bounds(Relaxation *r, const double *wanted) {
     }
     const double unit = fmax(largest, EXACT * size);
     r->scale = size;
-    r->tolerance = fmax(EXACT, NOISE / r->weight) * (wanted ? size : fmax(size, unit));
+    r->tolerance = EXACT * (wanted ? size : fmax(size, unit));
     r->settings.primal_tol = wanted ? ROUNDING : r->tolerance / unit;
     for (int j = 0; j < r->count; j++) {
         r->daqp.dupper[j] /= unit;
@@ -356,9 +371,6 @@ static void keep_active(Relaxation *r, int level) {
     for (int j = 0; j < r->count; j++) warm[r->entry[j]] = r->daqp.sense[j] & (DAQP_ACTIVE | DAQP_LOWER);
 }
 
-/* Smallest violation of an entry that counts. */
-static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
-
 /* List what determines the level's answer: the active rows of the levels above, then the level's own equations and
  * violated rows.  Return the number of the former; `all` is that of both. */
 static int list_held(Relaxation *r, int level, int missed, int *all) {
@@ -378,62 +390,59 @@ static int list_held(Relaxation *r, int level, int missed, int *all) {
     return exact;
 }
 
+/* Find the exact answer of a level from nearly the right rows, and return how many coordinates they take. */
+static int finish_level(Relaxation *r, int level, int missed, int *all) {
+    int exact = list_held(r, level, missed, all), last = -1, kept = 0;
+    for (int k = 0; k < MOST_MOVES && r->left > 1; k++) {
+        const int rank = turn(r, kept, exact, *all), stop = move(r, *all);
+        r->left -= (int)(MOVE_COST * *all);
+        if (stop < 0 && !drop_rows(r, &exact, all)) return rank;
+        kept = stop < 0 ? 0 : exact;
+        if (stop < 0) continue;
+        if (stop == last) break;
+        last = stop;
+        r->rows[*all] = stop;
+        if (r->p->level[stop] < level || level == 0) {
+            r->rows[*all] = r->rows[exact];
+            r->rows[exact++] = stop;
+        }
+        ++*all;
+    }
+    /* The point is good, if not the best: its rows stay as they are. */
+    list_held(r, level, missed, all);
+    for (int i = 0; i < *all; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
+    return turn(r, 0, 0, *all);
+}
+
 /* Bring the point as near to a level as the levels above permit, then keep it there. */
 static int solve_level(Relaxation *r, int level) {
     const int free = r->n - r->fixed;
-    int flag = 1, missed = 0, all = 0, rank, done = 0;
-    double before = 0;
-    int flat = 0;
-    r->weight = STEP_WEIGHT;
+    int missed = 0, all = 0, same = 0;
     list_rows(r, level, NULL);
-    for (int k = 0; k < MOST_STEPS && !done; k++) {
+    for (int k = 0; k < MOST_STEPS && !same && r->count; k++) {
         const double unit = set_bounds(r, NULL);
         const int left = r->left;
-        if (r->count) {
-            r->daqp.reuse_ind = 0;
-            for (int j = 0; flat && j < r->count; j++) r->daqp.rho_us[j] = r->daqp.rho_ls[j] *= LIGHTER;
-            if (flat) r->weight *= LIGHTER;
-            flag = k && !flat ? run(r) : start(r);
-            keep_active(r, level);
-            if (flag == DAQP_EXIT_ITERLIMIT || (flag <= 0 && level <= 1 && !k)) return flag;
-            if (flag <= 0) break;
-            const double length = unit * norm(r->daqp.u, free);
-            for (int i = 0; i < r->n; i++) r->z[i] += unit * dot(r->Z + i * r->n + r->fixed, r->daqp.u, free);
-            update_values(r);
-            missed = 0;
-            for (int j = 0; j < r->count && !missed; j++)
-                missed = (r->daqp.sense[j] & DAQP_SOFT) && violation(r, r->entry[j]) > least(r, r->entry[j]);
-#ifdef RELAXATION_TRACE
-            RELAXATION_TRACE("step", level, r->daqp.iterations, length);
-#endif
-            /* The active rows are final only where another step finds the same. */
-            const int same = left - r->left == 1 && k;
-            flat = same && length > FLAT_STEP * before && r->weight > 1.001 * LEAST_WEIGHT;
-            before = length;
-            /* The active rows are final only where another step finds the same. */
-            if (missed && !same) continue;
+        r->daqp.reuse_ind = 0;
+        int flag = k ? run(r) : start(r);
+        if (flag <= 0 && flag != DAQP_EXIT_ITERLIMIT && !k) {
+            /* A larger weight is easier. */
+            for (int j = 0; j < r->count; j++) r->daqp.rho_us[j] = r->daqp.rho_ls[j] *= 100;
+            flag = start(r);
         }
-        int exact = list_held(r, level, missed, &all), left_over;
-        do {
-            rank = turn(r, exact, all);
-            done = move(r, all);
-            left_over = done && exact ? drop_rows(r, exact, all) : -all;
-            if (left_over > 0) {
-                memcpy(r->z, r->before, (size_t)r->n * sizeof *r->z);
-                exact -= all - left_over;
-                all = left_over;
-            }
-        } while (left_over > 0);
+        keep_active(r, level);
+        if (flag == DAQP_EXIT_ITERLIMIT || (flag <= 0 && level <= 1 && !k)) return flag;
+        if (flag <= 0) break;
+        for (int i = 0; i < r->n; i++) r->z[i] += unit * dot(r->Z + i * r->n + r->fixed, r->daqp.u, free);
+        update_values(r);
+        missed = 0;
+        for (int j = 0; j < r->count && !missed; j++)
+            missed = (r->daqp.sense[j] & DAQP_SOFT) && violation(r, r->entry[j]) > least(r, r->entry[j]);
+        same = !missed || (k && left - r->left == 1);
     }
-    if (!done) {
-        list_held(r, level, missed, &all);
-        for (int i = 0; i < all; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
-        rank = turn(r, 0, all);
-        for (int i = 0; i < all; i++) r->held[r->rows[i]] = 1;
-    }
-#ifdef RELAXATION_TRACE
-    RELAXATION_TRACE("done", done, rank, all);
-#endif
+    const int rank = finish_level(r, level, missed, &all);
+    /* A dependent row may still move by rounding: an inequality goes on as one. */
+    for (int i = 0; i < all; i++) r->held[r->rows[i]] = is_equation(r, r->rows[i]);
+    for (int k = 0; k < rank; k++) r->held[r->rows[r->lead[k]]] = 1;
     eliminate(r, rank);
     /* The point is a solution, whatever rounding makes of its rows. */
     for (int i = 0; i < r->entries; i++)
@@ -441,7 +450,7 @@ static int solve_level(Relaxation *r, int level) {
             r->lower[i] = fmin(r->lower[i], r->value[i]);
             r->upper[i] = fmax(r->upper[i], r->value[i]);
         }
-    return 1;
+    return r->left > 1 ? 1 : DAQP_EXIT_ITERLIMIT;
 }
 
 /* Factorize the reduced cost plus `share` of its largest entry; false where it is not positive. */
@@ -477,40 +486,60 @@ static int factorize(Relaxation *r, double share) {
     return 1;
 }
 
-/* Minimize the cost in the coordinates that are left. */
+/* Turn whitened coordinates into those of Z. */
+static void unwhiten(const Relaxation *r, double *y) {
+    for (int i = r->n - r->fixed - 1; i >= 0; i--) {
+        y[i] /= r->L[i * r->n + i];
+        add(y, -y[i], r->L + i * r->n, i);
+    }
+}
+
+/* Move to the minimum of the cost with the active rows of its program held, where a proximal term has kept it off. */
+static void finish_cost(Relaxation *r, int active) {
+    for (int k = 0; k < MOST_MOVES; k++) {
+        const int rank = turn(r, 0, active, active);
+        for (int i = 0; i < active; i++) r->held[r->rows[i]] = 1;
+        eliminate(r, rank);
+        const int free = r->n - r->fixed;
+        if (!free || !factorize(r, 0)) return;
+        memcpy(r->step, r->wanted, (size_t)free * sizeof *r->step);
+        unwhiten(r, r->step);
+        const int stop = move(r, 0);
+        if (stop < 0) return;
+        r->rows[0] = stop;
+        active = 1;
+    }
+}
+
+/* Minimize the cost in the coordinates that are left.  What is too flat once starts with a proximal term afterwards,
+ * because DAQP notices a cycle only after many iterations. */
 static int solve_cost(Relaxation *r) {
     const int n = r->n, free = n - r->fixed;
-    int flag = 0;
+    int flag = 0, active = 0;
     if (!free) return 1;
-    for (size_t k = 0; k < sizeof PROXIMAL / sizeof *PROXIMAL; k++) {
-        if (!factorize(r, PROXIMAL[k])) continue;
+    for (; *r->proximal < (int)(sizeof PROXIMAL / sizeof *PROXIMAL); ++*r->proximal) {
+        if (!factorize(r, PROXIMAL[*r->proximal])) continue;
         list_rows(r, r->p->levels + 1, r->L);
         const double unit = set_bounds(r, r->wanted);
         flag = start(r);
-#ifdef RELAXATION_TRACE
-        RELAXATION_TRACE("cost", flag, r->daqp.iterations, PROXIMAL[k]);
-#endif
         keep_active(r, r->p->levels + 1);
         if (flag == DAQP_EXIT_ITERLIMIT) return flag;
         if (flag <= 0) continue;
-        double *y = r->wanted;
-        add(y, unit, r->daqp.u, free);
-        for (int i = free - 1; i >= 0; i--) {
-            y[i] /= r->L[i * n + i];
-            add(y, -y[i], r->L + i * n, i);
-        }
-        for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + i * n + r->fixed, y, free);
+        add(r->wanted, unit, r->daqp.u, free);
+        unwhiten(r, r->wanted);
+        for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + i * n + r->fixed, r->wanted, free);
         update_values(r);
-        int active = 0;
-        for (int j = 0; j < r->daqp.n_active; j++) {
-            const int at = r->daqp.WS[j], i = r->entry[at];
+        for (; active < r->daqp.n_active; active++) {
+            const int at = r->daqp.WS[active], i = r->entry[at];
             r->goal[i] = (r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i];
-            r->rows[active++] = i;
+            r->rows[active] = i;
         }
-        turn(r, active, active);
+        turn(r, 0, active, active);
         move(r, active);
+        if (*r->proximal) finish_cost(r, active);
         return 1;
     }
+    *r->proximal = 0;
     return flag;
 }
 
@@ -527,15 +556,17 @@ static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels
     const size_t e = n + m, active = n + e + 2;
     size_t used = 0;
     const struct { double **array; size_t count; } doubles[] = {
-        {&r->Z, n * n}, {&r->T, m * n}, {&r->z, n}, {&r->before, n}, {&r->value, e}, {&r->lower, e}, {&r->upper, e},
-        {&r->length, e}, {&r->B, e * n}, {&r->v, n * n}, {&r->tau, n}, {&r->rhs, e}, {&r->goal, e}, {&r->step, n}, {&r->column, e},
+        {&r->Z, n * n}, {&r->T, m * n}, {&r->z, n}, {&r->value, e}, {&r->lower, e}, {&r->upper, e},
+        {&r->length, e}, {&r->B, e * n}, {&r->v, n * n}, {&r->tau, n}, {&r->rhs, e}, {&r->goal, e}, {&r->step, n},
+        {&r->column, e},
         {&r->L, n * n}, {&r->wanted, n}, {&r->M, e * n}, {&r->size, e}, {&r->daqp.dupper, e}, {&r->daqp.dlower, e},
         {&r->daqp.scaling, e}, {&r->daqp.Mu, e}, {&r->daqp.rho_ls, e}, {&r->daqp.rho_us, e}, {&r->daqp.w_ls, e},
         {&r->daqp.lam, active}, {&r->daqp.lam_star, active}, {&r->daqp.D, active}, {&r->daqp.xldl, active},
         {&r->daqp.zldl, active}, {&r->daqp.L, active * (active + 1) / 2}, {&r->daqp.u, n}, {&r->daqp.xold, n},
     };
     const struct { int **array; size_t count; } ints[] = {
-        {&r->warm, (levels + 2) * e}, {&r->first, m}, {&r->last, m}, {&r->held, e}, {&r->rows, e}, {&r->lead, n}, {&r->entry, e},
+        {&r->proximal, 1}, {&r->warm, (levels + 2) * e}, {&r->first, m}, {&r->last, m}, {&r->held, e}, {&r->rows, e},
+        {&r->lead, n}, {&r->entry, e},
         {&r->daqp.sense, e}, {&r->daqp.WS, active}, {&r->daqp.prox_mask, n},
     };
     /* The active rows, which outlive a solution, come first. */
@@ -594,10 +625,12 @@ int relaxation_solve(const relaxation_problem *p, void *work, int budget, double
             r.goal[i] = p->lower[i];
             r.rows[always++] = i;
         }
-    const int rank = turn(&r, always, always);
+    const int rank = turn(&r, 0, always, always);
     move(&r, always);
+    for (int i = 0; i < always; i++) r.held[r.rows[i]] = 1;
     eliminate(&r, rank);
-    for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++) flag = solve_level(&r, level);
+    for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++)
+        flag = solve_level(&r, level);
     if (flag > 0) {
         flag = solve_cost(&r);
         if (flag != DAQP_EXIT_ITERLIMIT) flag = flag > 0 ? RELAXATION_SOLVED : RELAXATION_WITHOUT_COST;
