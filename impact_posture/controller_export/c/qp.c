@@ -1,7 +1,11 @@
 /* The QP of a tick as DAQP solves it: the least |u|^2 with lower <= M u <= upper, rows of length one.
  *
- * The variables z = [v; w; f] are z = T (center + u), where T makes the cost |T^-1 z|^2/2.  Where T is diagonal, joints come
- * before the base in u, and their bounds are bounds on u.  Where it is not, they are the last rows. */
+ * The variables z = [v; w; f] are z = T (center + u), where T makes the cost |T^-1 z|^2/2:
+ * - IP_DENSE: T is the inverse of a Cholesky factor.  The bounds on joints are the last rows.
+ * - IP_MOMENTUM: the cost is diagonal in the joints, the acceleration of the center of mass in the world, which stands
+ *   for that of the base, and the angular acceleration of the base.
+ * - Otherwise T is diagonal.
+ * In the last two, joints come first in u, and their bounds are bounds on u. */
 
 /* A zero of DAQP. */
 #define IP_NOTHING 1e-11
@@ -26,6 +30,16 @@ static void ip_whiten(const ip_context *c, const double *row, double *out)
     for (j = i; j < IP_NV; ++j) {
       out[j] += s * factor[j];
     }
+  }
+#elif IP_MOMENTUM
+  const double *M = c->m.M, *R = c->m.base, scale = 1.0 / M[0];
+  const double x = row[0] * scale, y = row[1] * scale, z = row[2] * scale;
+  for (j = 3; j < IP_NV; ++j) {
+    i = j < IP_BASE ? IP_JOINTS_V + j : j - IP_BASE;
+    out[i] = (row[j] - x * M[j] - y * M[IP_NV + j] - z * M[2 * IP_NV + j]) * c->ease[i];
+  }
+  for (i = 0; i < 3; ++i) {
+    out[IP_JOINTS_V + i] = ip_dot(R + 3 * i, row, 3) * c->ease[IP_JOINTS_V + i];
   }
 #else
   (void)j;
@@ -111,12 +125,23 @@ static void ip_factorize(ip_context *c)
     }
   }
 #else
-  (void)j, (void)k;
+  (void)j;
   for (i = 0; i < IP_NV; ++i) {
     g[i] = c->p.posture_weight[i] * c->wanted[i];
   }
+  for (k = 0; IP_MOMENTUM && k < IP_TASKS; ++k) {
+    for (i = ip_task_row[k]; i < ip_task_row[k + 1]; ++i) {
+      g[(ip_task_kind[k] == IP_BASE_TURN ? 3 : 0) + i - ip_task_row[k]] += c->p.task_weight[i] * c->a[i];
+    }
+  }
 #endif
+#if IP_MOMENTUM
+  for (i = 0; i < IP_NV; ++i) {
+    c->center[i] = g[ip_entry(i)] * c->ease[i];
+  }
+#else
   ip_whiten(c, g, c->center);
+#endif
 }
 
 /* The row of s'(M v + h - J'f), of so many entries from the first on; return s'h. */
@@ -295,7 +320,12 @@ static void ip_begin_qp(ip_context *c)
     c->added[i] = fmax(c->p.posture_weight[i], 1e-8);
   }
   for (i = 0; i < IP_NV; ++i) {
-    c->ease[i] = 1.0 / sqrt(c->added[ip_entry(i)]);
+    double weight = c->added[ip_entry(i)];
+    for (k = 0; IP_MOMENTUM && k < IP_TASKS; ++k) {
+      const int first = ip_task_kind[k] == IP_BASE_TURN ? 3 : 0, own = ip_entry(i) - first;
+      weight = own >= 0 && own < 3 ? c->p.task_weight[ip_task_row[k] + own] + (first ? weight : 0.0) : weight;
+    }
+    c->ease[i] = 1.0 / sqrt(weight);
   }
   for (i = 0; i < IP_SPARE; ++i) {
     c->ease[IP_NV + i] = 1.0 / sqrt(c->p.spare_weight[0]);
@@ -355,6 +385,9 @@ static void ip_begin_rank(ip_context *c)
 static void ip_add_turned(const ip_context *c, const double *x, double *out)
 {
   int i, j;
+#if IP_MOMENTUM
+  double moved[3] = {0};
+#endif
   for (i = 0; i < IP_NV; ++i) {
 #if IP_DENSE
     double sum = 0.0;
@@ -362,11 +395,23 @@ static void ip_add_turned(const ip_context *c, const double *x, double *out)
       sum += c->factor[i * IP_NV + j] * x[j];
     }
     out[i] += sum;
+#elif IP_MOMENTUM
+    const double step = c->ease[i] * x[i];
+    const int at = ip_entry(i);
+    out[at] += at < 3 ? 0.0 : step;
+    for (j = 0; j < 3; ++j) {
+      moved[j] += at < 3 ? c->m.base[3 * at + j] * step : -c->m.M[j * IP_NV + at] / c->m.M[0] * step;
+    }
 #else
     (void)j;
     out[ip_entry(i)] += c->ease[i] * x[i];
 #endif
   }
+#if IP_MOMENTUM
+  for (j = 0; j < 3; ++j) {
+    out[j] += moved[j];
+  }
+#endif
   for (i = IP_NV; i < IP_VARIABLES; ++i) {
     out[i] += c->ease[i] * x[i];
   }
@@ -383,14 +428,25 @@ static void ip_decode(ip_context *c, DAQPWorkspace *w)
     c->z[i] = 0.0;
   }
   ip_add_turned(c, x, c->z);
+  memset(x, 0, sizeof x);
+#if IP_MOMENTUM
+  /* The least weight of the acceleration of the base is no part of the diagonal cost. */
+  double rest[IP_NV] = {0};
+  for (i = 0; i < 3; ++i) {
+    rest[i] = -c->added[i] * c->z[i];
+  }
+  ip_whiten(c, rest, x);
+#endif
   for (i = 0; i < w->n_active; ++i) {
     const int at = w->WS[i], r = at - IP_SIMPLE, joint = IP_DENSE ? r - (IP_GENERAL - IP_JOINTS_V) : at;
     const int bounds = IP_LAW && (IP_DENSE ? joint >= 0 : r < 0);
     const double value = bounds ? c->z[IP_BASE + joint] : ip_dot(c->rows[r], c->z, IP_VARIABLES);
     w->xldl[i] = c->scaling[at] * (value - (c->sense[at] & DAQP_LOWER ? c->low[at] : c->high[at]));
+    if (IP_MOMENTUM) {
+      w->xldl[i] += at < IP_SIMPLE ? x[at] : ip_dot(c->M[at - IP_SIMPLE], x, IP_VARIABLES);
+    }
   }
   daqp_solve_working_set(w);
-  memset(x, 0, sizeof x);
   for (i = 0; i < w->n_active; ++i) {
     const int at = w->WS[i];
     w->lam_star[i] += w->xldl[i];

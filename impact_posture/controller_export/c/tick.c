@@ -52,6 +52,17 @@ int ip_init(ip_context *c, const ip_params *p)
       return IP_AT_CONTACT_NORMAL;
     }
   }
+  for (i = 0; IP_MOMENTUM && i < 3; ++i) {
+    /* These coordinates have no place for a weight of the base. */
+    if (p->posture_weight[i] != 0.0) {
+      return IP_AT_POSTURE_WEIGHT;
+    }
+  }
+  for (i = 0; IP_MOMENTUM && i < IP_ROWS; ++i) {
+    if (!(p->task_weight[i] > 0.0)) {
+      return IP_AT_TASK_WEIGHT;
+    }
+  }
   if (!(p->law_rate[0] >= 4.0 * p->law_approach[0])) {
     return IP_AT_LAW_RATE;
   }
