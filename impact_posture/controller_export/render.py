@@ -125,7 +125,7 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
         "q_names": configuration_names(robot), "v_names": robot.tangent_names, "u_names": s.actuators.names,
         "convention": robot.convention, "tasks": [t.name for t in s.tasks] or ["none"], "metric": metric,
         "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
-        "identity": identity, "tables": tables, "named": _NAMED, "literals": _initializer,
+        "identity": identity, "tables": tables, "named": [(f.name, k) for k, f in enumerate(fields, 1) if f.name in _NAMED], "literals": _initializer,
         "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
         "constants": code.constants, "blocks": code.blocks, "angles": code.angles, "work": code.work,
         "places": _braced(map(str, code.angles)), "outputs": code.outputs, "constant_outputs": code.constant_outputs,

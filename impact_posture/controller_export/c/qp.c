@@ -18,7 +18,7 @@ static int ip_entry(int k)
 }
 
 /* out = row T for a row on the accelerations v. */
-static void ip_whiten(const ip_context *c, const double *row, double *out)
+static void ip_whiten(const ip_context *c, const double *row, double *restrict out)
 {
   int i, j;
 #if IP_DENSE
@@ -34,8 +34,12 @@ static void ip_whiten(const ip_context *c, const double *row, double *out)
 #elif IP_MOMENTUM
   const double *M = c->m.M, *R = c->m.base, scale = 1.0 / M[0];
   const double x = row[0] * scale, y = row[1] * scale, z = row[2] * scale;
-  for (j = 3; j < IP_NV; ++j) {
-    i = j < IP_BASE ? IP_JOINTS_V + j : j - IP_BASE;
+  for (i = 0; i < IP_JOINTS_V; ++i) {
+    j = IP_BASE + i;
+    out[i] = (row[j] - x * M[j] - y * M[IP_NV + j] - z * M[2 * IP_NV + j]) * c->ease[i];
+  }
+  for (j = 3; j < IP_BASE; ++j) {
+    i = IP_JOINTS_V + j;
     out[i] = (row[j] - x * M[j] - y * M[IP_NV + j] - z * M[2 * IP_NV + j]) * c->ease[i];
   }
   for (i = 0; i < 3; ++i) {
@@ -190,16 +194,17 @@ static void ip_measure_rank(ip_context *c)
   enum { N = IP_EQUATIONS };
   const double least = 2e-2;
   double *G = c->scratch, *S = c->scratch + N * N, way = 0.0, low, high, trace = 0.0;
+  double way_of[IP_VARIABLES];
   int i, j, k;
   for (i = 0; i < N; ++i) {
     const double s = 1.0 / c->length[i];
-    double sum = 0.0;
-    for (j = 0; j < IP_VARIABLES; ++j) {
-      const double unit = j < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
-      const double d = (c->rows[i][j] - c->reference[i][j]) * s * unit;
-      sum += d * d;
+    for (j = 0; j < IP_NV + IP_SPARE; ++j) {
+      way_of[j] = (c->rows[i][j] - c->reference[i][j]) * s;
     }
-    way += sum;
+    for (; j < IP_VARIABLES; ++j) {
+      way_of[j] = (c->rows[i][j] - c->reference[i][j]) * s * c->m.M[0];
+    }
+    way += ip_dot(way_of, way_of, IP_VARIABLES);
   }
   if (way < c->space) {
     return;
