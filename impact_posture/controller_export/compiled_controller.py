@@ -48,6 +48,7 @@ class CompiledController:
         rows += [
             ("multipliers", max(1, bounds)),
             ("relaxed", 1 + len(manifest.levels)),
+            ("deficient", room("LEVELS")),
             ("dynamics", 1),
             ("level", 1),
             ("value", 1),
@@ -153,7 +154,7 @@ class CompiledController:
         return self._commanded()
 
     def report(self) -> Report:
-        """Return the diagnosis of the last tick; ``deficient`` is empty."""
+        """Return the diagnosis of the last tick."""
         checked, found = self._checked, self._diagnosis
         self._call("last_report", ctypes.byref(self._report))
         status = _STATUSES[self._report.status]
@@ -177,7 +178,9 @@ class CompiledController:
         iterations = int(self._report.iterations)
         names = ("joint limits", *(name for name, _ in checked.levels))
         relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, found["relaxed"], strict=True) if x > 0)
-        return Report(status, relaxed, (), residuals, tuple(active), dynamics, level, value, iterations)
+        missed = zip(names[1:], found["deficient"], strict=False)
+        deficient = tuple(Relaxed(n, float(x)) for n, x in missed if x > 0)
+        return Report(status, relaxed, deficient, residuals, tuple(active), dynamics, level, value, iterations)
 
     # ---- targets and phases ------------------------------------------------------------------------------------
 

@@ -27,7 +27,7 @@ from impact_posture.impact.contact import point_on
 from impact_posture.version import __version__
 
 # Files in c/, in the order in which one source has them.
-_CORE = ("algebra.c", "tasks.c", "posture.c", "qp.c", "give_way.c", "tick.c")
+_CORE = ("algebra.c", "tasks.c", "posture.c", "qp.c", "rank.c", "give_way.c", "tick.c")
 # Parameters that init compares with others.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
 # Bytes of variables, saved registers and return addresses of all functions below a tick, beside the arrays.
@@ -110,7 +110,7 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
     nv, equations = sizes["NV"], sizes["EQUATIONS"]
     n, m = sizes["VARIABLES"], sizes["GENERAL"] - sizes["BOUNDED"]
     more = {
-        "SCRATCH": max(3 * nv * nv, n * n, 2 * equations * equations), "BOUNDS": bounds, "GAVE": 1 + sizes["LEVELS"],
+        "SCRATCH": max(3 * nv * nv, 2 * n * (n + equations) + 2 * equations * equations), "BOUNDS": bounds, "GAVE": 1 + sizes["LEVELS"],
         "RELAXATION": _relaxation_room(n, m, 1 + sizes["LEVELS"]),
     }  # fmt: skip
     room = {name: max(1, value) for name, value in (sizes | more).items()}

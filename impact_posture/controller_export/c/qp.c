@@ -186,70 +186,6 @@ static void ip_put(ip_context *c, int r, double lower, double upper)
   ip_finish(c, r, lower, upper);
 }
 
-/* Whether the equations are independent, as LevelRank decides: no singular value of the scaled rows is below 0.02.  No
- * singular value moves further than the matrix does, so most ticks need no decomposition. */
-static void ip_measure_rank(ip_context *c)
-{
-#if IP_LEVELS
-  enum { N = IP_EQUATIONS };
-  const double least = 2e-2;
-  double *G = c->scratch, *S = c->scratch + N * N, way = 0.0, low, high, trace = 0.0;
-  double way_of[IP_VARIABLES];
-  int i, j, k;
-  for (i = 0; i < N; ++i) {
-    const double s = 1.0 / c->length[i];
-    for (j = 0; j < IP_NV + IP_SPARE; ++j) {
-      way_of[j] = (c->rows[i][j] - c->reference[i][j]) * s;
-    }
-    for (; j < IP_VARIABLES; ++j) {
-      way_of[j] = (c->rows[i][j] - c->reference[i][j]) * s * c->m.M[0];
-    }
-    way += ip_dot(way_of, way_of, IP_VARIABLES);
-  }
-  if (way < c->space) {
-    return;
-  }
-  memcpy(c->reference, c->rows, sizeof c->reference);
-  c->space = 0.0;
-  c->independent = 1;
-  if (!isfinite(way)) {
-    return;
-  }
-  for (i = 0; i < N; ++i) {
-    for (j = 0; j <= i; ++j) {
-      double sum = 0.0;
-      for (k = 0; k < IP_VARIABLES; ++k) {
-        const double unit = k < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
-        sum += c->rows[i][k] * c->rows[j][k] * unit * unit;
-      }
-      G[i * N + j] = G[j * N + i] = sum / (c->length[i] * c->length[j]);
-    }
-    trace += G[i * (N + 1)];
-  }
-  /* Squares of a lower and an upper bound on the least singular value. */
-  low = least * least;
-  high = trace / N;
-  for (k = 0; k < 7; ++k) {
-    const double middle = k ? sqrt(low * high) : low;
-    memcpy(S, G, sizeof(double) * N * N);
-    for (i = 0; i < N; ++i) {
-      S[i * (N + 1)] -= middle;
-    }
-    if (ip_cholesky(S, N)) {
-      low = middle;
-    } else if (k) {
-      high = middle;
-    } else {
-      c->independent = 0;
-      return;
-    }
-  }
-  c->space = (sqrt(low) - least) * (sqrt(low) - least);
-#else
-  c->independent = 1;
-#endif
-}
-
 /* Fill M and the bounds. */
 static void ip_assemble(ip_context *c)
 {
@@ -304,7 +240,6 @@ static void ip_assemble(ip_context *c)
       c->lower[i] = -to[1] * c->scaling[i] - c->center[i];
     }
   }
-  ip_measure_rank(c);
 }
 
 /* The types of the bounds before any is active. */
@@ -355,35 +290,6 @@ static void ip_begin_qp(ip_context *c)
     }
   }
   ip_cool(c);
-}
-
-/* Lengths of the equations, by which their rank is measured: the longest row of a level. */
-static void ip_begin_rank(ip_context *c)
-{
-  int r = IP_BLIND, i, j, k;
-  for (i = 0; i < IP_EQUATIONS; ++i) {
-    double sum = 0.0;
-    for (j = 0; j < IP_VARIABLES; ++j) {
-      const double x = c->rows[i][j] * (j < IP_NV + IP_SPARE ? 1.0 : c->m.M[0]);
-      sum += x * x;
-    }
-    c->length[i] = sqrt(sum);
-  }
-  for (k = 0; k < IP_LEVELS; ++k) {
-    double most = 0.0;
-    for (i = r; i < r + ip_level_rows[k]; ++i) {
-      most = fmax(most, c->length[i]);
-    }
-    for (i = r; i < r + ip_level_rows[k]; ++i) {
-      c->length[i] = most;
-    }
-    r += ip_level_rows[k];
-  }
-  for (i = 0; i < IP_EQUATIONS; ++i) {
-    c->length[i] = c->length[i] == 0.0 ? 1.0 : c->length[i];
-  }
-  c->space = -1.0;
-  ip_measure_rank(c);
 }
 
 /* out = T x, added to out. */

@@ -156,14 +156,13 @@ static void ip_answer(ip_context *c, ip_command *out)
     ip_hold(c, IP_NON_FINITE, c->v, out);
     return;
   }
+  memset(c->gave, 0, sizeof c->gave);
+  memset(c->missed, 0, sizeof c->missed);
   if (!c->independent) {
     ip_cool(c);
-    ip_hold(c, IP_UNSOLVED, c->v, out);
-    return;
   }
-  memset(c->gave, 0, sizeof c->gave);
-  flag = ip_solve_warm(c);
-  if (flag <= 0 && flag != DAQP_EXIT_INFEASIBLE) {
+  flag = c->independent ? ip_solve_warm(c) : 0;
+  if (c->independent && flag <= 0 && flag != DAQP_EXIT_INFEASIBLE) {
     /* The solver gave up from its warm start.  Try once without. */
     flag = ip_solve_warm(c);
   }
@@ -224,9 +223,6 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
     return 2;
   }
 #endif
-  for (i = 0; i < IP_EQUATIONS; ++i) {
-    c->length[i] = 1.0;
-  }
   ip_assemble(c);
   ip_begin_rank(c);
   for (i = 0; i < IP_NV; ++i) {
@@ -272,6 +268,7 @@ int ip_tick(ip_context *c, double t, const double q[IP_NQ], const double v[IP_NV
   ip_advance(c, dt);
   ip_build(c);
   ip_assemble(c);
+  ip_measure_rank(c);
   ip_answer(c, out);
   return out->status;
 }
@@ -289,6 +286,7 @@ void ip_last_report(const ip_context *c, ip_report *report)
   }
   report->iterations = c->iterations;
   memcpy(report->relaxed, c->gave, sizeof report->relaxed);
+  memcpy(report->deficient, c->missed, sizeof report->deficient);
   memcpy(report->multipliers, c->multipliers, sizeof report->multipliers);
   for (r = 0; r < IP_ROWS; ++r) {
     report->rows[r] = ip_dot(c->J[r], c->z, IP_NV) - c->a[r];
