@@ -5,29 +5,23 @@
 
 #include "daqp.h"
 
-/* DAQP finds the active rows of a level, with a weight of the step (squared) against the violation: at first this,
- * and LIGHTER times as much where steps do not become shorter.  The exact answer of these rows then follows without
- * it, by orthogonal elimination. */
-#define STEP_WEIGHT 1e-4
-#define LIGHTER 1e-2
-#define LEAST_WEIGHT 1e-6
-/* Most steps of a level, each around the last answer, which undo the weight.  Relative to the one before, a step that
- * may be the last one, and one that calls for less weight. */
-#define MOST_STEPS 8
-#define SMALL_STEP 1e-2
-#define FLAT_STEP 0.1
+/* DAQP finds the active rows of a level nearly, with this weight of the step (squared) against the violation, by steps
+ * that each start at the last answer.  The exact answer then follows by moves with eliminated rows, which a bound may
+ * stop, and which count against the budget like so many iterations for each row. */
+#define STEP_WEIGHT 1e-5
+#define MOST_STEPS 4
+#define MOST_MOVES 24
+#define MOVE_COST 0.3
 /* Largest violation of a bound, and the violation that counts, relative to the numbers of the problem. */
-#define EXACT 1e-10
+#define EXACT 1e-9
 #define COUNTS 1e-7
 /* Largest violation of level 0 in the end. */
 #define WRONG 1e-7
-/* Rounding of a level's program, times its weight. */
-#define NOISE 3e-14
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
 #define ROUNDING 1e-10
 /* Length of a row that cannot move any more, and least pivot of an elimination, relative to the row's own length. */
-#define FLAT 1e-9
-#define PIVOT 1e-6
+#define FLAT 1e-12
+#define PIVOT 1e-8
 /* Tried in order: added to the reduced cost, relative to its largest entry, where it is too flat. */
 static const double PROXIMAL[] = {0.0, 1e-9, 1e-6, 1e-3};
 
@@ -47,7 +41,7 @@ typedef struct {
     int *entry, count;           /* entries of these rows */
     int soft;                    /* coordinates that the exact rows of an elimination take */
     int *warm;                   /* levels + 2 times entries: active rows of each program at the last solution */
-    double tolerance, weight, scale; /* `scale`: size of the point, in `unit` */
+    double tolerance, scale; /* `scale`: size of the point, in `unit` */
 } Relaxation;
 
 static double dot(const double *a, const double *b, int n) {
@@ -92,6 +86,9 @@ static int is_equation(const Relaxation *r, int entry) { return r->p->lower[entr
 static double violation(const Relaxation *r, int entry) {
     return fmax(r->lower[entry] - r->value[entry], r->value[entry] - r->upper[entry]);
 }
+
+/* Smallest violation of an entry that counts. */
+static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
 
 /* Compute [z; A z]. */
 static void update_values(Relaxation *r) {
@@ -207,56 +204,66 @@ static int turn(Relaxation *r, int exact, int all) {
     return rank;
 }
 
-/* Move by r->step unless a row of the program would violate its bounds; return whether none does. */
+/* Move by r->step until a row of the program stops it.  Return that row's entry, or -1 where none does. */
 static int move(Relaxation *r, int all) {
     const int n = r->n, free = n - r->fixed;
-    int fits = 1;
-    memcpy(r->before, r->z, (size_t)n * sizeof *r->z);
-    for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + i * n + r->fixed, r->step, free);
+    double part = 1;
+    int stop = -1;
     for (int i = 0; i < all; i++) r->held[r->rows[i]] = 1;
-    for (int j = 0; j < r->count && fits; j++) {
+    for (int j = 0; j < r->count; j++) {
         const int i = r->entry[j];
-        const double room = r->tolerance * r->length[i], value = value_of(r, i);
-        fits = r->held[i] || (value <= fmax(r->upper[i], r->value[i]) + room &&
-                              value >= fmin(r->lower[i], r->value[i]) - room);
+        if (r->held[i]) continue;
+        const double by = dot(motion(r, i), r->step, free), room = r->tolerance * r->length[i];
+        const double upper = fmax(r->upper[i], r->value[i]), lower = fmin(r->lower[i], r->value[i]);
+        if (r->value[i] + part * by > upper + room)
+            part = (upper - r->value[i]) / by, stop = i;
+        else if (r->value[i] + part * by < lower - room)
+            part = (lower - r->value[i]) / by, stop = i;
     }
-    if (!fits) {
-        memcpy(r->z, r->before, (size_t)n * sizeof *r->z);
-        for (int i = 0; i < all; i++) r->held[r->rows[i]] = 0;
-    }
-    return fits;
+    for (int i = 0; i < all; i++) r->held[r->rows[i]] = 0;
+    for (int i = 0; i < n; i++) r->z[i] += part * dot(r->Z + i * n + r->fixed, r->step, free);
+    update_values(r);
+    if (stop >= 0) r->goal[stop] = dot(motion(r, stop), r->step, free) > 0 ? r->upper[stop] : r->lower[stop];
+    return stop;
 }
 
-/* Drop the exact rows without a multiplier, or with one of the wrong sign, from the list of turn(), after its move.
- * Return how many are left, as a negative number where none was dropped. */
-static int drop_rows(Relaxation *r, int exact, int all) {
+/* Drop the rows that the answer does not need from the list of turn(), after its move: exact rows without a multiplier
+ * or with one of the wrong sign, and inequalities that hold.  Return whether there are any. */
+static int drop_rows(Relaxation *r, int *exact, int *all) {
     double *force = r->column, most = 0;
-    int kept = 0, changed = 0;
-    for (int k = 0; k < r->soft; k++) force[k] = 0;
-    for (int i = exact; i < all; i++)
-        add(force, r->goal[r->rows[i]] - value_of(r, r->rows[i]), r->B + i * r->n, r->soft);
-    for (int i = 0; i < exact; i++) r->rhs[i] = 0;
-    for (int k = r->soft - 1; k >= 0; k--) {
-        const double *b = r->B + r->lead[k] * r->n, multiplier = force[k] / b[k];
-        add(force, -multiplier, b, k);
-        r->rhs[r->lead[k]] = multiplier * r->length[r->rows[r->lead[k]]];
-        most = fmax(most, fabs(r->rhs[r->lead[k]]));
+    int kept = 0, first = *exact, dropped = 0;
+    memset(force, 0, (size_t)r->soft * sizeof *force);
+    memset(r->rhs, 0, (size_t)first * sizeof *r->rhs);
+    for (int i = first; i < *all; i++) {
+        const double miss = r->goal[r->rows[i]] - r->value[r->rows[i]];
+        if (fabs(miss) <= least(r, r->rows[i])) continue;
+        add(force, miss, r->B + i * r->n, r->soft);
+        most = fmax(most, fabs(miss) * r->length[r->rows[i]]);
     }
-    for (int i = 0; i < all; i++) {
+    for (int k = r->soft - 1; k >= 0; k--) {
+        const int i = r->lead[k];
+        const double *b = r->B + i * r->n, multiplier = force[k] / b[k];
+        add(force, -multiplier, b, k);
+        r->rhs[i] = multiplier * r->length[r->rows[i]];
+    }
+    for (int i = 0; i < *all; i++) {
         const int row = r->rows[i];
         const double pushes = r->goal[row] == r->upper[row] ? r->rhs[i] : -r->rhs[i];
-        if (i < exact && !(pushes > COUNTS * most)) {
-            r->held[row] = 0;
-            changed++;
+        const int needed = i < first ? pushes > COUNTS * most && most > 0 : is_equation(r, row) || violation(r, row) > least(r, row);
+        if (!needed) {
+            dropped++;
+            if (i < first) --*exact;
         } else
             r->rows[kept++] = row;
     }
-    return changed ? kept : -kept;
+    *all = kept;
+    return dropped;
 }
 
 /* Leave out the first `rank` of the coordinates of turn(). */
 static void eliminate(Relaxation *r, int rank) {
     const int n = r->n, free = n - r->fixed, rest = free - rank;
+    if (!rank) return;
     if (rest < rank) {
         /* Few coordinates are left: Z times each of them. */
         for (int c = 0; c < rest; c++) {
@@ -275,8 +282,7 @@ static void eliminate(Relaxation *r, int rank) {
             for (int k = 0; k < rank; k++)
                 reflect(r->v + k * n, r->tau[k], r->Z + i * n + r->fixed + k, free - k);
     r->fixed += rank;
-    update_values(r);
-    update_rows(r);
+    if (rest) update_rows(r);
 }
 
 /* ---- least-distance programs ---------------------------------------------------------------------------------- */
@@ -303,7 +309,7 @@ static void list_rows(Relaxation *r, int level, const double *L) {
         /* The tolerance of a row is relative to its length in the units of the problem.  That of the cost is what
          * rounding permits; its active rows are made exact afterwards. */
         r->daqp.scaling[count] = L ? 1 : r->length[i] / size;
-        r->daqp.rho_ls[count] = r->daqp.rho_us[count] = r->weight * longest * longest / (r->length[i] * r->length[i]);
+        r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * longest * longest / (r->length[i] * r->length[i]);
         r->daqp.sense[count] = (soft ? DAQP_SOFT : 0) | (equal ? DAQP_ACTIVE | DAQP_IMMUTABLE : 0);
         if (warm[i] & DAQP_ACTIVE) r->daqp.sense[count] |= warm[i];
         r->entry[count++] = i;
@@ -326,7 +332,7 @@ static double set_bounds(Relaxation *r, const double *wanted) {
     }
     const double unit = fmax(largest, EXACT * size);
     r->scale = size;
-    r->tolerance = fmax(EXACT, NOISE / r->weight) * (wanted ? size : fmax(size, unit));
+    r->tolerance = EXACT * (wanted ? size : fmax(size, unit));
     r->settings.primal_tol = wanted ? ROUNDING : r->tolerance / unit;
     for (int j = 0; j < r->count; j++) {
         r->daqp.dupper[j] /= unit;
@@ -356,9 +362,6 @@ static void keep_active(Relaxation *r, int level) {
     for (int j = 0; j < r->count; j++) warm[r->entry[j]] = r->daqp.sense[j] & (DAQP_ACTIVE | DAQP_LOWER);
 }
 
-/* Smallest violation of an entry that counts. */
-static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
-
 /* List what determines the level's answer: the active rows of the levels above, then the level's own equations and
  * violated rows.  Return the number of the former; `all` is that of both. */
 static int list_held(Relaxation *r, int level, int missed, int *all) {
@@ -378,62 +381,64 @@ static int list_held(Relaxation *r, int level, int missed, int *all) {
     return exact;
 }
 
+/* Find the exact answer of a level from nearly the right rows, and return how many coordinates they take. */
+static int finish_level(Relaxation *r, int level, int missed, int *all) {
+    int exact = list_held(r, level, missed, all), last = -1;
+    for (int k = 0; k < MOST_MOVES && r->left > 1; k++) {
+        const int rank = turn(r, exact, *all), stop = move(r, *all);
+        r->left -= (int)(MOVE_COST * *all);
+#ifdef RELAXATION_TRACE
+        RELAXATION_TRACE("move", rank, stop, (double)*all);
+#endif
+        if (stop < 0 && !drop_rows(r, &exact, all)) return rank;
+        if (stop < 0) continue;
+        if (stop == last) break;
+        last = stop;
+        r->rows[*all] = stop;
+        if (r->p->level[stop] < level || level == 0) {
+            r->rows[*all] = r->rows[exact];
+            r->rows[exact++] = stop;
+        }
+        ++*all;
+    }
+    /* The point is good, if not the best: its rows stay as they are. */
+    list_held(r, level, missed, all);
+    for (int i = 0; i < *all; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
+    return turn(r, 0, *all);
+}
+
 /* Bring the point as near to a level as the levels above permit, then keep it there. */
 static int solve_level(Relaxation *r, int level) {
     const int free = r->n - r->fixed;
-    int flag = 1, missed = 0, all = 0, rank, done = 0;
-    double before = 0;
-    int flat = 0;
-    r->weight = STEP_WEIGHT;
+    int missed = 0, all = 0, same = 0;
     list_rows(r, level, NULL);
-    for (int k = 0; k < MOST_STEPS && !done; k++) {
+    for (int k = 0; k < MOST_STEPS && !same && r->count; k++) {
         const double unit = set_bounds(r, NULL);
         const int left = r->left;
-        if (r->count) {
-            r->daqp.reuse_ind = 0;
-            for (int j = 0; flat && j < r->count; j++) r->daqp.rho_us[j] = r->daqp.rho_ls[j] *= LIGHTER;
-            if (flat) r->weight *= LIGHTER;
-            flag = k && !flat ? run(r) : start(r);
-            keep_active(r, level);
-            if (flag == DAQP_EXIT_ITERLIMIT || (flag <= 0 && level <= 1 && !k)) return flag;
-            if (flag <= 0) break;
-            const double length = unit * norm(r->daqp.u, free);
-            for (int i = 0; i < r->n; i++) r->z[i] += unit * dot(r->Z + i * r->n + r->fixed, r->daqp.u, free);
-            update_values(r);
-            missed = 0;
-            for (int j = 0; j < r->count && !missed; j++)
-                missed = (r->daqp.sense[j] & DAQP_SOFT) && violation(r, r->entry[j]) > least(r, r->entry[j]);
-#ifdef RELAXATION_TRACE
-            RELAXATION_TRACE("step", level, r->daqp.iterations, length);
-#endif
-            /* The active rows are final only where another step finds the same. */
-            const int same = left - r->left == 1 && k;
-            flat = same && length > FLAT_STEP * before && r->weight > 1.001 * LEAST_WEIGHT;
-            before = length;
-            /* The active rows are final only where another step finds the same. */
-            if (missed && !same) continue;
+        r->daqp.reuse_ind = 0;
+        int flag = k ? run(r) : start(r);
+        if (flag <= 0 && flag != DAQP_EXIT_ITERLIMIT && !k) {
+            /* A larger weight is easier. */
+            for (int j = 0; j < r->count; j++) r->daqp.rho_us[j] = r->daqp.rho_ls[j] *= 100;
+            flag = start(r);
         }
-        int exact = list_held(r, level, missed, &all), left_over;
-        do {
-            rank = turn(r, exact, all);
-            done = move(r, all);
-            left_over = done && exact ? drop_rows(r, exact, all) : -all;
-            if (left_over > 0) {
-                memcpy(r->z, r->before, (size_t)r->n * sizeof *r->z);
-                exact -= all - left_over;
-                all = left_over;
-            }
-        } while (left_over > 0);
-    }
-    if (!done) {
-        list_held(r, level, missed, &all);
-        for (int i = 0; i < all; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
-        rank = turn(r, 0, all);
-        for (int i = 0; i < all; i++) r->held[r->rows[i]] = 1;
-    }
+        keep_active(r, level);
+        if (flag == DAQP_EXIT_ITERLIMIT || (flag <= 0 && level <= 1 && !k)) return flag;
+        if (flag <= 0) break;
+        for (int i = 0; i < r->n; i++) r->z[i] += unit * dot(r->Z + i * r->n + r->fixed, r->daqp.u, free);
+        update_values(r);
 #ifdef RELAXATION_TRACE
-    RELAXATION_TRACE("done", done, rank, all);
+        RELAXATION_TRACE("step", level, r->daqp.iterations, unit * norm(r->daqp.u, free));
 #endif
+        missed = 0;
+        for (int j = 0; j < r->count && !missed; j++)
+            missed = (r->daqp.sense[j] & DAQP_SOFT) && violation(r, r->entry[j]) > least(r, r->entry[j]);
+        same = !missed || (k && left - r->left == 1);
+    }
+    const int rank = finish_level(r, level, missed, &all);
+    /* A dependent row may still move by rounding: an inequality goes on as one. */
+    for (int i = 0; i < all; i++) r->held[r->rows[i]] = is_equation(r, r->rows[i]);
+    for (int k = 0; k < rank; k++) r->held[r->rows[r->lead[k]]] = 1;
     eliminate(r, rank);
     /* The point is a solution, whatever rounding makes of its rows. */
     for (int i = 0; i < r->entries; i++)
@@ -441,7 +446,7 @@ static int solve_level(Relaxation *r, int level) {
             r->lower[i] = fmin(r->lower[i], r->value[i]);
             r->upper[i] = fmax(r->upper[i], r->value[i]);
         }
-    return 1;
+    return r->left > 1 ? 1 : DAQP_EXIT_ITERLIMIT;
 }
 
 /* Factorize the reduced cost plus `share` of its largest entry; false where it is not positive. */
@@ -596,6 +601,7 @@ int relaxation_solve(const relaxation_problem *p, void *work, int budget, double
         }
     const int rank = turn(&r, always, always);
     move(&r, always);
+    for (int i = 0; i < always; i++) r.held[r.rows[i]] = 1;
     eliminate(&r, rank);
     for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++) flag = solve_level(&r, level);
     if (flag > 0) {
