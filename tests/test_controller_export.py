@@ -106,6 +106,24 @@ def test_the_impact_robust_term_is_that_of_python_through_its_phases(name: str, 
     assert {0.0, 1.0} < levels
 
 
+def test_a_singular_arm_is_damped_as_in_python() -> None:
+    robot, formulation = formulation_of("panda")
+    ours, theirs = Controller(robot, formulation), compiled("panda")
+    ours.reset(robot.posture(), np.zeros(robot.nv))
+    theirs.reset(robot.posture(), np.zeros(robot.nv))
+    rng, deficient = np.random.default_rng(0), 0
+    for k in range(100):
+        q, v = random_state(robot, rng, 1.0)
+        a, b = ours.tick(1e-3 * k, q, 0.2 * v), theirs.tick(1e-3 * k, q, 0.2 * v)
+        assert a.status is b.status
+        if a.status is Status.SOLVED and ours.report().deficient:
+            deficient += 1
+            assert difference(a, b) < 1e-9
+            found, wanted = (c.report().deficient[0].amount for c in (theirs, ours))
+            assert found == pytest.approx(wanted, rel=1e-7)
+    assert deficient >= 2
+
+
 def test_targets_are_set_by_the_name_of_their_task() -> None:
     robot, formulation = formulation_of("panda")
     ours, theirs = Controller(robot, formulation), compiled("panda")

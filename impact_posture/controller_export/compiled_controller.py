@@ -114,6 +114,8 @@ class CompiledController:
         """
         targets = {name: row.copy() for name, row in self._targets.items()}
         refused = self._call("init", ctypes.byref(self._given))
+        if refused < 0:
+            raise SpecError("has too little memory for the relaxation", where="controller", hint="run codegen again")
         if refused:
             name = list(self.parameters)[refused - 1]
             values = ", ".join(f"{x:g}" for x in self.parameters[name][:8])

@@ -110,9 +110,11 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
     nv, equations = sizes["NV"], sizes["EQUATIONS"]
     n, m = sizes["VARIABLES"], sizes["GENERAL"] - sizes["BOUNDED"]
     more = {
-        "SCRATCH": max(3 * nv * nv, 2 * n * (n + equations) + 2 * equations * equations), "BOUNDS": bounds, "GAVE": 1 + sizes["LEVELS"],
+        "SCRATCH": max(3 * nv * nv, 2 * n * (n + equations) + 2 * equations * equations),
+        "BOUNDS": bounds,
+        "GAVE": 1 + sizes["LEVELS"],
         "RELAXATION": _relaxation_room(n, m, 1 + sizes["LEVELS"]),
-    }  # fmt: skip
+    }
     room = {name: max(1, value) for name, value in (sizes | more).items()}
     n += 1
     solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * bounds) + 2048
@@ -120,12 +122,13 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
     tables.append(("gravity", *_table(np.array(robot.model.gravity.linear, dtype=float))))
     allocation = s.actuators.G[: sizes["BASE"], : sizes["ROTORS"]]
     tables.append(("allocation", *_table(allocation)))
+    named_fields = [(field.name, k) for k, field in enumerate(fields, 1) if field.name in _NAMED]
     context: dict[str, Any] = {
         "robot": robot.name, "version": __version__, "prefix": prefix, "sizes": sizes, "room": room, "fields": fields,
         "q_names": configuration_names(robot), "v_names": robot.tangent_names, "u_names": s.actuators.names,
         "convention": robot.convention, "tasks": [t.name for t in s.tasks] or ["none"], "metric": metric,
         "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
-        "identity": identity, "tables": tables, "named": [(f.name, k) for k, f in enumerate(fields, 1) if f.name in _NAMED], "literals": _initializer,
+        "identity": identity, "tables": tables, "named": named_fields, "literals": _initializer,
         "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
         "constants": code.constants, "blocks": code.blocks, "angles": code.angles, "work": code.work,
         "places": _braced(map(str, code.angles)), "outputs": code.outputs, "constant_outputs": code.constant_outputs,
