@@ -163,6 +163,28 @@ def test_what_no_level_asks_for_goes_to_the_cost(relaxation: Relaxation) -> None
             assert np.allclose(z, best.x, atol=1e-5)
 
 
+def test_without_levels_or_rows(relaxation: Relaxation) -> None:
+    """The least of z²/2 with z ≥ 1 is 1, whatever the level of the bound is."""
+    for level in (0, 1):
+        one = np.ones(1)
+        tick = RelaxedTick(np.eye(1), 0 * one, np.zeros((0, 1)), one, np.inf * one, np.array([level]), one, one)
+        answer = relaxation.solve(tick)
+        assert answer.code == SOLVED and answer.z[0] == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_budget_is_kept(relaxation: Relaxation) -> None:
+    """With too few iterations there is a code and no answer; the next tick goes on from where this one stopped."""
+    tick = ticks_of("talos", "legged")[-1]
+    relaxation.forget()
+    needed = relaxation.solve(tick).iterations
+    assert needed > 50
+    relaxation.forget()
+    for budget in (1, 2, 10, needed // 2):
+        answer = relaxation.solve(tick, budget)
+        assert answer.code == BUDGET and answer.iterations <= budget + tick.g.size
+    assert relaxation.solve(tick).iterations < needed
+
+
 def test_what_has_no_answer(relaxation: Relaxation) -> None:
     relaxation.forget()
     bounds = np.array([-np.inf, -np.inf, 5.0, 2.0, 3.0]), np.array([np.inf, np.inf, 6.0, 2.0, 3.0])

@@ -64,6 +64,7 @@ STUDIES = {
         Study("kernel", "kernel.times", "H and ∇H beside Pinocchio C++, ADAM and CasADi; passes", 101),
         Study("loader", "exported:loader", "a call of exported code from Python; passes", 100, page=False),
         Study("tsid", "tsid", "a tick of the online controllers; ticks", 2000),
+        Study("relaxed", "relaxed", "relaxed ticks in C of pushed robots; budget of iterations", 100, page=False),
         Study("digits", "digits", "the digits that double precision keeps with feet; random postures", 3),
         Study("shapes", "shapes", "the collision shapes of the catalogue, fitted anew"),
         Study("feasible", "feasible", "what it costs to be clear of collisions and held", target="study-feasible"),

@@ -23,13 +23,13 @@
 #define FLAT 1e-12
 #define PIVOT 1e-8
 /* Tried in order: added to the reduced cost, relative to its largest entry, where it is too flat. */
-static const double PROXIMAL[] = {0.0, 1e-9, 1e-6, 1e-3};
+static const double PROXIMAL[] = {0.0, 1e-6, 1e-3};
 
 typedef struct {
     const relaxation_problem *p;
     int n, entries, fixed, left; /* variables, entries of [z; A z], eliminated coordinates, iterations left */
     double *Z, *T;               /* n x n and m x n: z and A z move by the columns from `fixed` on */
-    double *z, *before, *value, *lower, *upper, *length; /* the point, [z; A z], opened bounds, lengths in `unit` */
+    double *z, *value, *lower, *upper, *length; /* the point, [z; A z], opened bounds, lengths in `unit` */
     int *first, *last, *held;    /* range of a row's entries that are not zero; whether an entry is eliminated */
     double *goal;                /* values that listed rows are to have */
     double *B, *v, *tau, *rhs, *step, *column; /* of an elimination */
@@ -40,8 +40,9 @@ typedef struct {
     double *M, *size;            /* normalized rows of a least-distance program, and their former lengths */
     int *entry, count;           /* entries of these rows */
     int soft;                    /* coordinates that the exact rows of an elimination take */
+    int *proximal;               /* the proximal term of the cost that the last solution needed */
     int *warm;                   /* levels + 2 times entries: active rows of each program at the last solution */
-    double tolerance, scale; /* `scale`: size of the point, in `unit` */
+    double tolerance, scale;     /* violation that DAQP may leave; size of the point, in `unit` */
 } Relaxation;
 
 static double dot(const double *a, const double *b, int n) {
@@ -231,7 +232,8 @@ static int move(Relaxation *r, int all) {
  * or with one of the wrong sign, and inequalities that hold.  Return whether there are any. */
 static int drop_rows(Relaxation *r, int *exact, int *all) {
     double *force = r->column, most = 0;
-    int kept = 0, first = *exact, dropped = 0;
+    const int first = *exact;
+    int kept = 0;
     memset(force, 0, (size_t)r->soft * sizeof *force);
     memset(r->rhs, 0, (size_t)first * sizeof *r->rhs);
     for (int i = first; i < *all; i++) {
@@ -249,13 +251,12 @@ static int drop_rows(Relaxation *r, int *exact, int *all) {
     for (int i = 0; i < *all; i++) {
         const int row = r->rows[i];
         const double pushes = r->goal[row] == r->upper[row] ? r->rhs[i] : -r->rhs[i];
-        const int needed = i < first ? pushes > COUNTS * most && most > 0 : is_equation(r, row) || violation(r, row) > least(r, row);
-        if (!needed) {
-            dropped++;
-            if (i < first) --*exact;
-        } else
+        if (i < first ? most > 0 && pushes > COUNTS * most : is_equation(r, row) || violation(r, row) > least(r, row))
             r->rows[kept++] = row;
+        else if (i < first)
+            --*exact;
     }
+    const int dropped = *all - kept;
     *all = kept;
     return dropped;
 }
@@ -309,7 +310,8 @@ static void list_rows(Relaxation *r, int level, const double *L) {
         /* The tolerance of a row is relative to its length in the units of the problem.  That of the cost is what
          * rounding permits; its active rows are made exact afterwards. */
         r->daqp.scaling[count] = L ? 1 : r->length[i] / size;
-        r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * longest * longest / (r->length[i] * r->length[i]);
+        const double ratio = longest / r->length[i];
+        r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * ratio * ratio;
         r->daqp.sense[count] = (soft ? DAQP_SOFT : 0) | (equal ? DAQP_ACTIVE | DAQP_IMMUTABLE : 0);
         if (warm[i] & DAQP_ACTIVE) r->daqp.sense[count] |= warm[i];
         r->entry[count++] = i;
@@ -387,9 +389,6 @@ static int finish_level(Relaxation *r, int level, int missed, int *all) {
     for (int k = 0; k < MOST_MOVES && r->left > 1; k++) {
         const int rank = turn(r, exact, *all), stop = move(r, *all);
         r->left -= (int)(MOVE_COST * *all);
-#ifdef RELAXATION_TRACE
-        RELAXATION_TRACE("move", rank, stop, (double)*all);
-#endif
         if (stop < 0 && !drop_rows(r, &exact, all)) return rank;
         if (stop < 0) continue;
         if (stop == last) break;
@@ -427,9 +426,6 @@ static int solve_level(Relaxation *r, int level) {
         if (flag <= 0) break;
         for (int i = 0; i < r->n; i++) r->z[i] += unit * dot(r->Z + i * r->n + r->fixed, r->daqp.u, free);
         update_values(r);
-#ifdef RELAXATION_TRACE
-        RELAXATION_TRACE("step", level, r->daqp.iterations, unit * norm(r->daqp.u, free));
-#endif
         missed = 0;
         for (int j = 0; j < r->count && !missed; j++)
             missed = (r->daqp.sense[j] & DAQP_SOFT) && violation(r, r->entry[j]) > least(r, r->entry[j]);
@@ -482,40 +478,60 @@ static int factorize(Relaxation *r, double share) {
     return 1;
 }
 
-/* Minimize the cost in the coordinates that are left. */
+/* Turn whitened coordinates into those of Z. */
+static void unwhiten(const Relaxation *r, double *y) {
+    for (int i = r->n - r->fixed - 1; i >= 0; i--) {
+        y[i] /= r->L[i * r->n + i];
+        add(y, -y[i], r->L + i * r->n, i);
+    }
+}
+
+/* Move to the minimum of the cost with the active rows of its program held, where a proximal term has kept it off. */
+static void finish_cost(Relaxation *r, int active) {
+    for (int k = 0; k < MOST_MOVES; k++) {
+        const int rank = turn(r, active, active);
+        for (int i = 0; i < active; i++) r->held[r->rows[i]] = 1;
+        eliminate(r, rank);
+        const int free = r->n - r->fixed;
+        if (!free || !factorize(r, 0)) return;
+        memcpy(r->step, r->wanted, (size_t)free * sizeof *r->step);
+        unwhiten(r, r->step);
+        const int stop = move(r, 0);
+        if (stop < 0) return;
+        r->rows[0] = stop;
+        active = 1;
+    }
+}
+
+/* Minimize the cost in the coordinates that are left.  What is too flat once starts with a proximal term afterwards,
+ * because DAQP notices a cycle only after many iterations. */
 static int solve_cost(Relaxation *r) {
     const int n = r->n, free = n - r->fixed;
-    int flag = 0;
+    int flag = 0, active = 0;
     if (!free) return 1;
-    for (size_t k = 0; k < sizeof PROXIMAL / sizeof *PROXIMAL; k++) {
-        if (!factorize(r, PROXIMAL[k])) continue;
+    for (; *r->proximal < (int)(sizeof PROXIMAL / sizeof *PROXIMAL); ++*r->proximal) {
+        if (!factorize(r, PROXIMAL[*r->proximal])) continue;
         list_rows(r, r->p->levels + 1, r->L);
         const double unit = set_bounds(r, r->wanted);
         flag = start(r);
-#ifdef RELAXATION_TRACE
-        RELAXATION_TRACE("cost", flag, r->daqp.iterations, PROXIMAL[k]);
-#endif
         keep_active(r, r->p->levels + 1);
         if (flag == DAQP_EXIT_ITERLIMIT) return flag;
         if (flag <= 0) continue;
-        double *y = r->wanted;
-        add(y, unit, r->daqp.u, free);
-        for (int i = free - 1; i >= 0; i--) {
-            y[i] /= r->L[i * n + i];
-            add(y, -y[i], r->L + i * n, i);
-        }
-        for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + i * n + r->fixed, y, free);
+        add(r->wanted, unit, r->daqp.u, free);
+        unwhiten(r, r->wanted);
+        for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + i * n + r->fixed, r->wanted, free);
         update_values(r);
-        int active = 0;
-        for (int j = 0; j < r->daqp.n_active; j++) {
-            const int at = r->daqp.WS[j], i = r->entry[at];
+        for (; active < r->daqp.n_active; active++) {
+            const int at = r->daqp.WS[active], i = r->entry[at];
             r->goal[i] = (r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i];
-            r->rows[active++] = i;
+            r->rows[active] = i;
         }
         turn(r, active, active);
         move(r, active);
+        if (*r->proximal) finish_cost(r, active);
         return 1;
     }
+    *r->proximal = 0;
     return flag;
 }
 
@@ -532,15 +548,17 @@ static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels
     const size_t e = n + m, active = n + e + 2;
     size_t used = 0;
     const struct { double **array; size_t count; } doubles[] = {
-        {&r->Z, n * n}, {&r->T, m * n}, {&r->z, n}, {&r->before, n}, {&r->value, e}, {&r->lower, e}, {&r->upper, e},
-        {&r->length, e}, {&r->B, e * n}, {&r->v, n * n}, {&r->tau, n}, {&r->rhs, e}, {&r->goal, e}, {&r->step, n}, {&r->column, e},
+        {&r->Z, n * n}, {&r->T, m * n}, {&r->z, n}, {&r->value, e}, {&r->lower, e}, {&r->upper, e},
+        {&r->length, e}, {&r->B, e * n}, {&r->v, n * n}, {&r->tau, n}, {&r->rhs, e}, {&r->goal, e}, {&r->step, n},
+        {&r->column, e},
         {&r->L, n * n}, {&r->wanted, n}, {&r->M, e * n}, {&r->size, e}, {&r->daqp.dupper, e}, {&r->daqp.dlower, e},
         {&r->daqp.scaling, e}, {&r->daqp.Mu, e}, {&r->daqp.rho_ls, e}, {&r->daqp.rho_us, e}, {&r->daqp.w_ls, e},
         {&r->daqp.lam, active}, {&r->daqp.lam_star, active}, {&r->daqp.D, active}, {&r->daqp.xldl, active},
         {&r->daqp.zldl, active}, {&r->daqp.L, active * (active + 1) / 2}, {&r->daqp.u, n}, {&r->daqp.xold, n},
     };
     const struct { int **array; size_t count; } ints[] = {
-        {&r->warm, (levels + 2) * e}, {&r->first, m}, {&r->last, m}, {&r->held, e}, {&r->rows, e}, {&r->lead, n}, {&r->entry, e},
+        {&r->proximal, 1}, {&r->warm, (levels + 2) * e}, {&r->first, m}, {&r->last, m}, {&r->held, e}, {&r->rows, e},
+        {&r->lead, n}, {&r->entry, e},
         {&r->daqp.sense, e}, {&r->daqp.WS, active}, {&r->daqp.prox_mask, n},
     };
     /* The active rows, which outlive a solution, come first. */
@@ -603,7 +621,8 @@ int relaxation_solve(const relaxation_problem *p, void *work, int budget, double
     move(&r, always);
     for (int i = 0; i < always; i++) r.held[r.rows[i]] = 1;
     eliminate(&r, rank);
-    for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++) flag = solve_level(&r, level);
+    for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++)
+        flag = solve_level(&r, level);
     if (flag > 0) {
         flag = solve_cost(&r);
         if (flag != DAQP_EXIT_ITERLIMIT) flag = flag > 0 ? RELAXATION_SOLVED : RELAXATION_WITHOUT_COST;

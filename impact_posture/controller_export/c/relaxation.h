@@ -48,7 +48,7 @@ typedef struct {
 size_t relaxation_bytes(int n, int m, int levels);
 
 /* Write z (n numbers) where the result is positive, and return one of the codes above.
- * `budget`: most iterations of all quadratic programs together. */
+ * `budget`: most iterations of all quadratic programs together; a tick that has too few goes on with the next one. */
 int relaxation_solve(const relaxation_problem *problem, void *work, int budget, double *z, relaxation_report *report);
 
 #ifdef __cplusplus
