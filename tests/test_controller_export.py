@@ -9,7 +9,7 @@ import pytest
 from impact_posture.controller_export.compiled_controller import CompiledController
 from impact_posture.tsid.controller import Command, Controller, Report, Status
 from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
-from tests.exported_controller import KINDS, compiled, formulation_of, gradient_beside, impact_of, random_state
+from tests.exported_controller import compiled, formulation_of, gradient_beside, impact_of, random_state
 
 
 def difference(a: Command, b: Command) -> float:
@@ -27,7 +27,8 @@ def assert_same_report(a: Report, b: Report, size: float) -> None:
     assert (a.level, a.objective) == pytest.approx((b.level, b.objective), nan_ok=True)
 
 
-@pytest.mark.parametrize("name", KINDS)
+# The other robots of KINDS are in the study (make study-controller).
+@pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo8", "talos"])
 def test_the_commands_are_those_of_python(name: str) -> None:
     robot, formulation = formulation_of(name)
     ours, theirs = Controller(robot, formulation), compiled(name)
@@ -112,7 +113,7 @@ def test_a_singular_arm_is_damped_as_in_python() -> None:
     ours.reset(robot.posture(), np.zeros(robot.nv))
     theirs.reset(robot.posture(), np.zeros(robot.nv))
     rng, deficient = np.random.default_rng(0), 0
-    for k in range(100):
+    for k in range(280):
         q, v = random_state(robot, rng, 1.0)
         a, b = ours.tick(1e-3 * k, q, 0.2 * v), theirs.tick(1e-3 * k, q, 0.2 * v)
         assert a.status is b.status
