@@ -144,6 +144,22 @@ def test_targets_are_set_by_the_name_of_their_task() -> None:
         assert difference(ours.tick(0.004 * k, q, v), theirs.tick(0.004 * k, q, v)) < 1e-9
 
 
+def test_a_moving_reference_leads_the_posture() -> None:
+    robot, formulation = formulation_of("solo8")
+    ours, theirs = Controller(robot, formulation), compiled("solo8")
+    q, v = robot.posture(), np.zeros(robot.nv)
+    ours.reset(q, v)
+    theirs.reset(q, v)
+    posture = formulation.posture
+    assert posture is not None
+    goal = np.asarray(pin.integrate(robot.model, q, np.full(robot.nv, 0.02)))
+    posture._target[:], posture.target_velocity, posture.target_acceleration = goal, 0.3, -2.0
+    theirs.lead_posture(goal, 0.3, -2.0)
+    a, b = ours.tick(0.0, q, v), theirs.tick(0.0, q, v)
+    assert difference(a, b) < 1e-9
+    assert difference(a, theirs.reset(q, v)) > 1e-3
+
+
 def test_the_library_is_used_by_many_at_once() -> None:
     """Two contexts of one library do not disturb each other."""
     robot = formulation_of("panda")[0]

@@ -61,15 +61,22 @@ class CompiledController:
         memory = memoryview(self._context)
         targets = np.frombuffer(memory, dtype=float, count=_TARGET * tasks).reshape(tasks, _TARGET)
         self._targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
-        start = _TARGET * room("TASKS") * 8
-        motion = np.frombuffer(memory, dtype=float, count=2 * sizes["NV"], offset=start)
-        self.posture_velocity, self.posture_acceleration = np.split(motion, 2)
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
         doubles = ctypes.POINTER(ctypes.c_double)
         self._pointers = [x.ctypes.data_as(doubles) for x in (self._q, self._v, self._force)]
         self._functions = {
             name: getattr(library, f"{prefix}_{name}")
-            for name in ("init", "reset", "tick", "last_report", "move_to", "brace", "contact", "release")
+            for name in (
+                "init",
+                "reset",
+                "tick",
+                "last_report",
+                "move_to",
+                "lead_posture",
+                "brace",
+                "contact",
+                "release",
+            )
         }
         getattr(library, f"{prefix}_default_params")(ctypes.byref(self._given))
         self._ready = False
@@ -224,6 +231,18 @@ class CompiledController:
         self._q[:] = q
         if self._call("move_to", self._pointers[0], ctypes.c_double(over)):
             raise InputError("is no posture or no time", where="move_to", hint="give finite numbers, seconds above 0")
+
+    def lead_posture(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> None:
+        """Set ``q_des`` of the posture task, shape (nq,), with its velocity and acceleration, shape (nv,) each.
+
+        Raises:
+            InputError: A number is invalid, or ``reset`` has not been called.
+        """
+        self._q[:], self._v[:] = q, v
+        acceleration = np.ascontiguousarray(a, dtype=float) + np.zeros(self._v.size)
+        pointer = acceleration.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+        if self._call("lead_posture", *self._pointers[:2], pointer):
+            raise InputError("is no reference", where="lead_posture", hint="give a posture and finite numbers")
 
     def brace(self) -> None:
         """Switch the impact-robust term on."""

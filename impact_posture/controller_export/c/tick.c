@@ -323,6 +323,18 @@ int ip_move_to(ip_context *c, const double q[IP_NQ], double over)
   return 0;
 }
 
+int ip_lead_posture(ip_context *c, const double q[IP_NQ], const double v[IP_NV], const double a[IP_NV])
+{
+  if (!c->ready || !ip_measured(q, v, NULL) || !(ip_dot(a, a, IP_NV) < IP_ABSURD)) {
+    return 1;
+  }
+  memcpy(c->posture, q, sizeof c->posture);
+  memcpy(c->posture_velocity, v, sizeof c->posture_velocity);
+  memcpy(c->posture_acceleration, a, sizeof c->posture_acceleration);
+  c->blend = 1.0;
+  return 0;
+}
+
 int ip_brace(ip_context *c)
 {
   return ip_enter(c, IP_BRACE);
