@@ -102,7 +102,7 @@ def agreement(name: str, kind: str, ticks: int) -> Agreement:
 
 
 def no_worse(controller: Controller, a: Command, b: Command) -> bool:
-    """Return whether ``b`` answers the last program as well as ``a``: it violates less, or as little and costs no more.
+    """Return whether ``b`` answers the last program as well as ``a``: it violates less, or it costs no more.
 
     Python opens bounds a little where its solver fails at the program as it stands, and then it costs less.
     """
