@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from impact_posture import sweep, tsid
     from impact_posture.codegen.export import Export
     from impact_posture.codegen.impact_gradient import ImpactGradient
+    from impact_posture.controller_export.compiled_controller import CompiledController
+    from impact_posture.controller_export.export import export_controller
     from impact_posture.errors import ImpactPostureError
     from impact_posture.front_door import ImpactObjective, PostureProblem, PostureResult, optimize
     from impact_posture.impact.contact import ImpactContact, Support
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 
 
 _HOMES = {
+    "CompiledController": "controller_export.compiled_controller",
     "Export": "codegen.export",
     "ImpactContact": "impact.contact",
     "ImpactGradient": "codegen.impact_gradient",
@@ -43,6 +46,7 @@ _HOMES = {
     "PostureResult": "front_door",
     "Robot": "robot.robot",
     "Support": "impact.contact",
+    "export_controller": "controller_export.export",
     "known_robots": "robot.robot_loader",
     "load_robot": "robot.robot_loader",
     "optimize": "front_door",
@@ -51,6 +55,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "CompiledController",
     "Export",
     "ImpactContact",
     "ImpactGradient",
@@ -62,6 +67,7 @@ __all__ = [
     "Robot",
     "Support",
     "__version__",
+    "export_controller",
     "known_robots",
     "load_robot",
     "optimize",

@@ -26,7 +26,8 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 from tests.daqp import sources_or_skip
 
 KINDS: dict[str, ControllerKind] = {
-    "tilthex_arm": "aerial", "hextilt": "aerial", "panda": "arm", "solo8": "legged", "talos": "legged", "g1": "legged",
+    "tilthex_arm": "aerial", "hextilt": "aerial", "panda": "arm",
+    "solo8": "legged", "talos": "legged", "g1": "legged",
 }  # fmt: skip
 _KEPT = TemporaryDirectory()
 
@@ -43,11 +44,10 @@ def _exported(name: str, objective: ImpactObjective | None, flags: str) -> Path:
     robot = load_robot(name)
     formulation = default_formulation(robot, KINDS[name], objective)
     given = os.environ.get("DAQP_SOURCES")
+    daqp = Path(given) if given else None
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CFLAGS", flags)
-        export_controller(
-            robot, formulation, out, objective=objective, prefix="ctl", daqp=Path(given) if given else None, build=True
-        )
+        export_controller(robot, formulation, out, objective=objective, prefix="ctl", daqp=daqp, build=True)
     return out
 
 

@@ -48,6 +48,7 @@ class CompiledController:
         rows += [
             ("multipliers", max(1, bounds)),
             ("relaxed", 1 + len(manifest.levels)),
+            ("deficient", room("LEVELS")),
             ("dynamics", 1),
             ("level", 1),
             ("value", 1),
@@ -60,15 +61,22 @@ class CompiledController:
         memory = memoryview(self._context)
         targets = np.frombuffer(memory, dtype=float, count=_TARGET * tasks).reshape(tasks, _TARGET)
         self._targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
-        start = _TARGET * room("TASKS") * 8
-        motion = np.frombuffer(memory, dtype=float, count=2 * sizes["NV"], offset=start)
-        self.posture_velocity, self.posture_acceleration = np.split(motion, 2)
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
         doubles = ctypes.POINTER(ctypes.c_double)
         self._pointers = [x.ctypes.data_as(doubles) for x in (self._q, self._v, self._force)]
         self._functions = {
             name: getattr(library, f"{prefix}_{name}")
-            for name in ("init", "reset", "tick", "last_report", "move_to", "brace", "contact", "release")
+            for name in (
+                "init",
+                "reset",
+                "tick",
+                "last_report",
+                "move_to",
+                "lead_posture",
+                "brace",
+                "contact",
+                "release",
+            )
         }
         getattr(library, f"{prefix}_default_params")(ctypes.byref(self._given))
         self._ready = False
@@ -113,6 +121,8 @@ class CompiledController:
         """
         targets = {name: row.copy() for name, row in self._targets.items()}
         refused = self._call("init", ctypes.byref(self._given))
+        if refused < 0:
+            raise SpecError("has too little memory for the relaxation", where="controller", hint="run codegen again")
         if refused:
             name = list(self.parameters)[refused - 1]
             values = ", ".join(f"{x:g}" for x in self.parameters[name][:8])
@@ -153,7 +163,7 @@ class CompiledController:
         return self._commanded()
 
     def report(self) -> Report:
-        """Return the diagnosis of the last tick; ``deficient`` is empty."""
+        """Return the diagnosis of the last tick."""
         checked, found = self._checked, self._diagnosis
         self._call("last_report", ctypes.byref(self._report))
         status = _STATUSES[self._report.status]
@@ -177,7 +187,9 @@ class CompiledController:
         iterations = int(self._report.iterations)
         names = ("joint limits", *(name for name, _ in checked.levels))
         relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, found["relaxed"], strict=True) if x > 0)
-        return Report(status, relaxed, (), residuals, tuple(active), dynamics, level, value, iterations)
+        missed = zip(names[1:], found["deficient"], strict=False)
+        deficient = tuple(Relaxed(n, float(x)) for n, x in missed if x > 0)
+        return Report(status, relaxed, deficient, residuals, tuple(active), dynamics, level, value, iterations)
 
     # ---- targets and phases ------------------------------------------------------------------------------------
 
@@ -219,6 +231,18 @@ class CompiledController:
         self._q[:] = q
         if self._call("move_to", self._pointers[0], ctypes.c_double(over)):
             raise InputError("is no posture or no time", where="move_to", hint="give finite numbers, seconds above 0")
+
+    def lead_posture(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> None:
+        """Set ``q_des`` of the posture task, shape (nq,), with its velocity and acceleration, shape (nv,) each.
+
+        Raises:
+            InputError: A number is invalid, or ``reset`` has not been called.
+        """
+        self._q[:], self._v[:] = q, v
+        acceleration = np.ascontiguousarray(a, dtype=float) + np.zeros(self._v.size)
+        pointer = acceleration.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+        if self._call("lead_posture", *self._pointers[:2], pointer):
+            raise InputError("is no reference", where="lead_posture", hint="give a posture and finite numbers")
 
     def brace(self) -> None:
         """Switch the impact-robust term on."""

@@ -27,9 +27,9 @@ from impact_posture.impact.contact import point_on
 from impact_posture.version import __version__
 
 # Files in c/, in the order in which one source has them.
-_CORE = ("algebra.c", "tasks.c", "posture.c", "qp.c", "give_way.c", "tick.c")
+_CORE = ("algebra.c", "tasks.c", "posture.c", "qp.c", "rank.c", "give_way.c", "tick.c")
 # Parameters that init compares with others.
-_NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate")
+_NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
 # Bytes of variables, saved registers and return addresses of all functions below a tick, beside the arrays.
 _FRAMES = 4096
 
@@ -110,9 +110,11 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
     nv, equations = sizes["NV"], sizes["EQUATIONS"]
     n, m = sizes["VARIABLES"], sizes["GENERAL"] - sizes["BOUNDED"]
     more = {
-        "SCRATCH": max(3 * nv * nv, n * n, 2 * equations * equations), "BOUNDS": bounds, "GAVE": 1 + sizes["LEVELS"],
+        "SCRATCH": max(3 * nv * nv, 2 * n * (n + equations) + 2 * equations * equations),
+        "BOUNDS": bounds,
+        "GAVE": 1 + sizes["LEVELS"],
         "RELAXATION": _relaxation_room(n, m, 1 + sizes["LEVELS"]),
-    }  # fmt: skip
+    }
     room = {name: max(1, value) for name, value in (sizes | more).items()}
     n += 1
     solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * bounds) + 2048
@@ -120,12 +122,13 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
     tables.append(("gravity", *_table(np.array(robot.model.gravity.linear, dtype=float))))
     allocation = s.actuators.G[: sizes["BASE"], : sizes["ROTORS"]]
     tables.append(("allocation", *_table(allocation)))
+    named_fields = [(field.name, k) for k, field in enumerate(fields, 1) if field.name in _NAMED]
     context: dict[str, Any] = {
         "robot": robot.name, "version": __version__, "prefix": prefix, "sizes": sizes, "room": room, "fields": fields,
         "q_names": configuration_names(robot), "v_names": robot.tangent_names, "u_names": s.actuators.names,
         "convention": robot.convention, "tasks": [t.name for t in s.tasks] or ["none"], "metric": metric,
         "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
-        "identity": identity, "tables": tables, "named": _NAMED, "literals": _initializer,
+        "identity": identity, "tables": tables, "named": named_fields, "literals": _initializer,
         "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
         "constants": code.constants, "blocks": code.blocks, "angles": code.angles, "work": code.work,
         "places": _braced(map(str, code.angles)), "outputs": code.outputs, "constant_outputs": code.constant_outputs,

@@ -80,7 +80,8 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     assembly = Assembly(robot, formulation, actuators)
     nv, rotors, spare = robot.nv, actuators.rotors, actuators.spare.shape[1]
     law, posture = formulation.law, formulation.posture
-    dense = bool(formulation.weighted) or not assembly.contacts.hard.all()
+    momentum = _is_diagonal_in_momentum(robot, formulation)
+    dense = (bool(formulation.weighted) or not assembly.contacts.hard.all()) and not momentum
     forces, hard = assembly.contacts.size, int(assembly.contacts.hard.sum())
     joints = nv - actuators.base
     slots = Chart(robot.model).slots
@@ -108,6 +109,7 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
         "STIFF": int(posture is not None and posture.stiffness is not None),
         "LAW": int(law is not None),
         "DENSE": int(dense),
+        "MOMENTUM": int(momentum),
         "SIMPLE": joints if law is not None and not dense else 0,
         "VARIABLES": nv + spare + forces,
     }
@@ -146,6 +148,20 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     found: dict[str, NDArray[Any]] = {name: np.array(v, dtype=np.int64) for name, v in tables.items()}
     found |= {name: np.array(values, dtype=float).ravel() for name, values in doubles.items()}
     return Structure(robot, formulation, actuators, tasks, points, sizes, found)
+
+
+def _is_diagonal_in_momentum(robot: Robot, formulation: TaskFormulation) -> bool:
+    """Return whether center of mass, base orientation and the joints of a posture task make up the whole cost."""
+    tasks, posture = formulation.weighted, formulation.posture
+    kinds = {type(task) for task in tasks}
+    return (
+        robot.floating
+        and kinds == {CenterOfMass, BaseOrientation}
+        and len(tasks) == 2
+        and all((task.weight > 0).all() for task in tasks)
+        and all(contact.weight is None for contact in formulation.contacts)
+        and (posture is None or not posture.weight[:3].any())
+    )
 
 
 def _check(robot: Robot, formulation: TaskFormulation) -> None:

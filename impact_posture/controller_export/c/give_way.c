@@ -17,20 +17,21 @@ static void ip_list_gave_way(ip_context *c, const double *lower, const double *u
   }
   c->gave[0] = most > IP_OFF * size ? most : 0.0;
   for (k = 0; k < IP_LEVELS; ++k) {
-    double square = 0.0;
-    most = 0.0;
-    size = 0.0;
+    /* Rows that are equations, then rows that lack rank. */
+    double square[2] = {0}, worst[2] = {0}, sizes[2] = {1.0, 1.0};
     for (i = r; i < r + ip_level_rows[k]; ++i) {
-      const double off = ip_dot(c->rows[i], c->z, IP_VARIABLES) - c->low[IP_SIMPLE + i];
-      double terms = 0.0;
+      const int lacks = isinf(c->low[IP_SIMPLE + i]) ? 1 : 0;
+      const double off = ip_dot(c->rows[i], c->z, IP_VARIABLES) - (lacks ? c->wanted_rows[i] : c->low[IP_SIMPLE + i]);
+      double terms = 1.0;
       for (j = 0; j < IP_VARIABLES; ++j) {
         terms += fabs(c->rows[i][j] * c->z[j]);
       }
-      square += off * off;
-      most = fmax(most, fabs(off));
-      size = fmax(size, terms);
+      square[lacks] += off * off;
+      worst[lacks] = fmax(worst[lacks], fabs(off));
+      sizes[lacks] = fmax(sizes[lacks], terms);
     }
-    c->gave[1 + k] = most > IP_OFF * (1.0 + size) ? sqrt(square) : 0.0;
+    c->gave[1 + k] = worst[0] > IP_OFF * sizes[0] ? sqrt(square[0]) : 0.0;
+    c->missed[k] = worst[1] > IP_OFF * sizes[1] ? sqrt(square[1]) : 0.0;
     r += ip_level_rows[k];
   }
 }
@@ -45,6 +46,17 @@ static int ip_relax(ip_context *c)
   relaxation_report report;
   memset(H, 0, sizeof(double) * N * N);
   ip_cost(c, H, N, g);
+  for (i = IP_NV; i < N; ++i) {
+    H[i * (N + 1)] = 1.0 / (c->ease[i] * c->ease[i]);
+  }
+#if IP_LEVELS
+  if (!c->independent) {
+    for (i = 0; i < IP_NV; ++i) {
+      memcpy(c->cost + i * IP_NV, H + i * N, sizeof(double) * IP_NV);
+    }
+    ip_reduce(c, H, g);
+  }
+#endif
   for (i = 0; i < N; ++i) {
     unit[i] = i < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
     level[i] = 0;
@@ -53,9 +65,6 @@ static int ip_relax(ip_context *c)
     g[i] = -g[i];
     for (j = 0; j < i; ++j) {
       H[i * N + j] = H[j * N + i];
-    }
-    if (i >= IP_NV) {
-      H[i * (N + 1)] = 1.0 / (c->ease[i] * c->ease[i]);
     }
   }
   for (i = 0; IP_LAW && i < IP_JOINTS_V; ++i) {

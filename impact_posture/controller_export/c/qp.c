@@ -1,7 +1,11 @@
 /* The QP of a tick as DAQP solves it: the least |u|^2 with lower <= M u <= upper, rows of length one.
  *
- * The variables z = [v; w; f] are z = T (center + u), where T makes the cost |T^-1 z|^2/2.  Where T is diagonal, joints come
- * before the base in u, and their bounds are bounds on u.  Where it is not, they are the last rows. */
+ * The variables z = [v; w; f] are z = T (center + u), where T makes the cost |T^-1 z|^2/2:
+ * - IP_DENSE: T is the inverse of a Cholesky factor.  The bounds on joints are the last rows.
+ * - IP_MOMENTUM: the cost is diagonal in the joints, the acceleration of the center of mass in the world, which stands
+ *   for that of the base, and the angular acceleration of the base.
+ * - Otherwise T is diagonal.
+ * In the last two, joints come first in u, and their bounds are bounds on u. */
 
 /* A zero of DAQP. */
 #define IP_NOTHING 1e-11
@@ -14,7 +18,7 @@ static int ip_entry(int k)
 }
 
 /* out = row T for a row on the accelerations v. */
-static void ip_whiten(const ip_context *c, const double *row, double *out)
+static void ip_whiten(const ip_context *c, const double *row, double *restrict out)
 {
   int i, j;
 #if IP_DENSE
@@ -26,6 +30,20 @@ static void ip_whiten(const ip_context *c, const double *row, double *out)
     for (j = i; j < IP_NV; ++j) {
       out[j] += s * factor[j];
     }
+  }
+#elif IP_MOMENTUM
+  const double *M = c->m.M, *R = c->m.base, scale = 1.0 / M[0];
+  const double x = row[0] * scale, y = row[1] * scale, z = row[2] * scale;
+  for (i = 0; i < IP_JOINTS_V; ++i) {
+    j = IP_BASE + i;
+    out[i] = (row[j] - x * M[j] - y * M[IP_NV + j] - z * M[2 * IP_NV + j]) * c->ease[i];
+  }
+  for (j = 3; j < IP_BASE; ++j) {
+    i = IP_JOINTS_V + j;
+    out[i] = (row[j] - x * M[j] - y * M[IP_NV + j] - z * M[2 * IP_NV + j]) * c->ease[i];
+  }
+  for (i = 0; i < 3; ++i) {
+    out[IP_JOINTS_V + i] = ip_dot(R + 3 * i, row, 3) * c->ease[IP_JOINTS_V + i];
   }
 #else
   (void)j;
@@ -111,12 +129,23 @@ static void ip_factorize(ip_context *c)
     }
   }
 #else
-  (void)j, (void)k;
+  (void)j;
   for (i = 0; i < IP_NV; ++i) {
     g[i] = c->p.posture_weight[i] * c->wanted[i];
   }
+  for (k = 0; IP_MOMENTUM && k < IP_TASKS; ++k) {
+    for (i = ip_task_row[k]; i < ip_task_row[k + 1]; ++i) {
+      g[(ip_task_kind[k] == IP_BASE_TURN ? 3 : 0) + i - ip_task_row[k]] += c->p.task_weight[i] * c->a[i];
+    }
+  }
 #endif
+#if IP_MOMENTUM
+  for (i = 0; i < IP_NV; ++i) {
+    c->center[i] = g[ip_entry(i)] * c->ease[i];
+  }
+#else
   ip_whiten(c, g, c->center);
+#endif
 }
 
 /* The row of s'(M v + h - J'f), of so many entries from the first on; return s'h. */
@@ -155,69 +184,6 @@ static void ip_put(ip_context *c, int r, double lower, double upper)
     c->M[r][j] = row[j] * c->ease[j];
   }
   ip_finish(c, r, lower, upper);
-}
-
-/* Whether the equations are independent, as LevelRank decides: no singular value of the scaled rows is below 0.02.  No
- * singular value moves further than the matrix does, so most ticks need no decomposition. */
-static void ip_measure_rank(ip_context *c)
-{
-#if IP_LEVELS
-  enum { N = IP_EQUATIONS };
-  const double least = 2e-2;
-  double *G = c->scratch, *S = c->scratch + N * N, way = 0.0, low, high, trace = 0.0;
-  int i, j, k;
-  for (i = 0; i < N; ++i) {
-    const double s = 1.0 / c->length[i];
-    double sum = 0.0;
-    for (j = 0; j < IP_VARIABLES; ++j) {
-      const double unit = j < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
-      const double d = (c->rows[i][j] - c->reference[i][j]) * s * unit;
-      sum += d * d;
-    }
-    way += sum;
-  }
-  if (way < c->space) {
-    return;
-  }
-  memcpy(c->reference, c->rows, sizeof c->reference);
-  c->space = 0.0;
-  c->independent = 1;
-  if (!isfinite(way)) {
-    return;
-  }
-  for (i = 0; i < N; ++i) {
-    for (j = 0; j <= i; ++j) {
-      double sum = 0.0;
-      for (k = 0; k < IP_VARIABLES; ++k) {
-        const double unit = k < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
-        sum += c->rows[i][k] * c->rows[j][k] * unit * unit;
-      }
-      G[i * N + j] = G[j * N + i] = sum / (c->length[i] * c->length[j]);
-    }
-    trace += G[i * (N + 1)];
-  }
-  /* Squares of a lower and an upper bound on the least singular value. */
-  low = least * least;
-  high = trace / N;
-  for (k = 0; k < 7; ++k) {
-    const double middle = k ? sqrt(low * high) : low;
-    memcpy(S, G, sizeof(double) * N * N);
-    for (i = 0; i < N; ++i) {
-      S[i * (N + 1)] -= middle;
-    }
-    if (ip_cholesky(S, N)) {
-      low = middle;
-    } else if (k) {
-      high = middle;
-    } else {
-      c->independent = 0;
-      return;
-    }
-  }
-  c->space = (sqrt(low) - least) * (sqrt(low) - least);
-#else
-  c->independent = 1;
-#endif
 }
 
 /* Fill M and the bounds. */
@@ -274,7 +240,6 @@ static void ip_assemble(ip_context *c)
       c->lower[i] = -to[1] * c->scaling[i] - c->center[i];
     }
   }
-  ip_measure_rank(c);
 }
 
 /* The types of the bounds before any is active. */
@@ -295,7 +260,12 @@ static void ip_begin_qp(ip_context *c)
     c->added[i] = fmax(c->p.posture_weight[i], 1e-8);
   }
   for (i = 0; i < IP_NV; ++i) {
-    c->ease[i] = 1.0 / sqrt(c->added[ip_entry(i)]);
+    double weight = c->added[ip_entry(i)];
+    for (k = 0; IP_MOMENTUM && k < IP_TASKS; ++k) {
+      const int first = ip_task_kind[k] == IP_BASE_TURN ? 3 : 0, own = ip_entry(i) - first;
+      weight = own >= 0 && own < 3 ? c->p.task_weight[ip_task_row[k] + own] + (first ? weight : 0.0) : weight;
+    }
+    c->ease[i] = 1.0 / sqrt(weight);
   }
   for (i = 0; i < IP_SPARE; ++i) {
     c->ease[IP_NV + i] = 1.0 / sqrt(c->p.spare_weight[0]);
@@ -322,39 +292,13 @@ static void ip_begin_qp(ip_context *c)
   ip_cool(c);
 }
 
-/* Lengths of the equations, by which their rank is measured: the longest row of a level. */
-static void ip_begin_rank(ip_context *c)
-{
-  int r = IP_BLIND, i, j, k;
-  for (i = 0; i < IP_EQUATIONS; ++i) {
-    double sum = 0.0;
-    for (j = 0; j < IP_VARIABLES; ++j) {
-      const double x = c->rows[i][j] * (j < IP_NV + IP_SPARE ? 1.0 : c->m.M[0]);
-      sum += x * x;
-    }
-    c->length[i] = sqrt(sum);
-  }
-  for (k = 0; k < IP_LEVELS; ++k) {
-    double most = 0.0;
-    for (i = r; i < r + ip_level_rows[k]; ++i) {
-      most = fmax(most, c->length[i]);
-    }
-    for (i = r; i < r + ip_level_rows[k]; ++i) {
-      c->length[i] = most;
-    }
-    r += ip_level_rows[k];
-  }
-  for (i = 0; i < IP_EQUATIONS; ++i) {
-    c->length[i] = c->length[i] == 0.0 ? 1.0 : c->length[i];
-  }
-  c->space = -1.0;
-  ip_measure_rank(c);
-}
-
 /* out = T x, added to out. */
 static void ip_add_turned(const ip_context *c, const double *x, double *out)
 {
   int i, j;
+#if IP_MOMENTUM
+  double moved[3] = {0};
+#endif
   for (i = 0; i < IP_NV; ++i) {
 #if IP_DENSE
     double sum = 0.0;
@@ -362,11 +306,23 @@ static void ip_add_turned(const ip_context *c, const double *x, double *out)
       sum += c->factor[i * IP_NV + j] * x[j];
     }
     out[i] += sum;
+#elif IP_MOMENTUM
+    const double step = c->ease[i] * x[i];
+    const int at = ip_entry(i);
+    out[at] += at < 3 ? 0.0 : step;
+    for (j = 0; j < 3; ++j) {
+      moved[j] += at < 3 ? c->m.base[3 * at + j] * step : -c->m.M[j * IP_NV + at] / c->m.M[0] * step;
+    }
 #else
     (void)j;
     out[ip_entry(i)] += c->ease[i] * x[i];
 #endif
   }
+#if IP_MOMENTUM
+  for (j = 0; j < 3; ++j) {
+    out[j] += moved[j];
+  }
+#endif
   for (i = IP_NV; i < IP_VARIABLES; ++i) {
     out[i] += c->ease[i] * x[i];
   }
@@ -383,14 +339,25 @@ static void ip_decode(ip_context *c, DAQPWorkspace *w)
     c->z[i] = 0.0;
   }
   ip_add_turned(c, x, c->z);
+  memset(x, 0, sizeof x);
+#if IP_MOMENTUM
+  /* The least weight of the acceleration of the base is no part of the diagonal cost. */
+  double rest[IP_NV] = {0};
+  for (i = 0; i < 3; ++i) {
+    rest[i] = -c->added[i] * c->z[i];
+  }
+  ip_whiten(c, rest, x);
+#endif
   for (i = 0; i < w->n_active; ++i) {
     const int at = w->WS[i], r = at - IP_SIMPLE, joint = IP_DENSE ? r - (IP_GENERAL - IP_JOINTS_V) : at;
     const int bounds = IP_LAW && (IP_DENSE ? joint >= 0 : r < 0);
     const double value = bounds ? c->z[IP_BASE + joint] : ip_dot(c->rows[r], c->z, IP_VARIABLES);
     w->xldl[i] = c->scaling[at] * (value - (c->sense[at] & DAQP_LOWER ? c->low[at] : c->high[at]));
+    if (IP_MOMENTUM) {
+      w->xldl[i] += at < IP_SIMPLE ? x[at] : ip_dot(c->M[at - IP_SIMPLE], x, IP_VARIABLES);
+    }
   }
   daqp_solve_working_set(w);
-  memset(x, 0, sizeof x);
   for (i = 0; i < w->n_active; ++i) {
     const int at = w->WS[i];
     w->lam_star[i] += w->xldl[i];

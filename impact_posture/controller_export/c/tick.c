@@ -52,6 +52,17 @@ int ip_init(ip_context *c, const ip_params *p)
       return IP_AT_CONTACT_NORMAL;
     }
   }
+  for (i = 0; IP_MOMENTUM && i < 3; ++i) {
+    /* These coordinates have no place for a weight of the base. */
+    if (p->posture_weight[i] != 0.0) {
+      return IP_AT_POSTURE_WEIGHT;
+    }
+  }
+  for (i = 0; IP_MOMENTUM && i < IP_ROWS; ++i) {
+    if (!(p->task_weight[i] > 0.0)) {
+      return IP_AT_TASK_WEIGHT;
+    }
+  }
   if (!(p->law_rate[0] >= 4.0 * p->law_approach[0])) {
     return IP_AT_LAW_RATE;
   }
@@ -145,14 +156,13 @@ static void ip_answer(ip_context *c, ip_command *out)
     ip_hold(c, IP_NON_FINITE, c->v, out);
     return;
   }
+  memset(c->gave, 0, sizeof c->gave);
+  memset(c->missed, 0, sizeof c->missed);
   if (!c->independent) {
     ip_cool(c);
-    ip_hold(c, IP_UNSOLVED, c->v, out);
-    return;
   }
-  memset(c->gave, 0, sizeof c->gave);
-  flag = ip_solve_warm(c);
-  if (flag <= 0 && flag != DAQP_EXIT_INFEASIBLE) {
+  flag = c->independent ? ip_solve_warm(c) : 0;
+  if (c->independent && flag <= 0 && flag != DAQP_EXIT_INFEASIBLE) {
     /* The solver gave up from its warm start.  Try once without. */
     flag = ip_solve_warm(c);
   }
@@ -213,9 +223,6 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
     return 2;
   }
 #endif
-  for (i = 0; i < IP_EQUATIONS; ++i) {
-    c->length[i] = 1.0;
-  }
   ip_assemble(c);
   ip_begin_rank(c);
   for (i = 0; i < IP_NV; ++i) {
@@ -261,6 +268,7 @@ int ip_tick(ip_context *c, double t, const double q[IP_NQ], const double v[IP_NV
   ip_advance(c, dt);
   ip_build(c);
   ip_assemble(c);
+  ip_measure_rank(c);
   ip_answer(c, out);
   return out->status;
 }
@@ -278,6 +286,7 @@ void ip_last_report(const ip_context *c, ip_report *report)
   }
   report->iterations = c->iterations;
   memcpy(report->relaxed, c->gave, sizeof report->relaxed);
+  memcpy(report->deficient, c->missed, sizeof report->deficient);
   memcpy(report->multipliers, c->multipliers, sizeof report->multipliers);
   for (r = 0; r < IP_ROWS; ++r) {
     report->rows[r] = ip_dot(c->J[r], c->z, IP_NV) - c->a[r];
@@ -311,6 +320,18 @@ int ip_move_to(ip_context *c, const double q[IP_NQ], double over)
     return 1;
   }
   ip_fade_to(c, q, over);
+  return 0;
+}
+
+int ip_lead_posture(ip_context *c, const double q[IP_NQ], const double v[IP_NV], const double a[IP_NV])
+{
+  if (!c->ready || !ip_measured(q, v, NULL) || !(ip_dot(a, a, IP_NV) < IP_ABSURD)) {
+    return 1;
+  }
+  memcpy(c->posture, q, sizeof c->posture);
+  memcpy(c->posture_velocity, v, sizeof c->posture_velocity);
+  memcpy(c->posture_acceleration, a, sizeof c->posture_acceleration);
+  c->blend = 1.0;
   return 0;
 }
 
