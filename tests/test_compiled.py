@@ -24,6 +24,8 @@ from tests.plot.views import PENDULUM
 from tests.settings import make_settings
 from tests.tools import need, need_compiler
 
+OPTIMIZED = True
+
 
 @pytest.fixture(scope="module")
 def prepared() -> Prepared:

@@ -19,8 +19,6 @@ from tests.command import on_terminal
 from tests.command import run as start
 from tests.experiments.conftest import shortened
 
-pytestmark = pytest.mark.usefixtures("unoptimized")
-
 
 def document(*arguments: str, cwd: Path, prepare: Callable[[], None] | None = None) -> dict[str, Any]:
     done = start(*arguments, "--json", cwd=cwd, prepare=prepare)
