@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,9 +18,11 @@ from impact_posture.simulation import scenario_file
 from impact_posture.simulation.series import Series
 from impact_posture_cli.commands.simulate import _show
 from impact_posture_cli.output import Page
-from tests.command import on_terminal
+from tests.command import on_terminal, read_terminal
 from tests.command import run as start
 from tests.experiments.conftest import shortened
+
+COMMAND = Path(sys.executable).parent / "impact-posture"
 
 
 def document(*arguments: str, cwd: Path, prepare: Callable[[], None] | None = None) -> dict[str, Any]:
@@ -125,8 +130,14 @@ def test_contacts_are_counted_against_what_was_asked_for(capsys: pytest.CaptureF
 
 
 def test_progress_is_for_terminals(aerial: Path, tmp_path: Path) -> None:
-    asked = ("simulate", str(aerial), "--out", "run", "--force", "--format", "png")
-    said = on_terminal(*asked, cwd=tmp_path)
+    asked = ("simulate", str(aerial), "--out", "run", "--force", "--format", "png", "--no-report")
+    ours, theirs = os.openpty()
+    with subprocess.Popen(
+        [COMMAND, *asked], stdout=subprocess.DEVNULL, stderr=theirs, cwd=tmp_path, env={**os.environ, "TERM": "xterm"}
+    ) as process:
+        os.close(theirs)
+        said = read_terminal(ours)
+    assert process.returncode == 0
     for words in ("loading", "building the expressions", "simulating, t = ", "drawing"):
         assert words in said, words
     assert on_terminal(*asked, "--quiet", cwd=tmp_path) == ""
