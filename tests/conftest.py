@@ -47,11 +47,12 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(20_000, 20, 20)
 
 
-@pytest.fixture(scope="module")
-def unoptimized() -> Iterator[None]:
-    """Compile the C code of a module for its numbers alone: at -O2, as it is shipped, the others compile it."""
+@pytest.fixture(scope="module", autouse=True)
+def unoptimized(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Compile C code for its numbers alone; at -O2, as it is shipped, in modules that say ``OPTIMIZED = True``."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CFLAGS", "-O0")
+        if not getattr(request.module, "OPTIMIZED", False):
+            patch.setenv("CFLAGS", "-O0")
         yield
 
 

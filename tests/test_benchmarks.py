@@ -32,6 +32,8 @@ from tests.benchmarks.tsid import GOALS
 from tests.helpers import robot
 from tests.tools import need_compiler
 
+OPTIMIZED = True
+
 LINK = (
     '<link name="{0}"><inertial><origin xyz="0.1 0.02 0.05"/><mass value="1.5"/>'
     '<inertia ixx="0.02" ixy="0.001" ixz="0" iyy="0.03" iyz="0" izz="0.025"/></inertial></link>'

@@ -26,8 +26,6 @@ from impact_posture.toolchain import run_compiler
 from tests.helpers import Vector, assert_close, central_gradient, frame_placement, robot, unit
 from tests.tools import cxx_compiler, eigen_headers, need_compiler
 
-pytestmark = pytest.mark.usefixtures("unoptimized")
-
 DOCS = Path(__file__).parents[1] / "docs"
 EXAMPLES = DOCS / "examples"
 

@@ -32,6 +32,8 @@ from tests import exported
 from tests.exported import Exported
 from tests.tools import STRICT, need, need_compiler
 
+OPTIMIZED = True
+
 KINOVA = "example-robot-data:kinova_description/robots/kinova.urdf"
 UNIT = np.array([0.6, 0.0, 0.8])
 

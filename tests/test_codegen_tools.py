@@ -21,6 +21,8 @@ from impact_posture.toolchain import find_compiler, run_compiler
 from tests import exported
 from tests.tools import STRICT, need, need_compiler
 
+OPTIMIZED = True
+
 # ---- quantities that do not exist ---------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ import pytest
 import threadpoolctl
 
 from impact_posture import libraries
-from impact_posture.errors import CompilerError, OutputError
+from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.posture import compiled
 from impact_posture.posture.nlp import build_nlp, one_blas_thread
 from impact_posture.posture.problem import PostureProblem
@@ -23,6 +23,8 @@ from impact_posture.toolchain import run_compilers
 from tests.plot.views import PENDULUM
 from tests.settings import make_settings
 from tests.tools import need, need_compiler
+
+OPTIMIZED = True
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +146,11 @@ def test_compiling_needs_a_compiler(problem: PostureProblem, tmp_path: Path, mon
     monkeypatch.setattr(compiled, "find_compiler", lambda: None)
     with pytest.raises(CompilerError, match="no C compiler"):
         build_nlp(problem, compile="always")
+
+
+def test_a_mode_that_does_not_exist_is_refused(problem: PostureProblem) -> None:
+    with pytest.raises(InputError, match="compile: no mode 'off'; choose from auto, always, never"):
+        build_nlp(problem, compile="off")  # type: ignore[arg-type]
 
 
 def test_one_thread_within_and_as_before_after() -> None:

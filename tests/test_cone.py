@@ -45,8 +45,6 @@ from tests.helpers import (
 from tests.settings import make_settings
 from tests.tools import need_compiler
 
-pytestmark = pytest.mark.usefixtures("unoptimized")
-
 ANGLES = (1.0, 5.0, 20.0, 45.0, 80.0)
 ROBOTS = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "solo8": "base_link", "talos": "gripper_right_base_link"}
 CONE_KINDS: tuple[ObjectiveKind, ...] = ("impulse", "sticking", "energy")

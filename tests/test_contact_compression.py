@@ -167,7 +167,7 @@ def test_nothing_is_told_where_nothing_is_known() -> None:
 def test_the_bounds_hold_and_cost(name: str, more: dict[str, object]) -> None:
     asked = {"robot": name, "normal": (0.0, 0.0, 1.0), "contact_stiffness": 1e5, "speed": 0.8, "starts": 3, **more}
     plain = prepare(make_settings(asked))
-    free = solve(plain.problem, starts=3, compile="off")
+    free = solve(plain.problem, starts=3, compile="never")
     before, after = plain.impact.evaluate(free.initial), plain.impact.evaluate(free.q)
     assert before.compression is not None and after.compression is not None
     assert (
@@ -183,7 +183,7 @@ def test_the_bounds_hold_and_cost(name: str, more: dict[str, object]) -> None:
     _, jacobian = limits.evaluate(numeric.at(free.q))
     measured = central_gradient(lambda q: limits.evaluate(numeric.at(q))[0], model, free.q, 1e-4)
     assert relative(jacobian, measured) < 1e-5
-    found = solve(bounded.problem, starts=3, compile="off")
+    found = solve(bounded.problem, starts=3, compile="never")
     told = bounded.impact.evaluate(found.q)
     assert found.certificate.holds()
     assert told.compression is not None and told.compression.peak_force is not None and told.frictionless is not None
@@ -201,7 +201,7 @@ def test_a_tool_that_may_tilt_does_at_least_as_well() -> None:
     values = []
     for pose in ("aligned", "aligned:10", "aligned:30"):
         prepared = prepare(make_settings({**asked, "contact_pose": pose}))
-        found = solve(prepared.problem, starts=4, compile="off")
+        found = solve(prepared.problem, starts=4, compile="never")
         assert found.certificate.holds()
         values.append(prepared.problem.objective.value(found.q))
         for constraint in prepared.problem.constraints:
@@ -221,9 +221,9 @@ def test_the_front_of_jump_and_force_is_that_of_searches_with_a_bound(name: str)
     asked = {"robot": name, "normal": (0.0, 0.0, 1.0), "objective": "speed", "contact_stiffness": 1e5, "speed": 0.6}
     more = {"contact_pose": "aligned:30"} if name == "panda" else {}
     prepared = prepare(make_settings({**asked, **more}))
-    found = solve(prepared.problem, starts=4, compile="off")
+    found = solve(prepared.problem, starts=4, compile="never")
     contact = ContactStiffness(linear=1e5)
-    curve = pareto_front(found, 4, force=(contact, 0.6), compile="off")
+    curve = pareto_front(found, 4, force=(contact, 0.6), compile="never")
     assert curve.against == "force" and all(point.certified for point in curve.points)
     forces, values = ([getattr(p, key) for p in curve.points] for key in ("distance", "objective"))
     assert forces == sorted(forces) and values == sorted(values, reverse=True)
@@ -232,7 +232,7 @@ def test_the_front_of_jump_and_force_is_that_of_searches_with_a_bound(name: str)
     assert values[-1] == pytest.approx(prepared.problem.objective.value(found.q), rel=1e-6)
     middle = curve.points[2]
     bounded = prepare(make_settings({**asked, **more, "max_force": middle.within}))
-    again = solve(bounded.problem, starts=4, compile="off")
+    again = solve(bounded.problem, starts=4, compile="never")
     assert middle.objective <= bounded.problem.objective.value(again.q) * (1 + 1e-6), (
         "another search finds nothing better"
     )

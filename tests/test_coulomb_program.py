@@ -27,8 +27,6 @@ from tests.helpers import assert_close
 from tests.settings import make_settings
 from tests.tools import need_compiler
 
-pytestmark = pytest.mark.usefixtures("unoptimized")
-
 
 def problem_of(robot: str, normal: tuple[float, float, float], friction: float, **more: object) -> PostureProblem:
     values = {"robot": robot, "normal": normal, "friction": friction, "objective": "coulomb", **more}

@@ -86,8 +86,8 @@ def run_page(page: Path, folder: Path) -> Iterator[Ran]:
     for file in dict.fromkeys(example_files(page)):
         shutil.copy(file, folder / file.name)
     for shown in shown_commands(page):
-        # Nothing here depends on how fast the C code is.  One cache, because shapes take seconds to fit.
-        environment = {"COLUMNS": "300", "IMPACT_POSTURE_CACHE": str(ROOT / "build" / "cache"), "CFLAGS": "-O0"}
+        # One cache, because shapes take seconds to fit.
+        environment = {"COLUMNS": "300", "IMPACT_POSTURE_CACHE": str(ROOT / "build" / "cache")}
         done = run(*shown.arguments, cwd=folder, env=environment)
         yield Ran(shown, done.returncode, done.stdout, done.stderr)
 

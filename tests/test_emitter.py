@@ -16,6 +16,8 @@ from impact_posture.errors import CompilerError
 from impact_posture.toolchain import run_compiler
 from tests.tools import STRICT, need_compiler
 
+OPTIMIZED = True
+
 
 def c_function(function: ca.Function) -> str:
     """``void f(inputs..., outputs...)`` of an SX function."""

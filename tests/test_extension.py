@@ -38,6 +38,7 @@ from impact_posture.simulation.controller_factory import GROUP
 from impact_posture.simulation.run import run
 
 from .command import refused
+from .command import run as start
 from .experiments.conftest import shortened as cut
 from .helpers import Vector, robot
 from .simulation.factories import controller_factory, factory, needs_mujoco, shortened
@@ -169,20 +170,24 @@ def test_the_installed_command_runs_a_registered_controller(setback: ModuleType,
     scenario = tmp_path / "aerial.toml"
     scenario.write_text(cut("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05), encoding="utf-8")
 
-    def simulated(controller: str) -> subprocess.CompletedProcess[str]:
-        words = [COMMAND, "simulate", scenario, "--controller", controller, "--json", "--out", controller]
-        path = {**os.environ, "PYTHONPATH": str(tmp_path)}
-        return subprocess.run(words, cwd=tmp_path, env=path, capture_output=True, text=True, check=False)
-
-    done = simulated("setback")
+    words = ("simulate", scenario, "--json", "--controller")
+    path = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(
+        [COMMAND, *words, "setback", "--no-report"],
+        cwd=tmp_path,
+        env=path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     found = json.loads(done.stdout)
     assert (found["controller"], found["status"], found["warnings"]) == ("setback", "completed", [])
-    for name, words in (
+    for name, said in (
         ("setbakc", ("no controller 'setbakc'", "did you mean setback?")),
         ("gone", ("controller 'gone' (setback_gone:make)", "No module named 'setback_gone'")),
     ):
-        refused(simulated(name), 1, *words)
+        refused(start(*words, name, cwd=tmp_path), 1, *said)
 
 
 @pytest.mark.parametrize(("name", "words"), [("odd", "cannot be made: TypeError"), ("number", "makes a int")])

@@ -199,9 +199,9 @@ def test_the_search_is_certified(name: str, joint_model: JointModel) -> None:
     assert prepared.impact.robot.joint_model == joint_model
     reflected = prepare(replace(chosen, joint_model="reflected"))
     assert _key(prepared.problem) != _key(reflected.problem), "other functions, other cache"
-    found = solve(prepared.problem, starts=3, compile="off")
+    found = solve(prepared.problem, starts=3, compile="never")
     assert found.certificate.holds() and found.certified_starts == 3
-    other = solve(reflected.problem, starts=3, compile="off")
+    other = solve(reflected.problem, starts=3, compile="never")
     own = prepared.problem.objective.value
     assert own(found.q) <= own(other.q) * (1 + 1e-9), "the optimum of its own model"
 

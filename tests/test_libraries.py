@@ -63,9 +63,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ImpactObjective(robot, ImpactContact(f, (0.6, 0.8, 0), (0, 0.1, 0.2))) for f in robot.frame_names[-2:]
     ]
     export(objectives, folder, prefix="arm", check=False, portable=True)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CFLAGS", "-O0")
-        build_library(folder, "arm")
+    build_library(folder, "arm")
     return folder
 
 

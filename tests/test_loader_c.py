@@ -33,8 +33,6 @@ from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import LoadOptions
 from impact_posture.toolchain import find_compiler
 
-pytestmark = pytest.mark.usefixtures("unoptimized")
-
 UNIT = np.array([0.6, 0.0, 0.8])
 FRAMES = ("ee", "base_link")
 

@@ -365,7 +365,6 @@ def test_every_error_is_one_safe_line() -> None:
 
 def test_optimize_and_codegen_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiler = need_compiler()
-    monkeypatch.setenv("CFLAGS", "-O0")
     monkeypatch.setattr("impact_posture.plot.drawable", lambda _: ["jump"])
     names = ["base", '*/ #error "out"\n#include <x>', "$\\frac{$", "[red]|`<script>", "??/\\"]
     folder = tmp_path / "\x1b]0;x\x07 *\n"

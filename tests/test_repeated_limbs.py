@@ -32,6 +32,8 @@ from tests.exported import built
 from tests.helpers import assert_close, random_configurations, rng, robot, unit
 from tests.tools import need_compiler
 
+OPTIMIZED = True
+
 KINDS = ("revolute", "prismatic", "continuous")
 AXES = ("1 0 0", "0 1 0", "0 0 -1", "0.6 0 0.8")
 COMPUTE: dict[str, Callable[..., np.ndarray]] = {

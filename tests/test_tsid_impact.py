@@ -33,8 +33,6 @@ from tests.step_bounds import level_bound, step_bound
 from tests.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run
 from tests.tools import need_compiler
 
-pytestmark = pytest.mark.usefixtures("unoptimized")
-
 ARM = "tilthex_arm"
 UP = (0.0, 0.0, 1.0)
 

@@ -80,11 +80,11 @@ def test_the_hand_of_talos_is_not_sold() -> None:
     """The paper's objective falls, the jump at a given speed does not."""
     chosen = make_settings({"robot": "talos", "normal": (-1.0, 0.0, 0.0), "frame": "gripper_right_base_link"})
     prepared = prepare(chosen)
-    found = solve(prepared.problem, starts=4, compile="off")
+    found = solve(prepared.problem, starts=4, compile="never")
     told = verdict(prepared.impact, prepared.impact.evaluate(found.initial), prepared.impact.evaluate(found.q))
     assert found.reduction > 0.5 and told.outcome == "worse"
     better = prepare(replace(chosen, objective="coulomb"))
-    found = solve(better.problem, starts=4, compile="off")
+    found = solve(better.problem, starts=4, compile="never")
     told = verdict(better.impact, better.impact.evaluate(found.initial), better.impact.evaluate(found.q))
     assert told.outcome.startswith("better") and told.jump is not None and told.jump < 0
 

@@ -32,8 +32,6 @@ from tests.command import run
 from tests.helpers import NAMES, Vector, robot
 from tests.test_dynamics import write_urdf
 
-pytestmark = pytest.mark.usefixtures("unoptimized")
-
 QUANTITIES = ["H", "G", "Λ_c", "∇H"]
 HAS_MUJOCO = importlib.util.find_spec("mujoco") is not None
 

@@ -10,9 +10,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
-from impact_posture.collision.hull_fit import distance_from_hull
 from impact_posture.collision.shape_points import shape_points
-from impact_posture.collision.swept_hull import SweptHull, hull_corners
+from impact_posture.collision.swept_hull import SweptHull, distance_from_hull, hull_corners
 
 # Shapes are merged if no point of their common hull is farther (m) from them.
 _FILL = 0.01

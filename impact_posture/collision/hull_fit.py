@@ -6,10 +6,9 @@ from heapq import heapify, heapreplace
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.collision.swept_hull import MOST_VERTICES, SweptHull, hull_corners, separation
+from impact_posture.collision.swept_hull import MOST_VERTICES, SweptHull, distance_from_hull, hull_corners
 
 # A hull gets corners until no point is farther (m) outside it.
 _TOLERANCE = 0.004
@@ -53,12 +52,6 @@ def fit_hull(points: Array, tolerance: float = _TOLERANCE) -> Fit:
             break
         chosen.append(queue[0][1])
     return Fit(vertices, max((distance_from_hull(p, hull) for p in _outside(points, hull)), default=0.0) + _ROUNDING)
-
-
-def distance_from_hull(point: Array, hull: SweptHull) -> float:
-    """Return the distance of a point in the axes of a hull from the swept hull, m."""
-    here = pin.SE3.Identity()
-    return separation(SweptHull("", "", 0, point[None], 0.0), here, hull, here).distance
 
 
 def _outside(points: Array, hull: SweptHull) -> Array:

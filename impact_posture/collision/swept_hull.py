@@ -17,7 +17,9 @@ MOST_VERTICES = 40
 
 # A flat set of points is thickened to this half thickness (m), and a thinner one is a segment or a point.
 _THIN = 1e-4
-_GJK_TOLERANCE = 1e-12
+_REQUEST = coal.DistanceRequest(True)
+_REQUEST.gjk_tolerance = 1e-12
+_POINT = coal.Sphere(0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,17 +101,22 @@ class Separation(NamedTuple):
 def separation(a: SweptHull, placement_a: pin.SE3, b: SweptHull, placement_b: pin.SE3) -> Separation:
     """Return the signed distance of two swept hulls whose joints are at these placements in the world."""
     (shape_a, local_a), (shape_b, local_b) = a.solid, b.solid
-    request, result = coal.DistanceRequest(True), coal.DistanceResult()
-    request.gjk_tolerance = _GJK_TOLERANCE
-    at_a, at_b = placement_a * local_a, placement_b * local_b
-    distance = coal.distance(shape_a, transform(at_a), shape_b, transform(at_b), request, result)
+    result, at_a, at_b = coal.DistanceResult(), placement_a * local_a, placement_b * local_b
+    distance = coal.distance(shape_a, transform(at_a), shape_b, transform(at_b), _REQUEST, result)
     if not np.isfinite(result.normal).all():
         # A corner on a corner leaves coal without a direction, which a nanometer gives it.
         at_a.translation = at_a.translation + np.array([0.6, 0.64, 0.48]) * 1e-9
         result = coal.DistanceResult()
-        distance = coal.distance(shape_a, transform(at_a), shape_b, transform(at_b), request, result)
+        distance = coal.distance(shape_a, transform(at_a), shape_b, transform(at_b), _REQUEST, result)
     points = np.array(result.getNearestPoint1()), np.array(result.getNearestPoint2())
     return Separation(float(distance), -np.array(result.normal), *points)
+
+
+def distance_from_hull(point: Array, hull: SweptHull) -> float:
+    """Return the distance of a point in the axes of a hull from the swept hull, m."""
+    solid, at = hull.solid
+    place = coal.Transform3s(np.eye(3), point)
+    return float(coal.distance(_POINT, place, solid, transform(at), _REQUEST, coal.DistanceResult()))
 
 
 def transform(placement: pin.SE3) -> Any:

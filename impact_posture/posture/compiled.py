@@ -10,11 +10,11 @@ from __future__ import annotations
 import platform
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import casadi as ca
 
-from impact_posture.errors import CompilerError, OutputError
+from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.libraries import building, cache_folder, cache_path, is_cached, source_key
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.toolchain import find_compiler, no_compiler, run_compiler, run_compilers
@@ -58,9 +58,12 @@ def compiled_solver(
         derivatives: Options of ``nlpsol`` with the derivatives that are known.
 
     Raises:
+        InputError: There is no such mode.
         CompilerError: The mode is ``always``, and there is no compiler or it fails.
         OutputError: The mode is ``always``, and the cache cannot be written or others can write to it.
     """
+    if mode not in (modes := get_args(CompileMode)):
+        raise InputError(f"no mode '{mode}'", where="compile", hint=f"choose from {', '.join(modes)}")
     interpreted: ca.Function | None = None
     try:
         if mode != "never" and (found := _cached(problem, options)) is not None:

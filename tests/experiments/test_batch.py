@@ -14,8 +14,6 @@ from impact_posture.experiment import batch
 from impact_posture.experiment.batch import Store, key_of, run_batch
 from impact_posture.experiment.jobs import SCHEMA, Job, controller_factory, execute
 
-pytestmark = pytest.mark.usefixtures("unoptimized")
-
 
 def test_a_run_answers_with_its_document(aerial: Path) -> None:
     runs, found = execute(Job(str(aerial), "nominal"))

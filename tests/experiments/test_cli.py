@@ -22,8 +22,6 @@ from tests.command import on_terminal, read_terminal
 from tests.command import run as start
 from tests.experiments.conftest import shortened
 
-pytestmark = pytest.mark.usefixtures("unoptimized")
-
 COMMAND = Path(sys.executable).parent / "impact-posture"
 
 
@@ -132,7 +130,7 @@ def test_contacts_are_counted_against_what_was_asked_for(capsys: pytest.CaptureF
 
 
 def test_progress_is_for_terminals(aerial: Path, tmp_path: Path) -> None:
-    asked = ("simulate", str(aerial), "--out", "run", "--force", "--format", "png")
+    asked = ("simulate", str(aerial), "--out", "run", "--force", "--format", "png", "--no-report")
     ours, theirs = os.openpty()
     with subprocess.Popen(
         [COMMAND, *asked], stdout=subprocess.DEVNULL, stderr=theirs, cwd=tmp_path, env={**os.environ, "TERM": "xterm"}
