@@ -32,7 +32,7 @@ PAPER: dict[str, PaperRow] = {
 # The controllers that keep their targets most often over the envelope (docs: reproduction), or at least come nearest.
 RECOMMENDED: dict[str, str] = {
     "aerial-vertical": "posture",
-    "aerial-lateral": "robust-flow",
+    "aerial-lateral": "robust",
     "solo8-push": "stiff",
     "talos-push": "posture",
 }
