@@ -34,6 +34,8 @@ _TEMPLATES, _PROGRAMS = 64, 16
 _ROUNDS = 8
 # Postures from which the constraints are relaxed, and random starts where a neighbor is infeasible already.
 _TRIES, _FEW = 4, 3
+# Postures whose joints differ by more than this (rad, m) may be of different optima.
+SWITCH = 0.2
 # An optimum is better than another if its objective is lower by this share.
 _BETTER = 1e-4
 
@@ -146,6 +148,22 @@ class CaseSolver:
         except ImpactPostureError as error:
             return attempt.without("undefined", error.line)
 
+    def improve(self, walk: Walk, place: tuple[Any, Any], known: PointResult, guess: Array) -> PointResult:
+        """Return the better of a known answer and of the optimum that the posture of a later neighbor leads to."""
+        # The base of a robot that floats follows the target, which is no other optimum.
+        own = slice(3 if self.robot.floating else 0, None)
+        if known.q is not None and np.abs(known.q - guess)[own].max() < SWITCH:
+            return known
+        attempt = _Attempt(self, walk, place, 0)
+        try:
+            found = attempt.certified([guess], alone=True)
+        except ImpactPostureError:
+            found = None
+        if found is None or (known.q is not None and found.row["value"] > (1 - _BETTER) * known.row["value"]):
+            return known
+        counts = {key: known.row[key] + found.row[key] for key in ("optima", "runs")}
+        return PointResult({**found.row, **counts}, found.q)
+
 
 class _Attempt:
     """The runs at one point.
@@ -166,15 +184,21 @@ class _Attempt:
         self.problem, self.runs, self.fault = retarget(walk.problem, *place), 0, "no run converged"
         self._solver, self._walk, self._others = solver, walk, others
 
-    def certified(self, guesses: Sequence[Array]) -> PointResult | None:
-        """Return the best certified posture, with parts added to the program as its ends need them."""
+    def certified(self, guesses: Sequence[Array], *, alone: bool = False) -> PointResult | None:
+        """Return the best certified posture, with parts added to the program as its ends need them.
+
+        Args:
+            guesses: Where the runs start, besides the given posture and the random ones.
+            alone: Whether nothing else is started from.
+        """
         price = SLACK_PRICE
         for _ in range(_ROUNDS):
             problem = self.problem
             nlp = replace(self._walk.nlp, problem=problem)
             scale = problem.objective.value(guesses[0] if len(guesses) else problem.given)
-            ends = [self._run(nlp, start, scale, price) for start in [*guesses, problem.given]]
-            if not _agree(problem, ends[:-1], ends[-1]):
+            home = [] if alone else [problem.given]
+            ends = [self._run(nlp, start, scale, price) for start in [*guesses, *home]]
+            if not alone and not _agree(problem, ends[:-1], ends[-1]):
                 ends += [self._run(nlp, start, scale, price) for start in self._random_starts()]
             found = _optima(problem, ends)
             for end in found:

@@ -57,7 +57,7 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def mpi_ranks() -> Iterator[Executor]:
-    """Yield the executor over the ranks of ``mpiexec -n N python -m mpi4py.futures -m impact_posture_cli …``.
+    """Yield the executor over the ranks of ``mpiexec -n N python -m mpi4py.futures $(which impact-posture) …``.
 
     Raises:
         InputError: The package or an MPI library is missing.

@@ -74,15 +74,20 @@ def _solver(sweep: Sweep, key: str, case: int) -> CaseSolver:
 
 
 def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
+    """Solve the points of a shard, each from the neighbors before it, then look back from the neighbors after it."""
     results: list[PointResult] = []
     walks: OrderedDict[int, Walk] = OrderedDict()
-    last: tuple[Walk | None, Any] = None, None
-    for point in points:
+
+    def at(point: int) -> tuple[Walk, Any]:
         values = sweep.grid.values(point)
         prepared = solver.template(*solver.normal_and_speed(values))
         walk = kept(walks, id(prepared.problem), partial(Walk, solver, prepared.problem), _KEPT_WALKS)
-        target = solver.target(prepared, values)
-        if last[0] is walk and last[1] == target:
+        return walk, solver.target(prepared, values)
+
+    last: tuple[Walk, Any] | None = None
+    for point in points:
+        walk, target = at(point)
+        if last is not None and last[0] is walk and last[1] == target:
             # Only the speed differs, and the problem does not see it.
             results.append(results[-1])
             continue
@@ -91,6 +96,12 @@ def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
         few = not guesses and any(one.row["status"] == "infeasible" for one in before)
         results.append(solver.search(walk, target, guesses, few=few))
         last = walk, target
+    # An optimum that appears on the way may have been the better one already before.
+    for point in reversed(points):
+        posture = results[point - points.start].q
+        for other in sweep.grid.neighbors(point, points.start) if posture is not None else []:
+            known = results[other - points.start]
+            results[other - points.start] = solver.improve(*at(other), known, posture)
     return results
 
 

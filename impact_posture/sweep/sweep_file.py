@@ -140,7 +140,9 @@ def _values(name: str, given: Any, where: str) -> tuple[Any, ...]:
         ends = all(isinstance(v, int | float) and abs(v) < float("inf") for v in (low, high))
         if not ends or set(given) != {"from", "to", "count"} or type(count) is not int or not 2 <= count <= 10**6:
             raise SpecError("is no range", where=where, hint="give from, to and count (2 to 1e6), or a list")
-        return tuple(low + (high - low) * k / (count - 1) for k in range(count))
+        # Rounded, so that a tenth is a tenth and zero is zero.
+        even = [low + (high - low) * k / (count - 1) for k in range(count)]
+        return tuple(0.0 if abs(v) < 1e-12 * abs(high - low) else float(f"{v:.12g}") for v in even)
     if not isinstance(given, list) or not given:
         raise SpecError("is no axis", where=where, hint="give a list of values, or { from, to, count }")
     return tuple(float(v) if name in _INNER and type(v) is int else v for v in given)
