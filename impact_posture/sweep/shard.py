@@ -99,9 +99,10 @@ def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
     # An optimum that appears on the way may have been the better one already before.
     for point in reversed(points):
         posture = results[point - points.start].q
-        for other in sweep.grid.neighbors(point, points.start) if posture is not None else []:
-            known = results[other - points.start]
-            results[other - points.start] = solver.improve(*at(other), known, posture)
+        if posture is not None:
+            for other in sweep.grid.neighbors(point, points.start):
+                known = results[other - points.start]
+                results[other - points.start] = solver.improve(*at(other), known, posture)
     return results
 
 
