@@ -24,8 +24,8 @@ from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import wrapped_difference
 from impact_posture.settings import ProblemSettings
 from impact_posture.sweep.atlas import open_atlas, read_manifest
-from impact_posture.sweep.case_solver import SWITCH
 from impact_posture.sweep.grid import Axis, Grid
+from impact_posture.sweep.point_search import SWITCH
 from impact_posture.sweep.shard import STATUS
 from impact_posture.tables import validate
 
