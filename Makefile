@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-scan study-controller reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-scan study-controller study-sweep reproduction calibration regression
 .PHONY: pictures viewer clean
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo "make study-robustness  where each controller helps, and which targets it keeps: variations of each experiment (some hours; goes on where it was)"
 	@echo "make study-scan     what decides along the redundancy of an arm and of a humanoid, as a picture"
 	@echo "make study-controller  the controller in C against the one in Python: equal commands, times of a tick (some minutes)"
+	@echo "make study-sweep    what sweeps survive (killed workers and parents, MPI, Slurm jobs), and what they cost"
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make pictures    draw the pictures that the documentation shows"
@@ -110,6 +111,9 @@ study-flow: $(VENV)/.installed-test
 
 study-controller: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks.controller build/controller 10000
+
+study-sweep: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks.sweep
 
 reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks reproduction --write

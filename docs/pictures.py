@@ -52,6 +52,10 @@ def main() -> None:
                 picture_report(out / "report.html")
             for figure, name in figures.items():
                 shutil.copy(out / f"{figure}.png", IMAGES / f"{name}.png")
+    with tempfile.TemporaryDirectory() as folder:
+        for words in (["sweep", str(IMAGES.parent / "examples/press.toml"), "--quiet"], ["sweep", "show", "press"]):
+            subprocess.run([str(program), *words], cwd=folder, check=True)
+        shutil.copy(Path(folder) / "press/maps/map-0.png", IMAGES / "sweep.png")
 
 
 if __name__ == "__main__":

@@ -227,13 +227,13 @@ class SolverFailed(ImpactPostureError):
 
 
 class WorkerDied(ImpactPostureError):
-    """A worker process ended without an answer."""
+    """A worker process ended without an answer; carries the option that says how many there are."""
 
-    def __init__(self) -> None:
+    def __init__(self, option: str = "jobs") -> None:
         super().__init__(
             "a worker process was killed",
-            where="jobs",
-            hint="give it more memory, or work in one process: `jobs=1`",
+            where=option,
+            hint=f"give it more memory, or work in one process: `{option}=1`",
         )
 
 

@@ -88,12 +88,13 @@ class ImpactOracle:
         self.feet = [(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
         self.compliance = case.compliance
         self._q: Array | None = None
+        self._quantities: ImpactQuantities | None = None
 
     def at(self, q: Array) -> ImpactOracle:
         """Move to ``q`` and factorize there."""
         if self._q is not None and np.array_equal(q, self._q):
             return self
-        self._q = np.array(q, dtype=float)
+        self._q, self._quantities = np.array(q, dtype=float), None
         num = self.numeric.at(self._q)
         parts = [num.jacobian(point)[:rows] for point, rows in self.feet]
         Js = np.vstack(parts) if parts else np.zeros((0, self.robot.nv))
@@ -123,8 +124,10 @@ class ImpactOracle:
         return np.asarray((self.metric.diagonal(self._nv) * a.T).T)
 
     def quantities(self, q: Array) -> ImpactQuantities:
-        """Return all quantities at ``q``."""
+        """Return all quantities at ``q``, computed once for the last posture."""
         self.at(q)
+        if self._quantities is not None:
+            return self._quantities
         answers = self.answer(self.J.T)
         A = answers.a
         mobility = self.J @ A
@@ -137,7 +140,7 @@ class ImpactOracle:
         if held.can_move(self.n):
             found, s = held.answer(velocity=self.n)
             stuck = found.a
-        return ImpactQuantities(
+        self._quantities = ImpactQuantities(
             H=H,
             G=G,
             V=H / G**2 if G > 0 else float("inf"),
@@ -151,6 +154,7 @@ class ImpactOracle:
             normal=self.n.copy(),
             support_impulse=np.asarray(answers.f @ self.n),
         )
+        return self._quantities
 
     def with_support_impulses(self, a: Array) -> Array:
         """Return ``a`` and its support impulses ``−J_s a/ε`` at the last posture, as one vector."""

@@ -1,50 +1,31 @@
-"""Solve the points of one case: a program that is built once, warm starts, and a certificate for each point."""
+"""Robot, problems and programs of one case, which a process builds once."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.errors import ImpactPostureError, Infeasible, InputError
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.resolved_impact import resolve
 from impact_posture.posture.build_problem import retarget
-from impact_posture.posture.certificate import Certificate, certify
-from impact_posture.posture.elastic import elastic
-from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, build_nlp
+from impact_posture.posture.nlp import PostureNLP, build_nlp
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.problem_settings import Prepared, prepare
-from impact_posture.posture.search import FEASIBLE, HIGH_PRICE
-from impact_posture.posture.solve import distinct
-from impact_posture.posture.starts import Projector, random_posture
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.sweep.grid import Grid
-from impact_posture.sweep.sweep_file import OFFSETS, Case, at_point
+from impact_posture.sweep.point_search import Place, Timer, Walk
+from impact_posture.sweep.sweep_file import OFFSETS, Case
 
 # Problems and programs that a process keeps.  Both are small beside the solver itself.
 _TEMPLATES, _PROGRAMS = 64, 16
-# Most rounds in which the program of a point grows.
-_ROUNDS = 8
-# Postures from which the constraints are relaxed, and random starts where a neighbor is infeasible already.
-_TRIES, _FEW = 4, 3
-# An optimum is better than another if its objective is lower by this share.
-_BETTER = 1e-4
 
 _Value = TypeVar("_Value")
-
-
-class PointResult(NamedTuple):
-    """The answer to one problem: its columns in the table, and its posture, shape (nq,), if there is one."""
-
-    row: dict[str, Any]
-    q: Array | None = None
 
 
 class CaseSolver:
@@ -54,16 +35,15 @@ class CaseSolver:
         case: The case.
 
     Attributes:
-        solver_s: Processor time within IPOPT and the functions that it calls, s.
+        timer: Time of the solver.
         robot: The robot.
-        seed: Seed of the random starts.
 
     Raises:
         ImpactPostureError: A setting is wrong.
     """
 
     def __init__(self, case: Case) -> None:
-        self._case, self.solver_s, self.seed = case, 0.0, case.settings.seed
+        self._case, self.timer = case, Timer()
         self._loaded = load_robot(case.settings.robot, case.settings)
         self.template = lru_cache(_TEMPLATES)(self._template)
         self._programs: OrderedDict[str, PostureNLP] = OrderedDict()
@@ -77,39 +57,34 @@ class CaseSolver:
 
     def _template(self, normal: Any, speed: float) -> Prepared:
         """Return the problem with a normal and a speed, at the target of the case."""
-        settings = at_point(self._case, {"normal": normal, "speed": speed})
+        settings = replace(self._case.settings, normal=normal, speed=speed)
         made = prepare(settings, resolve(settings, self._loaded))
         # Most problems do not depend on the speed, and then all speeds share their solutions.
         objective = made.impact.objective
         key = objective.structure, tuple(objective.parameters), made.problem.requirements
         return replace(kept(self._known, key, lambda: made, _TEMPLATES), impact=made.impact)
 
-    def target(self, prepared: Prepared, values: Mapping[str, Any]) -> tuple[Any, Any]:
+    def target(self, prepared: Prepared, values: Mapping[str, Any]) -> Place:
         """Return the position and orientation of the contact frame at values of the grid."""
         position = values.get("target_position", self._case.settings.target_position)
         quaternion = values.get("target_quaternion", self._case.settings.target_quaternion)
-        offset = np.array([values.get(name, 0.0) for name in OFFSETS])
-        if offset.any() or any(name in values for name in OFFSETS):
+        if any(name in values for name in OFFSETS):
             if position is None:
                 frame = point_on(self.robot, prepared.impact.contact.frame)
                 position = Numeric(self.robot.model).at(prepared.impact.q).placement(frame).translation
-            position = tuple(float(v) for v in np.array(position) + offset)
+            position = tuple(float(v) for v in np.array(position) + [values.get(name, 0.0) for name in OFFSETS])
         return position, quaternion
 
     def check(self, grid: Grid) -> None:
         """Check that the targets of the grid fit the problem.
 
         Raises:
-            InputError: A target is given but the contact takes none, or a quaternion has no unit length.
+            InputError: The contact takes no target, or a quaternion has no unit length.
         """
         for axis in grid.axes:
-            for value in axis.values if axis.name in ("target_quaternion", "target_position") else axis.values[:1]:
+            for value in axis.values if axis.name.startswith("target") else axis.values[:1]:
                 prepared = self.template(*self.normal_and_speed({axis.name: value}))
-                if len(prepared.impact.objective.contacts) > 1:
-                    what, hint = "varies, but there are several contacts", "state one contact by `frame` and `normal`"
-                    raise InputError(what, where=f"grid.{axis.name}", hint=hint)
-                if axis.name not in ("normal", "speed"):
-                    retarget(prepared.problem, *self.target(prepared, {axis.name: value}))
+                retarget(prepared.problem, *self.target(prepared, {axis.name: value}))
 
     def program(self, problem: PostureProblem) -> PostureNLP:
         """Return the program of a problem, built anew only if its expressions are new.
@@ -121,155 +96,9 @@ class CaseSolver:
         made = kept(self._programs, key, lambda: build_nlp(problem, compile="never"), _PROGRAMS)
         return replace(made, problem=problem)
 
-    def search(
-        self, walk: Walk, place: tuple[Any, Any], guesses: Sequence[Array], *, few: bool = False
-    ) -> PointResult:
-        """Solve one point: from the guesses and the given posture, and from many starts where they disagree.
-
-        Args:
-            walk: Problem and program as the points before have left them.
-            place: Target position and orientation.
-            guesses: Optima of neighbors.
-            few: Whether few starts are enough, because a neighbor is infeasible and none has an optimum.
-        """
-        attempt = _Attempt(self, walk, place, _FEW if few else self._case.settings.starts - 1)
-        try:
-            if (found := attempt.certified(guesses)) is not None:
-                return found
-            # Either this finds the constraints that conflict, or a posture to start from.
-            relaxed = elastic(attempt.problem, self._case.settings.seed, 1 if few else _TRIES)
-            if relaxed.conflicts:
-                return attempt.without("infeasible", Infeasible(relaxed.conflicts).what)
-            if (found := attempt.certified([relaxed.q])) is not None:
-                return found
-            return attempt.without("uncertified", attempt.fault)
-        except ImpactPostureError as error:
-            return attempt.without("undefined", error.line)
-
-
-class _Attempt:
-    """The runs at one point.
-
-    Args:
-        solver: The solver of the case.
-        walk: Problem and program of the template, which this grows.
-        place: Target position and orientation.
-        others: Number of random starts where the first ones disagree.
-
-    Attributes:
-        problem: The problem at this point.
-        runs: Number of runs.
-        fault: What the last posture that failed its certificate lacks.
-    """
-
-    def __init__(self, solver: CaseSolver, walk: Walk, place: tuple[Any, Any], others: int) -> None:
-        self.problem, self.runs, self.fault = retarget(walk.problem, *place), 0, "no run converged"
-        self._solver, self._walk, self._others = solver, walk, others
-
-    def certified(self, guesses: Sequence[Array]) -> PointResult | None:
-        """Return the best certified posture, with parts added to the program as its ends need them."""
-        price = SLACK_PRICE
-        for _ in range(_ROUNDS):
-            problem = self.problem
-            nlp = replace(self._walk.nlp, problem=problem)
-            scale = problem.objective.value(guesses[0] if len(guesses) else problem.given)
-            ends = [self._run(nlp, start, scale, price) for start in [*guesses, problem.given]]
-            if not _agree(problem, ends[:-1], ends[-1]):
-                ends += [self._run(nlp, start, scale, price) for start in self._random_starts()]
-            found = _optima(problem, ends)
-            for end in found:
-                certificate = certify(problem, end.q, scale, end.auxiliaries)
-                if certificate.holds() and self._is_clear(end.q):
-                    return self._answer(end, certificate, len(found))
-                self.fault = f"stationarity {certificate.stationarity:.1e}, violation {certificate.primal:.1e}"
-            if not found:
-                return None
-            self.problem, guesses = problem.grown([end.q for end in found]), [end.q for end in found]
-            if self.problem is not problem:
-                self._walk.grow(self._solver, self.problem)
-            elif price == SLACK_PRICE:
-                # An end that lacks nothing and still violates something is a trap.
-                price = HIGH_PRICE
-            else:
-                return None
-        return None
-
-    def _random_starts(self) -> Iterator[Array]:
-        """Yield random postures that one projection takes to the constraints."""
-        projector = Projector(self.problem)
-        for k in range(1, self._others + 1):
-            rng = np.random.default_rng([self._solver.seed, k])
-            found = projector.project(random_posture(self.problem, projector.chart, rng, near=k % 2 == 1))
-            if found.violation <= FEASIBLE:
-                yield found.q
-
-    def _run(self, nlp: PostureNLP, start: Array, scale: float, price: float) -> _End:
-        record = nlp.solve(start, scale=scale, price=price)
-        self.runs += 1
-        self._solver.solver_s += record.cpu_s
-        value = scale * record.minimized if record.converged else np.inf
-        return _End(record.q, value, record.auxiliaries)
-
-    def _is_clear(self, q: Array) -> bool:
-        around = self.problem.surroundings
-        return self.problem.objective.movable(q) and not (around and around.collisions(q))
-
-    def _answer(self, end: _End, certificate: Certificate, optima: int) -> PointResult:
-        found = self.problem.impact.oracle.quantities(end.q)
-        row = {
-            "status": "certified",
-            "q": end.q.tolist(),
-            "value": self.problem.objective.value(end.q),
-            **{key: getattr(found, key) for key in "HGVSE"},
-            "stationarity": certificate.stationarity,
-            "violation": certificate.primal,
-            "optima": optima,
-            "runs": self.runs,
-        }
-        return PointResult(row, end.q)
-
-    def without(self, status: str, reason: str) -> PointResult:
-        """Return the answer that there is no posture."""
-        return PointResult({"status": status, "reason": reason, "optima": 0, "runs": self.runs})
-
-
-class Walk:
-    """Problem and program of one template on its way through a shard, where both may grow.
-
-    Args:
-        solver: The solver of the case.
-        problem: The problem of the template.
-    """
-
-    def __init__(self, solver: CaseSolver, problem: PostureProblem) -> None:
-        # Kept, because a shard knows it by its identity.
-        self._template = problem
-        self.problem, self.nlp = problem, solver.program(problem)
-
-    def grow(self, solver: CaseSolver, problem: PostureProblem) -> None:
-        """Go on with the parts that a point needed."""
-        self.problem, self.nlp = problem, solver.program(problem)
-
-
-class _End(NamedTuple):
-    """End of a run; the value, with what the program adds to the objective, is infinite if it did not converge."""
-
-    q: Array
-    value: float
-    auxiliaries: Array
-
-
-def _optima(problem: PostureProblem, ends: Sequence[_End]) -> list[_End]:
-    """Return one end for each distinct optimum, the best first."""
-    known = {id(end.q): end for end in ends}
-    return [known[id(one.q)] for one in distinct(problem, [(e.q, e.value) for e in ends if np.isfinite(e.value)])]
-
-
-def _agree(problem: PostureProblem, ends: Sequence[_End], home: _End) -> bool:
-    """Whether all neighbors lead to one optimum, and the given posture leads to no better one."""
-    if not ends or not all(np.isfinite(end.value) for end in ends):
-        return False
-    return len(_optima(problem, ends)) == 1 and home.value > (1 - _BETTER) * min(end.value for end in ends)
+    def walk(self, template: PostureProblem) -> Walk:
+        """Return the way of a template through a shard."""
+        return Walk(template, self._case.settings, self.program, self.timer)
 
 
 def kept(cache: OrderedDict[Any, _Value], key: Any, make: Callable[[], _Value], most: int) -> _Value:

@@ -11,18 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from impact_posture.errors import InputError
-from impact_posture.processes import depend
+from impact_posture.processes import depend, signals_held
 from impact_posture.sweep.atlas import check_package
 
 
 @contextmanager
 def process_pool(workers: int) -> Iterator[Executor]:
     """Yield a pool of processes on this machine; none outlives the block."""
-    # Spawned and not forked: a fork of a process with threads, such as those of pyarrow, may hang.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, depend, (os.getpid(),))
+    # Forked as everywhere in this package: nothing is imported again, and a signal leaves no semaphores behind.
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), depend, (os.getpid(),))
     others = set(multiprocessing.active_children())
     try:
+        # All workers are forked here, before anything starts a thread.  A signal reaches every process of the
+        # terminal, and no worker may act on it.
+        with signals_held():
+            pool.submit(os.getpid)
         yield pool
     finally:
         for child in set(multiprocessing.active_children()) - others:
@@ -57,7 +60,7 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def mpi_ranks() -> Iterator[Executor]:
-    """Yield the executor over the ranks of ``mpiexec -n N python -m mpi4py.futures -m impact_posture_cli …``.
+    """Yield the executor over the ranks of ``mpiexec -n N python -m mpi4py.futures $(which impact-posture) …``.
 
     Raises:
         InputError: The package or an MPI library is missing.

@@ -25,12 +25,13 @@ from impact_posture.posture.solve import wrapped_difference
 from impact_posture.settings import ProblemSettings
 from impact_posture.sweep.atlas import open_atlas, read_manifest
 from impact_posture.sweep.grid import Axis, Grid
+from impact_posture.sweep.point_search import SWITCH
 from impact_posture.sweep.shard import STATUS
 from impact_posture.tables import validate
 
-# The best posture switches between neighbors that differ by more than this (rad, m, tangent norm without the place of
-# the base), and by more than this many times what neighbors usually differ by.
-_SWITCH, _UNUSUAL = 0.2, 4.0
+# The best posture switches between neighbors that differ (tangent norm, without the place of the base) by more than
+# SWITCH, and by more than this many times what neighbors usually differ by.
+_UNUSUAL = 4.0
 # From this ratio of the largest to the least objective on, colors follow its logarithm.
 _WIDE = 20.0
 _HATCH = {"infeasible": "////", "uncertified": "....", "undefined": "xxxx"}
@@ -177,7 +178,7 @@ def _switches(postures: Sequence[Sequence[Array | None]], problem: PostureProble
                         size = float(np.linalg.norm(wrapped_difference(problem, q, next_to)[own]))
                         steps.append((size, (row, column), other))
     usual = float(np.median([size for size, _, _ in steps])) if steps else 0.0
-    return [(one, other) for size, one, other in steps if size > max(_SWITCH, _UNUSUAL * usual)]
+    return [(one, other) for size, one, other in steps if size > max(SWITCH, _UNUSUAL * usual)]
 
 
 def _best(data: Any, grid: Grid, number: int, values: dict[str, Any]) -> list[dict[str, Any]]:

@@ -82,7 +82,7 @@ def run_sweep(
                 if progress:
                     progress(done, points)
         except BrokenExecutor:
-            raise WorkerDied() from None
+            raise WorkerDied("workers") from None
     return SweepRun(folder, sweep.points, counts, shards, solver_s, total_s)
 
 

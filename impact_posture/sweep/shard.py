@@ -12,8 +12,9 @@ from functools import partial
 from typing import Any
 
 from impact_posture.posture.nlp import one_blas_thread
-from impact_posture.sweep.case_solver import CaseSolver, PointResult, Walk, kept
+from impact_posture.sweep.case_solver import CaseSolver, kept
 from impact_posture.sweep.grid import Axis
+from impact_posture.sweep.point_search import PointResult, Walk, improve, search
 from impact_posture.sweep.sweep_file import Sweep
 
 # MUMPS, within IPOPT, is not made for threads; a worker with several takes its shards one after the other.
@@ -62,11 +63,11 @@ def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
         began = time.process_time()
         case, points = sweep.span(index)
         solver = _solver(sweep, key, case)
-        solver.solver_s = 0.0
+        solver.timer.solver_s = 0.0
         results = _walk(sweep, solver, points)
         content = _parquet(sweep, key, case, points, results, solver)
         counts = {status: sum(one.row["status"] == status for one in results) for status in STATUS}
-        return ShardResult(index, content, counts, solver.solver_s, time.process_time() - began)
+        return ShardResult(index, content, counts, solver.timer.solver_s, time.process_time() - began)
 
 
 def _solver(sweep: Sweep, key: str, case: int) -> CaseSolver:
@@ -74,23 +75,35 @@ def _solver(sweep: Sweep, key: str, case: int) -> CaseSolver:
 
 
 def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
+    """Solve the points of a shard, each from the neighbors before it, then look back from the neighbors after it."""
     results: list[PointResult] = []
     walks: OrderedDict[int, Walk] = OrderedDict()
-    last: tuple[Walk | None, Any] = None, None
-    for point in points:
+
+    def at(point: int) -> tuple[Walk, Any]:
         values = sweep.grid.values(point)
         prepared = solver.template(*solver.normal_and_speed(values))
-        walk = kept(walks, id(prepared.problem), partial(Walk, solver, prepared.problem), _KEPT_WALKS)
-        target = solver.target(prepared, values)
-        if last[0] is walk and last[1] == target:
+        walk = kept(walks, id(prepared.problem), partial(solver.walk, prepared.problem), _KEPT_WALKS)
+        return walk, solver.target(prepared, values)
+
+    last: tuple[Walk, Any] | None = None
+    for point in points:
+        walk, target = at(point)
+        if last is not None and last[0] is walk and last[1] == target:
             # Only the speed differs, and the problem does not see it.
             results.append(results[-1])
             continue
         before = [results[k - points.start] for k in sweep.grid.neighbors(point, points.start)]
         guesses = [one.q for one in before if one.q is not None]
         few = not guesses and any(one.row["status"] == "infeasible" for one in before)
-        results.append(solver.search(walk, target, guesses, few=few))
+        results.append(search(walk, target, guesses, few=few))
         last = walk, target
+    # An optimum that appears on the way may have been the better one already before.
+    for point in reversed(points):
+        posture = results[point - points.start].q
+        if posture is not None:
+            for other in sweep.grid.neighbors(point, points.start):
+                known = results[other - points.start]
+                results[other - points.start] = improve(*at(other), known, posture)
     return results
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -112,9 +112,8 @@ def read_sweep(path: Path) -> Sweep:
     outer = [name for name in values if name not in _INNER]
     inner = [name for name in _INNER if name in values]
     _check_names([*outer, *inner], f"{path}: grid")
-    if "normal" in inner and "contact" in problem:
-        what = "varies, but `contact` states the normal of each contact"
-        raise SpecError(what, where=f"{path}: grid.normal", hint="use `frame` and `normal` in the problem")
+    if "contact" in problem:
+        raise SpecError("a sweep is of one contact", where=f"{where}.contact", hint="give `frame` and `normal`")
     first = {name: values[name][0] for name in inner if name not in OFFSETS}
     made = validate(ProblemSettings, problem | first | {name: values[name][0] for name in outer}, where)
     axes = tuple(Axis(name, _checked(name, values[name], problem | first, f"{path}: grid")) for name in inner)
@@ -140,7 +139,9 @@ def _values(name: str, given: Any, where: str) -> tuple[Any, ...]:
         ends = all(isinstance(v, int | float) and abs(v) < float("inf") for v in (low, high))
         if not ends or set(given) != {"from", "to", "count"} or type(count) is not int or not 2 <= count <= 10**6:
             raise SpecError("is no range", where=where, hint="give from, to and count (2 to 1e6), or a list")
-        return tuple(low + (high - low) * k / (count - 1) for k in range(count))
+        # Rounded, so that a tenth is a tenth and zero is zero.
+        even = [low + (high - low) * k / (count - 1) for k in range(count)]
+        return tuple(0.0 if abs(v) < 1e-12 * abs(high - low) else float(f"{v:.12g}") for v in even)
     if not isinstance(given, list) or not given:
         raise SpecError("is no axis", where=where, hint="give a list of values, or { from, to, count }")
     return tuple(float(v) if name in _INNER and type(v) is int else v for v in given)
@@ -174,9 +175,3 @@ def _checked(name: str, values: Sequence[Any], problem: dict[str, Any], where: s
     if len(set(map(repr, found))) < len(found):
         raise SpecError("has a value twice", where=f"{where}.{name}", hint="leave one of them out")
     return tuple(found)
-
-
-def at_point(case: Case, values: Mapping[str, Any]) -> ProblemSettings:
-    """Return the problem of a case at values of the grid, without its target."""
-    own = {name: values[name] for name in ("normal", "speed") if name in values}
-    return replace(case.settings, **own) if own else case.settings

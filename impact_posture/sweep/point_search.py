@@ -1,0 +1,226 @@
+"""Solve one point of a sweep: warm starts, random starts where they disagree, a certificate, or the reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from impact_posture.arrays import Array
+from impact_posture.errors import ImpactPostureError, Infeasible
+from impact_posture.posture.build_problem import retarget
+from impact_posture.posture.certificate import Certificate, certify
+from impact_posture.posture.elastic import elastic
+from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP
+from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.search import FEASIBLE, HIGH_PRICE
+from impact_posture.posture.solve import distinct
+from impact_posture.posture.starts import Projector, random_posture
+from impact_posture.settings import ProblemSettings
+
+# Most rounds in which the program of a point grows.
+_ROUNDS = 8
+# Postures from which the constraints are relaxed, and random starts where a neighbor is infeasible already.
+_TRIES, _FEW = 4, 3
+# Postures whose joints differ by more than this (rad, m) may be of different optima.
+SWITCH = 0.2
+# An optimum is better than another if its objective is lower by this share.
+_BETTER = 1e-4
+
+# Position and orientation of the contact frame; ``None`` where it is at the given posture.
+Place = tuple[Any, Any]
+
+
+class PointResult(NamedTuple):
+    """The answer to one problem: its columns in the table, and its posture, shape (nq,), if there is one."""
+
+    row: dict[str, Any]
+    q: Array | None = None
+
+
+@dataclass
+class Timer:
+    """Processor time within IPOPT and the functions that it calls, s."""
+
+    solver_s: float = 0.0
+
+
+class Walk:
+    """Problem and program of one template on its way through a shard, where both may grow.
+
+    Args:
+        template: The problem with the normal and the speed of some points.
+        settings: Number of starts, and their seed.
+        build: Returns the program of a problem.
+        timer: Where the time of the solver is added.
+    """
+
+    def __init__(
+        self,
+        template: PostureProblem,
+        settings: ProblemSettings,
+        build: Callable[[PostureProblem], PostureNLP],
+        timer: Timer,
+    ) -> None:
+        # The template is kept, because a shard knows it by its identity.
+        self._template, self._build, self.settings, self.timer = template, build, settings, timer
+        self.grow(template)
+
+    def grow(self, problem: PostureProblem) -> None:
+        """Go on with the parts that a point needed."""
+        self.problem, self.nlp = problem, self._build(problem)
+
+
+def search(walk: Walk, place: Place, guesses: Sequence[Array], *, few: bool = False) -> PointResult:
+    """Solve one point: from the guesses and the given posture, and from many starts where they disagree.
+
+    Args:
+        walk: Problem and program as the points before have left them.
+        place: Target position and orientation.
+        guesses: Optima of neighbors.
+        few: Whether few starts are enough, because a neighbor is infeasible and none has an optimum.
+    """
+    attempt = _Attempt(walk, place, _FEW if few else walk.settings.starts - 1)
+    try:
+        if (found := attempt.certified(guesses)) is not None:
+            return found
+        # Either this finds the constraints that conflict, or a posture to start from.
+        relaxed = elastic(attempt.problem, walk.settings.seed, 1 if few else _TRIES)
+        if relaxed.conflicts:
+            return attempt.without("infeasible", Infeasible(relaxed.conflicts).what)
+        if (found := attempt.certified([relaxed.q])) is not None:
+            return found
+        return attempt.without("uncertified", attempt.fault)
+    except ImpactPostureError as error:
+        return attempt.without("undefined", error.line)
+
+
+def improve(walk: Walk, place: Place, known: PointResult, guess: Array) -> PointResult:
+    """Return the better of a known answer and of the optimum that the posture of a later neighbor leads to."""
+    # The base of a robot that floats follows the target, which is no other optimum.
+    own = slice(3 if walk.problem.robot.floating else 0, None)
+    if known.q is not None and np.abs(known.q - guess)[own].max() < SWITCH:
+        return known
+    attempt = _Attempt(walk, place, 0)
+    try:
+        found = attempt.certified([guess], alone=True)
+    except ImpactPostureError:
+        found = None
+    if found is None or (known.q is not None and found.row["value"] > (1 - _BETTER) * known.row["value"]):
+        return known
+    counts = {key: known.row[key] + found.row[key] for key in ("optima", "runs")}
+    return PointResult({**found.row, **counts}, found.q)
+
+
+class _Attempt:
+    """The runs at one point.
+
+    Args:
+        walk: Problem and program of the template, which this grows.
+        place: Target position and orientation.
+        others: Number of random starts where the first ones disagree.
+
+    Attributes:
+        problem: The problem at this point.
+        runs: Number of runs.
+        fault: What the last posture that failed its certificate lacks.
+    """
+
+    def __init__(self, walk: Walk, place: Place, others: int) -> None:
+        self.problem, self.runs, self.fault = retarget(walk.problem, *place), 0, "no run converged"
+        self._walk, self._others = walk, others
+
+    def certified(self, guesses: Sequence[Array], *, alone: bool = False) -> PointResult | None:
+        """Return the best certified posture, with parts added to the program as its ends need them.
+
+        Args:
+            guesses: Where the runs start, besides the given posture and the random ones.
+            alone: Whether nothing else is started from.
+        """
+        price = SLACK_PRICE
+        for _ in range(_ROUNDS):
+            problem = self.problem
+            nlp = replace(self._walk.nlp, problem=problem)
+            scale = problem.objective.value(guesses[0] if len(guesses) else problem.given)
+            home = [] if alone else [problem.given]
+            ends = [self._run(nlp, start, scale, price) for start in [*guesses, *home]]
+            if not alone and not _agree(problem, ends[:-1], ends[-1]):
+                ends += [self._run(nlp, start, scale, price) for start in self._random_starts()]
+            found = _optima(problem, ends)
+            for end in found:
+                certificate = certify(problem, end.q, scale, end.auxiliaries)
+                if certificate.holds() and self._is_clear(end.q):
+                    return self._answer(end, certificate, len(found))
+                self.fault = f"stationarity {certificate.stationarity:.1e}, violation {certificate.primal:.1e}"
+            if not found:
+                return None
+            self.problem, guesses = problem.grown([end.q for end in found]), [end.q for end in found]
+            if self.problem is not problem:
+                self._walk.grow(self.problem)
+            elif price == SLACK_PRICE:
+                # An end that lacks nothing and still violates something is a trap.
+                price = HIGH_PRICE
+            else:
+                return None
+        return None
+
+    def _random_starts(self) -> Iterator[Array]:
+        """Yield random postures that one projection takes to the constraints."""
+        projector = Projector(self.problem)
+        for k in range(1, self._others + 1):
+            rng = np.random.default_rng([self._walk.settings.seed, k])
+            found = projector.project(random_posture(self.problem, projector.chart, rng, near=k % 2 == 1))
+            if found.violation <= FEASIBLE:
+                yield found.q
+
+    def _run(self, nlp: PostureNLP, start: Array, scale: float, price: float) -> _End:
+        record = nlp.solve(start, scale=scale, price=price)
+        self.runs += 1
+        self._walk.timer.solver_s += record.cpu_s
+        value = scale * record.minimized if record.converged else np.inf
+        return _End(record.q, value, record.auxiliaries)
+
+    def _is_clear(self, q: Array) -> bool:
+        around = self.problem.surroundings
+        return self.problem.objective.movable(q) and not (around and around.collisions(q))
+
+    def _answer(self, end: _End, certificate: Certificate, optima: int) -> PointResult:
+        found = self.problem.impact.oracle.quantities(end.q)
+        row = {
+            "status": "certified",
+            "q": end.q.tolist(),
+            "value": self.problem.objective.value(end.q),
+            **{key: getattr(found, key) for key in "HGVSE"},
+            "stationarity": certificate.stationarity,
+            "violation": certificate.primal,
+            "optima": optima,
+            "runs": self.runs,
+        }
+        return PointResult(row, end.q)
+
+    def without(self, status: str, reason: str) -> PointResult:
+        """Return the answer that there is no posture."""
+        return PointResult({"status": status, "reason": reason, "optima": 0, "runs": self.runs})
+
+
+class _End(NamedTuple):
+    """End of a run; the value, with what the program adds to the objective, is infinite if it did not converge."""
+
+    q: Array
+    value: float
+    auxiliaries: Array
+
+
+def _optima(problem: PostureProblem, ends: Sequence[_End]) -> list[_End]:
+    """Return one end for each distinct optimum, the best first."""
+    known = {id(end.q): end for end in ends}
+    return [known[id(one.q)] for one in distinct(problem, [(e.q, e.value) for e in ends if np.isfinite(e.value)])]
+
+
+def _agree(problem: PostureProblem, ends: Sequence[_End], home: _End) -> bool:
+    """Whether all neighbors lead to one optimum, and the given posture leads to no better one."""
+    if not ends or not all(np.isfinite(end.value) for end in ends):
+        return False
+    return len(_optima(problem, ends)) == 1 and home.value > (1 - _BETTER) * min(end.value for end in ends)
