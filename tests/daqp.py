@@ -1,4 +1,4 @@
-"""The sources of DAQP for tests, which use no network."""
+"""The sources of DAQP for tests."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from impact_posture.controller_export.daqp_sources import VERSION, daqp_sources
-from impact_posture.libraries import cache_path
+from impact_posture.controller_export.daqp_sources import daqp_sources
+from impact_posture.errors import InputError
 
 
 def sources_or_skip() -> dict[str, bytes]:
-    """Return the sources of the folder ``$DAQP_SOURCES`` or of the cache; skip the test where there are none."""
+    """Return the sources in ``$DAQP_SOURCES``, or those that pip has; skip the test where there are none."""
     folder = os.environ.get("DAQP_SOURCES")
     if folder:
         return daqp_sources(Path(folder))
-    if (cache_path() / f"daqp-{VERSION}.tar.gz").is_file():
+    try:
         return daqp_sources()
-    return pytest.skip(f"no sources of DAQP {VERSION} in the cache; DAQP_SOURCES names a folder that has them")
+    except InputError as error:
+        return pytest.skip(error.line)
