@@ -27,7 +27,9 @@ from impact_posture.impact.contact import point_on
 from impact_posture.version import __version__
 
 # Files in c/, in the order in which one source has them.
-_CORE = ("algebra.c", "tasks.c", "posture.c", "qp.c", "rank.c", "give_way.c", "tick.c")
+_CORE = (
+    "algebra.c", "tasks.c", "posture.c", "qp.c", "rank.c", "solve.c", "give_way.c", "init.c", "tick.c", "report.c",
+)  # fmt: skip
 # Parameters that init compares with others.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
 # Bytes of variables, saved registers and return addresses of all functions below a tick, beside the arrays.

@@ -4,83 +4,6 @@
 /* Largest sum of squares of a measurement (1e8 m, rad/s or N). */
 #define IP_ABSURD 1e16
 
-const unsigned long ip_context_bytes = (unsigned long)sizeof(ip_context);
-
-void ip_default_params(ip_params *params)
-{
-  *params = ip_defaults;
-}
-
-/* Whether x and y of a rule of ip_rules hold. */
-static int ip_holds(int rule, double x)
-{
-  switch (rule) {
-  case 0:
-    return isfinite(x);
-  case 1:
-    return isfinite(x) && x >= 0.0;
-  case 2:
-    return x > 0.0;
-  default:
-    return !isnan(x);
-  }
-}
-
-int ip_init(ip_context *c, const ip_params *p)
-{
-  const double *value = (const double *)p;
-  int k, i;
-  for (k = 0; k < IP_PARAMETERS; ++k) {
-    for (i = 0; i < ip_rules[2 * k]; ++i) {
-      if (!ip_holds(ip_rules[2 * k + 1], *value++)) {
-        return k + 1;
-      }
-    }
-  }
-  for (i = 0; i < IP_CONTROLS; ++i) {
-    if (!(p->control_lower[i] <= p->control_upper[i]) || p->control_lower[i] == INFINITY || p->control_upper[i] == -INFINITY) {
-      return IP_AT_CONTROL_UPPER;
-    }
-  }
-  for (i = IP_BASE; i < IP_NV; ++i) {
-    if (!(p->joint_lower[i] <= p->joint_upper[i])) {
-      return IP_AT_JOINT_UPPER;
-    }
-  }
-  for (k = 0; k < IP_CONTACTS; ++k) {
-    if (!(fabs(sqrt(ip_dot(p->contact_normal + 3 * k, p->contact_normal + 3 * k, 3)) - 1.0) < 1e-9)) {
-      return IP_AT_CONTACT_NORMAL;
-    }
-  }
-  for (i = 0; IP_MOMENTUM && i < 3; ++i) {
-    /* These coordinates have no place for a weight of the base. */
-    if (p->posture_weight[i] != 0.0) {
-      return IP_AT_POSTURE_WEIGHT;
-    }
-  }
-  for (i = 0; IP_MOMENTUM && i < IP_ROWS; ++i) {
-    if (!(p->task_weight[i] > 0.0)) {
-      return IP_AT_TASK_WEIGHT;
-    }
-  }
-  if (!(p->law_rate[0] >= 4.0 * p->law_approach[0])) {
-    return IP_AT_LAW_RATE;
-  }
-  if (relaxation_bytes(IP_VARIABLES, IP_OTHERS, 1 + IP_LEVELS) > sizeof c->relaxation) {
-    return -1;
-  }
-  memset(c, 0, sizeof *c);
-  c->p = *p;
-  c->excess = 1.0;
-  for (i = 0; i < IP_CONTROLS; ++i) {
-    c->excess = isfinite(p->control_lower[i]) ? fmax(c->excess, fabs(p->control_lower[i])) : c->excess;
-    c->excess = isfinite(p->control_upper[i]) ? fmax(c->excess, fabs(p->control_upper[i])) : c->excess;
-  }
-  c->excess *= 1e-6;
-  ip_dynamics_constants(&c->m);
-  return 0;
-}
-
 /* Whether a quaternion, or a cosine with its sine, is far from unit length. */
 static int ip_turned_wrong(const double *q)
 {
@@ -271,47 +194,6 @@ int ip_tick(ip_context *c, double t, const double q[IP_NQ], const double v[IP_NV
   ip_measure_rank(c);
   ip_answer(c, out);
   return out->status;
-}
-
-void ip_last_report(const ip_context *c, ip_report *report)
-{
-  int r, i, k, j;
-  memset(report, 0, sizeof *report);
-  report->status = c->status;
-  report->level = c->level;
-  report->value = c->value;
-  report->dynamics = NAN;
-  if (c->held_now) {
-    return;
-  }
-  report->iterations = c->iterations;
-  memcpy(report->relaxed, c->gave, sizeof report->relaxed);
-  memcpy(report->deficient, c->missed, sizeof report->deficient);
-  memcpy(report->multipliers, c->multipliers, sizeof report->multipliers);
-  for (r = 0; r < IP_ROWS; ++r) {
-    report->rows[r] = ip_dot(c->J[r], c->z, IP_NV) - c->a[r];
-  }
-  report->dynamics = 0.0;
-  for (i = 0; i < IP_NV; ++i) {
-    double error = ip_dot(c->m.M + i * IP_NV, c->z, IP_NV) + c->free_force[i];
-    report->posture[i] = c->z[i] - c->wanted[i];
-    for (k = 0; k < IP_CONTACTS; ++k) {
-      for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
-        error -= c->m.jacobian[ip_contact_point[k]][(j - ip_contact_row[k]) * IP_NV + i] * c->z[IP_NV + IP_SPARE + j];
-      }
-    }
-    for (j = 0; j < IP_ROTORS && i < IP_BASE; ++j) {
-      error -= ip_allocation[i * IP_ROTORS + j] * c->held[j];
-    }
-    error -= i < IP_BASE ? 0.0 : c->held[IP_ROTORS + i - IP_BASE];
-    report->dynamics = fmax(report->dynamics, fabs(error));
-  }
-  for (k = 0; k < IP_CONTACTS; ++k) {
-    for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
-      const double *J = c->m.jacobian[ip_contact_point[k]] + (j - ip_contact_row[k]) * IP_NV;
-      report->contacts[j] = ip_dot(J, c->z, IP_NV) - c->contact_a[j];
-    }
-  }
 }
 
 int ip_move_to(ip_context *c, const double q[IP_NQ], double over)

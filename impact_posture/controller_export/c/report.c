@@ -1,0 +1,42 @@
+/* What a program reads about a tick. */
+
+void ip_last_report(const ip_context *c, ip_report *report)
+{
+  int r, i, k, j;
+  memset(report, 0, sizeof *report);
+  report->status = c->status;
+  report->level = c->level;
+  report->value = c->value;
+  report->dynamics = NAN;
+  if (c->held_now) {
+    return;
+  }
+  report->iterations = c->iterations;
+  memcpy(report->relaxed, c->gave, sizeof report->relaxed);
+  memcpy(report->deficient, c->missed, sizeof report->deficient);
+  memcpy(report->multipliers, c->multipliers, sizeof report->multipliers);
+  for (r = 0; r < IP_ROWS; ++r) {
+    report->rows[r] = ip_dot(c->J[r], c->z, IP_NV) - c->a[r];
+  }
+  report->dynamics = 0.0;
+  for (i = 0; i < IP_NV; ++i) {
+    double error = ip_dot(c->m.M + i * IP_NV, c->z, IP_NV) + c->free_force[i];
+    report->posture[i] = c->z[i] - c->wanted[i];
+    for (k = 0; k < IP_CONTACTS; ++k) {
+      for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
+        error -= c->m.jacobian[ip_contact_point[k]][(j - ip_contact_row[k]) * IP_NV + i] * c->z[IP_NV + IP_SPARE + j];
+      }
+    }
+    for (j = 0; j < IP_ROTORS && i < IP_BASE; ++j) {
+      error -= ip_allocation[i * IP_ROTORS + j] * c->held[j];
+    }
+    error -= i < IP_BASE ? 0.0 : c->held[IP_ROTORS + i - IP_BASE];
+    report->dynamics = fmax(report->dynamics, fabs(error));
+  }
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
+      const double *J = c->m.jacobian[ip_contact_point[k]] + (j - ip_contact_row[k]) * IP_NV;
+      report->contacts[j] = ip_dot(J, c->z, IP_NV) - c->contact_a[j];
+    }
+  }
+}

@@ -1,0 +1,147 @@
+/* The solution of the QP by DAQP, warm from the last active set. */
+
+/* out = T x, added to out. */
+static void ip_add_turned(const ip_context *c, const double *x, double *out)
+{
+  int i, j;
+#if IP_MOMENTUM
+  double moved[3] = {0};
+#endif
+  for (i = 0; i < IP_NV; ++i) {
+#if IP_DENSE
+    double sum = 0.0;
+    for (j = i; j < IP_NV; ++j) {
+      sum += c->factor[i * IP_NV + j] * x[j];
+    }
+    out[i] += sum;
+#elif IP_MOMENTUM
+    const double step = c->ease[i] * x[i];
+    const int at = ip_entry(i);
+    out[at] += at < 3 ? 0.0 : step;
+    for (j = 0; j < 3; ++j) {
+      moved[j] += at < 3 ? c->m.base[3 * at + j] * step : -c->m.M[j * IP_NV + at] / c->m.M[0] * step;
+    }
+#else
+    (void)j;
+    out[ip_entry(i)] += c->ease[i] * x[i];
+#endif
+  }
+#if IP_MOMENTUM
+  for (j = 0; j < 3; ++j) {
+    out[j] += moved[j];
+  }
+#endif
+  for (i = IP_NV; i < IP_VARIABLES; ++i) {
+    out[i] += c->ease[i] * x[i];
+  }
+}
+
+/* Read z = [v; w; f] from u, and correct it once so that the active rows hold to the last digits: in the variables of
+ * DAQP, the large weights of the cost cost digits. */
+static void ip_decode(ip_context *c, DAQPWorkspace *w)
+{
+  double x[IP_VARIABLES];
+  int i, j;
+  for (i = 0; i < IP_VARIABLES; ++i) {
+    x[i] = c->center[i] + c->u[i];
+    c->z[i] = 0.0;
+  }
+  ip_add_turned(c, x, c->z);
+  memset(x, 0, sizeof x);
+#if IP_MOMENTUM
+  /* The least weight of the acceleration of the base is no part of the diagonal cost. */
+  double rest[IP_NV] = {0};
+  for (i = 0; i < 3; ++i) {
+    rest[i] = -c->added[i] * c->z[i];
+  }
+  ip_whiten(c, rest, x);
+#endif
+  for (i = 0; i < w->n_active; ++i) {
+    const int at = w->WS[i], r = at - IP_SIMPLE, joint = IP_DENSE ? r - (IP_GENERAL - IP_JOINTS_V) : at;
+    const int bounds = IP_LAW && (IP_DENSE ? joint >= 0 : r < 0);
+    const double value = bounds ? c->z[IP_BASE + joint] : ip_dot(c->rows[r], c->z, IP_VARIABLES);
+    w->xldl[i] = c->scaling[at] * (value - (c->sense[at] & DAQP_LOWER ? c->low[at] : c->high[at]));
+    if (IP_MOMENTUM) {
+      w->xldl[i] += at < IP_SIMPLE ? x[at] : ip_dot(c->M[at - IP_SIMPLE], x, IP_VARIABLES);
+    }
+  }
+  daqp_solve_working_set(w);
+  for (i = 0; i < w->n_active; ++i) {
+    const int at = w->WS[i];
+    w->lam_star[i] += w->xldl[i];
+    for (j = 0; at >= IP_SIMPLE && j < IP_VARIABLES; ++j) {
+      x[j] -= c->M[at - IP_SIMPLE][j] * w->xldl[i];
+    }
+    if (at < IP_SIMPLE) {
+      x[at] -= w->xldl[i];
+    }
+  }
+  ip_add_turned(c, x, c->z);
+}
+
+/* Solve from the present active set.  Return the flag of DAQP, positive for a solution. */
+static int ip_solve_warm(ip_context *c)
+{
+  enum { N = IP_VARIABLES, M = IP_SIMPLE + IP_GENERAL };
+  double lam[N + 1], lam_star[N + 1], xldl[N + 1], zldl[N + 1], D[N + 1], L[(N + 1) * (N + 2) / 2], xold[N], Mu[IP_GENERAL];
+  int WS[N + 1], prox[N], i, flag;
+  DAQPSettings settings;
+  DAQPWorkspace w;
+  for (i = 0; i < M; ++i) {
+    if (c->upper[i] - c->lower[i] < -1e-9 * c->scaling[i]) {
+      return DAQP_EXIT_INFEASIBLE;
+    }
+  }
+  memset(&w, 0, sizeof w);
+  memset(prox, 0, sizeof prox);
+  memset(&settings, 0, sizeof settings);
+  settings.primal_tol = 1e-9;
+  settings.dual_tol = DAQP_DEFAULT_DUAL_TOL;
+  settings.zero_tol = DAQP_DEFAULT_ZERO_TOL;
+  settings.pivot_tol = DAQP_DEFAULT_PIVOT_TOL;
+  settings.progress_tol = DAQP_DEFAULT_PROG_TOL;
+  settings.cycle_tol = DAQP_DEFAULT_CYCLE_TOL;
+  settings.iter_limit = IP_ITERATIONS;
+  settings.fval_bound = DAQP_INF;
+  settings.rho_soft = DAQP_DEFAULT_RHO_SOFT;
+  settings.sing_tol = DAQP_DEFAULT_SING_TOL;
+  settings.refactor_tol = DAQP_DEFAULT_REFACTOR_TOL;
+  settings.eq_reduction = DAQP_EQ_REDUCTION_OFF;
+  w.settings = &settings;
+  w.n = N;
+  w.m = M;
+  w.ms = IP_SIMPLE;
+  w.M = c->M[0];
+  w.dupper = c->upper;
+  w.dlower = c->lower;
+  w.scaling = c->scaling;
+  w.sense = c->sense;
+  w.Mu = Mu;
+  w.lam = lam;
+  w.lam_star = lam_star;
+  w.WS = WS;
+  w.D = D;
+  w.L = L;
+  w.xldl = xldl;
+  w.zldl = zldl;
+  w.u = w.x = c->u;
+  w.xold = xold;
+  w.prox_mask = prox;
+  w.outer_iter = 1;
+  memset(c->u, 0, sizeof c->u);
+  flag = daqp_reactivate_constraints(&w);
+  flag = flag < 0 ? flag : daqp_ldp(&w);
+  c->iterations = w.iterations;
+  memset(c->multipliers, 0, sizeof c->multipliers);
+  if (flag > 0) {
+    ip_decode(c, &w);
+  }
+  for (i = 0; flag > 0 && i < w.n_active; ++i) {
+    c->multipliers[WS[i]] = w.lam_star[i] * c->scaling[WS[i]];
+  }
+  if (flag <= 0) {
+    ip_cool(c);
+  }
+  return flag;
+}
+
