@@ -101,22 +101,26 @@ class Separation(NamedTuple):
 def separation(a: SweptHull, placement_a: pin.SE3, b: SweptHull, placement_b: pin.SE3) -> Separation:
     """Return the signed distance of two swept hulls whose joints are at these placements in the world."""
     (shape_a, local_a), (shape_b, local_b) = a.solid, b.solid
-    result, at_a, at_b = coal.DistanceResult(), placement_a * local_a, placement_b * local_b
-    distance = coal.distance(shape_a, transform(at_a), shape_b, transform(at_b), _REQUEST, result)
-    if not np.isfinite(result.normal).all():
-        # A corner on a corner leaves coal without a direction, which a nanometer gives it.
-        at_a.translation = at_a.translation + np.array([0.6, 0.64, 0.48]) * 1e-9
-        result = coal.DistanceResult()
-        distance = coal.distance(shape_a, transform(at_a), shape_b, transform(at_b), _REQUEST, result)
+    distance, result = _measure(shape_a, placement_a * local_a, shape_b, placement_b * local_b)
     points = np.array(result.getNearestPoint1()), np.array(result.getNearestPoint2())
-    return Separation(float(distance), -np.array(result.normal), *points)
+    return Separation(distance, -np.array(result.normal), *points)
 
 
 def distance_from_hull(point: Array, hull: SweptHull) -> float:
     """Return the distance of a point in the axes of a hull from the swept hull, m."""
-    solid, at = hull.solid
-    place = coal.Transform3s(np.eye(3), point)
-    return float(coal.distance(_POINT, place, solid, transform(at), _REQUEST, coal.DistanceResult()))
+    return _measure(_POINT, pin.SE3(np.eye(3), point), *hull.solid)[0]
+
+
+def _measure(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> tuple[float, Any]:
+    """Return the distance of two shapes of coal, m, and what coal says of it."""
+    result = coal.DistanceResult()
+    distance = coal.distance(a, transform(at_a), b, transform(at_b), _REQUEST, result)
+    if not np.isfinite(result.normal).all():
+        # A corner on a corner leaves coal without a direction, which a nanometer gives it.
+        at_a.translation = at_a.translation + np.array([0.6, 0.64, 0.48]) * 1e-9
+        result = coal.DistanceResult()
+        distance = coal.distance(a, transform(at_a), b, transform(at_b), _REQUEST, result)
+    return float(distance), result
 
 
 def transform(placement: pin.SE3) -> Any:
