@@ -23,6 +23,7 @@ from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.task_formulation import TaskFormulation
 from tests.command import run
 from tests.exported_controller import compiled, exported, formulation_of, impact_of
+from tests.tools import need
 
 ABUSE = Path(__file__).with_name("controller_abuse.c")
 STRICT = ["-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
@@ -156,3 +157,31 @@ def test_the_command_says_what_is_wrong_in_a_line(arguments: list[str], words: s
     assert words in " ".join(ran.stderr.split())
     assert "Traceback" not in ran.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_cmake_builds_a_program_with_its_own_daqp_or_an_installed_one(tmp_path: Path) -> None:
+    cmake = need("cmake")
+    folder = exported("panda")
+    (tmp_path / "main.c").write_text(
+        '#include "ctl.h"\n#include <stdlib.h>\n'
+        "int main(void) {\n"
+        "  ctl_context *c = malloc(sizeof *c); ctl_params p; ctl_command out;\n"
+        "  double q[CTL_NQ] = {0}, v[CTL_NV] = {0};\n"
+        "  ctl_default_params(&p);\n"
+        "  return ctl_init(c, &p) || ctl_reset(c, q, v, &out) || out.status > CTL_RELAXED;\n}\n"
+    )
+    (tmp_path / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.16)\nproject(user C)\n"
+        f'file(GLOB daqp "{folder}/daqp/*.c")\nadd_library(installed EXCLUDE_FROM_ALL ${{daqp}})\n'
+        f'add_subdirectory("{folder}" controller)\n'
+        "add_executable(user main.c)\ntarget_link_libraries(user PRIVATE ctl::ctl)\n"
+    )
+    for build, options in (("own", []), ("theirs", ["-Dctl_DAQP=installed"])):
+        place = tmp_path / build
+        subprocess.run(
+            [cmake, "-S", str(tmp_path), "-B", str(place), "-DCMAKE_C_FLAGS_RELEASE=-O0", *options],
+            check=True,
+            capture_output=True,
+        )
+        subprocess.run([cmake, "--build", str(place)], check=True, capture_output=True)
+        subprocess.run([place / "user"], check=True)

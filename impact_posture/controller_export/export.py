@@ -130,7 +130,7 @@ def export_controller(
     manifest["sources"] = [*own, *(f"daqp/{name}" for name in SOURCES)]
     texts = render(structure, fields, prefix, identity(manifest), metric)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
-    texts["Makefile"] = _makefile(manifest)
+    texts["Makefile"], texts["CMakeLists.txt"] = _makefile(manifest), _cmake(manifest)
     out = Path(f"{prefix}-c") if out is None else out
     library = library_path(out, prefix)
     products = (library.name, f"{library.name}.sha256")
@@ -226,4 +226,35 @@ clean:
 \trm -f lib{prefix}.so lib{prefix}.so.sha256
 
 .PHONY: clean
+"""
+
+
+def _cmake(manifest: dict[str, Any]) -> str:
+    prefix = manifest["prefix"]
+    here = [name for name in manifest["sources"] if not name.startswith("daqp/")]
+    return f"""# add_subdirectory(<this folder>), then target_link_libraries(<program> PRIVATE {prefix}::{prefix})
+cmake_minimum_required(VERSION 3.16)
+project({prefix} LANGUAGES C)
+
+if(NOT CMAKE_BUILD_TYPE AND NOT CMAKE_CONFIGURATION_TYPES)
+  set(CMAKE_BUILD_TYPE Release)
+endif()
+
+# CMake reserves names like test, all and install, so the target and its file have different names.
+add_library({prefix}_library {" ".join([f"{prefix}.c", *here])})
+add_library({prefix}::{prefix} ALIAS {prefix}_library)
+set({prefix}_DAQP "" CACHE STRING "installed library of DAQP {VERSION}; empty: the sources here")
+if({prefix}_DAQP)
+  target_link_libraries({prefix}_library PUBLIC ${{{prefix}_DAQP}})
+else()
+  file(GLOB daqp "${{CMAKE_CURRENT_SOURCE_DIR}}/daqp/*.c")
+  target_sources({prefix}_library PRIVATE ${{daqp}})
+endif()
+target_include_directories({prefix}_library PUBLIC "${{CMAKE_CURRENT_SOURCE_DIR}}")
+target_include_directories({prefix}_library SYSTEM PRIVATE "${{CMAKE_CURRENT_SOURCE_DIR}}/daqp")
+set_target_properties({prefix}_library PROPERTIES OUTPUT_NAME {prefix}
+  C_STANDARD 99 C_STANDARD_REQUIRED ON POSITION_INDEPENDENT_CODE ON)
+if(UNIX)
+  target_link_libraries({prefix}_library PUBLIC m)
+endif()
 """
