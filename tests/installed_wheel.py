@@ -39,8 +39,17 @@ COMMANDS = [
         "view result",
     ],
     ["robots", "inspect tilthex_arm", "evaluate ur5 --normal 0 0 1", "verify ur5 --samples 2"],
-    ["codegen ur5 --normal 0 0 1 --compile --out exported"],
+    ["codegen ur5 --normal 0 0 1 --compile --out exported", "codegen ur5 --controller arm --out arm"],
+    ["sweep grid.toml --workers 1 --out grid", "sweep show grid"],
 ]
+# What the command `sweep` above solves.
+GRID = """grid = { x = [0.0, 0.05] }
+[problem]
+robot = "ur5"
+normal = [0, 0, 1]
+collision = false
+starts = 1
+"""
 
 
 class Failed(Exception):
@@ -148,6 +157,8 @@ def commands(work: Path, programs: Path) -> None:
     if given != set(names):
         raise Failed(f"commands that are not run here, or are no more: {sorted(given ^ set(names))}")
 
+    (work / "grid.toml").write_text(GRID, encoding="utf-8")
+
     def row(lines: list[str]) -> None:
         for line in lines:
             done = run([str(programs / "impact-posture"), *line.split()], work)
@@ -213,11 +224,11 @@ def main() -> None:
             wheel = build(work)
         with step("install, with what a user needs"):
             run([options.python, "-m", "venv", "env"], work)
-            install(work, wheel, "sim", options.lowest)
+            install(work, wheel, "sim,sweep", options.lowest)
         with step("every command"):
             commands(work, programs)
         with step("install, with all extras"):
-            install(work, wheel, "sim,test,docs", options.lowest)
+            install(work, wheel, "sim,sweep,test,docs", options.lowest)
         # What mypy finds hangs on the types that other packages came with: those of today, for the Python that
         # pyproject.toml tells mypy (NumPy's for newer ones do not read as 3.11).
         if not options.lowest and options.python == sys.executable:

@@ -34,5 +34,5 @@ RECOMMENDED: dict[str, str] = {
     "aerial-vertical": "posture",
     "aerial-lateral": "robust",
     "solo8-push": "stiff",
-    "talos-push": "posture",
+    "talos-push": "robust-flow",
 }
