@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 
 # Seconds between two drawings of the line.
 _REFRESH = 0.1
+# Seconds after which a pace is known.
+_PACE = 2.0
 
 
 @contextmanager
@@ -43,6 +47,8 @@ def progress(
     line = Progress(*columns, console=console, transient=True, auto_refresh=False)
     task = line.add_task(f"{first or doing} …", total=None, count="")
     drawn, last = 0.0, ""
+    # When the first count came, and what was done by then: an earlier run may have done it.
+    began: tuple[float, int] | None = None
 
     def show(text: str, share: float | None = None) -> None:
         nonlocal drawn, last
@@ -54,11 +60,21 @@ def progress(
         line.refresh()
 
     def advance(done: int, total: int) -> None:
+        nonlocal began
+        began = began or (time.monotonic(), done)
+        left = _time_left(time.monotonic() - began[0], done - began[1], total - done)
         if unit:
-            line.update(task, count=f"{done}/{total} {unit}")
+            line.update(task, count=f"{done}/{total} {unit}{left}")
         show(doing, done / total)
 
     # The line hides the cursor; a signal that ends the process must show it again.
     with undone(line.stop), listening(show), line:
         line.refresh()
         yield advance
+
+
+def _time_left(took: float, done: int, left: int) -> str:
+    """Return an estimate of the time left, from the pace so far; nothing before there is a pace."""
+    if took < _PACE or not (done and left):
+        return ""
+    return f", {timedelta(seconds=math.ceil(took / done * left))} left"

@@ -315,3 +315,11 @@ def test_a_traceback_comes_only_when_asked_for(
     monkeypatch.setenv(boundary.DEBUG_VARIABLE, "1")
     assert boundary.run(Raises(ValueError("wrong")), []) == 1
     assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_long_wait_is_estimated_from_the_pace_so_far() -> None:
+    from impact_posture_cli.progress import _time_left
+
+    assert _time_left(30.0, 10, 20) == ", 0:01:00 left"
+    # No pace yet, and nothing left.
+    assert [_time_left(1.0, 10, 20), _time_left(30.0, 0, 20), _time_left(30.0, 30, 0)] == ["", "", ""]
