@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from impact_posture.arrays import Array
 from impact_posture.controller_export.compiled_controller import CompiledController
 from impact_posture.tsid.controller import Command, Controller, Report, Status
 from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
@@ -25,6 +26,16 @@ def assert_same_report(a: Report, b: Report, size: float) -> None:
     assert set(a.active) == set(b.active)
     assert abs(a.dynamics - b.dynamics) < 1e-8 * size
     assert (a.level, a.objective) == pytest.approx((b.level, b.objective), nan_ok=True)
+
+
+def both_at_rest(name: str) -> tuple[Controller, CompiledController, Array, Array]:
+    """Return the controllers in Python and in C, after a reset at the default posture, with that state."""
+    robot, formulation = formulation_of(name)
+    ours, theirs = Controller(robot, formulation), compiled(name)
+    q, v = robot.posture(), np.zeros(robot.nv)
+    ours.reset(q, v)
+    theirs.reset(q, v)
+    return ours, theirs, q, v
 
 
 # The other robots of KINDS are in the study (make study-controller).
@@ -53,10 +64,8 @@ def test_the_commands_are_those_of_python(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "talos"])
 def test_a_relaxed_tick_misses_its_levels_by_as_little(name: str) -> None:
-    robot, formulation = formulation_of(name)
-    ours, theirs = Controller(robot, formulation), compiled(name)
-    ours.reset(robot.posture(), np.zeros(robot.nv))
-    theirs.reset(robot.posture(), np.zeros(robot.nv))
+    ours, theirs, _, _ = both_at_rest(name)
+    robot = ours.robot
     rng = np.random.default_rng(1)
     relaxed = 0
     for k in range(12):
@@ -126,12 +135,8 @@ def test_a_singular_arm_is_damped_as_in_python() -> None:
 
 
 def test_targets_are_set_by_the_name_of_their_task() -> None:
-    robot, formulation = formulation_of("panda")
-    ours, theirs = Controller(robot, formulation), compiled("panda")
-    q, v = robot.posture(), np.zeros(robot.nv)
-    ours.reset(q, v)
-    theirs.reset(q, v)
-    task = formulation.levels[0][0]
+    ours, theirs, q, v = both_at_rest("panda")
+    robot, task = ours.robot, ours.formulation.levels[0][0]
     name = task.name
     turn = pin.exp3(np.array([0.1, -0.2, 0.3]))
     target = pin.SE3(task.target.rotation @ turn, task.target.translation + 0.01)  # type: ignore[attr-defined]
@@ -145,12 +150,8 @@ def test_targets_are_set_by_the_name_of_their_task() -> None:
 
 
 def test_a_moving_reference_leads_the_posture() -> None:
-    robot, formulation = formulation_of("solo8")
-    ours, theirs = Controller(robot, formulation), compiled("solo8")
-    q, v = robot.posture(), np.zeros(robot.nv)
-    ours.reset(q, v)
-    theirs.reset(q, v)
-    posture = formulation.posture
+    ours, theirs, q, v = both_at_rest("solo8")
+    robot, posture = ours.robot, ours.formulation.posture
     assert posture is not None
     goal = np.asarray(pin.integrate(robot.model, q, np.full(robot.nv, 0.02)))
     posture._target[:], posture.target_velocity, posture.target_acceleration = goal, 0.3, -2.0

@@ -31,32 +31,41 @@ SCHEMA = "impact-posture/codegen-run/1"
 
 
 @dataclass(frozen=True)
-class Export:
-    """A written export.
+class WrittenCode:
+    """Generated C in a folder.
 
     Attributes:
         out: The folder of the files.
         robot: The robot.
         files: The files.
         manifest: The content of ``<prefix>.json``.
-        agreement: Largest relative difference of the built code from the numbers of CasADi and Pinocchio; ``None``
-            where it was not built.
         library: The shared library, where one stays in the folder.
-        requested: Whether a library was requested.
     """
 
     out: Path
     robot: Robot
     files: tuple[Path, ...]
     manifest: dict[str, Any]
-    agreement: float | None = None
     library: Path | None = None
-    requested: bool = False
 
     @property
     def prefix(self) -> str:
         """Beginning of the C names."""
         return str(self.manifest["prefix"])
+
+
+@dataclass(frozen=True)
+class Export(WrittenCode):
+    """A written export of an objective.
+
+    Attributes:
+        agreement: Largest relative difference of the built code from the numbers of CasADi and Pinocchio; ``None``
+            where it was not built.
+        requested: Whether a library was requested.
+    """
+
+    agreement: float | None = None
+    requested: bool = False
 
     @property
     def compiled(self) -> bool:

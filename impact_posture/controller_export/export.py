@@ -11,6 +11,7 @@ from typing import Any
 
 import casadi as ca
 
+from impact_posture.codegen.export import WrittenCode
 from impact_posture.codegen.export import export as export_gradient
 from impact_posture.codegen.manifest import configuration_names
 from impact_posture.codegen.naming import c_identifier, check_prefix
@@ -34,27 +35,8 @@ RUN_SCHEMA = "impact-posture/controller-run/1"
 
 
 @dataclass(frozen=True)
-class ControllerExport:
-    """Written C of a controller.
-
-    Attributes:
-        out: The folder of the files.
-        robot: The robot.
-        files: The files.
-        manifest: The content of ``<prefix>.json``.
-        library: The shared library, where one was built.
-    """
-
-    out: Path
-    robot: Robot
-    files: tuple[Path, ...]
-    manifest: dict[str, Any]
-    library: Path | None = None
-
-    @property
-    def prefix(self) -> str:
-        """Beginning of the C names."""
-        return str(self.manifest["prefix"])
+class ControllerExport(WrittenCode):
+    """Written C of a controller."""
 
     @property
     def verdict(self) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from impact_posture.output_folder import whole_folder
 from impact_posture.simulation.metrics import JUMP
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.run import BRACE
-from impact_posture.simulation.scenario import RepeatedContacts, Scenario, Setup, SinglePush
+from impact_posture.simulation.scenario import RepeatedContacts, Setup, SinglePush
 from impact_posture.simulation.throw import Throw
 
 MODEL, PARAMETERS = "world.mjb", "world.txt"
@@ -41,19 +42,18 @@ def export_world(setup: Setup, out: Path, *, force: bool = False) -> None:
         InputError: The scenario throws a ball, or a joint is neither revolute, prismatic nor a floating base.
         OutputError: The folder exists without ``force``, is not ours, or cannot be written.
     """
-    lines = [" ".join([key, *map(repr, map(float, values))]) for key, values in _parameters(setup)]
     mjcf = setup.world.built.mjcf
+    model = mjcf.compile()
+    lines = [" ".join([key, *map(repr, map(float, values))]) for key, values in _parameters(setup, model)]
     with whole_folder(out, force=force, kind="world") as folder:
-        model = mjcf.compile()
         (folder / "world.xml").write_text(mjcf.spec.to_xml(), encoding="utf-8")
         import_mujoco().mj_saveModel(model, str(folder / MODEL))
         (folder / PARAMETERS).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _parameters(setup: Setup) -> Iterable[tuple[str, Iterable[float]]]:
+def _parameters(setup: Setup, model: Any) -> Iterable[tuple[str, Iterable[float]]]:
     scenario, robot, built = setup.scenario, setup.robot, setup.world.built
     sensors, step, control = scenario.sensors, scenario.physics.timestep, scenario.control
-    model = built.mjcf.compile()
     yield "timestep", [step]
     yield "period", [control.period]
     yield "brace", [BRACE]
@@ -73,7 +73,7 @@ def _parameters(setup: Setup) -> Iterable[tuple[str, Iterable[float]]]:
         frames = [shape.frame for shape in scenario.shapes]
         yield "force_shape", [frames.index(sensors.force_frame)]
         yield "force_smoothing", [-np.expm1(-2 * np.pi * sensors.force_cutoff * step)]
-    yield from _task(setup, scenario)
+    yield from _task(setup, model)
 
 
 def _joints(setup: Setup) -> Iterable[tuple[str, Iterable[float]]]:
@@ -90,8 +90,8 @@ def _joints(setup: Setup) -> Iterable[tuple[str, Iterable[float]]]:
             raise InputError(what, where="world export", hint="lock it (lock = [...] in the scenario)")
 
 
-def _task(setup: Setup, scenario: Scenario) -> Iterable[tuple[str, Iterable[float]]]:
-    task = scenario.task
+def _task(setup: Setup, model: Any) -> Iterable[tuple[str, Iterable[float]]]:
+    scenario, task = setup.scenario, setup.scenario.task
     if isinstance(task, Throw):
         raise InputError("a thrown ball cannot be exported", where=scenario.source, hint="take contacts or a push")
     if isinstance(task, RepeatedContacts):
@@ -104,7 +104,7 @@ def _task(setup: Setup, scenario: Scenario) -> Iterable[tuple[str, Iterable[floa
             yield "leg", leg
     elif isinstance(task, SinglePush):
         point = point_on(setup.robot, task.frame)
-        body = setup.world.built.mjcf.compile().body(setup.world.built.mjcf.bodies[point.joint]).id
+        body = model.body(setup.world.built.mjcf.bodies[point.joint]).id
         yield "push", [body, *point.position, *task.force, task.duration]
         yield "rest", [max(task.settle, BRACE + scenario.control.period), task.quiet, task.still, task.patience]
         yield "after", [task.after]
