@@ -170,6 +170,8 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
     notes = list(document["warnings"])
     if document["offline"] and document["offline"]["note"]:
         notes.append(document["offline"]["note"])
+    if document["path"] and document["path"]["reason"]:
+        notes.append(document["path"]["reason"])
     if document["metrics"] is not None and not document["metrics"]["rested"]:
         notes.append("the robot was not at rest before the push: its own motion is in what is measured")
     page.warnings(notes)

@@ -10,11 +10,14 @@ from typing import Literal, get_args
 
 from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.path.posture_path import PosturePath, check_package, posture_path
+from impact_posture.progress import tell
 from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.baselines import FlowPosture, WalkerDriver, resting_posture, spring_of_term
 from impact_posture.simulation.driver import Driver, FlowDriver, PostureDriver, RobustDriver
 from impact_posture.simulation.impact_baselines import ImpactAwareDriver, InvariantDriver, ReferenceSpreadingDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
+from impact_posture.simulation.path_driver import PathDriver
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
 from impact_posture.simulation.task_formulations import nominal_posture, posture_options
@@ -31,6 +34,7 @@ MEANING: dict[str, str] = {
     "robust-sticking": "the same with the gradient of S, the jump where the contact sticks",
     "robust-flow": "the posture flows to lower H before the impact, without a gain",
     "posture": "the offline optimum as posture, no gradient",
+    "path": "the offline optimum, along a timed path without collisions",
     "stiff": "the start posture, as stiff as the term is where robust rests",
     "posture-stiff": "the offline optimum, as stiff as the term is there",
     "invariant": "nominal, feedback projected on the impact-invariant subspace around the impact",
@@ -91,8 +95,16 @@ class ControllerFactory:
 
     @cached_property
     def offline(self) -> OfflinePosture:
-        """The posture of the ``posture`` controller."""
+        """The posture of the controllers ``posture`` and ``path``."""
         return offline_posture(self.setup, self.objective())
+
+    @cached_property
+    def path(self) -> PosturePath:
+        """The path of the ``path`` controller."""
+        check_package()
+        solution = self.offline.solution
+        tell("looking for a path to the offline posture")
+        return posture_path(solution)
 
     def driver(self, name: str, mode: Mode = "live", gain: float | None = None) -> Driver:
         """Make a controller.
@@ -124,6 +136,8 @@ class ControllerFactory:
             return self._stiffened(name.removesuffix(_STIFF), name.removesuffix(_STIFF), gain)
         if name == "posture":
             return PostureDriver(setup, nominal_posture(setup), self.offline.q)
+        if name == "path":
+            return PathDriver(setup, nominal_posture(setup), self.path)
         if name in _PLAIN:
             return _PLAIN[name](setup, nominal_posture(setup))
         term, gradient = setup.scenario.control.robust, self.gradient(_KINDS.get(name, "impulse"))

@@ -13,7 +13,7 @@ from impact_posture.posture.load_cases import load_cases
 from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.problem_settings import requirements
-from impact_posture.posture.solve import solve
+from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.progress import tell
 from impact_posture.settings import FRICTION, ProblemSettings
 from impact_posture.simulation.scenario import Setup
@@ -34,18 +34,28 @@ class OfflinePosture:
     """The posture that was found.
 
     Attributes:
-        q: The posture, shape (nq,).
+        solution: What the optimizer found.
         objective: Objective at the posture.
         initial: Objective at the start posture of the scenario, after it was put on the constraints.
         distance: Distance from that start posture, rad (m).
         note: What could not be demanded of the posture, and why.
     """
 
-    q: Array
+    solution: PostureSolution
     objective: float
     initial: float
     distance: float
     note: str = ""
+
+    @property
+    def q(self) -> Array:
+        """The posture, shape (nq,)."""
+        return self.solution.q
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        numbers = {name: getattr(self, name) for name in ("objective", "initial", "distance", "note")}
+        return {"q": self.q.tolist(), **numbers}
 
 
 def offline_posture(setup: Setup, objective: ImpactObjective, *, starts: int = 8) -> OfflinePosture:
@@ -81,7 +91,7 @@ def offline_posture(setup: Setup, objective: ImpactObjective, *, starts: int = 8
             continue
         value, initial = objective.value(solution.q), objective.value(solution.initial)
         way = distance(Chart(setup.robot.model), solution.q, solution.initial)
-        return OfflinePosture(solution.q, value, initial, way, "" if collision else note)
+        return OfflinePosture(solution, value, initial, way, "" if collision else note)
     raise AssertionError("the last attempt returns or raises")
 
 

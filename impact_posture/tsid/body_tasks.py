@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import pinocchio as pin
@@ -107,3 +108,17 @@ class CenterOfMass(TargetTask[Array]):
     def drift(self, state: State) -> Array:
         """Return ``J̇ν``."""
         return state.center_of_mass()[2]
+
+
+def lead(
+    tasks: Iterable[BaseOrientation | CenterOfMass], model: pin.Model, data: pin.Data, q: Array, v: Array, a: Array
+) -> None:
+    """Set the targets of body tasks to what they are in a motion at ``q``, ``ν``, ``ν̇``.  ``data`` is workspace."""
+    pin.centerOfMass(model, data, q, v, a, False)
+    for task in tasks:
+        if isinstance(task, CenterOfMass):
+            task.target = np.array(data.com[0])
+            task.target_velocity, task.target_acceleration = data.vcom[0], data.acom[0]
+        else:
+            task.target = pin.Quaternion(q[3:7]).matrix()
+            task.target_velocity, task.target_acceleration = v[3:6], a[3:6]

@@ -106,6 +106,11 @@ class JointPosture(Task):
             raise InputError("the time is not positive", where=self.name, hint="give seconds above zero")
         self._fade_to(self._robot.check_posture(np.asarray(target), limits=False), over)
 
+    def lead(self, q: Array, v: Array, a: Array) -> None:
+        """Set ``q_des`` with its velocity and acceleration in the tangent space, for this tick, without checks."""
+        self._target[:], self._blend = q, 1.0
+        self._velocity[:], self._acceleration[:] = v, a
+
     def advance(self, state: State, dt: float) -> None:
         """Advance a fade by ``dt`` seconds."""
         if self._blend < 1:

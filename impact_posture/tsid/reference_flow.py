@@ -119,8 +119,8 @@ class ReferenceFlow:
         self._model, self._gradient, self.options = robot.model, gradient, options
         self._contacts = formulation.contacts
         self._state = State(robot, formulation.points)
-        weighted = [t for t in formulation.weighted if not isinstance(t, CenterOfMass | BaseOrientation)]
-        self.led = tuple(t for t in formulation.weighted if t not in weighted)
+        self.led = tuple(t for t in formulation.weighted if isinstance(t, CenterOfMass | BaseOrientation))
+        weighted = [t for t in formulation.weighted if t not in self.led]
         self._tasks = [task for level in formulation.levels for task in level] + weighted
         self._base, nv = actuators.base, robot.nv
         fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]

@@ -6,14 +6,13 @@ import math
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
-from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
+from impact_posture.tsid.body_tasks import lead
 from impact_posture.tsid.impact_robust import Gradient, gradient_of
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.reference_flow import FlowOptions, ReferenceFlow
@@ -124,19 +123,6 @@ class ReferenceFlowPosture(JointPosture):
             return
         flow.advance(dt, state.q)
         self.value = flow.value
-        self._target[:], self._velocity[:], self._acceleration[:] = flow.q, flow.velocity, flow.acceleration
+        self.lead(flow.q, flow.velocity, flow.acceleration)
         if flow.led:
-            self._lead(flow)
-
-    def _lead(self, flow: ReferenceFlow) -> None:
-        """Move center of mass and base orientation with the flow."""
-        data = self._data
-        pin.centerOfMass(self._model, data, flow.q, flow.velocity, flow.acceleration, False)
-        for task in flow.led:
-            if isinstance(task, CenterOfMass):
-                task.target = np.array(data.com[0])
-                task.target_velocity, task.target_acceleration = data.vcom[0], data.acom[0]
-            elif isinstance(task, BaseOrientation):
-                task.target = pin.Quaternion(flow.q[3:7]).matrix()
-                task.target_velocity = flow.velocity[3:6]
-                task.target_acceleration = flow.acceleration[3:6]
+            lead(flow.led, self._model, self._data, flow.q, flow.velocity, flow.acceleration)

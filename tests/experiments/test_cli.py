@@ -122,7 +122,7 @@ def test_contacts_are_counted_against_what_was_asked_for(capsys: pytest.CaptureF
     event = {"status": "lost contact", "time": 1.25, "what": "2 of 5 contacts were never made", "sign": 1}
     found = {"scenario": "mine", "seed": 0, "status": "lost contact", "metrics": None, "events": [event],
              "windows": [{"kind": "dwell"}], "runs": [{"ticks": 900, "metrics": numbers}],
-             "offline": None, "warnings": []}  # fmt: skip
+             "offline": None, "path": None, "warnings": []}  # fmt: skip
     _show(Page(), found, "nominal", Path("there"))
     said = " ".join(capsys.readouterr().out.split())
     assert "contacts 3 of 5" in said and "relaxed 7 of 900 ticks" in said and "held 2 ticks" in said

@@ -62,7 +62,7 @@ def factory(name: str, settle: float | None = None) -> ControllerFactory:
 
 def driven(made: ControllerFactory, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
     """A run with the push forward alone."""
-    if controller.startswith("posture") and "offline" not in vars(made):
+    if controller.startswith(("posture", "path")) and "offline" not in vars(made):
         # Few starts: what is tested is the driver.
         made.offline = offline_posture(made.setup, made.objective(), starts=1)
     return run(made, controller, mode=mode, seed=seed, only=1)[0]
