@@ -9,10 +9,11 @@ from impact_posture.arrays import Array
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.driver import Driver, RobustDriver
 from impact_posture.simulation.reference import ReferencePoint
+from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient
 from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.controller import Command
-from impact_posture.tsid.impact_robust import ImpactRobustPosture, curvature
+from impact_posture.tsid.impact_robust import ImpactRobustPosture, curvature, curvature_scale
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.state import State
 
@@ -134,3 +135,55 @@ class WalkerDriver(RobustDriver):
         super().hold()
         # The reference is ahead of the robot wherever other tasks kept the robot back.
         self.posture.move_to(self.controller.state.q, self.term.activation.ramp)
+
+
+class ReleaseDriver(RobustDriver):
+    """The impact-robust term without the nominal spring, until ``H`` falls no more.
+
+    Without ``K_p``, the posture flows to the optimum itself instead of resting short of it.  The term is scaled with
+    the larger curvature of the start and of the offline optimum, hence nowhere between is it a spring much stiffer
+    than ``K``.  As soon as ``H`` has fallen by less than :attr:`LEAST` of itself within :attr:`PATIENCE`, the reached
+    posture is held.
+
+    Args:
+        setup: The experiment.
+        term: The term, with ``spring="release"`` and an activation that is not live.
+        gradient: ``q → (H, ∇H)``.
+        optimum: Posture found offline, shape (nq,).
+    """
+
+    PATIENCE, LEAST = 0.5, 0.01
+
+    def __init__(self, setup: Setup, term: ImpactRobustPosture, gradient: Gradient, optimum: Array) -> None:
+        """Measure both curvatures."""
+        super().__init__(setup, term, term)
+        scales = []
+        for q in (setup.q, optimum):
+            self.controller.reset(q, np.zeros(setup.robot.nv))
+            Z = self.controller.assembly.redundancy(self.controller.state)
+            scales.append(curvature_scale(gradient, setup.robot.model, q, Z, term.name))
+        self._scale = max(scales)
+        self._ticks, self._reached, self._braced = 0, np.inf, False
+
+    def reset(self, q: Array) -> Command:
+        """Begin at rest."""
+        command = super().reset(q)
+        self.term.scale = self._scale
+        self._ticks, self._reached, self._braced = 0, np.inf, False
+        return command
+
+    def brace(self) -> None:
+        """Switch the term on."""
+        super().brace()
+        self._braced = True
+
+    def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
+        """Return the command.  Now and then, look whether ``H`` still falls."""
+        if self._braced and self.level == 1:
+            self._ticks += 1
+            if self._ticks * self.controller.period >= self.PATIENCE:
+                if self.term.value > (1 - self.LEAST) * self._reached:
+                    self._braced = False
+                    self.hold()
+                self._ticks, self._reached = 0, self.term.value
+        return super().tick(reading, reference)

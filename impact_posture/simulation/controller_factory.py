@@ -13,7 +13,13 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.path.posture_path import PosturePath, check_package, posture_path
 from impact_posture.progress import tell
 from impact_posture.settings import ObjectiveKind
-from impact_posture.simulation.baselines import FlowPosture, WalkerDriver, resting_posture, spring_of_term
+from impact_posture.simulation.baselines import (
+    FlowPosture,
+    ReleaseDriver,
+    WalkerDriver,
+    resting_posture,
+    spring_of_term,
+)
 from impact_posture.simulation.driver import Driver, FlowDriver, PostureDriver, RobustDriver
 from impact_posture.simulation.impact_baselines import ImpactAwareDriver, InvariantDriver, ReferenceSpreadingDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
@@ -32,6 +38,7 @@ MEANING: dict[str, str] = {
     "robust": "its posture task with -K grad H, the paper's",
     "robust-speed": "the same with the gradient of V, the jump per approach speed",
     "robust-sticking": "the same with the gradient of S, the jump where the contact sticks",
+    "robust-release": "robust without the nominal spring, until the metric falls no more",
     "robust-flow": "the posture flows to lower H before the impact, without a gain",
     "posture": "the offline optimum as posture, no gradient",
     "path": "the offline optimum, along a timed path without collisions",
@@ -144,6 +151,12 @@ class ControllerFactory:
         K, options = term.gain if gain is None else gain, posture_options(setup)
         if name == "robust-flow":
             return FlowDriver(setup, ReferenceFlowPosture(robot, gradient, **options))
+        if name == "robust-release":
+            once = Activation(ramp=term.ramp, live=False)
+            released = ImpactRobustPosture(
+                robot, gradient, K=K, fade=term.fade, activation=once, spring="release", **options
+            )
+            return ReleaseDriver(setup, released, gradient, self.offline.q)
         activation = Activation(ramp=term.ramp, live=mode == "live")
         robust = ImpactRobustPosture(robot, gradient, K=K, fade=term.fade, activation=activation, **options)
         posture = FlowPosture(robot, robust) if name == "walker" else robust

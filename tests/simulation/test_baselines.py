@@ -9,10 +9,11 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.simulation.actuator_command import ActuatorCommand
-from impact_posture.simulation.baselines import WalkerDriver, resting_posture, spring_of_term
+from impact_posture.simulation.baselines import ReleaseDriver, WalkerDriver, resting_posture, spring_of_term
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.driver import RobustDriver
 from impact_posture.simulation.impact_baselines import InvariantDriver
+from impact_posture.simulation.offline import offline_posture
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts
 from impact_posture.simulation.sensor_noise import Reading
@@ -67,6 +68,28 @@ def test_stiff_has_the_spring_that_robust_is_where_it_rests(name: str) -> None:
     np.testing.assert_allclose(posture.stiffness, np.diag(posture.kp) + spring, rtol=1e-9, atol=1e-9)
     # Critical in every direction at once: (s + K^½)² = s² + D s + K.
     np.testing.assert_allclose(posture.damping @ posture.damping / 4, posture.stiffness, rtol=1e-9, atol=1e-9)
+
+
+# ---- robust-release -----------------------------------------------------------------------------------------------
+
+
+def test_without_the_spring_the_posture_goes_further_and_is_held_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = factory("aerial-vertical")
+    value, setup = made.objective().value, made.setup
+    monkeypatch.setitem(vars(made), "offline", offline_posture(setup, made.objective(), starts=1))
+    driver = made.driver("robust-release")
+    assert isinstance(driver, ReleaseDriver)
+    reached = resting_posture(driver, 6.0)
+    assert driver.level == 0
+    assert not driver.term.activation.live
+    assert value(reached) < 0.5 * value(resting_posture(made.driver("robust"), 3.0))
+    assert value(reached) < 1.05 * value(made.offline.q)
+    # What is held is the posture, as the term left it.
+    away = pin.difference(setup.robot.model, reached, driver.posture.target)[6:]
+    assert np.abs(away).max() < 0.02
+    driver.reset(setup.q)
+    assert driver.level == 0
+    assert driver.term.scale >= made.driver("robust").term.scale
 
 
 @pytest.mark.parametrize("name", ["aerial-lateral", "solo8-push"])
