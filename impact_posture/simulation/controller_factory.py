@@ -40,6 +40,7 @@ MEANING: dict[str, str] = {
     "robust-sticking": "the same with the gradient of S, the jump where the contact sticks",
     "robust-release": "robust without the nominal spring, until the metric falls no more",
     "robust-flow": "the posture flows to lower H before the impact, without a gain",
+    "robust-flow-sticking": "the same to lower S, for impacts at a given speed",
     "posture": "the offline optimum as posture, no gradient",
     "path": "the offline optimum, along a timed path without collisions",
     "stiff": "the start posture, as stiff as the term is where robust rests",
@@ -58,7 +59,11 @@ _PLAIN = {
     "reference-spreading": ReferenceSpreadingDriver,
     "impact-aware": ImpactAwareDriver,
 }
-_KINDS: dict[str, ObjectiveKind] = {"robust-speed": "speed", "robust-sticking": "sticking"}
+_KINDS: dict[str, ObjectiveKind] = {
+    "robust-speed": "speed",
+    "robust-sticking": "sticking",
+    "robust-flow-sticking": "sticking",
+}
 # Entry points by which other installed packages add controllers.
 GROUP = "impact_posture.controllers"
 
@@ -149,7 +154,7 @@ class ControllerFactory:
             return _PLAIN[name](setup, nominal_posture(setup))
         term, gradient = setup.scenario.control.robust, self.gradient(_KINDS.get(name, "impulse"))
         K, options = term.gain if gain is None else gain, posture_options(setup)
-        if name == "robust-flow":
+        if name.startswith("robust-flow"):
             return FlowDriver(setup, ReferenceFlowPosture(robot, gradient, **options))
         if name == "robust-release":
             once = Activation(ramp=term.ramp, live=False)
