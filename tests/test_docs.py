@@ -113,7 +113,8 @@ def test_shown_commands_run(page: Path, tmp_path: Path) -> None:
 CLAIMS: dict[str, list[tuple[str, str, str]]] = {
     "aerial": [("floor", "HVS", "G"), ("wall", "HV", "S"), ("wall-sticking", "S", "")],
     "arm": [("box", "HGV", "S")],
-    "humanoid": [("hand", "HV", "S")],
+    # Which optimum of the hand is found depends on rounding, and V with it.
+    "humanoid": [("hand", "H", "S")],
 }
 
 
