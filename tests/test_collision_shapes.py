@@ -140,7 +140,9 @@ def test_obstacles_and_planes_are_found_by_name() -> None:
     hand = np.array(data.oMf[robot.frame_id("panda_hand")].act(np.array([0.0, 0.0, 0.04])))
     ball = Obstacle(name="ball", sphere=0.02, position=tuple(hand.tolist()))
     far = Obstacle(name="far", box=(0.1, 0.1, 0.1), position=(5.0, 0.0, 0.0))
-    hits = mesh_collisions(robot, shapes, q, obstacles=[(obstacle_hull(ball), ()), (obstacle_hull(far), ())])
+    hits = mesh_collisions(
+        robot, shapes, q, obstacles=[(obstacle_hull(body), pin.SE3.Identity(), ()) for body in (ball, far)]
+    )
     assert {name for _, name in hits} == {"ball"}
     assert {shape.partition("[")[0] for shape, _ in hits} <= {"panda_hand", "panda_leftfinger", "panda_rightfinger"}
     # The whole robot is above its base, but for what the base itself reaches below.

@@ -93,7 +93,10 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
 
 
 def retarget(
-    problem: PostureProblem, position: Vector3 | None, quaternion: tuple[float, float, float, float] | None
+    problem: PostureProblem,
+    position: Vector3 | None,
+    quaternion: tuple[float, float, float, float] | None,
+    numeric: Numeric | None = None,
 ) -> PostureProblem:
     """Return the problem with another target of its only contact; all else stays, so its program fits as it is.
 
@@ -101,14 +104,15 @@ def retarget(
         problem: A problem with one contact.
         position: Position of the contact frame, world, meters; ``None`` for its initial position.
         quaternion: Its orientation, x y z w; ``None`` for its initial orientation.
+        numeric: The model, if the caller has it; it is moved to the given posture.
 
     Raises:
         InputError: The contact pose takes no target, or the quaternion has no unit length.
     """
     requirements = replace(problem.requirements, target_position=position, target_quaternion=quaternion)
-    _check(problem.robot, requirements)
+    _check_target(requirements)
     (contact,) = problem.objective.contacts
-    numeric = Numeric(problem.robot.model).at(problem.given)
+    numeric = (numeric or Numeric(problem.robot.model)).at(problem.given)
     made = _contact_constraints(problem.robot, contact, numeric, requirements, requirements.contact_pose)
     # The constraints of the contact follow those of the feet.
     first = len(problem.objective.supports)
@@ -154,6 +158,12 @@ def _check(robot: Robot, requirements: Requirements) -> None:
         raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
     if requirements.hold_force and not requirements.holdable:
         raise InputError("does nothing without `holdable=True`", where="hold_force", hint="leave out one of them")
+    for joint in requirements.hold:
+        robot.joint_id(joint)
+    _check_target(requirements)
+
+
+def _check_target(requirements: Requirements) -> None:
     quaternion = requirements.target_quaternion
     if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):
         raise InputError(
@@ -167,8 +177,6 @@ def _check(robot: Robot, requirements: Requirements) -> None:
         )
     if requirements.target_position is not None and not np.isfinite(requirements.target_position).all():
         raise InputError("is not finite", where="target_position", hint="give three numbers")
-    for joint in requirements.hold:
-        robot.joint_id(joint)
 
 
 def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constraint:

@@ -92,7 +92,13 @@ class Certificate:
         return {key: value for key, value in json_block(self).items() if key != "active"}
 
 
-def certify(problem: PostureProblem, q: Array, scale: float, auxiliaries: Array | None = None) -> Certificate:
+def certify(
+    problem: PostureProblem,
+    q: Array,
+    scale: float,
+    auxiliaries: Array | None = None,
+    numeric: Numeric | None = None,
+) -> Certificate:
     """Certify ``q``.
 
     Args:
@@ -100,13 +106,13 @@ def certify(problem: PostureProblem, q: Array, scale: float, auxiliaries: Array 
         q: The posture, shape (nq,).
         scale: The initial objective f₀.
         auxiliaries: Auxiliaries of the constraints at ``q``; by default the guesses of the constraints.
+        numeric: The model, if the caller has it; it is moved to ``q``.
     """
-    numeric = Numeric(problem.robot.model)
+    numeric = (numeric or Numeric(problem.robot.model)).at(q)
     gradients, gaps = objective_gradients(problem, q, scale)
-    numeric.at(q)
     errors = [c.pose_error(numeric) for c in problem.constraints]
     own = problem.guess(numeric).values if auxiliaries is None else auxiliaries
-    parts = [c.linearize(numeric, z) for c, z in zip(problem.constraints, problem.split(numeric, own), strict=True)]
+    parts = [c.linearize(numeric, z) for c, z in zip(problem.constraints, problem.split(own), strict=True)]
     rows = _Rows(problem.robot.nv, parts)
     limits, limit_violation = _limits(problem, q)
     near = [*rows.near(), *(replace(row, outward=rows.pad(row.outward)) for row in limits)]
@@ -147,7 +153,7 @@ def objective_gradients(problem: PostureProblem, q: Array, scale: float) -> tupl
     gradients = found.gradients / scale
     weight = problem.requirements.regularization
     if weight:
-        gradients = gradients + weight * distance_gradient(Chart(problem.robot.model), q, problem.given)
+        gradients = gradients + weight * distance_gradient(Chart.of(problem.robot.model), q, problem.given)
     return gradients, found.gaps / scale
 
 
@@ -215,7 +221,7 @@ class _Rows:
 
 def _limits(problem: PostureProblem, q: Array) -> tuple[list[_Near], float]:
     """Joint limits that are near, and the largest violation of all limits."""
-    chart = Chart(problem.robot.model)
+    chart = Chart.of(problem.robot.model)
     x, unit = chart.to_x(q), np.eye(problem.robot.nv)
     near: list[_Near] = []
     worst = 0.0

@@ -107,6 +107,11 @@ class Holdable(Constraint):
         own = tree if tree.model is load.model else Tree(load.model, tree.q)
         return LiftedRows(_rows(rest.rows) @ load.symbolic(own, z) + rest.offset, z)
 
+    @property
+    def unknowns(self) -> int:
+        """See :class:`Constraint`."""
+        return self._rest.load.count if self.active else 0
+
     def guess(self, model: Numeric) -> Guess:
         """See :class:`Constraint`."""
         if not self.active:

@@ -58,12 +58,12 @@ def run_start(
 ) -> tuple[SolveRecord, Certificate]:
     """Solve from a feasible start and certify the end; try the other guesses of the objective if it fails."""
     record = nlp.solve(start, scale=scale, price=price)
-    certificate = certify(nlp.problem, record.q, scale, record.auxiliaries)
+    certificate = certify(nlp.problem, record.q, scale, record.auxiliaries, nlp.program.numeric)
     for attempt in range(1, nlp.problem.objective.attempts):
         if certificate.holds():
             break
         again = nlp.solve(start, scale=scale, attempt=attempt, price=price)
-        certificate = certify(nlp.problem, again.q, scale, again.auxiliaries)
+        certificate = certify(nlp.problem, again.q, scale, again.auxiliaries, nlp.program.numeric)
         record = replace(
             again,
             iterations=record.iterations + again.iterations,

@@ -44,7 +44,7 @@ class Projector:
     def __init__(self, problem: PostureProblem) -> None:
         self.problem = problem
         self.numeric = Numeric(problem.robot.model)
-        self.chart = Chart(problem.robot.model)
+        self.chart = Chart.of(problem.robot.model)
         self._held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
         self._to_v = _bounded_entries(self.chart)
 

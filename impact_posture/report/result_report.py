@@ -55,7 +55,7 @@ def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> 
             at = numeric.placement(point_on(view.robot, one.frame, one.offset))
             turn = at.rotation if one.normal_frame == "contact" else np.eye(3)
             planes.append(("surface", at.translation, turn @ one.normal))
-    bodies = tuple(hull.vertices for hull, _ in solids)
+    bodies = tuple(hull.vertices @ at.rotation.T + at.translation for hull, at, _ in solids)
     return Scene(
         draw_robot(view.robot, meshes), view.objective, (_track(prepared, view),), tuple(planes), bodies, True
     )
