@@ -24,7 +24,7 @@ from impact_posture.sweep.point_search import Place, Timer, Walk
 from impact_posture.sweep.sweep_file import OFFSETS, Case
 
 # Problems and programs that a process keeps.  Both are small beside the solver itself.
-_TEMPLATES, _PROGRAMS = 64, 16
+_TEMPLATES, _PROGRAMS = 16, 16
 
 _Value = TypeVar("_Value")
 

@@ -7,6 +7,7 @@ times give the bytes of the pool.  Then the speed, the memory of a long run, and
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import random
@@ -39,31 +40,25 @@ normal = [[0, 0, 1], [0, 0.2, 1], [0, 0.4, 1], [0.2, 0, 1], [0.4, 0, 1], [0.3, 0
 x = { from = -0.1, to = 0.1, count = 10 }
 z = { from = -0.1, to = 0.1, count = 10 }
 """
-# The base stays within a box, so that some targets are out of reach.
-LARGE = {
-    "tilthex_arm": """
-[problem]
-robot = "tilthex_arm"
-base = "box"
-normal = [0, 0, 1]
-[grid]
-normal = [[0, 0, 1], [0, 0.4, 1]]
-x = { from = -0.3, to = 0.3, count = COUNT }
-z = { from = -0.3, to = 0.3, count = COUNT }
-""",
-    "talos": """
-shard = 32
+TALOS = """
+shard = 16
 [problem]
 robot = "talos"
 frame = "gripper_right_base_link"
 normal = [-1, 0, 0]
 starts = 4
 [grid]
-normal = [[-1, 0, 0], [-1, 0, 0.4]]
 x = { from = -0.15, to = 0.15, count = COUNT }
 z = { from = -0.15, to = 0.15, count = COUNT }
-""",
-}
+"""
+
+
+def tilted(count: int) -> str:
+    """A sweep over tilts of the surface and of the tool of the aerial manipulator, ``count`` of each."""
+    tilts = [(k / (count - 1) - 0.5, 3.7 * k / (count - 1) - 1.7) for k in range(count)]
+    normals = [[0.0, math.sin(tilt), math.cos(tilt)] for tilt, _ in tilts]
+    turns = [[math.cos(tilt / 2), 0.0, -math.sin(tilt / 2), 0.0] for _, tilt in tilts]
+    return f'[problem]\nrobot = "tilthex_arm"\n[grid]\nnormal = {normals}\ntarget_quaternion = {turns}\n'
 
 
 def shards(folder: Path) -> dict[str, bytes]:
@@ -185,11 +180,11 @@ def _resident(process: int | str = "self") -> float:
     return pages * resource.getpagesize() / 1e6
 
 
-def atlas(folder: Path, text: str, name: str, points: int) -> None:
+def atlas(folder: Path, name: str, points: int) -> None:
     """Solve a large sweep by two processes, or go on with it, and print what it took and what it found."""
     folder.mkdir(parents=True, exist_ok=True)
-    file = folder / f"{name}.toml"
-    file.write_text(text.replace("COUNT", str(max(2, round((points / 2) ** 0.5)))))
+    file, count = folder / f"{name}.toml", max(2, round(points**0.5))
+    file.write_text(tilted(count) if name == "tilthex_arm" else TALOS.replace("COUNT", str(count)))
     sweep, began, seen = read_sweep(file), time.perf_counter(), list[tuple[int, float]]()
 
     def progress(done: int, count: int) -> None:
@@ -235,7 +230,7 @@ def task_overhead() -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) == 4:
-        atlas(Path(sys.argv[1]), LARGE[sys.argv[2]], sys.argv[2], int(sys.argv[3]))
+        atlas(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))
         sys.exit()
     with tempfile.TemporaryDirectory() as place:
         parts = sys.argv[1:] or ["robustness", "speed", "overhead"]
