@@ -55,7 +55,7 @@ z = { from = -0.15, to = 0.15, count = COUNT }
 
 def tilted(count: int) -> str:
     """A sweep over tilts of the surface and of the tool of the aerial manipulator, ``count`` of each."""
-    tilts = [(k / (count - 1) - 0.5, 3.7 * k / (count - 1) - 1.7) for k in range(count)]
+    tilts = [(k / (count - 1) - 0.5, 3.1 * k / (count - 1) - 1.35) for k in range(count)]
     normals = [[0.0, math.sin(tilt), math.cos(tilt)] for tilt, _ in tilts]
     turns = [[math.cos(tilt / 2), 0.0, -math.sin(tilt / 2), 0.0] for _, tilt in tilts]
     return f'[problem]\nrobot = "tilthex_arm"\n[grid]\nnormal = {normals}\ntarget_quaternion = {turns}\n'
