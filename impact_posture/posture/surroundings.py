@@ -198,16 +198,12 @@ class Surroundings:
     def _meshes(self) -> MeshCheck:
         return MeshCheck(self.robot, self.shapes)
 
-    @cached_property
-    def _moved(self) -> Numeric:
-        return Numeric(self.robot.model)
-
     def walls_at(self, q: Array) -> tuple[list[HalfSpace], list[tuple[SweptHull, pin.SE3, frozenset[int]]]]:
         """Return the planes and the bodies, with their placements, that the links stay clear of at ``q``.
 
         Each comes with its exempt joints.
         """
-        numeric = self._moved.at(q)
+        numeric = Numeric(self.robot.model).at(q)
         planes, solids = [], []
         for wall in self._walls:
             at = wall.body.placement(numeric)
