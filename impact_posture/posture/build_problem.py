@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-import scipy
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
@@ -32,6 +31,7 @@ from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.regular import pin_undetermined, regularize
 from impact_posture.posture.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.setting import tilt_of
 from impact_posture.settings import Vector3
 
@@ -286,17 +286,14 @@ def _com_constraint(
             for sy in (-1, 1):
                 corner = placement.act(np.array([sx * support.size[0], sy * support.size[1], 0.0]))
                 corners.append(corner[:2])
-    try:
-        equations = scipy.spatial.ConvexHull(np.array(corners)).equations
-    except (scipy.spatial.QhullError, ValueError):
+    edges = polygon_edges(corners)
+    if edges is None:
         raise InputError(
             "the feet span no area to keep the center of mass above",
             where="com_over_feet",
             hint="give three feet or soles with a size, or set com_over_feet = false, or `com=False`",
-        ) from None
-    # One row for each edge: qhull repeats the equation of an edge that it met in pieces.
-    unique = np.unique(np.round(equations, 12), axis=0)
-    return CenterOfMassOverFeet(unique[:, :2], -unique[:, 2], margin)
+        )
+    return CenterOfMassOverFeet(*edges, margin)
 
 
 def _bounds(robot: Robot, chart: Chart, given: Array, requirements: Requirements) -> tuple[Array, Array]:

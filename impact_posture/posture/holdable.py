@@ -79,9 +79,13 @@ class Holdable(Constraint):
         shares = np.full(len(self._names), -1.0) if found.unbalanced else np.abs(found.shares) - 1
         return np.append(found.unbalanced, shares), found.jacobian
 
+    def value(self, model: Numeric) -> Array:
+        """See :class:`Constraint`; at the limits of all actuators where even forces show that it holds."""
+        return np.zeros(self.rows) if self._rest.spares(model.q, 0.0) else self.evaluate(model)[0]
+
     def grown(self, model: Numeric) -> Self:
         """See :class:`Constraint`."""
-        if self.active or self._rest.spares(model.q, _NEAR) or self.evaluate(model)[0].max() <= _KEPT:
+        if self.active or self.value(model).max() <= _KEPT:
             return self
         return type(self)(self._load, self._rest, self._words, active=True)
 

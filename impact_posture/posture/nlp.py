@@ -50,6 +50,9 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.bound_relax_factor": 0.0,
     "ipopt.honor_original_bounds": "yes",
     "ipopt.mu_strategy": "adaptive",
+    # The rows of a program are of like size.  To scale and permute each matrix takes MUMPS longer than it saves.
+    "ipopt.mumps_scaling": 0,
+    "ipopt.mumps_permuting_scaling": 0,
     "ipopt.max_iter": 300,
     "print_time": False,
     "calc_lam_p": False,
