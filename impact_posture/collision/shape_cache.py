@@ -14,6 +14,7 @@ from impact_posture.stored_text import read_stored, write_stored
 from impact_posture.tables import STRICT
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
+_Index = Annotated[int, Field(ge=0)]
 _Names = tuple[tuple[str, str], ...]
 
 
@@ -25,9 +26,15 @@ class StoredHull:
 
     name: str
     link: str
-    joint: Annotated[int, Field(ge=0)]
+    joint: _Index
     vertices: Annotated[tuple[tuple[_Number, _Number, _Number], ...], Field(min_length=1, max_length=MOST_VERTICES)]
     radius: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    faces: tuple[tuple[_Index, _Index, _Index], ...]
+
+    @property
+    def whole(self) -> bool:
+        """Whether all faces join vertices."""
+        return all(k < len(self.vertices) for face in self.faces for k in face)
 
 
 @dataclass(frozen=True)
@@ -37,7 +44,7 @@ class StoredShapes:
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
     bodies: tuple[StoredHull, ...]
-    pairs: tuple[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], ...]
+    pairs: tuple[tuple[_Index, _Index], ...]
     always_touching: _Names
     hulls_touching: _Names
     warnings: tuple[str, ...]
@@ -49,8 +56,11 @@ def read_shapes(key: str, joints: int) -> StoredShapes | None:
     # A pydantic fault is a ValueError.
     with suppress(ValueError):
         stored: StoredShapes | None = None if text is None else _adapter().validate_json(text)
-        indices = [index for pair in stored.pairs for index in pair] if stored else []
-        if stored and all(h.joint < joints for h in stored.bodies) and all(k < len(stored.bodies) for k in indices):
+        if (
+            stored
+            and all(hull.joint < joints and hull.whole for hull in stored.bodies)
+            and all(k < len(stored.bodies) for pair in stored.pairs for k in pair)
+        ):
             return stored
     return None
 

@@ -150,6 +150,9 @@ class Search:
         with fork_map(
             lambda k: self._run(waiting[k], last=last), len(waiting), jobs if unknowns > _FORK else 1
         ) as results:
+            if around := self.problem.surroundings:
+                # The last word needs the shapes themselves, and this process would only wait.
+                _ = around.shapes.geometry
             for k, run in results:
                 yield waiting[k], run
 

@@ -7,6 +7,7 @@ import gzip
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -79,8 +80,9 @@ class Scene:
     bodies: tuple[Array, ...]
     ghost: bool
 
-    def pack(self) -> tuple[str, str]:
-        """Return the scene as JSON, and its arrays as base64 of a gzipped buffer into which the JSON points."""
+    @cached_property
+    def packed(self) -> tuple[str, str]:
+        """The scene as JSON, and its arrays as base64 of a gzipped buffer into which the JSON points."""
         model, tracks = self.objective.robot.model, [self._track(track) for track in self.tracks]
         low, high = self._box()
         size, center = float(np.linalg.norm(high - low)), (low + high) / 2
