@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -143,3 +145,19 @@ def test_what_even_forces_hold_needs_no_linear_program(monkeypatch: pytest.Monke
     monkeypatch.setattr(held[0], "evaluate", None)
     # Both say that nothing is violated.
     assert (exact <= 1e-8).all() and (held[0].value(model) <= held[0].upper).all()
+
+
+def test_an_answer_of_a_small_robot_imports_no_part_of_scipy() -> None:
+    """A part of SciPy takes longer to import than such a problem takes to solve."""
+    program = """if True:
+        import sys
+        from impact_posture.front_door import PostureProblem, optimize
+        from impact_posture.posture.problem_settings import prepare
+        from impact_posture.settings import ProblemSettings
+
+        prepared = prepare(ProblemSettings(robot="tilthex_arm", frame="ee", normal=(0, 0, 1)))
+        assert optimize(PostureProblem.of(prepared), starts=2, jobs=1).document
+        print([part for part in ("linalg", "spatial", "optimize") if f"scipy.{part}" in sys.modules])
+        """
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("[]\n", "")
