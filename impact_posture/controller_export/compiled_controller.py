@@ -52,8 +52,9 @@ class CompiledController:
             ("dynamics", 1),
             ("level", 1),
             ("value", 1),
+            ("target", manifest.nq),
         ]
-        self._report, self._diagnosis = _structure(rows, ["status", "iterations"])
+        self._report, self._diagnosis = _structure(rows, ["status", "iterations", "resting", "flow_failures"])
         self._given, self.parameters = _structure([*manifest.parameters.items()], [])
         bytes_ = ctypes.c_ulong.in_dll(library, f"{prefix}_context_bytes").value
         self._context = ctypes.create_string_buffer(bytes_)
@@ -76,6 +77,7 @@ class CompiledController:
                 "brace",
                 "contact",
                 "release",
+                *(["brace_before"] if sizes.get("FLOW") else []),
             )
         }
         getattr(library, f"{prefix}_default_params")(ctypes.byref(self._given))
@@ -117,7 +119,7 @@ class CompiledController:
         Raises:
             InputError: A parameter is out of range; names it.
             PostureError: ``q`` is no configuration of the robot, or ``v`` is no velocity.
-            MetricError: The gradient of the impact-robust term does not exist there, or vanishes.
+            MetricError: The gradient that the posture task follows does not exist there, or vanishes.
         """
         targets = {name: row.copy() for name, row in self._targets.items()}
         refused = self._call("init", ctypes.byref(self._given))
@@ -244,16 +246,38 @@ class CompiledController:
         if self._call("lead_posture", *self._pointers[:2], pointer):
             raise InputError("is no reference", where="lead_posture", hint="give a posture and finite numbers")
 
-    def brace(self) -> None:
-        """Switch the impact-robust term on."""
-        self._enter("brace")
+    @property
+    def target(self) -> Array:
+        """``q_des`` of the posture task at the last tick, shape (nq,)."""
+        self._call("last_report", ctypes.byref(self._report))
+        return self._diagnosis["target"].copy()
+
+    @property
+    def flow_failures(self) -> int:
+        """Steps since the reset that the solver of a reference flow did not find.  The flow then comes to rest."""
+        self._call("last_report", ctypes.byref(self._report))
+        return int(self._report.flow_failures)
+
+    def brace(self, t_impact: float | None = None) -> None:
+        """Switch the impact-robust term on, or let the reference flow go.
+
+        Args:
+            t_impact: Time until the impact, s, before which a reference flow comes to rest.
+
+        Raises:
+            InputError: The time is not finite or there is no flow, or ``reset`` has not been called.
+        """
+        if t_impact is None:
+            self._enter("brace")
+        elif "brace_before" not in self._functions or self._call("brace_before", ctypes.c_double(t_impact)):
+            raise InputError("no flow can rest before that time", where="brace", hint="give finite seconds from now")
 
     def contact(self) -> None:
         """Hold the reached posture during the impact, or keep the term on if it is live."""
         self._enter("contact")
 
     def release(self) -> None:
-        """Switch the impact-robust term off and hold the reached posture."""
+        """Switch the impact-robust term or the flow off and hold the reached posture."""
         self._enter("release")
 
     # ---- parts --------------------------------------------------------------------------------------------------

@@ -84,7 +84,7 @@ def export_controller(
         robot: The robot.
         formulation: Tasks of this package, contacts and limits.
         out: The folder; ``./<prefix>-c`` by default.
-        objective: The objective whose gradient an impact-robust posture task follows.
+        objective: The objective whose gradient an impact-robust posture task or a reference flow follows.
         prefix: Beginning of the C names; by default, the robot and ``controller``.
         period: Expected time between ticks, s.
         daqp: Folder of the sources of DAQP, where they cannot be downloaded.
@@ -98,11 +98,9 @@ def export_controller(
     """
     prefix = c_identifier(robot.name, "controller") if prefix is None else check_prefix(prefix)
     structure = structure_of(robot, formulation)
-    if (structure.robust is None) != (objective is None):
-        what = (
-            "the impact-robust posture task has no objective" if objective is None else "no task uses the objective"
-        )
-        hint = "give the objective of its gradient" if objective is None else "give an impact-robust posture task"
+    if (structure.robust is None and structure.flow is None) != (objective is None):
+        what = "the posture task has no objective" if objective is None else "no task uses the objective"
+        hint = "give the objective of its gradient" if objective is None else "give a posture task that follows one"
         raise InputError(what, where="controller export", hint=hint)
     sources = daqp_sources(daqp)
     fields = parameters(structure, period)

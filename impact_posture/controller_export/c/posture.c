@@ -12,6 +12,10 @@ static void ip_fade_to(ip_context *c, const double *q, double over)
   c->over = over;
 }
 
+#if IP_FLOW
+static void ip_flow_lead(ip_context *c, double dt);
+#endif
+
 #if IP_ROBUST
 /* Evaluate the term at q; keep the previous one where the gradient does not exist. */
 static void ip_evaluate(ip_context *c)
@@ -106,7 +110,7 @@ static int ip_normalize(ip_context *c)
   for (k = 0; k < free_count; ++k) {
     double z[N];
     for (i = 0; i < N; ++i) {
-      z[i] = V[i * N + at[k]];
+      z[i] = V[at[k] * N + i];
     }
     for (j = 0; j < 2; ++j) {
       ip_integrate(c->q, z, j ? -1e-5 : 1e-5, q);
@@ -117,7 +121,7 @@ static int ip_normalize(ip_context *c)
     for (i = 0; i < free_count; ++i) {
       double sum = 0.0;
       for (j = 0; j < N; ++j) {
-        sum += V[j * N + at[i]] * (g[0][j] - g[1][j]) / 2e-5;
+        sum += V[at[i] * N + j] * (g[0][j] - g[1][j]) / 2e-5;
       }
       B[i * free_count + k] = sum;
     }
@@ -181,6 +185,9 @@ static void ip_advance(ip_context *c, double dt)
       c->blend = 1.0;
     }
   }
+#if IP_FLOW
+  ip_flow_lead(c, dt);
+#endif
 #if IP_ROBUST
   ip_activate(c, dt);
   if (c->level <= 0.0) {
@@ -239,6 +246,13 @@ static int ip_enter(ip_context *c, int phase)
   const int fits = phase == IP_BRACE ? c->phase == IP_FREE || c->phase == IP_RELEASE
                    : phase == IP_CONTACT ? c->phase == IP_BRACE : c->phase == IP_BRACE || c->phase == IP_CONTACT;
   const double was = c->goal;
+#if IP_FLOW
+  /* The flow stops and goes in any order. */
+  c->flow.on = phase == IP_BRACE;
+  c->flow.deadline = INFINITY;
+  c->level = c->flow.on;
+  return !c->ready;
+#endif
   if (!c->ready || !IP_ROBUST || !fits) {
     return 1;
   }

@@ -7,6 +7,11 @@ void ip_last_report(const ip_context *c, ip_report *report)
   report->status = c->status;
   report->level = c->level;
   report->value = c->value;
+  memcpy(report->target, c->posture, sizeof report->target);
+#if IP_FLOW
+  report->flow_failures = c->flow.failures;
+  report->resting = c->flow.resting;
+#endif
   report->dynamics = NAN;
   if (c->held_now) {
     return;

@@ -79,21 +79,10 @@ static void ip_decode(ip_context *c, DAQPWorkspace *w)
   ip_add_turned(c, x, c->z);
 }
 
-/* Solve from the present active set.  Return the flag of DAQP, positive for a solution. */
-static int ip_solve_warm(ip_context *c)
+/* How DAQP solves. */
+static DAQPSettings ip_settings(void)
 {
-  enum { N = IP_VARIABLES, M = IP_SIMPLE + IP_GENERAL };
-  double lam[N + 1], lam_star[N + 1], xldl[N + 1], zldl[N + 1], D[N + 1], L[(N + 1) * (N + 2) / 2], xold[N], Mu[IP_GENERAL];
-  int WS[N + 1], prox[N], i, flag;
   DAQPSettings settings;
-  DAQPWorkspace w;
-  for (i = 0; i < M; ++i) {
-    if (c->upper[i] - c->lower[i] < -1e-9 * c->scaling[i]) {
-      return DAQP_EXIT_INFEASIBLE;
-    }
-  }
-  memset(&w, 0, sizeof w);
-  memset(prox, 0, sizeof prox);
   memset(&settings, 0, sizeof settings);
   settings.primal_tol = 1e-9;
   settings.dual_tol = DAQP_DEFAULT_DUAL_TOL;
@@ -107,6 +96,24 @@ static int ip_solve_warm(ip_context *c)
   settings.sing_tol = DAQP_DEFAULT_SING_TOL;
   settings.refactor_tol = DAQP_DEFAULT_REFACTOR_TOL;
   settings.eq_reduction = DAQP_EQ_REDUCTION_OFF;
+  return settings;
+}
+
+/* Solve from the present active set.  Return the flag of DAQP, positive for a solution. */
+static int ip_solve_warm(ip_context *c)
+{
+  enum { N = IP_VARIABLES, M = IP_SIMPLE + IP_GENERAL };
+  double lam[N + 1], lam_star[N + 1], xldl[N + 1], zldl[N + 1], D[N + 1], L[(N + 1) * (N + 2) / 2], xold[N], Mu[IP_GENERAL];
+  int WS[N + 1], prox[N], i, flag;
+  DAQPSettings settings = ip_settings();
+  DAQPWorkspace w;
+  for (i = 0; i < M; ++i) {
+    if (c->upper[i] - c->lower[i] < -1e-9 * c->scaling[i]) {
+      return DAQP_EXIT_INFEASIBLE;
+    }
+  }
+  memset(&w, 0, sizeof w);
+  memset(prox, 0, sizeof prox);
   w.settings = &settings;
   w.n = N;
   w.m = M;

@@ -146,6 +146,11 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
     return 2;
   }
 #endif
+#if IP_FLOW
+  if (!ip_flow_begin(c)) {
+    return 2;
+  }
+#endif
   ip_assemble(c);
   ip_begin_rank(c);
   for (i = 0; i < IP_NV; ++i) {
@@ -221,6 +226,17 @@ int ip_brace(ip_context *c)
 {
   return ip_enter(c, IP_BRACE);
 }
+
+#if IP_FLOW
+int ip_brace_before(ip_context *c, double t_impact)
+{
+  if (!isfinite(t_impact) || ip_brace(c)) {
+    return 1;
+  }
+  c->flow.deadline = c->flow.clock + t_impact - ip_flow_settle(&c->p);
+  return 0;
+}
+#endif
 
 int ip_contact(ip_context *c)
 {
