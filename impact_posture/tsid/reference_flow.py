@@ -218,9 +218,11 @@ class ReferenceFlow:
         z = self._seen[k]
         if sign > 0:
             # The columns of Z are as good as any others of that space.  What a fixed direction has in it is unique.
-            seen = self._seen[:k]
-            z[:] = Z @ (Z.T @ (self._mixed[k] - (seen @ self._mixed[k]) @ seen))
-            z /= math.sqrt(max(float(z @ z), _EMPTY))
+            seen, z[:] = self._seen[:k], self._mixed[k]
+            for _ in range(2):
+                # The first time leaves an error where little of the direction is new.
+                z[:] = Z @ (Z.T @ (z - (seen @ z) @ seen))
+                z /= math.sqrt(max(float(z @ z), _EMPTY))
         # Both sides of the posture of the last look, because the flow has moved on since.
         q = pin.integrate(self._model, self._here, sign * _STEP * z)
         _, slope = self._evaluate(q)
@@ -302,12 +304,12 @@ class ReferenceFlow:
 
 
 def mixed_directions(nv: int) -> Array:
-    """Return directions in which no entry is left out, shape (nv, nv), the same numbers on every machine.
+    """Return directions in which no entry is left out, shape (nv, nv), bit for bit the same on every machine.
 
-    The fractions of ``k² φ``, φ the golden ratio, are spread like random numbers.
+    The fractions of ``k² φ``, φ the golden ratio in 32 bits, are spread like random numbers.
     """
-    whole = np.arange(1.0, nv * nv + 1.0) ** 2 * ((math.sqrt(5.0) - 1.0) / 2.0)
-    return (whole - np.floor(whole) - 0.5).reshape(nv, nv)
+    k = np.arange(1, nv * nv + 1, dtype=np.uint32)
+    return np.asarray((k * k * np.uint32(2654435769) / 2.0**32 - 0.5).reshape(nv, nv))
 
 
 PHASES: tuple[Callable[[ReferenceFlow], None], ...] = (

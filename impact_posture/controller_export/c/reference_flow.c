@@ -101,23 +101,26 @@ static void ip_flow_look(ip_context *c)
 /* A direction of the redundancy that does not depend on its basis: what is new of a fixed one. */
 static void ip_flow_aim(ip_flow *f)
 {
-  double *z = f->seen[f->probed], s;
-  int i, k;
+  double *z = f->seen[f->probed], *was = f->work, s;
+  int i, k, again;
   for (i = 0; i < IP_NV; ++i) {
     const uint32_t j = (uint32_t)(f->probed * IP_NV + i + 1);
     z[i] = (double)(uint32_t)(j * j * UINT32_C(2654435769)) / 4294967296.0 - 0.5;
   }
-  memcpy(f->work, z, sizeof(double) * IP_NV);
-  for (k = 0; k < f->probed; ++k) {
-    s = ip_dot(f->seen[k], f->work, IP_NV);
-    for (i = 0; i < IP_NV; ++i) {
-      z[i] -= s * f->seen[k][i];
+  /* The first time leaves an error where little of the direction is new. */
+  for (again = 0; again < 2; ++again) {
+    memcpy(was, z, sizeof(double) * IP_NV);
+    for (k = 0; k < f->probed; ++k) {
+      s = ip_dot(f->seen[k], was, IP_NV);
+      for (i = 0; i < IP_NV; ++i) {
+        z[i] -= s * f->seen[k][i];
+      }
     }
-  }
-  ip_flow_project(f, z);
-  s = sqrt(fmax(ip_dot(z, z, IP_NV), 1e-24));
-  for (i = 0; i < IP_NV; ++i) {
-    z[i] /= s;
+    ip_flow_project(f, z);
+    s = sqrt(fmax(ip_dot(z, z, IP_NV), 1e-24));
+    for (i = 0; i < IP_NV; ++i) {
+      z[i] /= s;
+    }
   }
 }
 
