@@ -92,12 +92,13 @@ class FlowDirection:
         # The pull towards the start acts on joints.  Others lead the base.
         self._pull = np.full(nv, rho)
         self._pull[: 6 if robot.floating else 0] = 0.0
-        self.B, self.T, self.gain, self.failures = np.zeros((nv, nv)), np.zeros((controls, nv)), 0.0, 0
+        self.B, self.gain, self.failures = np.zeros((nv, nv)), 0.0, 0
         # The sizes never change.  Directions that the constraints take keep columns of zeros.
         self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + controls)
         self._solver = DaqpSolver(nv, self._qp.m)
         self._rows = np.zeros((self._qp.m, nv))
         self._rows[np.arange(self._joints.size), self._joints] = 1.0
+        self.T = self._rows[self._qp.m - controls :]
 
     def learn(self, z: Array, curvature: Array, slope: Array) -> None:
         """Learn the curvature of ``H/H₀`` and the slope of the static controls along a unit vector, shape (nv,)."""
@@ -124,7 +125,6 @@ class FlowDirection:
         if k:
             np.matmul(self._edges, state.center_of_mass()[1][:2], out=self._rows[count : count + k])
             upper[count : count + k] = rooms
-        self._rows[count + k :] = self.T
         upper[count + k :] = 1.0 - shares
         lower[count + k :] = -1.0 - shares
         ahead = self._rows @ coasting
