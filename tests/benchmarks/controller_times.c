@@ -25,6 +25,9 @@ int main(int count, char **arguments)
       || ctl_reset(&context, state, state + CTL_NQ, &command) != 0) {
     return 1;
   }
+#if CTL_FLOW
+  ctl_brace(&context);
+#endif
   for (tick = 0; fread(state, sizeof state, 1, file) == 1; ++tick) {
     for (k = 0; count > 2 && k < sizeof junk; k += 64) {
       sink += junk[k]++;

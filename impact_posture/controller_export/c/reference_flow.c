@@ -189,9 +189,9 @@ static void ip_flow_direct(ip_context *c)
 }
 
 /* The velocity that brings q_r back to contacts and tasks; of all such motions that of the base and not of the joints. */
-static void ip_flow_back(const ip_context *c, double *back)
+static void ip_flow_back(ip_context *c, double *back)
 {
-  const ip_flow *f = &c->flow;
+  ip_flow *f = &c->flow;
   double rate[IP_LARGEST];
   int i, k, row;
   for (i = 0; i < IP_HELD; ++i) {
@@ -207,7 +207,7 @@ static void ip_flow_back(const ip_context *c, double *back)
   }
 #if IP_BASE
   {
-    double *square = c->flow.work, x[IP_NV];
+    double *square = f->work, x[IP_NV];
     const int n = f->left;
     for (k = 0; k < n; ++k) {
       for (i = 0; i <= k; ++i) {

@@ -50,7 +50,7 @@ static void ip_flow_limits(ip_context *c)
 
 /* The step with the least |y|^2/2 + slope y, step = sum of y[k] way[k] over the redundancy; zero if the solver fails.
  * With u = y + slope this is the least |u|^2. */
-static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *slope, double *step)
+APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *slope, double *step)
 {
   enum { N = IP_NV, M = IP_FLOW_ROWS };
   double lam[N + 1], lam_star[N + 1], xldl[N + 1], zldl[N + 1], D[N + 1], L[(N + 1) * (N + 2) / 2], xold[N], Mu[M], u[N];

@@ -3,7 +3,7 @@
 
 /* Singular value of the constraints, relative to the largest, below which they are springs, and their stiffness relative
  * to H0, 1/m2. */
-#define IP_SOFT 2e-2
+#define IP_SLACK 2e-2
 #define IP_SPRING 3e4
 /* Weight of a moment (N m) relative to that of a force (N), and a share that makes equations solvable. */
 #define IP_MOMENT 100.0
@@ -11,6 +11,7 @@
 /* Least share of the half range of a control that counts as left. */
 #define IP_LEFT 0.1
 
+#if IP_BASE
 /* Solve R'R x = b in place, R upper triangular in n x n. */
 static void ip_solve_factor(const double *R, int n, double *b)
 {
@@ -28,6 +29,7 @@ static void ip_solve_factor(const double *R, int n, double *b)
     b[i] /= R[i * (n + 1)];
   }
 }
+#endif
 
 /* Decompose J = U S V': the inverse of the directions that it holds, and an orthonormal basis of the others, by the rows
  * of Z.  A Gram matrix is exact enough, because what counts has singular values above 2 %. */
@@ -49,7 +51,7 @@ static void ip_flow_space(ip_flow *f)
   for (k = 0; k < M && rank < N; ++k) {
     const double value = G[k * (M + 1)];
     double *row = held + rank * N;
-    if (!(value > IP_SOFT * IP_SOFT * most)) {
+    if (!(value > IP_SLACK * IP_SLACK * most)) {
       continue;
     }
     memset(row, 0, sizeof(double) * N);
