@@ -62,7 +62,9 @@ class ReferenceFlowPosture(JointPosture):
         visited = np.zeros((0, robot.nq)) if path is None else np.atleast_2d(np.asarray(path, dtype=float))
         self._path = [robot.check_posture(q, limits=False) for q in visited]
         self._flow: ReferenceFlow | None = None
-        self._data = robot.model.createData()
+        self._data = data = robot.model.createData()
+        # Views on what Pinocchio writes at the same place each time.
+        self._com, self._turned = (data.com[0], data.vcom[0], data.acom[0]), data.oMi[1].rotation
         slowest = float(self.kp[6 if robot.floating else 0 :].min(initial=np.inf))
         self.settle = 4.0 / np.sqrt(slowest) if 0 < slowest < np.inf else 0.0
 
@@ -130,13 +132,13 @@ class ReferenceFlowPosture(JointPosture):
 
     def _lead(self, flow: ReferenceFlow) -> None:
         """Move center of mass and base orientation with the flow."""
-        data = self._data
-        pin.centerOfMass(self._model, data, flow.q, flow.velocity, flow.acceleration, False)
+        pin.centerOfMass(self._model, self._data, flow.q, flow.velocity, flow.acceleration, False)
+        position, velocity, acceleration = self._com
         for task in flow.led:
             if isinstance(task, CenterOfMass):
-                task.target = np.array(data.com[0])
-                task.target_velocity, task.target_acceleration = data.vcom[0], data.acom[0]
+                task.target = position.copy()
+                task.target_velocity, task.target_acceleration = velocity, acceleration
             elif isinstance(task, BaseOrientation):
-                task.target = pin.Quaternion(flow.q[3:7]).matrix()
+                task.target = self._turned.copy()
                 task.target_velocity = flow.velocity[3:6]
                 task.target_acceleration = flow.acceleration[3:6]
