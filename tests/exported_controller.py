@@ -22,6 +22,7 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import library_path, load_library
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task_formulation import TaskFormulation
 from tests.daqp import sources_or_skip
 
@@ -32,17 +33,30 @@ KINDS: dict[str, ControllerKind] = {
 _KEPT = TemporaryDirectory()
 
 
-def exported(name: str, objective: ImpactObjective | None = None, flags: str = "-O0") -> Path:
-    """Return the folder of a robot's controller with default gains and a library."""
+def exported(
+    name: str, objective: ImpactObjective | None = None, flags: str = "-O0", path: tuple[float, ...] | None = None
+) -> Path:
+    """Return the folder of a robot's controller with default gains and a library.
+
+    Args:
+        name: The robot.
+        objective: What the posture task follows.
+        flags: Flags for the compiler.
+        path: Follow by a reference flow that visits this posture first; empty for none.
+    """
     sources_or_skip()
-    return _exported(name, objective, flags)
+    return _exported(name, objective, flags, path)
 
 
 @cache
-def _exported(name: str, objective: ImpactObjective | None, flags: str) -> Path:
+def _exported(name: str, objective: ImpactObjective | None, flags: str, path: tuple[float, ...] | None) -> Path:
     out = Path(_KEPT.name) / f"{name}-{len(os.listdir(_KEPT.name))}"
     robot = load_robot(name)
-    formulation = default_formulation(robot, KINDS[name], objective)
+    formulation = default_formulation(robot, KINDS[name], objective, flow=path is not None)
+    if path:
+        flow = formulation.posture
+        assert isinstance(flow, ReferenceFlowPosture)
+        flow._path = [np.array(path)]
     given = os.environ.get("DAQP_SOURCES")
     daqp = Path(given) if given else None
     with pytest.MonkeyPatch.context() as patch:
