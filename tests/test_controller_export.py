@@ -174,4 +174,4 @@ def test_the_library_is_used_by_many_at_once() -> None:
     other.tick(0.0, q - 0.1, v)
     assert np.array_equal(one.tick(0.0, q, v).u, first.u)
     with pytest.raises(InputError, match="no flow"):
-        one.brace(1.0)
+        one.brace(t_impact=1.0)

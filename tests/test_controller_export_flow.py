@@ -68,7 +68,7 @@ def test_the_reference_goes_as_in_python(name: str, path: tuple[float, ...], tic
             if k == at:
                 for target in (posture, theirs):
                     # The second time, the flow has to rest before an impact.
-                    getattr(target, phase)(*([posture.settle + 0.1] if phase == "brace" and k else []))
+                    getattr(target, phase)(**({"t_impact": posture.settle + 0.1} if phase == "brace" and k else {}))
         for i, controller in enumerate((ours, theirs)):
             q, v = states[i]
             command = controller.tick(k * DT, q, v)
@@ -114,7 +114,7 @@ def test_what_is_no_time_no_parameter_and_no_task_is_refused() -> None:
     _, _, theirs = both("panda", ELBOW)
     at_rest: tuple[Array, Array] = (r.posture(), np.zeros(r.nv))
     with pytest.raises(InputError, match="no flow can rest"):
-        theirs.brace(float("nan"))
+        theirs.brace(t_impact=float("nan"))
     for name, wrong in (("flow_share", 1.5), ("flow_speed", np.inf), ("flow_mu", 0.0), ("flow_rho", -1.0)):
         before = theirs.parameters[name].copy()
         theirs.parameters[name][:] = wrong

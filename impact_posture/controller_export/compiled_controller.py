@@ -258,7 +258,7 @@ class CompiledController:
         self._call("last_report", ctypes.byref(self._report))
         return int(self._report.flow_failures)
 
-    def brace(self, t_impact: float | None = None) -> None:
+    def brace(self, *, t_impact: float | None = None) -> None:
         """Switch the impact-robust term on, or let the reference flow go.
 
         Args:

@@ -40,7 +40,7 @@ _CORE = (
     "report.c",
 )
 _FOLLOW = ("eigen.c",)
-_FLOW = ("reference_flow_space.c", "reference_flow_direction.c", "reference_flow.c")
+_FLOW = ("reference_flow_space.c", "reference_flow_direction.c", "reference_flow.c", "reference_flow_motion.c")
 # Parameters that init compares with others.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
 # Bytes of variables, saved registers and return addresses of all functions below a tick, beside the arrays.

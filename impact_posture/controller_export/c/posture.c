@@ -249,7 +249,6 @@ static int ip_enter(ip_context *c, int phase)
 #if IP_FLOW
   /* The flow stops and goes in any order. */
   c->flow.on = phase == IP_BRACE;
-  c->flow.deadline = INFINITY;
   c->level = c->flow.on;
   return !c->ready;
 #endif

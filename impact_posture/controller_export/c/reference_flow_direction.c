@@ -53,11 +53,10 @@ static void ip_flow_limits(ip_context *c)
 APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *slope, double *step)
 {
   enum { N = IP_NV, M = IP_FLOW_ROWS };
-  double lam[N + 1], lam_star[N + 1], xldl[N + 1], zldl[N + 1], D[N + 1], L[(N + 1) * (N + 2) / 2], xold[N], Mu[M], u[N];
-  double upper[M], lower[M], scaling[M], *rows = f->work;
-  int WS[N + 1], prox[N], sense[M], i, k, r;
+  double u[N], upper[M], lower[M], scaling[M], *rows = f->work;
+  int sense[M], i, k, r;
   const int n = f->left;
-  DAQPSettings settings = ip_settings();
+  ip_memory memory;
   DAQPWorkspace w;
   memset(step, 0, sizeof(double) * IP_NV);
   f->gain = 0.0;
@@ -82,29 +81,12 @@ APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *
     /* A row of zeros bounds nothing. */
     sense[r] = length >= IP_NOTHING ? 0 : DAQP_IMMUTABLE;
   }
-  memset(&w, 0, sizeof w);
-  memset(prox, 0, sizeof prox);
-  memset(u, 0, sizeof u);
-  w.settings = &settings;
-  w.n = n;
-  w.m = M;
+  ip_prepare(&memory, n, 0, M, u, &w);
   w.M = rows;
   w.dupper = upper;
   w.dlower = lower;
   w.scaling = scaling;
   w.sense = sense;
-  w.Mu = Mu;
-  w.lam = lam;
-  w.lam_star = lam_star;
-  w.WS = WS;
-  w.D = D;
-  w.L = L;
-  w.xldl = xldl;
-  w.zldl = zldl;
-  w.u = w.x = u;
-  w.xold = xold;
-  w.prox_mask = prox;
-  w.outer_iter = 1;
   if (daqp_reactivate_constraints(&w) < 0 || daqp_ldp(&w) <= 0) {
     ++f->failures;
     return;

@@ -224,6 +224,9 @@ int ip_lead_posture(ip_context *c, const double q[IP_NQ], const double v[IP_NV],
 
 int ip_brace(ip_context *c)
 {
+#if IP_FLOW
+  c->flow.deadline = INFINITY;
+#endif
   return ip_enter(c, IP_BRACE);
 }
 
