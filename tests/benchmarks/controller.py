@@ -16,10 +16,13 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.controller_export.compiled_controller import CompiledController
+from impact_posture.controller_export.manifest import read_controller
 from impact_posture.robot.robot import Robot
 from impact_posture.toolchain import find_compiler
 from impact_posture.tsid.controller import Command, Controller, Status
 from tests.benchmarks.core import Vector, machine, one_core, table
+from tests.benchmarks.flow import CASES
 from tests.exported_controller import KINDS, compiled, exported, formulation_of, random_state
 
 HARNESS = Path(__file__).with_name("controller_times.c")
@@ -114,13 +117,27 @@ def no_worse(controller: Controller, a: Command, b: Command) -> bool:
     return theirs <= max(ours, exact) and (ours > exact or its <= cost + 1e-10 * (1.0 + abs(cost)))
 
 
-def times(name: str, recorded: list[Vector], flags: list[str], cold: bool) -> tuple[float, float]:
+def flowing(name: str, ticks: int) -> tuple[Path, list[Vector]]:
+    """Return the folder of a controller with a reference flow, and the states of a robot that follows the flow."""
+    objective = next(case for case in CASES if case.robot == name).problem().objective
+    folder, robot = exported(name, objective, path=()), objective.robot
+    controller, recorded = CompiledController.load(folder), list[Vector]()
+    q, v = robot.posture(), np.zeros(robot.nv)
+    controller.reset(q, v)
+    controller.brace()
+    for k in range(ticks):
+        recorded.append(np.concatenate([q, v]))
+        v = v + 1e-3 * controller.tick(1e-3 * k, q, v).acceleration
+        q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
+    return folder, recorded
+
+
+def times(folder: Path, recorded: list[Vector], flags: list[str], cold: bool) -> tuple[float, float]:
     """Return median and 99th percentile of the ticks, each the least of its repetitions, µs."""
-    folder = exported(name)
     with tempfile.TemporaryDirectory() as scratch:
         program, data = Path(scratch) / "times", Path(scratch) / "ticks.bin"
         np.array([recorded[0], *recorded]).tofile(data)
-        sources = ["ctl.c", "ctl_relaxation.c", *sorted(str(p) for p in (folder / "daqp").glob("*.c")), str(HARNESS)]
+        sources = ["ctl.c", *read_controller(folder)[1].sources, str(HARNESS)]
         command = [*(find_compiler() or ["cc"]), "-std=c99", "-ffp-contract=fast", "-isystem", "daqp", "-I.", *flags]
         subprocess.run([*command, *sources, "-o", str(program), "-lm"], cwd=folder, check=True)
         runs = []
@@ -155,7 +172,8 @@ def main(out: Path, ticks: int) -> None:
         recorded, python = quiet[0].states, np.array(quiet[0].python)
         speeds.append([name, f"{np.median(python):.0f} / {np.percentile(python, 99):.0f}"])
         for flags, cold in ((BUILDS["-O2"], False), (BUILDS["native"], False), (BUILDS["-O2"], True)):
-            speeds[-1].append("{:.1f} / {:.1f}".format(*times(name, recorded, flags, cold)))
+            speeds[-1].append("{:.1f} / {:.1f}".format(*times(exported(name), recorded, flags, cold)))
+        speeds[-1].append("{:.1f} / {:.1f}".format(*times(*flowing(name, 4 * ticks), BUILDS["-O2"], False)))
         print(*speeds[-1], flush=True)
     agree = [
         "robot",
@@ -166,13 +184,13 @@ def main(out: Path, ticks: int) -> None:
         "relaxed",
         "other (Python/C)",
     ]
-    speed = ["robot", "Python, µs", "C -O2", "C native", "C -O2, caches flushed"]
+    speed = ["robot", "Python, µs", "C -O2", "C native", "C -O2, caches flushed", "on the way of a flow, C -O2"]
     lines = [
         machine("daqp"),
         "",
         *table(agree, rows),
         "",
-        "Median / p99 over quiet states.",
+        "Median / p99 over quiet states, and while the posture flows.",
         "",
         *table(speed, speeds),
     ]

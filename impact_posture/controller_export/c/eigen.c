@@ -1,6 +1,15 @@
 /* Eigenvalues of a symmetric matrix: Householder's tridiagonal form, then QR steps with Wilkinson's shift (Golub and Van
  * Loan, Matrix Computations, sections 8.3.1 and 8.3.3). */
 
+/* out += s x. */
+static void ip_add(double *restrict out, double s, const double *restrict x, int n)
+{
+  int i;
+  for (i = 0; i < n; ++i) {
+    out[i] += s * x[i];
+  }
+}
+
 /* Take the reflection I - beta v v' of the entries from k + 1 on out of A, and put it into the rows of V. */
 static void ip_reflect(double *A, double *V, int n, int k, const double *v, double beta)
 {
@@ -10,9 +19,7 @@ static void ip_reflect(double *A, double *V, int n, int k, const double *v, doub
     p[i] = beta * ip_dot(A + i * n + k + 1, v + k + 1, n - k - 1);
     half += 0.5 * beta * p[i] * v[i];
   }
-  for (i = k + 1; i < n; ++i) {
-    p[i] -= half * v[i];
-  }
+  ip_add(p + k + 1, -half, v + k + 1, n - k - 1);
   for (i = k + 1; i < n; ++i) {
     for (j = k + 1; j < n; ++j) {
       A[i * n + j] -= v[i] * p[j] + p[i] * v[j];
@@ -20,14 +27,10 @@ static void ip_reflect(double *A, double *V, int n, int k, const double *v, doub
   }
   memset(p, 0, sizeof p);
   for (i = k + 1; i < n; ++i) {
-    for (j = 0; j < n; ++j) {
-      p[j] += beta * v[i] * V[i * n + j];
-    }
+    ip_add(p, beta * v[i], V + i * n, n);
   }
   for (i = k + 1; i < n; ++i) {
-    for (j = 0; j < n; ++j) {
-      V[i * n + j] -= v[i] * p[j];
-    }
+    ip_add(V + i * n, -v[i], p, n);
   }
 }
 

@@ -67,17 +67,15 @@ static void ip_flow_evaluate(ip_flow *f, const double *q, double *slope)
 static void ip_flow_look(ip_context *c)
 {
   ip_flow *f = &c->flow;
-  int i, j;
+  int i;
   memcpy(f->here, f->q, sizeof f->here);
   ip_flow_place(c, f->q, f->error);
   ip_flow_evaluate(f, f->q, f->slope);
   f->value = f->found;
   ip_flow_space(f);
-  for (j = 0; j < IP_HELD; ++j) {
-    f->multiplier[j] = 0.0;
-    for (i = 0; i < IP_NV; ++i) {
-      f->multiplier[j] += f->inverse[i * IP_HELD + j] * f->slope[i];
-    }
+  memset(f->multiplier, 0, sizeof f->multiplier);
+  for (i = 0; i < IP_NV; ++i) {
+    ip_add(f->multiplier, f->slope[i], f->inverse + i * IP_HELD, IP_HELD);
   }
   ip_flow_shares(c, f->shares);
   ip_flow_limits(c);
@@ -96,10 +94,7 @@ static void ip_flow_aim(ip_flow *f)
   for (again = 0; again < 2; ++again) {
     memcpy(was, z, sizeof(double) * IP_NV);
     for (k = 0; k < f->probed; ++k) {
-      s = ip_dot(f->seen[k], was, IP_NV);
-      for (i = 0; i < IP_NV; ++i) {
-        z[i] -= s * f->seen[k][i];
-      }
+      ip_add(z, -ip_dot(f->seen[k], was, IP_NV), f->seen[k], IP_NV);
     }
     ip_flow_project(f, z);
     s = sqrt(fmax(ip_dot(z, z, IP_NV), 1e-24));
@@ -114,7 +109,7 @@ static void ip_flow_probe(ip_context *c, double sign)
 {
   ip_flow *f = &c->flow;
   double q[IP_NQ], slope[IP_NV], shares[IP_CONTROLS];
-  int i, j;
+  int i;
   if (f->failed || !f->left) {
     return;
   }
@@ -126,10 +121,8 @@ static void ip_flow_probe(ip_context *c, double sign)
   ip_integrate(f->here, f->seen[f->probed], sign * IP_PROBE, q);
   ip_flow_evaluate(f, q, slope);
   ip_flow_place(c, q, NULL);
-  for (j = 0; j < IP_HELD; ++j) {
-    for (i = 0; i < IP_NV; ++i) {
-      slope[i] -= f->multiplier[j] * f->J[j][i];
-    }
+  for (i = 0; i < IP_HELD; ++i) {
+    ip_add(slope, -f->multiplier[i], f->J[i], IP_NV);
   }
   ip_flow_shares(c, shares);
   if (sign > 0.0) {

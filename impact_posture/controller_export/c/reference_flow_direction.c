@@ -54,7 +54,7 @@ APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *
 {
   enum { N = IP_NV, M = IP_FLOW_ROWS };
   double u[N], upper[M], lower[M], scaling[M], *rows = f->work;
-  int sense[M], i, k, r;
+  int sense[M], k, r;
   const int n = f->left;
   ip_memory memory;
   DAQPWorkspace w;
@@ -94,9 +94,7 @@ APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *
   for (k = 0; k < n; ++k) {
     const double y = u[k] - slope[k];
     f->gain -= slope[k] * y + y * y / 2.0;
-    for (i = 0; i < N; ++i) {
-      step[i] += y * way[k][i];
-    }
+    ip_add(step, y, way[k], N);
   }
   if (!isfinite(ip_dot(step, step, N))) {
     ++f->failures;
@@ -131,9 +129,7 @@ static void ip_flow_newton(ip_context *c)
     /* Nearly dependent constraints are springs. */
     for (k = 0; k < n; ++k) {
       slope[k] -= IP_SPRING * f->spring[i][k] * f->error[i];
-      for (j = 0; j < n; ++j) {
-        C[k * n + j] += IP_SPRING * f->spring[i][k] * f->spring[i][j];
-      }
+      ip_add(C + k * n, IP_SPRING * f->spring[i][k], f->spring[i], n);
     }
   }
   ip_eigen(C, V, n);
@@ -141,9 +137,7 @@ static void ip_flow_newton(ip_context *c)
     const double ease = 1.0 / sqrt(fmax(fabs(C[k * (n + 1)]), c->p.flow_mu[0]));
     memset(f->way[k], 0, sizeof f->way[k]);
     for (j = 0; j < n; ++j) {
-      for (i = 0; i < N; ++i) {
-        f->way[k][i] += ease * V[k * n + j] * f->Z[j][i];
-      }
+      ip_add(f->way[k], ease * V[k * n + j], f->Z[j], N);
     }
     turned[k] = ease * ip_dot(V + k * n, slope, n);
   }
@@ -151,29 +145,23 @@ static void ip_flow_newton(ip_context *c)
   f->gain *= root;
 }
 
-/* Learn curvature and slope of the static controls along f->z, from differences over one rad. */
+/* Learn the curvature and the slope of the static controls along the direction of the last probe. */
 static void ip_flow_learn(ip_flow *f, const double *curvature, const double *controls)
 {
   const double *z = f->seen[f->probed];
   double missing[IP_NV], along;
-  int i, j;
+  int i;
   for (i = 0; i < IP_NV; ++i) {
     missing[i] = curvature[i] - ip_dot(f->B + i * IP_NV, z, IP_NV);
   }
   along = ip_dot(z, missing, IP_NV) / 2.0;
+  ip_add(missing, -along, z, IP_NV);
   for (i = 0; i < IP_NV; ++i) {
-    missing[i] -= along * z[i];
-  }
-  for (i = 0; i < IP_NV; ++i) {
-    for (j = 0; j < IP_NV; ++j) {
-      f->B[i * IP_NV + j] += missing[i] * z[j] + z[i] * missing[j];
-    }
+    ip_add(f->B + i * IP_NV, missing[i], z, IP_NV);
+    ip_add(f->B + i * IP_NV, z[i], missing, IP_NV);
   }
   for (i = 0; i < IP_CONTROLS; ++i) {
-    const double more = controls[i] - ip_dot(f->T[i], z, IP_NV);
-    for (j = 0; j < IP_NV; ++j) {
-      f->T[i][j] += more * z[j];
-    }
+    ip_add(f->T[i], controls[i] - ip_dot(f->T[i], z, IP_NV), z, IP_NV);
   }
 }
 
@@ -188,7 +176,7 @@ static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
   ip_flow_project(f, uphill);
   climb = ip_dot(uphill, f->flow, IP_NV) + ip_dot(uphill, step, IP_NV);
   square = ip_dot(uphill, uphill, IP_NV);
-  for (i = 0; climb > 0.0 && i < IP_NV; ++i) {
-    step[i] -= uphill[i] * climb / square;
+  if (climb > 0.0) {
+    ip_add(step, -climb / square, uphill, IP_NV);
   }
 }

@@ -46,9 +46,7 @@ static void ip_flow_back(ip_context *c, double *back)
     if (n && ip_cholesky(square, n)) {
       ip_solve_factor(square, n, x);
       for (k = 0; k < n; ++k) {
-        for (i = 0; i < IP_NV; ++i) {
-          back[i] -= x[k] * f->Z[k][i];
-        }
+        ip_add(back, -x[k], f->Z[k], IP_NV);
       }
     }
   }
@@ -97,10 +95,9 @@ static void ip_flow_govern(ip_context *c)
     more[i] = step[i] / period;
   }
   part = ip_flow_permitted(c, known, more);
-  for (i = 0; i < N; ++i) {
-    f->flow[i] += part * step[i];
-    f->acceleration[i] = known[i] + part * step[i] / period;
-  }
+  ip_add(f->flow, part, step, N);
+  ip_add(known, part, more, N);
+  memcpy(f->acceleration, known, sizeof known);
 }
 
 /* Time at rest before a known impact, s: four time constants of the slowest joint. */
@@ -128,8 +125,10 @@ static int ip_flow_begin(ip_context *c)
   ip_dynamics_constants(&f->m);
   ip_dynamics_constants(&f->ahead);
   for (k = 0; k < IP_TASKS; ++k) {
-    for (i = 0; !ip_flow_led[k] && i < ip_task_row[k + 1] - ip_task_row[k]; ++i, ++row) {
-      f->J[row][3 + i] = ip_task_kind[k] <= IP_BASE_TURN ? 1.0 : 0.0;
+    for (i = 0; !ip_flow_led[k] && i < ip_task_row[k + 1] - ip_task_row[k] && row < IP_HELD; ++i, ++row) {
+      if (ip_task_kind[k] <= IP_BASE_TURN) {
+        f->J[row][3 + i] = 1.0;
+      }
     }
   }
   for (i = 0; row < IP_HELD; ++i, ++row) {
@@ -181,9 +180,7 @@ static void ip_flow_lead(ip_context *c, double dt)
   default:
     ip_flow_govern(c);
   }
-  for (i = 0; i < IP_NV; ++i) {
-    f->velocity[i] += dt * f->acceleration[i];
-  }
+  ip_add(f->velocity, dt, f->acceleration, IP_NV);
   ip_integrate(f->q, f->velocity, dt, f->q);
   c->value = f->value;
   memcpy(c->posture, f->q, sizeof c->posture);

@@ -56,14 +56,10 @@ static void ip_flow_space(ip_flow *f)
     }
     memset(row, 0, sizeof(double) * N);
     for (j = 0; j < M; ++j) {
-      for (i = 0; i < N; ++i) {
-        row[i] += U[k * M + j] * f->J[j][i];
-      }
+      ip_add(row, U[k * M + j], f->J[j], N);
     }
     for (i = 0; i < N; ++i) {
-      for (j = 0; j < M; ++j) {
-        f->inverse[i * IP_HELD + j] += row[i] * U[k * M + j] / value;
-      }
+      ip_add(f->inverse + i * M, row[i] / value, U + k * M, M);
       row[i] /= sqrt(value);
     }
     ++rank;
@@ -74,11 +70,8 @@ static void ip_flow_space(ip_flow *f)
     v[k] += v[k] < 0.0 ? -size : size;
     beta[k] = 1.0 / (size * fabs(v[k]));
     for (i = k + 1; i < rank; ++i) {
-      double *row = held + i * N;
-      const double s = beta[k] * ip_dot(v + k, row + k, N - k);
-      for (j = k; j < N; ++j) {
-        row[j] -= s * v[j];
-      }
+      double *row = held + i * N + k;
+      ip_add(row, -beta[k] * ip_dot(v + k, row, N - k), v + k, N - k);
     }
   }
   f->left = N - rank;
@@ -88,10 +81,8 @@ static void ip_flow_space(ip_flow *f)
     memset(z, 0, sizeof f->Z[i]);
     z[rank + i] = 1.0;
     for (k = rank - 1; k >= 0; --k) {
-      const double *v = held + k * N, s = beta[k] * ip_dot(v + k, z + k, N - k);
-      for (j = k; j < N; ++j) {
-        z[j] -= s * v[j];
-      }
+      const double *v = held + k * N + k;
+      ip_add(z + k, -beta[k] * ip_dot(v, z + k, N - k), v, N - k);
     }
   }
   for (i = 0; f->soft && i < M; ++i) {
@@ -105,12 +96,9 @@ static void ip_flow_space(ip_flow *f)
 static void ip_flow_project(const ip_flow *f, double *x)
 {
   double out[IP_NV] = {0};
-  int i, k;
+  int k;
   for (k = 0; k < f->left; ++k) {
-    const double s = ip_dot(f->Z[k], x, IP_NV);
-    for (i = 0; i < IP_NV; ++i) {
-      out[i] += s * f->Z[k][i];
-    }
+    ip_add(out, ip_dot(f->Z[k], x, IP_NV), f->Z[k], IP_NV);
   }
   memcpy(x, out, sizeof out);
 }
@@ -120,14 +108,12 @@ static void ip_flow_carry(ip_flow *f)
 {
 #if IP_CONTACTS
   double square[36] = {0}, trace = 0.0, s[6];
-  int i, j, k, row;
+  int i, k, row;
   for (k = 0; k < IP_CONTACTS; ++k) {
     for (row = ip_contact_row[k]; row < ip_contact_row[k + 1]; ++row) {
       const double ease = row - ip_contact_row[k] < 3 ? 1.0 : 1.0 / IP_MOMENT;
       for (i = 0; i < 6; ++i) {
-        for (j = 0; j < 6; ++j) {
-          square[6 * i + j] += ease * f->J[row][i] * f->J[row][j];
-        }
+        ip_add(square + 6 * i, ease * f->J[row][i], f->J[row], 6);
       }
     }
   }
@@ -151,9 +137,7 @@ static void ip_flow_carry(ip_flow *f)
       }
       ip_solve_factor(square, 6, s);
       for (i = 0; i < IP_NV; ++i) {
-        for (j = 0; j < 6; ++j) {
-          f->carried[i][j] += f->J[row][i] * s[j];
-        }
+        ip_add(f->carried[i], f->J[row][i], s, 6);
       }
     }
   }

@@ -102,8 +102,7 @@ static void ip_present(const ip_context *c, int k, ip_target *target)
   target->set = 1.0;
 }
 
-/* Way from a pose with the rotation R to another one: e has the way of the origin in the world, and gets log6 of the
- * whole in world axes. */
+/* Make log6 of the way to a pose, in world axes, of e, the way of its origin, and both rotations. */
 static void ip_pose_error(const double *R, const double *wanted, double *e)
 {
   double way[9], w[3], p[3], linear[3];
@@ -121,7 +120,7 @@ static void ip_task_output(const ip_target *target, int k, const ip_model *m, co
 {
   const int point = ip_task_point[k];
   const double *axis = ip_task_axis + 9 * k;
-  double R[9], w[3], p[3];
+  double R[9], w[3] = {0}, p[3];
   int i, j;
   switch (ip_task_kind[k]) {
   case IP_TILT:
@@ -143,12 +142,11 @@ static void ip_task_output(const ip_target *target, int k, const ip_model *m, co
       e[i] = target->position[i] - m->position[point][i];
     }
     memcpy(J, m->jacobian[point], sizeof(double) * 3 * IP_NV);
-    memcpy(drift, m->drift[point], sizeof(double) * 6);
+    memcpy(drift, ip_task_kind[k] == IP_POSE ? m->spatial[point] : m->drift[point], sizeof(double) * 6);
   }
   if (ip_task_kind[k] == IP_POSE) {
     ip_pose_error(m->rotation[point], target->rotation, e);
     memcpy(J + 3 * IP_NV, m->jacobian[point] + 3 * IP_NV, sizeof(double) * 3 * IP_NV);
-    memcpy(drift, m->spatial[point], sizeof(double) * 6);
   } else if (ip_task_kind[k] == IP_ALIGNED) {
     const double *turned = m->rotation[point];
     double wanted[3], across[2][3], cross[3], sine, cosine;
@@ -176,8 +174,7 @@ static void ip_task_output(const ip_target *target, int k, const ip_model *m, co
                                  + across[i][2] * angular[2 * IP_NV];
       }
     }
-    drift[3] = w[0];
-    drift[4] = w[1];
+    memcpy(drift + 3, w, sizeof(double) * 2);
   }
 }
 
@@ -193,12 +190,10 @@ static void ip_task_rows(ip_context *c, int k)
     more[i] = c->p.task_softness[6 * k + i] * c->force[i];
   }
   if (c->pushed && ip_task_kind[k] == IP_ALIGNED) {
-    double across[3], turn[2];
-    for (i = 0; i < 2; ++i) {
-      ip_turn(c->m.rotation[point], ip_task_axis + 9 * k + 3 + 3 * i, 0, across);
-      turn[i] = ip_dot(across, more + 3, 3);
-    }
-    memcpy(more + 3, turn, sizeof turn);
+    double local[3];
+    ip_turn(c->m.rotation[point], more + 3, 1, local);
+    more[3] = ip_dot(ip_task_axis + 9 * k + 3, local, 3);
+    more[4] = ip_dot(ip_task_axis + 9 * k + 6, local, 3);
   }
   for (i = 0; i < size; ++i) {
     const double rate = ip_dot(J + i * IP_NV, c->v, IP_NV);
