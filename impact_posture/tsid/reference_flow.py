@@ -35,6 +35,8 @@ _REACHED = 0.02
 _STILL = 1e-5
 # Square of the length below which a direction is none.
 _EMPTY = 1e-24
+# Length of what is new in a direction below which once more makes it exact.
+_NEW = 0.1
 # Pull to zero of the base's share in a motion that the joints do not determine.
 _IDLE = 1e-9
 
@@ -220,9 +222,11 @@ class ReferenceFlow:
             # The columns of Z are as good as any others of that space.  What a fixed direction has in it is unique.
             seen, z[:] = self._seen[:k], self._mixed[k]
             for _ in range(2):
-                # The first time leaves an error where little of the direction is new.
                 z[:] = Z @ (Z.T @ (z - (seen @ z) @ seen))
-                z /= math.sqrt(max(float(z @ z), _EMPTY))
+                length = math.sqrt(max(float(z @ z), _EMPTY))
+                z /= length
+                if length > _NEW:
+                    break
         # Both sides of the posture of the last look, because the flow has moved on since.
         q = pin.integrate(self._model, self._here, sign * _STEP * z)
         _, slope = self._evaluate(q)

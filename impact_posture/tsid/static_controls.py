@@ -47,6 +47,11 @@ class StaticControls:
         self._inverse = self._inverse[self.limited] / self._half[:, None]
         # Forces on the contacts that carry the base, times -Jᵀ: what they take from generalized forces.
         self._carried = np.zeros((actuators.G.shape[0], base))
+        if contacts:
+            # Imported here, because SciPy takes long to import.  For six unknowns it takes a third of NumPy's time.
+            from scipy.linalg.lapack import dposv
+
+            self._solve = dposv
         self._central, self._pair = self._middle / self._half, np.zeros((actuators.G.shape[0], 2))
 
     def shares(self, state: State, J: Array) -> Array:
@@ -63,7 +68,9 @@ class StaticControls:
             square = eased @ A.T
             # Feet on a line carry no moment about it.
             square.flat[:: self._base + 1] += _TINY * square.trace()
-            np.matmul(J.T, np.linalg.solve(square, eased).T, out=self._carried)
+            _, found, wrong = self._solve(square, eased)
+            if not wrong:
+                np.matmul(J.T, found.T, out=self._carried)
         return np.asarray(self._needed(state.h) - self._central)
 
     def permitted(self, M: Array, known: Array, more: Array, shares: Array, most: float) -> float:

@@ -5,6 +5,8 @@
 /* Step of the differences, rad; step below which a posture on the way is reached, rad (m). */
 #define IP_PROBE 1e-4
 #define IP_REACHED 0.02
+/* Length of what is new in a direction below which it is taken twice. */
+#define IP_NEW 0.1
 
 static double ip_largest(const double *x, int first)
 {
@@ -90,8 +92,8 @@ static void ip_flow_aim(ip_flow *f)
     const uint32_t j = (uint32_t)(f->probed * IP_NV + i + 1);
     z[i] = (double)(uint32_t)(j * j * UINT32_C(2654435769)) / 4294967296.0 - 0.5;
   }
-  /* The first time leaves an error where little of the direction is new. */
-  for (again = 0; again < 2; ++again) {
+  /* Where little of the direction is new, once more makes it exact. */
+  for (again = 0, s = 0.0; again < 2 && s < IP_NEW; ++again) {
     memcpy(was, z, sizeof(double) * IP_NV);
     for (k = 0; k < f->probed; ++k) {
       ip_add(z, -ip_dot(f->seen[k], was, IP_NV), f->seen[k], IP_NV);
