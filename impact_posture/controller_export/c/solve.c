@@ -72,7 +72,7 @@ static void ip_decode(ip_context *c, DAQPWorkspace *w)
     for (j = 0; at >= IP_SIMPLE && j < IP_VARIABLES; ++j) {
       x[j] -= c->M[at - IP_SIMPLE][j] * w->xldl[i];
     }
-    if (at < IP_SIMPLE) {
+    if (IP_SIMPLE && at < IP_SIMPLE) {
       x[at] -= w->xldl[i];
     }
   }
