@@ -155,7 +155,7 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
 def _relaxation_room(n: int, m: int, levels: int) -> int:
     """Return a bound on the doubles in the memory of the relaxation, which ``init`` checks."""
     entries, active = n + m, 2 * n + m + 2
-    matrices = 4 * n * n + m * n + 2 * entries * n + active * (active + 1) // 2
+    matrices = 2 * n * n + m * n + 3 * entries * n + active * (active + 1) // 2
     return matrices + 16 * n + 7 * active + (20 + levels) * entries + 64
 
 
