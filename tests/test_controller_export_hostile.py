@@ -16,6 +16,7 @@ from impact_posture.controller_export.compiled_controller import CompiledControl
 from impact_posture.controller_export.export import export_controller
 from impact_posture.controller_export.structure import structure_of
 from impact_posture.errors import InputError, ManifestMismatch, SpecError
+from impact_posture.libraries import library_path
 from impact_posture.toolchain import find_compiler
 from impact_posture.tsid.body_tasks import CenterOfMass
 from impact_posture.tsid.controller import Status
@@ -42,11 +43,10 @@ def test_no_state_leads_to_undefined_behavior_or_out_of_the_limits(
         pytest.skip("--hostile-full: compilers take long to put sanitizers into straight-line code")
     robot = formulation_of(name)[0]
     folder = exported(name, None if frame is None else impact_of(robot, frame, (0.0, 0.0, 1.0)))
-    own = ["ctl.c", "ctl_relaxation.c", *([] if frame is None else ["ctl_metric.c"])]
-    others = sorted(str(path.relative_to(folder)) for path in folder.glob("daqp/*.c"))
+    own = ["ctl.c", "ctl_relaxation.c", "ctl_daqp.c", *([] if frame is None else ["ctl_metric.c"])]
     program = str(tmp_path / "abuse")
     sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-O0", "-g0"]
-    built = compile_c(folder, *sanitizers, f"-I{folder}", str(ABUSE), *own, *others, "-o", program, "-lm")
+    built = compile_c(folder, *sanitizers, f"-I{folder}", str(ABUSE), *own, "-o", program, "-lm")
     if built.returncode and "sanit" in built.stderr + built.stdout:
         pytest.skip("no sanitizers")
     assert built.returncode == 0, built.stderr
@@ -159,24 +159,36 @@ def test_the_command_says_what_is_wrong_in_a_line(arguments: list[str], words: s
     assert not (tmp_path / "out").exists()
 
 
-def test_cmake_builds_a_program_with_its_own_daqp_or_an_installed_one(tmp_path: Path) -> None:
+def test_cmake_builds_two_controllers_into_a_program_each_with_its_own_daqp_or_an_installed_one(
+    tmp_path: Path,
+) -> None:
     cmake = need("cmake")
-    folder = exported("panda")
+    folder, other = exported("panda"), tmp_path / "other"
+    export_controller(*formulation_of("panda"), other, prefix="other", daqp=folder / "daqp")
+    run_one = """
+static int run_ctl(double *u) {
+  ctl_context *c = malloc(sizeof *c); ctl_params p; ctl_command out;
+  double q[CTL_NQ] = {0}, v[CTL_NV] = {0};
+  ctl_default_params(&p);
+  if (ctl_init(c, &p) || ctl_reset(c, q, v, &out) || out.status > CTL_RELAXED) return 1;
+  memcpy(u, out.u, sizeof out.u);
+  return 0;
+}
+"""
     (tmp_path / "main.c").write_text(
-        '#include "ctl.h"\n#include <stdlib.h>\n'
-        "int main(void) {\n"
-        "  ctl_context *c = malloc(sizeof *c); ctl_params p; ctl_command out;\n"
-        "  double q[CTL_NQ] = {0}, v[CTL_NV] = {0};\n"
-        "  ctl_default_params(&p);\n"
-        "  return ctl_init(c, &p) || ctl_reset(c, q, v, &out) || out.status > CTL_RELAXED;\n}\n"
+        '#include "ctl.h"\n#include "other.h"\n#include <stdlib.h>\n#include <string.h>\n'
+        + run_one
+        + run_one.replace("ctl", "other").replace("CTL", "OTHER")
+        + "int main(void) {\n  double u[2][CTL_CONTROLS];\n"
+        "  return run_ctl(u[0]) || run_other(u[1]) || memcmp(u[0], u[1], sizeof u[0]);\n}\n"
     )
     (tmp_path / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(user C)\n"
         f'file(GLOB daqp "{folder}/daqp/*.c")\nadd_library(installed EXCLUDE_FROM_ALL ${{daqp}})\n'
-        f'add_subdirectory("{folder}" controller)\n'
-        "add_executable(user main.c)\ntarget_link_libraries(user PRIVATE ctl::ctl)\n"
+        f'add_subdirectory("{folder}" controller)\nadd_subdirectory(other)\n'
+        "add_executable(user main.c)\ntarget_link_libraries(user PRIVATE ctl::ctl other::other)\n"
     )
-    for build, options in (("own", []), ("theirs", ["-Dctl_DAQP=installed"])):
+    for build, options in (("own", []), ("theirs", ["-Dctl_DAQP=installed", "-Dother_DAQP=installed"])):
         place = tmp_path / build
         subprocess.run(
             [cmake, "-S", str(tmp_path), "-B", str(place), "-DCMAKE_C_FLAGS_RELEASE=-O0", *options],
@@ -185,3 +197,7 @@ def test_cmake_builds_a_program_with_its_own_daqp_or_an_installed_one(tmp_path: 
         )
         subprocess.run([cmake, "--build", str(place)], check=True, capture_output=True)
         subprocess.run([place / "user"], check=True)
+    names = subprocess.run(
+        [need("nm"), "-g", "--defined-only", library_path(folder, "ctl")], capture_output=True, text=True
+    )
+    assert all(line.split()[-1].startswith("ctl_") for line in names.stdout.splitlines()), names.stdout

@@ -162,7 +162,7 @@ def _relaxation_room(n: int, m: int, levels: int) -> int:
 def _relaxation(prefix: str) -> dict[str, str]:
     """Return the files of the relaxation, with names that another controller in the program does not have."""
     texts = {f"{prefix}_relaxation.{end}": _own(f"relaxation.{end}") for end in ("h", "c")}
-    return {name: re.sub(r"\brelaxation([_.][a-z])", rf"{prefix}_relaxation\1", text) for name, text in texts.items()}
+    return {name: re.sub(r"\b(daqp\.h|relaxation[_.][a-z])", rf"{prefix}_\1", text) for name, text in texts.items()}
 
 
 def named(text: str, prefix: str) -> str:

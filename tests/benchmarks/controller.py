@@ -120,7 +120,7 @@ def times(name: str, recorded: list[Vector], flags: list[str], cold: bool) -> tu
     with tempfile.TemporaryDirectory() as scratch:
         program, data = Path(scratch) / "times", Path(scratch) / "ticks.bin"
         np.array([recorded[0], *recorded]).tofile(data)
-        sources = ["ctl.c", "ctl_relaxation.c", *sorted(str(p) for p in (folder / "daqp").glob("*.c")), str(HARNESS)]
+        sources = ["ctl.c", "ctl_relaxation.c", "ctl_daqp.c", str(HARNESS)]
         command = [*(find_compiler() or ["cc"]), "-std=c99", "-ffp-contract=fast", "-isystem", "daqp", "-I.", *flags]
         subprocess.run([*command, *sources, "-o", str(program), "-lm"], cwd=folder, check=True)
         runs = []
