@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -10,7 +12,7 @@ from impact_posture.arrays import Array
 from impact_posture.controller_export.compiled_controller import CompiledController
 from impact_posture.tsid.controller import Command, Controller, Report, Status
 from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
-from tests.exported_controller import compiled, formulation_of, gradient_beside, impact_of, random_state
+from tests.exported_controller import compiled, exported, formulation_of, gradient_beside, impact_of, random_state
 
 
 def difference(a: Command, b: Command) -> float:
@@ -60,6 +62,21 @@ def test_the_commands_are_those_of_python(name: str) -> None:
         v = v + 1e-3 * (a.acceleration + rng.normal(size=robot.nv))
         q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
     assert Status.SOLVED in seen
+
+
+def test_the_iterations_of_a_tick_are_bounded_and_suffice() -> None:
+    """Unrelated states far from any posture need more than a run, and at most half of what the header permits."""
+    robot, rng = formulation_of("talos")[0], np.random.default_rng(3)
+    theirs = compiled("talos")
+    theirs.reset(robot.posture(), np.zeros(robot.nv))
+    header = (exported("talos") / "ctl.h").read_text(encoding="utf-8")
+    most = int(re.findall(r"#define CTL_MOST_ITERATIONS (\d+)", header)[0])
+    counts = []
+    for k in range(100):
+        command = theirs.tick(1e-3 * k, *random_state(robot, rng, 0.3))
+        assert command.status in (Status.SOLVED, Status.RELAXED)
+        counts.append(theirs.report().iterations)
+    assert 100 < max(counts) <= most / 2
 
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "talos"])

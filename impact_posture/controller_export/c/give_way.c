@@ -97,8 +97,8 @@ static int ip_relax(ip_context *c)
   problem.H = H;
   problem.g = g;
   problem.unit = unit;
-  flag = relaxation_solve(&problem, c->relaxation, IP_RELAXED_ITERATIONS, c->z, &report);
-  c->iterations = report.iterations;
+  flag = relaxation_solve(&problem, c->relaxation, IP_ITERATIONS, c->z, &report);
+  c->iterations += report.iterations;
   memset(c->multipliers, 0, sizeof c->multipliers);
   if (flag > 0) {
     ip_list_gave_way(c, lower, upper);

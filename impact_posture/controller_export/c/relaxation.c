@@ -436,9 +436,11 @@ static int finish_level(Relaxation *r, int level, int missed) {
     int last = -1;
     r->square = INFINITY;
     list_held(r, level, missed);
-    for (int k = 0; k < MOST_MOVES && r->left > 1; k++) {
+    for (int k = 0; k < MOST_MOVES; k++) {
+        const int cost = (int)(MOVE_COST * (r->exact + r->near));
+        if (r->left <= cost) break;
+        r->left -= cost;
         const int rank = find_step(r), stop = move(r);
-        r->left -= (int)(MOVE_COST * (r->exact + r->near));
         if (stop < 0 && !drop_rows(r)) return rank;
         if (stop < 0) continue;
         if (stop == last) break;

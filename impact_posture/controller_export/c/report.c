@@ -8,10 +8,10 @@ void ip_last_report(const ip_context *c, ip_report *report)
   report->level = c->level;
   report->value = c->value;
   report->dynamics = NAN;
+  report->iterations = c->iterations;
   if (c->held_now) {
     return;
   }
-  report->iterations = c->iterations;
   memcpy(report->relaxed, c->gave, sizeof report->relaxed);
   memcpy(report->deficient, c->missed, sizeof report->deficient);
   memcpy(report->multipliers, c->multipliers, sizeof report->multipliers);

@@ -131,7 +131,7 @@ static int ip_solve_warm(ip_context *c)
   memset(c->u, 0, sizeof c->u);
   flag = daqp_reactivate_constraints(&w);
   flag = flag < 0 ? flag : daqp_ldp(&w);
-  c->iterations = w.iterations;
+  c->iterations += w.iterations;
   memset(c->multipliers, 0, sizeof c->multipliers);
   if (flag > 0) {
     ip_decode(c, &w);

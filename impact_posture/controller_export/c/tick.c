@@ -32,7 +32,7 @@ static void ip_write(ip_context *c, const double *u, int status, ip_command *out
     out->forces[i] = c->held_now ? 0.0 : c->z[IP_NV + IP_SPARE + i];
   }
   out->status = status;
-  out->iterations = c->held_now ? 0 : c->iterations;
+  out->iterations = c->iterations;
 }
 
 /* Give the previous command, with damping of the joints whose rates are finite. */
@@ -128,7 +128,7 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   if (!ip_measured(q, v, NULL)) {
     return 1;
   }
-  c->pushed = 0;
+  c->pushed = c->iterations = 0;
   ip_read_state(c, q, v);
   for (k = 0; k < IP_TASKS; ++k) {
     ip_constant_rows(c, k);
@@ -177,6 +177,7 @@ int ip_tick(ip_context *c, double t, const double q[IP_NQ], const double v[IP_NV
     out->status = IP_UNSOLVED;
     return IP_UNSOLVED;
   }
+  c->iterations = 0;
   if (!isfinite(t) || !ip_measured(q, v, force)) {
     ip_hold(c, IP_NON_FINITE, v, out);
     return out->status;
