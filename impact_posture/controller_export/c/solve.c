@@ -132,6 +132,10 @@ static int ip_solve_warm(ip_context *c)
   flag = daqp_reactivate_constraints(&w);
   flag = flag < 0 ? flag : daqp_ldp(&w);
   c->iterations += w.iterations;
+  if (w.state & DAQP_STATE_NOISE_FLOOR) {
+    /* It went in circles and then took violated bounds for rounding. */
+    flag = DAQP_EXIT_CYCLE;
+  }
   memset(c->multipliers, 0, sizeof c->multipliers);
   if (flag > 0) {
     ip_decode(c, &w);
