@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,11 +25,13 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.tsid.task_formulation import TaskFormulation
 from tests.daqp import sources_or_skip
+from tests.tools import need_compiler
 
 KINDS: dict[str, ControllerKind] = {
     "tilthex_arm": "aerial", "hextilt": "aerial", "panda": "arm",
     "solo8": "legged", "talos": "legged", "g1": "legged",
 }  # fmt: skip
+ABUSE = Path(__file__).with_name("controller_abuse.c")
 _KEPT = TemporaryDirectory()
 
 
@@ -49,6 +52,14 @@ def _exported(name: str, objective: ImpactObjective | None, flags: str) -> Path:
         patch.setenv("CFLAGS", flags)
         export_controller(robot, formulation, out, objective=objective, prefix="ctl", daqp=daqp, build=True)
     return out
+
+
+def abuse_program(folder: Path, out: Path) -> Path:
+    """Return a program that abuses the library of a controller (:data:`ABUSE`)."""
+    library, program = library_path(folder, "ctl"), out / "abuse"
+    command = [*need_compiler(), "-std=gnu99", "-O1", f"-I{folder}", str(ABUSE), str(library), "-o", str(program)]
+    subprocess.run([*command, f"-Wl,-rpath,{folder}", "-lm", "-lpthread"], check=True)
+    return program
 
 
 def formulation_of(name: str) -> tuple[Robot, TaskFormulation]:

@@ -23,16 +23,25 @@ from impact_posture.tsid.controller import Status
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.task_formulation import TaskFormulation
 from tests.command import run
-from tests.exported_controller import compiled, exported, formulation_of, impact_of
+from tests.exported_controller import ABUSE, abuse_program, compiled, exported, formulation_of, impact_of
 from tests.tools import need
 
-ABUSE = Path(__file__).with_name("controller_abuse.c")
 STRICT = ["-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
 
 
 def compile_c(folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
     command = [*(find_compiler() or ["cc"]), "-std=c99", "-isystem", "daqp", *flags]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+def abuse_with(sanitizers: str, folder: Path, program: Path, *more: str) -> None:
+    """Build the abuse with the sources of a controller and sanitizers, or skip."""
+    flags = [f"-fsanitize={sanitizers}", "-fno-sanitize-recover=all", "-O0", "-g0", f"-I{folder}", str(ABUSE)]
+    sources = ["ctl.c", "ctl_relaxation.c", "ctl_daqp.c", *more]
+    built = compile_c(folder, *flags, *sources, "-o", str(program), "-lm", "-lpthread")
+    if (built.returncode and "sanit" in built.stderr + built.stdout) or "cannot find -l" in built.stderr:
+        pytest.skip(f"the compiler has no -fsanitize={sanitizers}")
+    assert built.returncode == 0, built.stderr
 
 
 @pytest.mark.parametrize(("name", "frame"), [("panda", None), ("solo8", None), ("tilthex_arm", "ee")])
@@ -43,15 +52,31 @@ def test_no_state_leads_to_undefined_behavior_or_out_of_the_limits(
         pytest.skip("--hostile-full: compilers take long to put sanitizers into straight-line code")
     robot = formulation_of(name)[0]
     folder = exported(name, None if frame is None else impact_of(robot, frame, (0.0, 0.0, 1.0)))
-    own = ["ctl.c", "ctl_relaxation.c", "ctl_daqp.c", *([] if frame is None else ["ctl_metric.c"])]
-    program = str(tmp_path / "abuse")
-    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-O0", "-g0"]
-    built = compile_c(folder, *sanitizers, f"-I{folder}", str(ABUSE), *own, "-o", program, "-lm")
-    if built.returncode and "sanit" in built.stderr + built.stdout:
-        pytest.skip("no sanitizers")
-    assert built.returncode == 0, built.stderr
-    ran = subprocess.run([program], capture_output=True, text=True)
+    abuse_with("address,undefined", folder, tmp_path / "abuse", *([] if frame is None else ["ctl_metric.c"]))
+    ran = subprocess.run([tmp_path / "abuse"], capture_output=True, text=True)
     assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+def test_contexts_in_threads_share_nothing(tmp_path: Path) -> None:
+    abuse_with("thread", exported("panda"), tmp_path / "abuse")
+    ran = subprocess.run([tmp_path / "abuse", "80", "3"], capture_output=True, text=True)
+    if "unexpected memory mapping" in ran.stderr:
+        pytest.skip("this kernel places memory where the thread sanitizer does not expect it")
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+@pytest.mark.parametrize("name", ["panda", "tilthex_arm"])
+def test_ten_thousand_random_ticks_take_no_memory_and_stay_within_the_limits(name: str, tmp_path: Path) -> None:
+    program = abuse_program(exported(name), tmp_path)
+    ran = subprocess.run([program, "10000"], capture_output=True, text=True)
+    assert ran.returncode == 0 and ran.stdout.startswith("growth 0 B, 0 kB"), ran.stdout
+
+
+def test_no_tick_reads_what_was_not_written(tmp_path: Path) -> None:
+    """By valgrind, which also sees reads and writes out of bounds."""
+    valgrind, program = need("valgrind"), abuse_program(exported("panda"), tmp_path)
+    ran = subprocess.run([valgrind, "-q", "--error-exitcode=9", program, "24"], capture_output=True, text=True)
+    assert ran.returncode == 0 and not ran.stderr, ran.stderr
 
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "talos", "solo8"])

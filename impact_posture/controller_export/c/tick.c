@@ -95,10 +95,9 @@ static void ip_answer(ip_context *c, ip_command *out)
   }
   for (i = 0; i < IP_CONTROLS; ++i) {
     const int r = IP_EQUATIONS + i;
-    double beyond;
-    u[i] = c->known[i] + ip_dot(c->rows[r], c->z, IP_VARIABLES);
-    beyond = u[i] - fmin(fmax(u[i], c->p.control_lower[i]), c->p.control_upper[i]);
-    over += beyond * beyond;
+    const double exact = c->known[i] + ip_dot(c->rows[r], c->z, IP_VARIABLES);
+    u[i] = fmin(fmax(exact, c->p.control_lower[i]), c->p.control_upper[i]);
+    over += (exact - u[i]) * (exact - u[i]);
   }
   /* Not ">", which is false for a NaN. */
   if (!(over <= c->excess * c->excess)) {
