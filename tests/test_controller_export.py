@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pinocchio as pin
@@ -10,8 +12,9 @@ import pytest
 
 from impact_posture.arrays import Array
 from impact_posture.controller_export.compiled_controller import CompiledController
+from impact_posture.controller_export.export import export_controller
 from impact_posture.tsid.controller import Command, Controller, Report, Status
-from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
+from impact_posture.tsid.impact_robust import ImpactRobustPosture, Spring, gradient_of
 from tests.exported_controller import compiled, exported, formulation_of, gradient_beside, impact_of, random_state
 from tests.relaxation_in_c import missed, stationarity
 from tests.relaxed_ticks import problem_of
@@ -126,17 +129,22 @@ def test_a_relaxed_tick_misses_its_levels_by_as_little(name: str) -> None:
     assert relaxed >= 3
 
 
-@pytest.mark.parametrize(("name", "frame"), [("tilthex_arm", "ee"), ("solo8", "base_link")])
-def test_the_impact_robust_term_is_that_of_python_through_its_phases(name: str, frame: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "frame", "spring"),
+    [("tilthex_arm", "ee", "keep"), ("tilthex_arm", "ee", "follow"), ("tilthex_arm", "ee", "release"),
+     ("solo8", "base_link", "release")],
+)  # fmt: skip
+def test_the_impact_robust_term_is_that_of_python_through_its_phases(name: str, frame: str, spring: Spring) -> None:
     robot, formulation = formulation_of(name)
     objective = impact_of(robot, frame, (0.0, 0.0, 1.0))
     theirs = compiled(name, objective)
     posture = formulation.posture
     assert posture is not None
-    options = {"kp": posture.kp, "weight": posture.weight}
-    robust = ImpactRobustPosture(robot, gradient_of(gradient_beside(name, objective)), **options)
-    robust.activation.ramp = 0.02
-    theirs.parameters["robust_ramp"][:] = 0.02
+    gradient = gradient_of(gradient_beside(name, objective))
+    robust = ImpactRobustPosture(robot, gradient, kp=posture.kp, weight=posture.weight, spring=spring, follow=0.02)
+    robust.activation.ramp = 0.01
+    for parameter, value in (("ramp", 0.01), ("follow", 0.02), ("spring", get_args(Spring).index(spring))):
+        theirs.parameters[f"robust_{parameter}"][:] = value
     ours = Controller(robot, type(formulation)(
         formulation.levels, formulation.weighted, robust, formulation.contacts, formulation.force_point,
     ))  # fmt: skip
@@ -144,8 +152,8 @@ def test_the_impact_robust_term_is_that_of_python_through_its_phases(name: str, 
     ours.reset(q, v)
     theirs.reset(q, v)
     levels = set()
-    for k in range(110):
-        for phase, at in (("brace", 3), ("contact", 40), ("release", 75)):
+    for k in range(56):
+        for phase, at in (("brace", 3), ("contact", 20), ("release", 38)):
             if k == at:
                 getattr(robust, phase)()
                 getattr(theirs, phase)()
@@ -156,6 +164,22 @@ def test_the_impact_robust_term_is_that_of_python_through_its_phases(name: str, 
         v = v + 1e-3 * a.acceleration
         q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
     assert {0.0, 1.0} < levels
+
+
+def test_a_stiffened_posture_is_that_of_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, formulation = formulation_of("panda")
+    root = np.random.default_rng(2).normal(size=(robot.nv, robot.nv))
+    assert formulation.posture is not None
+    formulation.posture.stiffen(3.0 * root @ root.T)
+    monkeypatch.setenv("CFLAGS", "-O0")
+    written = export_controller(robot, formulation, tmp_path / "c", daqp=exported("panda") / "daqp", build=True)
+    ours, theirs, q, v = Controller(robot, formulation), written.load(), robot.posture(), np.zeros(robot.nv)
+    for controller in (ours, theirs):
+        controller.reset(q, v)
+    rng = np.random.default_rng(3)
+    for k in range(5):
+        state = random_state(robot, rng, 0.03)
+        assert difference(ours.tick(1e-3 * k, *state), theirs.tick(1e-3 * k, *state)) < 1e-9
 
 
 def test_a_singular_arm_is_damped_as_in_python() -> None:
