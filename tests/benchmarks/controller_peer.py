@@ -20,6 +20,7 @@ from tests.benchmarks.core import Vector
 from tests.exported_controller import formulation_of
 
 SOURCE = Path(__file__).with_suffix(".cpp")
+_REPETITIONS, _MOST = 7, 500
 _PREFIX = Path(pin.__file__).parents[4]
 # Of Pinocchio's CMake package.
 _DEFINITIONS = ["BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_LIMIT_VECTOR_SIZE=30", "BOOST_FUSION_INVOKE_MAX_ARITY=12",
@@ -55,10 +56,12 @@ def _build(folder: Path, daqp: Path) -> Path:
     headers = ["-I", str(daqp / "include"), "-isystem", str(_PREFIX / "include")]
     # CasADi's wheel has the headers of Eigen, Pinocchio's has not.
     eigen = ["-isystem", str(Path(casadi.__file__).parent / "include" / "eigen3")]
+    definitions = [f"-D{word}" for word in _DEFINITIONS]
+    objects = [f"{Path(source).stem}.o" for source in sources]
     commands = [
         ["cc", "-O2", *headers, "-c", *sources],
-        ["c++", "-std=c++17", "-O2", *(f"-D{word}" for word in _DEFINITIONS), *headers, *eigen, str(SOURCE), "-o", str(program),
-         *(f"{Path(source).stem}.o" for source in sources), library, f"-Wl,-rpath,{_PREFIX / 'lib'}", "-lm"],
+        ["c++", "-std=c++17", "-O2", *definitions, *headers, *eigen, str(SOURCE), "-o", str(program), *objects,
+         library, f"-Wl,-rpath,{_PREFIX / 'lib'}", "-lm"],
     ]  # fmt: skip
     for command in commands:
         try:
@@ -70,7 +73,7 @@ def _build(folder: Path, daqp: Path) -> Path:
     return program
 
 
-def times(program: Path, name: str, recorded: list[Vector], repetitions: int) -> tuple[float, float]:
+def times(program: Path, name: str, recorded: list[Vector]) -> tuple[float, float]:
     """Return median and 99th percentile of the ticks that Python solves, each the least of its repetitions, µs."""
     robot, formulation = formulation_of(name)
     controller = Controller(robot, formulation)
@@ -85,7 +88,7 @@ def times(program: Path, name: str, recorded: list[Vector], repetitions: int) ->
         with data.open("wb") as file:
             ids = [robot.model.getFrameId(frame) for frame in sorted(frames)]
             file.write(np.array([qp.n, qp.m, len(ids), *ids, *qp.sense], dtype=np.intc).tobytes())
-            for k, state in enumerate(recorded):
+            for k, state in enumerate(recorded[:_MOST]):
                 command = controller.tick(1e-3 * k, state[: robot.nq], state[robot.nq :])
                 qp = controller.assembly.rank.qp
                 if command.status is Status.SOLVED and not controller.report().deficient:
@@ -93,7 +96,7 @@ def times(program: Path, name: str, recorded: list[Vector], repetitions: int) ->
                     arrays = [state, qp.H, qp.g, qp.A, qp.upper, qp.lower, *z]
                     file.write(np.concatenate([np.ravel(x) for x in arrays]).tobytes())
         runs = []
-        for _ in range(repetitions):
+        for _ in range(_REPETITIONS):
             ran = subprocess.run([program, model, data], capture_output=True, text=True)
             if ran.returncode:
                 raise Missing(f"answers differ: {ran.stdout.splitlines()[-1:]}")
