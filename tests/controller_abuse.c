@@ -74,11 +74,11 @@ int main(void)
       break;
     case 5:
       c.target[0].position[0] = 0.0;
-      (void)ctl_brace(&c);
+      (void)ctl_brace(&c, 1e-3 * k);
       break;
     case 6:
       (void)ctl_move_to(&c, start, 0.01);
-      (void)ctl_release(&c);
+      (void)ctl_release(&c, k % 16 == 6 ? NAN : 1e-3 * (k + k % 3));
       break;
     default:
       break;

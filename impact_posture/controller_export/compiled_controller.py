@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike
 from impact_posture.arrays import Array
 from impact_posture.codegen.reader import check_library, check_robot
 from impact_posture.controller_export.manifest import Manifest, build_controller, read_controller
-from impact_posture.errors import InputError, MetricError, PostureError, SpecError
+from impact_posture.errors import ContactError, InputError, MetricError, PostureError, SpecError
 from impact_posture.libraries import library_path, load_library
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.controller import Command, Report, Status
@@ -60,6 +61,8 @@ class CompiledController:
         tasks = len(manifest.tasks)
         memory = memoryview(self._context)
         targets = np.frombuffer(memory, dtype=float, count=_TARGET * tasks).reshape(tasks, _TARGET)
+        # The level stands behind the targets; C has no arrays of length zero.
+        self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * _TARGET * max(1, tasks))
         self._targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
         doubles = ctypes.POINTER(ctypes.c_double)
@@ -118,6 +121,7 @@ class CompiledController:
             InputError: A parameter is out of range; names it.
             PostureError: ``q`` is no configuration of the robot, or ``v`` is no velocity.
             MetricError: The gradient of the impact-robust term does not exist there, or vanishes.
+            ContactError: A sole stands on its edge.
         """
         targets = {name: row.copy() for name, row in self._targets.items()}
         refused = self._call("init", ctypes.byref(self._given))
@@ -135,6 +139,8 @@ class CompiledController:
             raise PostureError(
                 "no state of the robot", where="reset", hint="give finite numbers and unit quaternions"
             )
+        if code == 3:
+            raise ContactError("the sole stands on its edge", where="contact", hint="put the sole on the ground")
         if code:
             raise MetricError("the objective vanishes with its curvature", where="reset", hint="start elsewhere")
         self._ready = True
@@ -244,25 +250,33 @@ class CompiledController:
         if self._call("lead_posture", *self._pointers[:2], pointer):
             raise InputError("is no reference", where="lead_posture", hint="give a posture and finite numbers")
 
-    def brace(self) -> None:
-        """Switch the impact-robust term on."""
-        self._enter("brace")
+    def brace(self, t: float = -math.inf) -> None:
+        """Switch the impact-robust term on, from the first tick at the time ``t``, s, or later.
 
-    def contact(self) -> None:
-        """Hold the reached posture during the impact, or keep the term on if it is live."""
-        self._enter("contact")
+        Raises:
+            InputError: This phase does not follow the present one, or ``t`` is before that of a phase that waits.
+        """
+        self._enter("brace", t)
 
-    def release(self) -> None:
-        """Switch the impact-robust term off and hold the reached posture."""
-        self._enter("release")
+    def contact(self, t: float = -math.inf) -> None:
+        """Hold the reached posture during the impact, or keep the term on if it is live; as :meth:`brace`."""
+        self._enter("contact", t)
+
+    def release(self, t: float = -math.inf) -> None:
+        """Switch the impact-robust term off and hold the reached posture; as :meth:`brace`."""
+        self._enter("release", t)
+
+    @property
+    def level(self) -> float:
+        """Level of the impact-robust term, 0 to 1."""
+        return float(self._level[0])
 
     # ---- parts --------------------------------------------------------------------------------------------------
 
-    def _enter(self, phase: str) -> None:
-        if self._call(phase):
-            raise InputError(
-                f"'{phase}' does not follow the present phase", where="controller", hint="reset it first"
-            )
+    def _enter(self, phase: str, t: float) -> None:
+        if self._call(phase, ctypes.c_double(t)):
+            words = f"'{phase}' at {t:g} s does not follow the phase before it"
+            raise InputError(words, where="controller", hint="give phases in the order of their times, or reset it")
 
     def _target(self, task: str) -> Array:
         if task not in self._targets:

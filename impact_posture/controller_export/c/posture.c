@@ -152,6 +152,7 @@ static void ip_reset_posture(ip_context *c)
   c->blend = 1.0;
   c->x = c->level = c->goal = 0.0;
   c->phase = IP_FREE;
+  c->waiting = 0;
   c->count = c->hold = c->failed = 0;
   c->value = NAN;
   memset(c->term, 0, sizeof c->term);
@@ -234,22 +235,32 @@ static void ip_posture_wanted(ip_context *c)
 #endif
 }
 
-static int ip_enter(ip_context *c, int phase)
+/* Let a phase begin with the first tick at a time or later. */
+static int ip_announce(ip_context *c, int phase, double t)
 {
-  const int fits = phase == IP_BRACE ? c->phase == IP_FREE || c->phase == IP_RELEASE
-                   : phase == IP_CONTACT ? c->phase == IP_BRACE : c->phase == IP_BRACE || c->phase == IP_CONTACT;
-  const double was = c->goal;
-  if (!c->ready || !IP_ROBUST || !fits) {
+  const int before = c->waiting > 0 ? c->entering[c->waiting - 1] : c->phase;
+  const int fits = phase == IP_BRACE ? before == IP_FREE || before == IP_RELEASE
+                   : phase == IP_CONTACT ? before == IP_BRACE : before == IP_BRACE || before == IP_CONTACT;
+  if (!c->ready || !IP_ROBUST || !fits || isnan(t) || c->waiting == IP_WAITING
+      || (c->waiting > 0 && t < c->since[c->waiting - 1])) {
     return 1;
   }
-#if IP_ROBUST
-  {
-    const int live = c->p.robust_live[0] > 0.0;
-    c->goal = phase == IP_BRACE || (phase == IP_CONTACT && live) ? 1.0 : 0.0;
-    c->hold = phase == IP_CONTACT ? !live : phase == IP_RELEASE ? c->hold || was > 0.0 : c->hold;
-  }
-#endif
-  (void)was;
-  c->phase = phase;
+  c->entering[c->waiting] = phase;
+  c->since[c->waiting++] = t;
   return 0;
+}
+
+/* Begin the first phase that waits. */
+static void ip_enter(ip_context *c)
+{
+#if IP_ROBUST
+  const int live = c->p.robust_live[0] > 0.0, phase = c->entering[0];
+  const double was = c->goal;
+  c->goal = phase == IP_BRACE || (phase == IP_CONTACT && live) ? 1.0 : 0.0;
+  c->hold = phase == IP_CONTACT ? !live : phase == IP_RELEASE ? c->hold || was > 0.0 : c->hold;
+#endif
+  c->phase = c->entering[0];
+  --c->waiting;
+  memmove(c->entering, c->entering + 1, sizeof c->entering - sizeof c->entering[0]);
+  memmove(c->since, c->since + 1, sizeof c->since - sizeof c->since[0]);
 }

@@ -2,6 +2,8 @@
 
 /* Kinds of tasks in ip_task_kind. */
 enum { IP_TILT, IP_BASE_TURN, IP_MASS_CENTER, IP_POSITION, IP_POSE, IP_ALIGNED };
+/* Least length of a heading across a normal. */
+#define IP_ACROSS 1e-6
 /* Phases in c->phase. */
 enum { IP_FREE, IP_BRACE, IP_CONTACT, IP_RELEASE };
 
@@ -210,6 +212,32 @@ static void ip_contact_rows(ip_context *c)
   }
 }
 
+/* Part of a heading across the unit vector n; return its length. */
+static double ip_across(const double *n, const double *heading, double *across)
+{
+  const double along = ip_dot(n, heading, 3);
+  int i;
+  for (i = 0; i < 3; ++i) {
+    across[i] = heading[i] - n[i] * along;
+  }
+  return sqrt(ip_dot(across, across, 3));
+}
+
+/* Whether the heading of a sole points along the normal of its ground. */
+static int ip_on_edge(const ip_context *c)
+{
+  int k;
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    const double *R = c->m.rotation[ip_contact_point[k]], heading[3] = {R[0], R[3], R[6]};
+    double across[3];
+    if (ip_contact_row[k + 1] - ip_contact_row[k] == 6
+        && ip_across(c->p.contact_normal + 3 * k, heading, across) < IP_ACROSS) {
+      return 1;
+    }
+  }
+  return 0;
+}
+
 /* Hold the contacts where they are, with friction cones in world axes (friction.py has the formulas). */
 static void ip_hold_contacts(ip_context *c)
 {
@@ -218,22 +246,18 @@ static void ip_hold_contacts(ip_context *c)
     const int point = ip_contact_point[k], size = ip_contact_row[k + 1] - ip_contact_row[k];
     const double *n = c->p.contact_normal + 3 * k, *R = c->m.rotation[point];
     const double mu = c->p.contact_friction[k] / sqrt(2.0), X = c->p.contact_half[2 * k], Y = c->p.contact_half[2 * k + 1];
-    double heading[3] = {1.0, 0.0, 0.0}, axes[9], along, length, local[17][6] = {{0}};
+    double heading[3] = {1.0, 0.0, 0.0}, axes[9], length, local[17][6] = {{0}};
     memcpy(c->home_position[k], c->m.position[point], sizeof c->home_position[k]);
     memcpy(c->home_rotation[k], R, sizeof c->home_rotation[k]);
     for (i = 0; size == 6 && i < 3; ++i) {
       heading[i] = R[3 * i];
     }
     for (b = 0; b < 2; ++b) {
-      along = ip_dot(n, heading, 3);
-      for (i = 0; i < 3; ++i) {
-        axes[i] = heading[i] - n[i] * along;
-      }
-      length = sqrt(ip_dot(axes, axes, 3));
-      if (!(length < 1e-6)) {
+      length = ip_across(n, heading, axes);
+      if (!(length < IP_ACROSS)) {
         break;
       }
-      /* The heading points along the normal: take the world axis that is least so. */
+      /* A point has any heading: take the world axis that is least so. */
       j = fabs(n[1]) < fabs(n[0]) ? 1 : 0;
       j = fabs(n[2]) < fabs(n[j]) ? 2 : j;
       for (i = 0; i < 3; ++i) {

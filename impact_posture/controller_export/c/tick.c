@@ -3,6 +3,8 @@
 #define IP_LONGEST 10.0
 /* Largest sum of squares of a measurement (1e8 m, rad/s or N). */
 #define IP_ABSURD 1e16
+/* Times that differ by less are equal, s, because sums of periods are not exact. */
+#define IP_SAME 1e-9
 
 /* Whether a quaternion, or a cosine with its sine, is far from unit length. */
 static int ip_turned_wrong(const double *q)
@@ -130,6 +132,9 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   }
   c->pushed = 0;
   ip_read_state(c, q, v);
+  if (ip_on_edge(c)) {
+    return 3;
+  }
   for (k = 0; k < IP_TASKS; ++k) {
     ip_constant_rows(c, k);
     if (c->target[k].set <= 0.0) {
@@ -188,6 +193,9 @@ int ip_tick(ip_context *c, double t, const double q[IP_NQ], const double v[IP_NV
     memcpy(c->force, force, sizeof c->force);
   }
   ip_read_state(c, q, v);
+  while (c->waiting > 0 && t >= c->since[0] - IP_SAME) {
+    ip_enter(c);
+  }
   ip_advance(c, dt);
   ip_build(c);
   ip_assemble(c);
@@ -217,17 +225,17 @@ int ip_lead_posture(ip_context *c, const double q[IP_NQ], const double v[IP_NV],
   return 0;
 }
 
-int ip_brace(ip_context *c)
+int ip_brace(ip_context *c, double t)
 {
-  return ip_enter(c, IP_BRACE);
+  return ip_announce(c, IP_BRACE, t);
 }
 
-int ip_contact(ip_context *c)
+int ip_contact(ip_context *c, double t)
 {
-  return ip_enter(c, IP_CONTACT);
+  return ip_announce(c, IP_CONTACT, t);
 }
 
-int ip_release(ip_context *c)
+int ip_release(ip_context *c, double t)
 {
-  return ip_enter(c, IP_RELEASE);
+  return ip_announce(c, IP_RELEASE, t);
 }
