@@ -28,7 +28,7 @@ Compile = Annotated[
     CompileMode,
     typer.Option(
         "--compile", rich_help_panel=RUN,
-        help="Whether controllers run as machine code. auto: if it is in the cache, or 3 seeds pay for building it.",
+        help="Whether controllers run as machine code. auto: from 3 seeds on, which pay for building it.",
     ),
 ]  # fmt: skip
 Processes = Annotated[

@@ -23,6 +23,9 @@ from impact_posture.tsid.relaxation import Relaxed
 
 # Statuses in the order of their numbers in C.
 _STATUSES = tuple(Status)
+_FUNCTIONS = (
+    "init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release",
+)  # fmt: skip
 # Numbers of a target: set, position, rotation, velocity, acceleration.
 _TARGET = 25
 
@@ -67,20 +70,7 @@ class CompiledController:
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
         doubles = ctypes.POINTER(ctypes.c_double)
         self._pointers = [x.ctypes.data_as(doubles) for x in (self._q, self._v, self._force)]
-        self._functions = {
-            name: getattr(library, f"{prefix}_{name}")
-            for name in (
-                "init",
-                "reset",
-                "tick",
-                "last_report",
-                "move_to",
-                "lead_posture",
-                "brace",
-                "contact",
-                "release",
-            )
-        }
+        self._functions = {name: getattr(library, f"{prefix}_{name}") for name in _FUNCTIONS}
         getattr(library, f"{prefix}_default_params")(ctypes.byref(self._given))
         self._ready = False
 

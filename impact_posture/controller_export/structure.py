@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -77,7 +78,10 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     actuators = Actuators(robot)
     strict = tuple(task for level in formulation.levels for task in level)
     tasks, contacts, points = (*strict, *formulation.weighted), formulation.contacts, formulation.points
-    assembly = Assembly(robot, formulation, actuators)
+    # An assembly moves the targets of its tasks into its own buffers, and a controller may run with these tasks.
+    levels = tuple(tuple(map(copy, level)) for level in formulation.levels)
+    copies = replace(formulation, levels=levels, weighted=tuple(map(copy, formulation.weighted)))
+    assembly = Assembly(robot, copies, actuators)
     nv, rotors, spare = robot.nv, actuators.rotors, actuators.spare.shape[1]
     law, posture = formulation.law, formulation.posture
     momentum = _is_diagonal_in_momentum(robot, formulation)

@@ -12,7 +12,7 @@ from impact_posture.controller_export.parameters import parameters
 from impact_posture.controller_export.structure import Structure
 from impact_posture.errors import CompilerError
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.libraries import cache_folder, cache_path, is_cached, library_path, source_key
+from impact_posture.libraries import cache_folder, is_cached, library_path, source_key
 from impact_posture.progress import tell
 from impact_posture.simulation.scenario_objective import locked, objective_key
 from impact_posture.simulation.sensor_noise import Reading
@@ -33,8 +33,7 @@ class CompiledTick:
     def __init__(self, controller: Controller, structure: Structure, library: CompiledController) -> None:
         """Take a library of the formulation of the controller."""
         self.library, self._controller, self._structure = library, controller, structure
-        posture = controller.formulation.posture
-        self._tasks = [t for t in controller.formulation.tasks if isinstance(t, TargetTask) and t is not posture]
+        self._tasks = [t for t in controller.formulation.tasks if isinstance(t, TargetTask)]
         self._sent: dict[str, tuple[object, bytes, bytes]] = {}
         self._last: Reading | None = None
 
@@ -71,26 +70,20 @@ class CompiledTick:
                 self._sent[task.name] = now
 
 
-def compiled_tick(
-    controller: Controller, structure: Structure, objective: ImpactObjective | None, *, build: bool
-) -> CompiledTick | None:
-    """Return the controller as machine code from the cache, or build it.
+def compiled_tick(controller: Controller, structure: Structure, objective: ImpactObjective | None) -> CompiledTick:
+    """Return the controller as machine code, which is built once and cached.
 
     Args:
         controller: The controller in Python.
         structure: Structure of its formulation.
         objective: The objective of its impact-robust posture task, if it has one.
-        build: Whether to build what is not in the cache.  If not, there may be none.
 
     Raises:
         InputError: There are no sources of DAQP.
         CompilerError: There is no compiler, or it failed.
         OutputError: The cache cannot be written, or other users can write it.
     """
-    robot, key = controller.robot, _key(structure, objective)
-    if not build and not is_cached(library_path(cache_path() / "controllers" / key, _PREFIX)):
-        return None
-    folder = cache_folder("controllers") / key
+    robot, folder = controller.robot, cache_folder("controllers") / _key(structure, objective)
     with locked(folder.with_suffix(".lock")):
         if not is_cached(library_path(folder, _PREFIX)):
             if find_compiler() is None:

@@ -57,7 +57,8 @@ _PLAIN = {
 }
 # Drivers that a controller in C can serve.
 _IN_C = (Driver, RobustDriver, FlowDriver, PostureDriver)
-# Runs from which building pays: a humanoid's library takes about 10 s, and saves 4 s of each run.
+# Runs from which building pays: a humanoid's library takes about 10 s, and saves 4 s of each run.  The cache does not
+# count, because a run would then depend on what ran before, and differ from another one by amplified rounding.
 _PAYS = 3
 _KINDS: dict[str, ObjectiveKind] = {"robust-speed": "speed", "robust-sticking": "sticking"}
 # Entry points by which other installed packages add controllers.
@@ -72,8 +73,8 @@ class ControllerFactory:
         setup: The experiment.
         free: Whether gradients and the offline optimum ignore the feet.
         gradient_of: Makes the gradient of an objective, compiled or interpreted.
-        compile: Whether controllers run as machine code: from the cache if they are there (``auto``), or always.
-        runs: Number of runs of each controller, for which ``auto`` builds what is not in the cache if that pays.
+        compile: Whether controllers run as machine code: ``auto`` where building it pays, always, or never.
+        runs: Number of runs of each controller that building has to pay for.
         warnings: What of the last driver is not compiled although it should have been, and why.
     """
 
@@ -173,7 +174,7 @@ class ControllerFactory:
         Other drivers look into their controller, and only Python has one to look into.
         """
         always, controller = self.compile == "always", driver.controller
-        if self.compile == "never" or self._fault:
+        if not always and (self.compile == "never" or self.runs < _PAYS or self._fault or find_compiler() is None):
             return None
         try:
             if type(driver) not in _IN_C:
@@ -186,8 +187,7 @@ class ControllerFactory:
         plain = type(controller.formulation.posture) is JointPosture
         objective = None if plain else self.objective(_KINDS.get(name, "impulse"))
         try:
-            build = always or (self.runs >= _PAYS and find_compiler() is not None)
-            return compiled_tick(controller, structure, objective, build=build)
+            return compiled_tick(controller, structure, objective)
         except InputError as error:
             if always:
                 raise

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.mjcf import import_mujoco
-from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import hover
@@ -21,7 +19,7 @@ from impact_posture.simulation.actuator_command import ActuatorCommand, Push, Tr
 from impact_posture.simulation.contact_forces import ContactLog
 from impact_posture.simulation.rotors import Rotors, Vibration
 from impact_posture.simulation.scene import Scene
-from impact_posture.simulation.sensor_noise import Reading, SensorNoise
+from impact_posture.simulation.sensor_noise import Reading, Sample, SensorNoise
 from impact_posture.simulation.throw import Ball, Throw
 from impact_posture.simulation.world_builder import BuiltScene, build_scene
 from impact_posture.tsid.controller import Command
@@ -29,23 +27,6 @@ from impact_posture.tsid.state import checked_velocity
 
 # No robot is so far away or so fast, m, m/s, rad/s, and no torque so large, N·m.
 _RUNAWAY = 1e6
-
-
-@dataclass(frozen=True, eq=False)
-class _Sample:
-    """What the sensors see after a step."""
-
-    layout: MjcfLayout
-    qpos: Array
-    qvel: Array
-    speeds: Array
-    phases: Array
-    force: Array
-
-    @cached_property
-    def state(self) -> tuple[Array, Array]:
-        """The Pinocchio ``(q, ν)``, which callers must copy."""
-        return self.layout.state(self.qpos, self.qvel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +79,7 @@ class World:
         self._felt = None if sensors.force_frame is None else frames.index(sensors.force_frame)
         self._smoothing = -np.expm1(-2 * np.pi * sensors.force_cutoff * self.timestep)
         self._force: Array = np.zeros(3)
-        self._past: deque[_Sample] = deque(maxlen=1 + round(sensors.delay / self.timestep))
+        self._past: deque[Sample] = deque(maxlen=1 + round(sensors.delay / self.timestep))
         self._pushes: list[_ActivePush] = []
         self._steps = 0
         limited = np.array(self._model.jnt_limited, dtype=bool)
@@ -256,10 +237,10 @@ class World:
             at_stops=tuple(self._limited_names[k] for k in stopped),
         )
 
-    def _sample(self, speeds: Array, phases: Array) -> _Sample:
+    def _sample(self, speeds: Array, phases: Array) -> Sample:
         data = self._data
         qpos, qvel = data.qpos[: self._layout.nqpos].copy(), data.qvel[: self._layout.nv].copy()
-        return _Sample(self._layout, qpos, qvel, speeds, phases, self._force.copy())
+        return Sample(self._layout, qpos, qvel, speeds, phases, self._force.copy())
 
     def _apply_pushes(self) -> None:
         data = self._data
