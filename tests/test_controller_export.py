@@ -8,6 +8,8 @@ import pytest
 
 from impact_posture.arrays import Array
 from impact_posture.controller_export.compiled_controller import CompiledController
+from impact_posture.controller_export.structure import structure_of
+from impact_posture.errors import ContactError, InputError
 from impact_posture.tsid.controller import Command, Controller, Report, Status
 from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
 from tests.exported_controller import compiled, formulation_of, gradient_beside, impact_of, random_state
@@ -102,18 +104,50 @@ def test_the_impact_robust_term_is_that_of_python_through_its_phases(name: str, 
     ours.reset(q, v)
     theirs.reset(q, v)
     levels = set()
+    phases = (("brace", 3), ("contact", 40), ("release", 75))
+    # Python's phases begin at the call.  C takes their times, and a call that is early, or due.
+    for phase, at in phases[:2]:
+        getattr(theirs, phase)(1e-3 * at)
+    for wrong, at in (("brace", 0.08), ("contact", 0.08), ("release", 0.03), ("release", np.nan)):
+        with pytest.raises(InputError, match="follow"):
+            getattr(theirs, wrong)(at)
     for k in range(110):
-        for phase, at in (("brace", 3), ("contact", 40), ("release", 75)):
+        for phase, at in phases:
             if k == at:
                 getattr(robust, phase)()
-                getattr(theirs, phase)()
+                if phase == "release":
+                    theirs.release()
         a, b = ours.tick(1e-3 * k, q, v), theirs.tick(1e-3 * k, q, v)
         assert a.status is b.status is Status.SOLVED
         assert difference(a, b) < 1e-9
-        levels.add(round(theirs.report().level, 3))
+        assert theirs.level == theirs.report().level == robust.level
+        levels.add(round(theirs.level, 3))
         v = v + 1e-3 * a.acceleration
         q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
     assert {0.0, 1.0} < levels
+
+
+def test_a_sole_on_its_edge_is_refused_and_changes_nothing() -> None:
+    ours, theirs, q, v = both_at_rest("talos")
+    turned = q.copy()
+    turned[3:7] = [0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)]
+    for controller in (ours, theirs):
+        with pytest.raises(ContactError, match="stands on its edge"):
+            controller.reset(turned, v)
+    # Python's is half reset then.
+    ours.reset(q, v)
+    assert difference(ours.tick(0.0, q, v), theirs.tick(0.0, q, v)) < 1e-9
+
+
+def test_an_export_leaves_the_tasks_of_a_running_controller_alone() -> None:
+    robot, formulation = formulation_of("panda")
+    controller, task = Controller(robot, formulation), formulation.levels[0][0]
+    controller.reset(robot.posture(), np.zeros(robot.nv))
+    structure_of(robot, formulation)
+    before = controller.tick(0.0, robot.posture(), np.zeros(robot.nv))
+    task.target_velocity = np.full(task.size, 0.1)
+    after = controller.tick(1e-3, robot.posture(), np.zeros(robot.nv))
+    assert difference(before, after) > 0.1
 
 
 def test_a_singular_arm_is_damped_as_in_python() -> None:

@@ -28,7 +28,8 @@ from impact_posture.version import __version__
 
 # Files in c/, in the order in which one source has them.
 _CORE = (
-    "algebra.c", "tasks.c", "posture.c", "qp.c", "rank.c", "solve.c", "give_way.c", "init.c", "tick.c", "report.c",
+    "vector.c", "algebra.c", "tasks.c", "posture.c", "qp.c", "rank.c", "solve.c", "give_way.c", "init.c", "tick.c",
+    "report.c",
 )  # fmt: skip
 # Parameters that init compares with others.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")

@@ -3,23 +3,6 @@
 /* Families of joints in ip_joint_family. */
 enum { IP_DIRECT, IP_CONTINUOUS, IP_FREE_FLYER, IP_SPHERICAL };
 
-static double ip_dot(const double *a, const double *b, int n)
-{
-  /* Sums that do not wait for each other. */
-  double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
-  int i;
-  for (i = 0; i + 3 < n; i += 4) {
-    s0 += a[i] * b[i];
-    s1 += a[i + 1] * b[i + 1];
-    s2 += a[i + 2] * b[i + 2];
-    s3 += a[i + 3] * b[i + 3];
-  }
-  for (; i < n; ++i) {
-    s0 += a[i] * b[i];
-  }
-  return (s0 + s1) + (s2 + s3);
-}
-
 static void ip_cross(const double *a, const double *b, double *out)
 {
   out[0] = a[1] * b[2] - a[2] * b[1];

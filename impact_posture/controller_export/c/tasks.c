@@ -212,17 +212,6 @@ static void ip_contact_rows(ip_context *c)
   }
 }
 
-/* Part of a heading across the unit vector n; return its length. */
-static double ip_across(const double *n, const double *heading, double *across)
-{
-  const double along = ip_dot(n, heading, 3);
-  int i;
-  for (i = 0; i < 3; ++i) {
-    across[i] = heading[i] - n[i] * along;
-  }
-  return sqrt(ip_dot(across, across, 3));
-}
-
 /* Whether the heading of a sole points along the normal of its ground. */
 static int ip_on_edge(const ip_context *c)
 {
@@ -298,12 +287,13 @@ static void ip_hold_contacts(ip_context *c)
 static void ip_bounds(const ip_context *c, int i, double *to)
 {
   const ip_params *p = &c->p;
-  const double margin = fmin(p->law_margin[0], (p->joint_upper[i] - p->joint_lower[i]) / 4.0);
+  const double margin = ip_least(p->law_margin[0], (p->joint_upper[i] - p->joint_lower[i]) / 4.0);
   int s;
   for (s = 0; s < 2; ++s) {
     const double way = c->room[s][i] - margin, room = fabs(way);
-    double speed = fmin(fmin(p->law_approach[0] * room, sqrt(2.0 * p->law_deceleration[0] * room)), p->joint_velocity[i]);
+    double speed = sqrt(2.0 * p->law_deceleration[0] * room);
+    speed = ip_least(ip_least(p->law_approach[0] * room, speed), p->joint_velocity[i]);
     speed = copysign(speed, way) * p->law_rate[0] + (s ? 1.0 : -1.0) * p->law_rate[0] * c->v[i];
-    to[s] = i < IP_BASE ? speed : fmin(fmax(speed, -p->law_acceleration[0]), p->law_acceleration[0]);
+    to[s] = i < IP_BASE ? speed : ip_least(ip_most(speed, -p->law_acceleration[0]), p->law_acceleration[0]);
   }
 }

@@ -99,7 +99,7 @@ static void ip_answer(ip_context *c, ip_command *out)
     const int r = IP_EQUATIONS + i;
     double beyond;
     u[i] = c->known[i] + ip_dot(c->rows[r], c->z, IP_VARIABLES);
-    beyond = u[i] - fmin(fmax(u[i], c->p.control_lower[i]), c->p.control_upper[i]);
+    beyond = u[i] - ip_least(ip_most(u[i], c->p.control_lower[i]), c->p.control_upper[i]);
     over += beyond * beyond;
   }
   /* Not ">", which is false for a NaN. */
