@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,7 @@ _ROWS, _FIRST = np.arange(3), np.arange(3) == 0
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
-@dataclass(frozen=True, eq=False)
-class ShapeTruth:
+class ShapeTruth(NamedTuple):
     """Contact of a shape with all surfaces.
 
     Attributes:
@@ -38,8 +37,7 @@ class ShapeTruth:
     slip: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Pairs:
+class _Pairs(NamedTuple):
     """Contacts of geoms: which shape each belongs to, the way it pushes, and whether it is one on the ground.
 
     All three have shape (shapes, contacts).  ``bodies`` and ``roots`` are those of the second geoms.
@@ -114,16 +112,19 @@ class ContactLog:
 
     def look(self, data: Any) -> tuple[ShapeTruth, ...]:
         """Return the contact of every shape, and begin new peaks and new first touches."""
-        slips = self._slips(data)
+        slips, pushed = self._slips(data).tolist(), (self._normal > 0).tolist()
+        peaks, began = self._peaks.tolist(), self._began.tolist()
+        # One copy for all shapes, whose rows nobody writes.
+        forces, impulses = self.forces.copy(), self._impulses.copy()
         found = tuple(
             ShapeTruth(
                 frame=frame,
-                touching=bool(self._normal[k] > 0),
-                force=self.forces[k].copy(),
-                impulse=self._impulses[k].copy(),
-                peak=float(self._peaks[k]),
-                began=None if np.isnan(self._began[k]) else float(self._began[k]),
-                slip=float(slips[k]),
+                touching=pushed[k],
+                force=forces[k],
+                impulse=impulses[k],
+                peak=peaks[k],
+                began=None if math.isnan(began[k]) else began[k],
+                slip=slips[k],
             )
             for k, frame in enumerate(self._frames)
         )

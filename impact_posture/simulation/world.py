@@ -79,6 +79,7 @@ class World:
         self._felt = None if sensors.force_frame is None else frames.index(sensors.force_frame)
         self._smoothing = -np.expm1(-2 * np.pi * sensors.force_cutoff * self.timestep)
         self._force: Array = np.zeros(3)
+        self._feels = False
         self._past: deque[Sample] = deque(maxlen=1 + round(sensors.delay / self.timestep))
         self._pushes: list[_ActivePush] = []
         self._steps = 0
@@ -114,7 +115,7 @@ class World:
         if self._vibration is not None:
             self._vibration.reset(q, self._generator.uniform(0, 2 * np.pi, self._count))
         self._log.reset()
-        self._force[:] = 0.0
+        self._force[:], self._feels = 0.0, False
         self._torques = np.zeros(self._effort.size)
         self._pushes.clear()
         self._steps = 0
@@ -202,7 +203,8 @@ class World:
             second(model, data)
             self._steps += 1
             self._log.step(data)
-            if self._felt is not None and (self._log.pushing or self._force.any()):
+            self._feels = self._feels or self._log.pushing
+            if self._felt is not None and self._feels:
                 self._force += self._smoothing * (self._log.forces[self._felt] - self._force)
             # Now positions, contacts and velocities are those of the new state, and forces those of the step.
             first(model, data)
