@@ -82,9 +82,9 @@ class Driver:
         """Level of the term that prepares for the impact, 0 to 1."""
         return self.posture.level if self.compiled is None else self.compiled.library.level
 
-    def _tell(self, posture: JointPosture, method: str, *given: Any) -> None:
+    def _tell(self, posture: JointPosture, method: str, *given: Any, **named: Any) -> None:
         """Call a method of a posture task, or that of its counterpart in C."""
-        getattr(posture if self.compiled is None else self.compiled.library, method)(*given)
+        getattr(posture if self.compiled is None else self.compiled.library, method)(*given, **named)
 
     def _follow(self, reference: ReferencePoint) -> None:
         task, home = self._end_effector, self._home
@@ -149,7 +149,7 @@ class FlowDriver(Driver):
     def expect(self, t: float) -> None:
         """Rest early enough before an impact at a time, s."""
         if self.level > 0:
-            self._tell(self.posture, "brace", t - self._now)
+            self._tell(self.posture, "brace", t_impact=t - self._now)
 
 
 class PostureDriver(Driver):
