@@ -114,6 +114,7 @@ class CompiledController:
             ContactError: A sole stands on its edge.
         """
         targets = {name: row.copy() for name, row in self._targets.items()}
+        self._ready = False
         refused = self._call("init", ctypes.byref(self._given))
         if refused < 0:
             raise SpecError("has too little memory for the relaxation", where="controller", hint="run codegen again")
