@@ -15,6 +15,7 @@ from impact_posture.controller_export.structure import structure_of
 from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.compiled import CompileMode
+from impact_posture.progress import tell
 from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.baselines import FlowPosture, WalkerDriver, resting_posture, spring_of_term
 from impact_posture.simulation.compiled_tick import CompiledTick, compiled_tick
@@ -110,6 +111,7 @@ class ControllerFactory:
     @cached_property
     def metric(self) -> Callable[[Array], float]:
         """``q → H``, the objective in the CasADi interpreter, which is ready at once."""
+        tell("building the expressions")
         function, normal = self.objective().value_fun(), np.array(self.objective().contact.normal, dtype=float)
         return lambda q: float(function(q, normal))
 
