@@ -23,6 +23,7 @@ def write_controller(
     robot: str,
     kind: ControllerKind,
     *,
+    flow: bool,
     scenario: str | None,
     daqp: str | None,
     prefix: str | None,
@@ -35,7 +36,7 @@ def write_controller(
     """Write the controller and say what was written."""
     from impact_posture.controller_export.export import export_controller
 
-    made, formulation, objective = _formulation(given, robot, kind, scenario)
+    made, formulation, objective = _formulation(given, robot, kind, flow, scenario)
     folders = (None if name is None else Path(name) for name in (out, daqp))
     written = export_controller(
         made, formulation, next(folders), objective=objective, prefix=prefix, daqp=next(folders), build=build,
@@ -45,16 +46,17 @@ def write_controller(
         print_json(written.to_dict())
         return
     page = Page(quiet=quiet)
-    page.title(f"{made.name}, {kind}", "impact-robust" if objective is not None else "nominal posture")
+    posture = "nominal posture" if objective is None else "reference flow" if flow else "impact-robust"
+    page.title(f"{made.name}, {kind}", posture)
     tasks = ", ".join(task["name"] for task in written.manifest["tasks"])
     page.pairs([("folder", str(written.out)), ("tasks", tasks), ("header", f"{written.prefix}.h")])
     page.line(written.verdict)
 
 
 def _formulation(
-    given: Given, robot: str, kind: ControllerKind, scenario: str | None
+    given: Given, robot: str, kind: ControllerKind, flow: bool, scenario: str | None
 ) -> tuple[Robot, TaskFormulation, ImpactObjective | None]:
-    """Return the robot, its tasks, and the objective of an impact-robust posture."""
+    """Return the robot, its tasks, and the objective that the posture task follows."""
     if scenario is not None:
         from impact_posture.simulation.controller_factory import ControllerFactory
         from impact_posture.simulation.scenario import set_up
@@ -67,7 +69,8 @@ def _formulation(
         if setup.robot.name != robot:
             raise UsageError(f"The scenario {scenario} is of {setup.robot.name}, not of {robot}.")
         factory = ControllerFactory(setup, gradient_of=interpreted)
-        return setup.robot, factory.driver("robust").controller.formulation, factory.objective()
+        driver = factory.driver("robust-flow" if flow else "robust")
+        return setup.robot, driver.controller.formulation, factory.objective()
     from impact_posture.controller_export.builtin import default_formulation
 
     if "normal" in given.values:
@@ -77,9 +80,11 @@ def _formulation(
         if len(frames) > 1:
             raise UsageError("--controller follows the gradient of one impact: give one --frame.")
         objective = resolve(given.fill(ImpactSettings, robot=robot, frame=frames[0])).objective
-        return objective.robot, default_formulation(objective.robot, kind, objective), objective
+        return objective.robot, default_formulation(objective.robot, kind, objective, flow=flow), objective
     from impact_posture.robot.robot_loader import load_robot
 
+    if flow:
+        raise UsageError("--flow lowers impacts: give --normal X Y Z, or --scenario.")
     known = {field.name for field in fields(LoadOptions)}
     for name in given.values:
         if name not in known:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 RUN = "Run"
 Mode = Literal["live", "held"]
+CompileMode = Literal["auto", "always", "never"]
 
 ScenarioName = Annotated[
     str,
@@ -23,6 +24,13 @@ ScenarioName = Annotated[
     ),
 ]
 Seeds = Annotated[int, typer.Option("--seeds", min=1, rich_help_panel=RUN, help="Seeds a controller, from 0.")]
+Compile = Annotated[
+    CompileMode,
+    typer.Option(
+        "--compile", rich_help_panel=RUN,
+        help="Whether controllers run as machine code. auto: from 3 seeds on, which pay for building it.",
+    ),
+]  # fmt: skip
 Processes = Annotated[
     int, typer.Option("--jobs", min=1, rich_help_panel=RUN, help="Processes that run at the same time.")
 ]

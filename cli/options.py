@@ -71,6 +71,13 @@ ControllerKind = Annotated[
         help="Write the whole online controller of such a robot; with --normal, the impact-robust one.",
     ),
 ]  # fmt: skip
+ControllerFlow = Annotated[
+    bool,
+    option(
+        "--flow", panel=OUTPUT,
+        help="With --controller and an impact, let the posture follow the reference flow (robust-flow).",
+    ),
+]  # fmt: skip
 ControllerScenario = Annotated[
     str | None,
     option(

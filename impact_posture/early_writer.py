@@ -50,14 +50,18 @@ def _load(settings: ProblemSettings, folder: Path, report: bool, meshes: bool) -
     tempfile.tempdir = str(folder)
     import impact_posture.codegen.export
     import impact_posture.plot  # noqa: F401 (the import is what takes long)
+    from impact_posture.codegen.render import load_templates
     from impact_posture.posture.problem_settings import prepare
     from impact_posture.result_folder import finish_result
 
+    load_templates()
     prepared = prepare(settings)
     if report:
         # What goes wrong here goes wrong again for the report, which says so.
         with suppress(Exception):
+            from impact_posture.report.page import load_template
             from impact_posture.report.shapes import draw_robot
 
+            load_template()
             draw_robot(prepared.impact.robot, meshes)
     return partial(finish_result, prepared)

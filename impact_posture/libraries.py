@@ -214,7 +214,7 @@ def source_key(content: Iterable[str], *packages: str) -> str:
     digest = hashlib.sha256("\n".join([__version__, *content]).encode())
     for package in packages:
         for path in sorted((Path(__file__).parent / package).glob("**/*")):
-            if path.suffix in (".py", ".jinja"):
+            if path.suffix in (".py", ".jinja", ".c", ".h"):
                 digest.update(path.read_bytes())
     return digest.hexdigest()[:32]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
     from impact_posture.path.posture_path import PosturePath
     from impact_posture.plot import ResultView
+    from impact_posture.report.scene import Scene
 
 FORMATS = ("png",)
 
@@ -147,20 +149,41 @@ def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finish
     view = result_view(prepared, initial, optimal, path, document, motion, mapped)
     tasks += _drawings(view, folder, formats)
     count = len(tasks) + report
+    scene: Scene | None = None
     with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
+        if report:
+            # This process would only wait.  What goes wrong here goes wrong again for the report, which says so.
+            with suppress(Exception):
+                scene = _scene(prepared, view, meshes)
         for done, (index, result) in enumerate(results, start=1):
             yield done, count, result if codegen and index == 0 else None
     if report:
         # It shows the figures, so it comes last.
-        yield count, count, _report(folder, prepared, view, document, meshes)
+        yield count, count, _report(folder, prepared, view, document, meshes, scene)
 
 
-def _report(folder: Path, prepared: Prepared, view: ResultView, document: dict[str, Any], meshes: bool) -> str:
+def _scene(prepared: Prepared, view: ResultView, meshes: bool) -> Scene:
+    """Return the packed scene of the report."""
+    from impact_posture.report.result_report import result_scene
+
+    scene = result_scene(prepared, view, meshes)
+    _ = scene.packed
+    return scene
+
+
+def _report(
+    folder: Path,
+    prepared: Prepared,
+    view: ResultView,
+    document: dict[str, Any],
+    meshes: bool,
+    scene: Scene | None,
+) -> str:
     """Write the report; return why that failed, because a result is kept without it."""
     try:
         from impact_posture.report.result_report import write_result_report
 
-        write_result_report(folder, prepared, view, document, meshes=meshes)
+        write_result_report(folder, prepared, view, document, meshes=meshes, scene=scene)
     except Exception as error:
         return one_line(f"{type(error).__name__}: {error}")
     return ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,33 +23,57 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import library_path, load_library
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task_formulation import TaskFormulation
 from tests.daqp import sources_or_skip
+from tests.tools import need_compiler
 
 KINDS: dict[str, ControllerKind] = {
     "tilthex_arm": "aerial", "hextilt": "aerial", "panda": "arm",
     "solo8": "legged", "talos": "legged", "g1": "legged",
 }  # fmt: skip
+ABUSE = Path(__file__).with_name("controller_abuse.c")
 _KEPT = TemporaryDirectory()
 
 
-def exported(name: str, objective: ImpactObjective | None = None, flags: str = "-O0") -> Path:
-    """Return the folder of a robot's controller with default gains and a library."""
+def exported(
+    name: str, objective: ImpactObjective | None = None, flags: str = "-O0", path: tuple[float, ...] | None = None
+) -> Path:
+    """Return the folder of a robot's controller with default gains and a library.
+
+    Args:
+        name: The robot.
+        objective: What the posture task follows.
+        flags: Flags for the compiler.
+        path: Follow by a reference flow that visits this posture first; empty for none.
+    """
     sources_or_skip()
-    return _exported(name, objective, flags)
+    return _exported(name, objective, flags, path)
 
 
 @cache
-def _exported(name: str, objective: ImpactObjective | None, flags: str) -> Path:
+def _exported(name: str, objective: ImpactObjective | None, flags: str, path: tuple[float, ...] | None) -> Path:
     out = Path(_KEPT.name) / f"{name}-{len(os.listdir(_KEPT.name))}"
     robot = load_robot(name)
-    formulation = default_formulation(robot, KINDS[name], objective)
+    formulation = default_formulation(robot, KINDS[name], objective, flow=path is not None)
+    if path:
+        flow = formulation.posture
+        assert isinstance(flow, ReferenceFlowPosture)
+        flow._path = [np.array(path)]
     given = os.environ.get("DAQP_SOURCES")
     daqp = Path(given) if given else None
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CFLAGS", flags)
         export_controller(robot, formulation, out, objective=objective, prefix="ctl", daqp=daqp, build=True)
     return out
+
+
+def abuse_program(folder: Path, out: Path) -> Path:
+    """Return a program that abuses the library of a controller (:data:`ABUSE`)."""
+    library, program = library_path(folder, "ctl"), out / "abuse"
+    command = [*need_compiler(), "-std=gnu99", "-O1", f"-I{folder}", str(ABUSE), str(library), "-o", str(program)]
+    subprocess.run([*command, f"-Wl,-rpath,{folder}", "-lm", "-lpthread"], check=True)
+    return program
 
 
 def formulation_of(name: str) -> tuple[Robot, TaskFormulation]:

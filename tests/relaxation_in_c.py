@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import subprocess
 import time
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from tests.relaxed_ticks import RelaxedTick
 SOURCES = Path(daqp_sources.__file__).parent / "c"
 SOLVED, WITHOUT_COST, INFEASIBLE, BUDGET, UNSOLVED = 1, 2, -1, -4, -8
 _STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror")
+FORCE_UNIT = float(re.findall(r"#define IP_FORCE_UNIT (\S+)", (SOURCES / "give_way.c").read_text())[0])
 _ARRAYS = ("A", "lower", "upper", "level", "H", "g", "unit")
 
 
@@ -76,6 +78,8 @@ class Relaxation:
         m, n = tick.A.shape
         levels = int(tick.level.max())
         values = {name: np.ascontiguousarray(getattr(tick, name), dtype=float) for name in _ARRAYS}
+        # The search measures forces as give_way.c does; the certificate keeps Python's units.
+        values["unit"] = np.where(tick.unit == 1.0, 1.0, FORCE_UNIT * tick.unit)
         values["level"] = np.ascontiguousarray(tick.level, dtype=np.intc)
         problem = _Problem(n, m, levels, *(values[name].ctypes.data for name in _ARRAYS))
         work = self._work.setdefault((n, m, levels), np.zeros(self._bytes(n, m, levels) // 8 + 1))

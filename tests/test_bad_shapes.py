@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from impact_posture import stored_text
 from impact_posture.arrays import Array
-from impact_posture.collision import shape_cache
 from impact_posture.collision import shapes as collision_shapes
 from impact_posture.collision.mesh_check import mesh_collisions
 from impact_posture.collision.obstacle import obstacle_hull
@@ -248,22 +248,26 @@ def test_the_cache_is_used_and_depends_on_content(tmp_path: Path, own_cache: Pat
     assert len(list(own_cache.glob("*.json"))) == 2
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "binary", "number", "joint", "pair", "many", "nan", "folder"])
+@pytest.mark.parametrize(
+    "damage", ["cut", "empty", "binary", "number", "joint", "pair", "face", "many", "nan", "folder"]
+)
 def test_a_damaged_cache_is_fitted_again(tmp_path: Path, own_cache: Path, damage: str) -> None:
     first = arm(tmp_path, BOX)
     path = stored(own_cache)
     text = path.read_text().split("\n", 1)[1]
     content = json.loads(text)
-    if damage in ("joint", "pair", "many", "nan"):
+    if damage in ("joint", "pair", "face", "many", "nan"):
         # Whole, with its seal, and yet no shapes of this robot.
         if damage == "joint":
             content["bodies"][0]["joint"] = 99
         elif damage == "pair":
             content["pairs"] = [[0, 10**9]]
+        elif damage == "face":
+            content["bodies"][0]["faces"][0] = [0, 1, 8]
         else:
             content["bodies"][0]["vertices"] = [[0.0, 0.0, float("nan")]] if damage == "nan" else [[0.0] * 3] * 10**4
         changed = json.dumps(content)
-        path.write_text(f"{shape_cache._seal(changed)}\n{changed}")
+        path.write_text(f"{stored_text._seal(changed)}\n{changed}")
     elif damage == "folder":
         path.unlink()
         path.mkdir()
@@ -286,7 +290,7 @@ def test_a_cache_that_others_may_write_is_not_read(tmp_path: Path, own_cache: Pa
     content = json.loads(path.read_text().split("\n", 1)[1])
     content["bodies"][0]["radius"] = 0.5
     text = json.dumps(content)
-    path.write_text(f"{shape_cache._seal(text)}\n{text}")
+    path.write_text(f"{stored_text._seal(text)}\n{text}")
     fresh()
     assert arm(tmp_path, BOX).bodies[0].radius == 0.5
     for place in (path, own_cache):
@@ -295,7 +299,7 @@ def test_a_cache_that_others_may_write_is_not_read(tmp_path: Path, own_cache: Pa
         fresh()
         assert arm(tmp_path, BOX).bodies[0].radius < 0.5
         place.chmod(mode)
-        path.write_text(f"{shape_cache._seal(text)}\n{text}")
+        path.write_text(f"{stored_text._seal(text)}\n{text}")
 
 
 # ---- obstacles ----------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from itertools import product
 
 import casadi as ca
@@ -18,7 +19,9 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.contact import point_on
+from impact_posture.posture.build_problem import retarget
 from impact_posture.posture.clearance import Clearance
+from impact_posture.posture.elastic import ElasticProgram, elastic
 from impact_posture.posture.nlp import build_nlp
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.search import feasible
@@ -245,6 +248,24 @@ def test_a_surface_lies_where_the_link_of_the_contact_reaches(name: str, normal:
     assert not touched(-1e-6)
     # A swept hull is a few millimeters larger than the mesh inside.
     assert touched(0.015)
+
+
+def test_a_relaxed_program_serves_other_targets_and_is_let_go() -> None:
+    problem = prepare(validate(ProblemSettings, {"robot": "panda", "normal": (0, 0, 1)}, "test")).problem
+    program = ElasticProgram(problem)
+    for height in (1.4, -0.3, 1.5):
+        kept, fresh = (
+            elastic(retarget(one.problem, (0.4, 0.1, height), None), tries=1, program=one)
+            for one in (program, ElasticProgram(problem))
+        )
+        assert bool(kept.conflicts) is bool(height > 1) and kept.conflicts.keys() == fresh.conflicts.keys()
+        assert sum(kept.conflicts.values()) == pytest.approx(sum(fresh.conflicts.values()), rel=0.05)
+    assert program.cpu_s > 0 and program.problem is not problem
+    shared = [c._lifted for c in problem.constraints if isinstance(c, Clearance)]
+    assert any(len(lifted) for lifted in shared)
+    del program, kept, fresh
+    gc.collect()
+    assert not any(len(lifted) for lifted in shared)
 
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo12"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -9,15 +10,15 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from impact_posture.arrays import Array
-from impact_posture.collision.mesh_check import mesh_collisions
+from impact_posture.collision.mesh_check import MeshCheck, mesh_collisions
 from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import load_shapes
-from impact_posture.collision.swept_hull import SweptHull, separation
+from impact_posture.collision.swept_hull import SweptHull, separation, transform
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.urdf import resolve_path, robots_data
@@ -30,6 +31,11 @@ ROBOTS = ("tilthex_arm", "panda", "solo8", "talos")
 @cache
 def robot_of(name: str) -> Robot:
     return load_robot(name)
+
+
+@cache
+def check_of(name: str) -> MeshCheck:
+    return MeshCheck(robot_of(name), load_shapes(robot_of(name)))
 
 
 def surface(shape: pin.GeometryObject, random: np.random.Generator, count: int) -> Array:
@@ -140,7 +146,9 @@ def test_obstacles_and_planes_are_found_by_name() -> None:
     hand = np.array(data.oMf[robot.frame_id("panda_hand")].act(np.array([0.0, 0.0, 0.04])))
     ball = Obstacle(name="ball", sphere=0.02, position=tuple(hand.tolist()))
     far = Obstacle(name="far", box=(0.1, 0.1, 0.1), position=(5.0, 0.0, 0.0))
-    hits = mesh_collisions(robot, shapes, q, obstacles=[(obstacle_hull(ball), ()), (obstacle_hull(far), ())])
+    hits = mesh_collisions(
+        robot, shapes, q, obstacles=[(obstacle_hull(body), pin.SE3.Identity(), ()) for body in (ball, far)]
+    )
     assert {name for _, name in hits} == {"ball"}
     assert {shape.partition("[")[0] for shape, _ in hits} <= {"panda_hand", "panda_leftfinger", "panda_rightfinger"}
     # The whole robot is above its base, but for what the base itself reaches below.
@@ -150,6 +158,42 @@ def test_obstacles_and_planes_are_found_by_name() -> None:
     ceiling = SimpleNamespace(name="ceiling", point=hand, normal=np.array([0.0, 0.0, -1.0]), exempt=base)
     found = {shape for shape, plane in mesh_collisions(robot, shapes, q, planes=[ceiling]) if plane == "ceiling"}
     assert "panda_link4" in found and not any(shape.startswith("panda_link0") for shape in found)
+
+
+@pytest.mark.parametrize("name", ["solo8", "panda"])
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=12)
+def test_a_kept_check_finds_what_coal_finds_of_every_shape(name: str, seed: int) -> None:
+    robot, random = robot_of(name), np.random.default_rng(seed)
+    shapes, data, check = load_shapes(robot), robot.model.createData(), check_of(name)
+    check.collisions(random_posture(robot, seed + 1))
+    q = random_posture(robot, seed)
+    found = check.collisions(q)
+    assert found == mesh_collisions(robot, shapes, q)
+    pin.forwardKinematics(robot.model, data, q)
+    # Meshes do not meet a swept hull in coal.
+    body = replace(shapes.bodies[int(random.integers(len(shapes.bodies)))], name="body", radius=0.0)
+    at = pin.SE3(pin.exp3(random.normal(size=3)), random.normal(size=3) * 0.3)
+    normal = random.normal(size=3)
+    plane = SimpleNamespace(
+        name="plane", point=random.normal(size=3) * 0.2, normal=normal / np.linalg.norm(normal), exempt={1}
+    )
+    solid, local = body.solid
+    walls = [
+        ("body", solid, at * local, {2}),
+        ("plane", coal.Halfspace(plane.normal, float(plane.normal @ plane.point)), pin.SE3.Identity(), {1}),
+    ]
+    wanted = [
+        (shape.name, wall)
+        for shape in shapes.geometry.geometryObjects
+        for wall, other, where, exempt in walls
+        if shape.parentJoint not in exempt
+        and coal.collide(
+            shape.geometry, transform(data.oMi[shape.parentJoint] * shape.placement), other, transform(where),
+            coal.CollisionRequest(), coal.CollisionResult(),
+        )
+    ]  # fmt: skip
+    assert check.collisions(q, [(body, at, {2})], [plane]) == found + wanted
 
 
 @pytest.mark.parametrize("depth, hit", [(5e-7, False), (2e-6, True), (-1e-9, False)])

@@ -16,22 +16,32 @@ from impact_posture.controller_export.compiled_controller import CompiledControl
 from impact_posture.controller_export.export import export_controller
 from impact_posture.controller_export.structure import structure_of
 from impact_posture.errors import InputError, ManifestMismatch, SpecError
+from impact_posture.libraries import library_path
 from impact_posture.toolchain import find_compiler
 from impact_posture.tsid.body_tasks import CenterOfMass
 from impact_posture.tsid.controller import Status
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.task_formulation import TaskFormulation
 from tests.command import run
-from tests.exported_controller import compiled, exported, formulation_of, impact_of
+from tests.exported_controller import ABUSE, abuse_program, compiled, exported, formulation_of, impact_of
 from tests.tools import need
 
-ABUSE = Path(__file__).with_name("controller_abuse.c")
 STRICT = ["-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
 
 
 def compile_c(folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
     command = [*(find_compiler() or ["cc"]), "-std=c99", "-isystem", "daqp", *flags]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+def abuse_with(sanitizers: str, folder: Path, program: Path, *more: str) -> None:
+    """Build the abuse with the sources of a controller and sanitizers, or skip."""
+    flags = [f"-fsanitize={sanitizers}", "-fno-sanitize-recover=all", "-O0", "-g0", f"-I{folder}", str(ABUSE)]
+    sources = ["ctl.c", "ctl_relaxation.c", "ctl_daqp.c", *more]
+    built = compile_c(folder, *flags, *sources, "-o", str(program), "-lm", "-lpthread")
+    if (built.returncode and "sanit" in built.stderr + built.stdout) or "cannot find -l" in built.stderr:
+        pytest.skip(f"the compiler has no -fsanitize={sanitizers}")
+    assert built.returncode == 0, built.stderr
 
 
 @pytest.mark.parametrize(("name", "frame"), [("panda", None), ("solo8", None), ("tilthex_arm", "ee")])
@@ -42,16 +52,31 @@ def test_no_state_leads_to_undefined_behavior_or_out_of_the_limits(
         pytest.skip("--hostile-full: compilers take long to put sanitizers into straight-line code")
     robot = formulation_of(name)[0]
     folder = exported(name, None if frame is None else impact_of(robot, frame, (0.0, 0.0, 1.0)))
-    own = ["ctl.c", "ctl_relaxation.c", *([] if frame is None else ["ctl_metric.c"])]
-    others = sorted(str(path.relative_to(folder)) for path in folder.glob("daqp/*.c"))
-    program = str(tmp_path / "abuse")
-    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-O0", "-g0"]
-    built = compile_c(folder, *sanitizers, f"-I{folder}", str(ABUSE), *own, *others, "-o", program, "-lm")
-    if built.returncode and "sanit" in built.stderr + built.stdout:
-        pytest.skip("no sanitizers")
-    assert built.returncode == 0, built.stderr
-    ran = subprocess.run([program], capture_output=True, text=True)
+    abuse_with("address,undefined", folder, tmp_path / "abuse", *([] if frame is None else ["ctl_metric.c"]))
+    ran = subprocess.run([tmp_path / "abuse"], capture_output=True, text=True)
     assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+def test_contexts_in_threads_share_nothing(tmp_path: Path) -> None:
+    abuse_with("thread", exported("panda"), tmp_path / "abuse")
+    ran = subprocess.run([tmp_path / "abuse", "80", "3"], capture_output=True, text=True)
+    if "unexpected memory mapping" in ran.stderr:
+        pytest.skip("this kernel places memory where the thread sanitizer does not expect it")
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+@pytest.mark.parametrize("name", ["panda", "tilthex_arm"])
+def test_ten_thousand_random_ticks_take_no_memory_and_stay_within_the_limits(name: str, tmp_path: Path) -> None:
+    program = abuse_program(exported(name), tmp_path)
+    ran = subprocess.run([program, "10000"], capture_output=True, text=True)
+    assert ran.returncode == 0 and ran.stdout.startswith("growth 0 B, 0 kB"), ran.stdout
+
+
+def test_no_tick_reads_what_was_not_written(tmp_path: Path) -> None:
+    """By valgrind, which also sees reads and writes out of bounds."""
+    valgrind, program = need("valgrind"), abuse_program(exported("panda"), tmp_path)
+    ran = subprocess.run([valgrind, "-q", "--error-exitcode=9", program, "24"], capture_output=True, text=True)
+    assert ran.returncode == 0 and not ran.stderr, ran.stderr
 
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "talos", "solo8"])
@@ -159,24 +184,36 @@ def test_the_command_says_what_is_wrong_in_a_line(arguments: list[str], words: s
     assert not (tmp_path / "out").exists()
 
 
-def test_cmake_builds_a_program_with_its_own_daqp_or_an_installed_one(tmp_path: Path) -> None:
+def test_cmake_builds_two_controllers_into_a_program_each_with_its_own_daqp_or_an_installed_one(
+    tmp_path: Path,
+) -> None:
     cmake = need("cmake")
-    folder = exported("panda")
+    folder, other = exported("panda"), tmp_path / "other"
+    export_controller(*formulation_of("panda"), other, prefix="other", daqp=folder / "daqp")
+    run_one = """
+static int run_ctl(double *u) {
+  ctl_context *c = malloc(sizeof *c); ctl_params p; ctl_command out;
+  double q[CTL_NQ] = {0}, v[CTL_NV] = {0};
+  ctl_default_params(&p);
+  if (ctl_init(c, &p) || ctl_reset(c, q, v, &out) || out.status > CTL_RELAXED) return 1;
+  memcpy(u, out.u, sizeof out.u);
+  return 0;
+}
+"""
     (tmp_path / "main.c").write_text(
-        '#include "ctl.h"\n#include <stdlib.h>\n'
-        "int main(void) {\n"
-        "  ctl_context *c = malloc(sizeof *c); ctl_params p; ctl_command out;\n"
-        "  double q[CTL_NQ] = {0}, v[CTL_NV] = {0};\n"
-        "  ctl_default_params(&p);\n"
-        "  return ctl_init(c, &p) || ctl_reset(c, q, v, &out) || out.status > CTL_RELAXED;\n}\n"
+        '#include "ctl.h"\n#include "other.h"\n#include <stdlib.h>\n#include <string.h>\n'
+        + run_one
+        + run_one.replace("ctl", "other").replace("CTL", "OTHER")
+        + "int main(void) {\n  double u[2][CTL_CONTROLS];\n"
+        "  return run_ctl(u[0]) || run_other(u[1]) || memcmp(u[0], u[1], sizeof u[0]);\n}\n"
     )
     (tmp_path / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(user C)\n"
         f'file(GLOB daqp "{folder}/daqp/*.c")\nadd_library(installed EXCLUDE_FROM_ALL ${{daqp}})\n'
-        f'add_subdirectory("{folder}" controller)\n'
-        "add_executable(user main.c)\ntarget_link_libraries(user PRIVATE ctl::ctl)\n"
+        f'add_subdirectory("{folder}" controller)\nadd_subdirectory(other)\n'
+        "add_executable(user main.c)\ntarget_link_libraries(user PRIVATE ctl::ctl other::other)\n"
     )
-    for build, options in (("own", []), ("theirs", ["-Dctl_DAQP=installed"])):
+    for build, options in (("own", []), ("theirs", ["-Dctl_DAQP=installed", "-Dother_DAQP=installed"])):
         place = tmp_path / build
         subprocess.run(
             [cmake, "-S", str(tmp_path), "-B", str(place), "-DCMAKE_C_FLAGS_RELEASE=-O0", *options],
@@ -185,3 +222,7 @@ def test_cmake_builds_a_program_with_its_own_daqp_or_an_installed_one(tmp_path: 
         )
         subprocess.run([cmake, "--build", str(place)], check=True, capture_output=True)
         subprocess.run([place / "user"], check=True)
+    names = subprocess.run(
+        [need("nm"), "-g", "--defined-only", library_path(folder, "ctl")], capture_output=True, text=True
+    )
+    assert all(line.split()[-1].startswith("ctl_") for line in names.stdout.splitlines()), names.stdout

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import impact_posture as ip
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.contact import ImpactContact, Support, default_compliance
 from impact_posture.impact.impact_case import ImpactCase
@@ -17,6 +18,7 @@ from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.metric import Metric, build_metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
+from impact_posture.impact.supports import resolve_supports
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import ObjectiveKind
 from tests.helpers import (
@@ -193,6 +195,25 @@ def test_objective_functions_agree_with_its_own_numbers(name: str, kind: Objecti
             assert_close(value, 9.0 * quantities.H, VALUE, f"bound squared ({where})")
         assert objective.name == kind
         assert objective.units
+
+
+@pytest.mark.parametrize("name", ["panda", "talos"])
+def test_an_oracle_that_comes_back_to_a_posture_knows_it(name: str) -> None:
+    """Also after more postures than it keeps, and with its model moved to each."""
+    robot, rng = ip.load_robot(name), np.random.default_rng(3)
+    contact = ImpactContact(
+        {"panda": "panda_hand_tcp", "talos": "gripper_right_base_link"}[name], normal=(0, 0.6, 0.8)
+    )
+    postures = [pin.integrate(robot.model, robot.posture(), 0.2 * rng.normal(size=robot.nv)) for _ in range(36)]
+    kept = ImpactObjective(robot, contact, kind="speed", supports=resolve_supports(robot, None))
+    for k in [*range(36), 35, 34, 0, 0, 35, 10, 11]:
+        q = postures[k]
+        fresh = ImpactObjective(robot, contact, kind="speed", supports=kept.supports)
+        assert kept.value(q) == fresh.value(q)
+        if k % 5 == 0:
+            np.testing.assert_array_equal(kept.gradient(q), fresh.gradient(q))
+            at = [one.oracle.numeric.placement(one.oracle.point).translation for one in (kept, fresh)]
+            np.testing.assert_array_equal(*at)
 
 
 def test_degenerate_combinations_are_named() -> None:

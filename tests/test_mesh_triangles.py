@@ -6,6 +6,7 @@ from pathlib import Path
 
 import coal
 import numpy as np
+import pinocchio as pin
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -68,7 +69,9 @@ def test_the_check_sees_every_part_of_a_mesh(tmp_path: Path, monkeypatch: pytest
     for part in PARTS:
         # A plate through the part, that no other part touches.
         plate = Obstacle(name="plate", box=(0.02, 0.2, 0.02), position=tuple((middle + part).tolist()))
-        seen.append(bool(mesh_collisions(shapes.robot, shapes, q, obstacles=[(obstacle_hull(plate), ())])))
+        seen.append(
+            bool(mesh_collisions(shapes.robot, shapes, q, obstacles=[(obstacle_hull(plate), pin.SE3.Identity(), ())]))
+        )
     assert seen == [True, right, right]
     # Right triangles reach as far as the corners.
     reach = mesh_points(solid)[mesh_triangles(solid)][..., 0].max()

@@ -177,7 +177,7 @@ def test_every_contact_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     )
     prepared, view, _ = load_result(tmp_path / "out")
     scene = result_scene(prepared, view)
-    packed, arrays = json.loads(scene.pack()[0]), gzip.decompress(base64.b64decode(scene.pack()[1]))
+    packed, arrays = json.loads(scene.packed[0]), gzip.decompress(base64.b64decode(scene.packed[1]))
     model, data, (track,) = robot.model, robot.model.createData(), packed["tracks"]
     q = scene.tracks[0].q[-1]
     pin.framesForwardKinematics(model, data, q)

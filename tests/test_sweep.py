@@ -19,7 +19,7 @@ from impact_posture.errors import ImpactPostureError, InputError, OutputError, S
 from impact_posture.posture.build_problem import build_problem, retarget
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.settings import ProblemSettings
-from impact_posture.sweep.executors import dask_cluster, parse_options, process_pool
+from impact_posture.sweep.executors import SlurmJobs, dask_cluster, parse_options, process_pool
 from impact_posture.sweep.grid import Axis, Grid
 from impact_posture.sweep.maps import draw_maps
 from impact_posture.sweep.run import SweepRun, run_sweep
@@ -283,6 +283,15 @@ def test_the_command_says_it_in_one_line(tmp_path: Path, arm: Path) -> None:
     refused(run("sweep", "show", arm, "--axes", "x,w"), 1, "no axis 'w'")
     for words in (("show",), ("a.toml", "b"), ("a.toml", "--mpi", "--scheduler", "tcp://a:1")):
         assert run("sweep", *words, cwd=tmp_path).returncode == 2
+
+
+def test_refused_options_of_slurm_leave_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("submitit")
+    for options, words in (({"frob": 3}, "frob"), ({"timeout_min": "x"}, "timeout_min")):
+        with pytest.raises(InputError, match=words):
+            SlurmJobs(tmp_path / "a" / "logs", options, "local")
+    SlurmJobs(tmp_path / "logs", {"timeout_min": 3}, "local").shutdown()
+    assert not os.listdir(tmp_path)
 
 
 def test_what_is_no_sweep_folder_cannot_be_opened(tmp_path: Path) -> None:

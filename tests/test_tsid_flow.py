@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -16,6 +17,7 @@ from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.controller import Controller, Status
+from impact_posture.tsid.flow_direction import Redundancy
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.reference_flow import PHASES, FlowOptions, ReferenceFlow
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
@@ -104,11 +106,10 @@ def valley(r: Robot, key: object) -> Well:
     return function
 
 
-@pytest.mark.parametrize("name", ["talos", "g1"])
-def test_it_does_not_climb_where_it_turns(name: str) -> None:
+def test_it_does_not_climb_where_it_turns() -> None:
     """Without looking ahead it climbs by 2e-2 and more."""
-    r = robot(name)
-    found = course(flow_of(r, valley(r, 3)), r.posture(), 4.0)
+    r = robot("talos")
+    found = course(flow_of(r, valley(r, 3)), r.posture(), 3.0)
     assert (found.values - np.minimum.accumulate(found.values)).max() < 1e-3
     assert found.values[-1] < 0.3
 
@@ -165,6 +166,22 @@ def test_the_rest_is_an_optimum_under_the_constraints() -> None:
     assert best.success and found.values[-1] * function(r.posture())[0] == pytest.approx(best.fun, rel=1e-3)
 
 
+def test_the_law_does_not_depend_on_the_basis_of_the_redundancy(monkeypatch: pytest.MonkeyPatch) -> None:
+    r, find = robot("talos"), Redundancy.of
+    function, found = well(r, goal_of(r, "basis", 0.6)), []
+    for turned in (False, True):
+
+        def of(J: Vector, turned: bool = turned) -> Redundancy:
+            space = find(J)
+            Q = np.linalg.qr(rng("basis").normal(size=(space.basis.shape[1],) * 2))[0]
+            return replace(space, basis=space.basis @ Q) if turned else space
+
+        monkeypatch.setattr(Redundancy, "of", of)
+        found.append(course(flow_of(r, function), r.posture(), 0.5).q)
+    assert np.abs(found[0] - r.posture()).max() > 0.05
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
+
+
 def test_a_tick_evaluates_at_most_one_gradient() -> None:
     r, calls = robot("solo8"), [0]
     inner = well(r, goal_of(r, "calls", 0.5))
@@ -197,8 +214,8 @@ def arm_well() -> Well:
     return well(robot("tilthex_arm"), goal_of(robot("tilthex_arm"), "arm", 1.0))
 
 
-@pytest.mark.parametrize("t_impact", [1.6, 2.0])
-def test_it_rests_before_an_impact_at_a_known_time(t_impact: float) -> None:
+def test_it_rests_before_an_impact_at_a_known_time() -> None:
+    t_impact = 1.6
     controller, posture, q, v = flying(arm_well())
     posture.brace(t_impact)
     moved, start = 0.0, q.copy()
@@ -233,7 +250,7 @@ def test_contact_and_release_stop_it_and_a_reset_forgets_all() -> None:
     for stop in (posture.contact, posture.release):
         stop()
         assert posture.level == 0
-        torques(2000)
+        torques(1000)
         target = posture.target.copy()
         torques(20)
         np.testing.assert_array_equal(posture.target, target)

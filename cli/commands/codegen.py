@@ -29,6 +29,7 @@ def codegen(
     portable: options.Portable = False,
     compile: options.CompileLibrary = False,
     controller: options.ControllerKind = None,
+    flow: options.ControllerFlow = False,
     scenario: options.ControllerScenario = None,
     daqp: options.Daqp = None,
     force: options.Force = False,
@@ -41,12 +42,12 @@ def codegen(
         if float_ or portable:
             raise UsageError("--controller is double and plain C99: leave --float and --portable out.")
         write_controller(
-            given, robot, controller, scenario=scenario, daqp=daqp, prefix=prefix, out=out, build=compile,
-            force=force, json=json, quiet=quiet,
+            given, robot, controller, flow=flow, scenario=scenario, daqp=daqp, prefix=prefix, out=out,
+            build=compile, force=force, json=json, quiet=quiet,
         )  # fmt: skip
         return
-    if scenario is not None or daqp is not None:
-        raise UsageError("--scenario and --daqp belong to --controller: give aerial, legged or arm.")
+    if flow or scenario is not None or daqp is not None:
+        raise UsageError("--flow, --scenario and --daqp belong to --controller: give aerial, legged or arm.")
     if not from_result:
         given.check_contact()
     from impact_posture.codegen.export import write_export

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from impact_posture_cli import options
-from impact_posture_cli.experiments import RUN, Processes, ScenarioName, Seeds, rows_table
+from impact_posture_cli.experiments import RUN, Compile, Processes, ScenarioName, Seeds, rows_table
 from impact_posture_cli.output import Page, complain, print_json
 from impact_posture_cli.progress import progress
 
@@ -27,6 +27,7 @@ def compare(
     controllers: Controllers = "nominal,robust,posture",
     seeds: Seeds = 3,
     jobs: Processes = 2,
+    compile: Compile = "auto",
     out: Out = None,
     force: options.Force = False,
     format: options.Formats = None,
@@ -50,7 +51,7 @@ def compare(
     store = None if folder is None else store_beside(folder)
     failure = ""
     with progress("running", "runs", shown=not (quiet or json)) as advance:
-        found = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance)
+        found = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
         if folder is not None and store is not None:
             failure = write_comparison(
                 folder, found, plan, store,

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from impact_posture_cli import options
-from impact_posture_cli.experiments import RUN, Processes, Seeds, rows_table
+from impact_posture_cli.experiments import RUN, Compile, Processes, Seeds, rows_table
 from impact_posture_cli.output import Page, print_json
 from impact_posture_cli.progress import progress
 
@@ -30,6 +30,7 @@ Out = Annotated[str, options.out_option("Folder of the results.")]
 def reproduce(
     seeds: Seeds = 10,
     jobs: Processes = 2,
+    compile: Compile = "auto",
     all_: All = False,
     scenario: Scenarios = None,
     out: Out = "reproduction",
@@ -56,7 +57,7 @@ def reproduce(
     store = store_beside(folder)
     with progress("running", "runs", shown=not (quiet or json)) as advance:
         plan = {name: controllers_of(name, all_) for name in scenarios}
-        found = reproduce_all(plan, seeds=seeds, processes=jobs, store=store, progress=advance)
+        found = reproduce_all(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
         formats = format or FORMATS
         document = write_reproduction(folder, found, plan, store, force=force, formats=formats)
     if json:

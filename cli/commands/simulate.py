@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from impact_posture_cli import options
-from impact_posture_cli.experiments import RUN, Mode, ScenarioName
+from impact_posture_cli.experiments import RUN, Compile, Mode, ScenarioName
 from impact_posture_cli.output import Page, complain, number, print_json
 from impact_posture_cli.progress import progress
 from impact_posture_cli.settings_options import positive
@@ -68,6 +68,7 @@ def simulate(
     free: Free = False,
     gain: Gain = None,
     sign: Sign = None,
+    compile: Compile = "auto",
     export_world: ExportWorld = None,
     out: Out = None,
     force: options.Force = False,
@@ -95,7 +96,7 @@ def simulate(
     check_output(folder, force=force, kind="run")
     with progress("running", shown=not (quiet or json)):
         with one_blas_thread():
-            runs, document = execute(job)
+            runs, document = execute(job, compile=compile)
         formats = format or FORMATS
         failure = write_simulation(
             folder, job, runs, document, force=force, formats=formats, report=not no_report, meshes=meshes

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
+import casadi as ca
+
 from impact_posture.codegen.emitter import BlockText, Constants, Emitter, Real
-from impact_posture.codegen.functions import Exported, NamedObjective, library
+from impact_posture.codegen.functions import Exported, Library, NamedObjective, library
 from impact_posture.codegen.graph import ARITHMETIC, Graph
 from impact_posture.codegen.layout import Layout, lay_out
 from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.sums import rebuilt
+from impact_posture.libraries import source_key
+from impact_posture.stored_text import read_stored, write_stored
 
 LARGEST_VECTOR = 64
 """Bytes of the widest vectors that the source uses, and of the widest group of narrower vectors in a batch."""
@@ -59,7 +65,7 @@ class Code:
 
 
 def build_code(exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False) -> Code:
-    """Generate the functions of each objective.
+    """Generate the functions of each objective, or take them from the cache of the user by what they compute.
 
     Args:
         exported: The objectives, all of one robot.
@@ -67,10 +73,35 @@ def build_code(exported: Sequence[NamedObjective], prefix: str, real: Real, *, p
         real: The C type to compute in.
         portable: Use no vectors, for compilers that have none.
     """
+    found = library(exported)
+    models = [
+        (v.stem, v.joint, v.free, v.objective.contact, v.objective.scale, v.objective.is_multiple_of_H)
+        for v in exported
+    ]
+    content = (ca.CasadiMeta.version(), found.constants, found.seeds, found.functions, models, prefix, real, portable)
+    key = source_key([repr(content), found.function.serialize()], "codegen")
+    text = read_stored("code", key)
+    # A pydantic fault is a ValueError.
+    with suppress(ValueError):
+        if text is not None:
+            code: Code = _adapter().validate_json(text)
+            return code
+    code = _generate(exported, found, prefix, real, portable=portable)
+    write_stored("code", key, _adapter().dump_json(code).decode())
+    return code
+
+
+@cache
+def _adapter() -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(Code)
+
+
+def _generate(exported: Sequence[NamedObjective], found: Library, prefix: str, real: Real, *, portable: bool) -> Code:
     single = [v for v in exported if not v.joint]
     contacts = {v.stem: v.objective.contact for v in single}
     robot = single[0].objective.robot
-    found = library(exported)
     scalars = found.graph()
     # A single call waits for results more than for arithmetic units.  A batch has other lanes to go on with.
     graph = rebuilt(scalars if portable else found.vector_graph())

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from impact_posture.codegen.build_check import self_test_tolerance
 from impact_posture.codegen.code import Code
@@ -37,16 +37,18 @@ def render(
     exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: Code, real: Real
 ) -> dict[str, str]:
     """Return file name → text of every file but the manifest."""
-    templates = {
+    context = _context(exported, prefix, manifest, code, real)
+    return {name: template.render(context) for name, template in load_templates(prefix).items()}
+
+
+def load_templates(prefix: str = "") -> dict[str, Template]:
+    """Return file name → template, which takes long for the first time."""
+    names = {
         f"{prefix}.h": "header.h", f"{prefix}.c": "source.c",
         **{name: name for name in ("example.c", "example.cpp", "Makefile", "CMakeLists.txt", "README.md")},
     }  # fmt: skip
-    context = _context(exported, prefix, manifest, code, real)
-    texts = {}
-    for name, template in templates.items():
-        environment = _environment(markdown if name.endswith(".md") else c_comment)
-        texts[name] = environment.get_template(f"{template}.jinja").render(context)
-    return texts
+    languages = {name: _environment(markdown if name.endswith(".md") else c_comment) for name in names}
+    return {name: languages[name].get_template(f"{template}.jinja") for name, template in names.items()}
 
 
 @cache

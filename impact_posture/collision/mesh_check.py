@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Protocol
 
 import coal
@@ -18,7 +18,7 @@ TOLERANCE = 1e-6
 """Depth (m) up to which two shapes may be in each other, because a solver lets hulls touch within its tolerance."""
 
 
-Standing = tuple[SweptHull, Collection[int]]
+Standing = tuple[SweptHull, pin.SE3, Collection[int]]
 
 
 class Plane(Protocol):
@@ -41,54 +41,81 @@ class Plane(Protocol):
         """Joints whose shapes may be behind the plane."""
 
 
-def mesh_collisions(
-    robot: Robot,
-    shapes: RobotShapes,
-    q: Array,
-    obstacles: Sequence[Standing] = (),
-    planes: Sequence[Plane] = (),
-) -> list[tuple[str, str]]:
-    """Return what collides at a posture, by the shapes of the URDF.
+class MeshCheck:
+    """The check on the shapes of a robot, with what it needs of them at every posture.
 
     A collision counts from a depth of 1 µm.  Meshes are surfaces: one that is wholly inside another does not collide.
 
     Args:
         robot: The robot.
         shapes: Its shapes.
-        q: The posture, shape (nq,).
-        obstacles: Swept hulls in the world, with joint 0, each with the joints whose shapes may touch it.
-        planes: Planes that the shapes have to stay in front of.
-
-    Returns:
-        Names of two shapes, of a shape and an obstacle, or of a shape and a plane.
     """
-    geometry, data = shapes.geometry, robot.model.createData()
-    pin.forwardKinematics(robot.model, data, q)
-    objects = list(geometry.geometryObjects)
-    at = [data.oMi[shape.parentJoint] * shape.placement for shape in objects]
-    placed = geometry.createData()
-    pin.computeCollisions(robot.model, data, geometry, placed, q, False)
-    found = []
-    for pair, result in zip(geometry.collisionPairs, placed.collisionResults, strict=True):
-        i, j = pair.first, pair.second
-        if result.isCollision() and _deep(objects[i].geometry, at[i], objects[j].geometry, at[j]):
-            found.append((objects[i].name, objects[j].name))
-    for shape, placement in zip(objects, at, strict=True):
-        for name, solid, where in _scene(obstacles, planes, int(shape.parentJoint)):
-            if _deep(shape.geometry, placement, solid, where):
-                found.append((shape.name, name))
-    return found
 
+    def __init__(self, robot: Robot, shapes: RobotShapes) -> None:
+        self._model, self._geometry = robot.model, shapes.geometry
+        self._data, self._placed = robot.model.createData(), shapes.geometry.createData()
+        self._shapes = list(shapes.geometry.geometryObjects)
+        for shape in self._shapes:
+            shape.geometry.computeLocalAABB()
+        self._joints = [int(shape.parentJoint) for shape in self._shapes]
+        # A ball around each shape: its center in the axes of the joint, and its radius.
+        self._centers = [shape.placement.act(shape.geometry.aabb_center) for shape in self._shapes]
+        self._reach = np.array([shape.geometry.aabb_radius for shape in self._shapes])
 
-def _scene(obstacles: Sequence[Standing], planes: Sequence[Plane], joint: int) -> Iterator[tuple[str, Any, pin.SE3]]:
-    """Yield name, shape and placement of everything that the shapes of a joint stay clear of."""
-    for obstacle, exempt in obstacles:
-        if joint not in exempt:
-            yield obstacle.name, *obstacle.solid
-    for plane in planes:
-        if joint not in plane.exempt:
+    def collisions(
+        self, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[Plane] = ()
+    ) -> list[tuple[str, str]]:
+        """Return what collides at a posture.
+
+        Args:
+            q: The posture, shape (nq,).
+            obstacles: Swept hulls, each with its placement in the world and the joints whose shapes may touch it.
+            planes: Planes that the shapes have to stay in front of.
+
+        Returns:
+            Names of two shapes, of a shape and an obstacle, or of a shape and a plane.
+        """
+        found, shapes = [], self._shapes
+        if pin.computeCollisions(self._model, self._data, self._geometry, self._placed, q, False):
+            for pair, result in zip(self._geometry.collisionPairs, self._placed.collisionResults, strict=True):
+                i, j = pair.first, pair.second
+                if result.isCollision() and _deep(shapes[i].geometry, self._at(i), shapes[j].geometry, self._at(j)):
+                    found.append((shapes[i].name, shapes[j].name))
+        if not shapes:
+            return found
+        centers = np.array([self._data.oMi[k].act(at) for k, at in zip(self._joints, self._centers, strict=True)])
+        walls: list[tuple[str, Any, pin.SE3]] = []
+        near = [np.zeros((len(shapes), 0), dtype=bool)]
+        for hull, at, exempt in obstacles:
+            solid, local = hull.solid
+            walls.append((hull.name, solid, at * local))
+            away = np.linalg.norm(centers - at.act(hull.center), axis=1) - hull.reach
+            near.append(self._within(away, exempt))
+        for plane in planes:
             normal = np.asarray(plane.normal, dtype=float)
-            yield plane.name, coal.Halfspace(normal, float(normal @ plane.point)), pin.SE3.Identity()
+            height = float(normal @ plane.point)
+            walls.append((plane.name, coal.Halfspace(normal, height), pin.SE3.Identity()))
+            near.append(self._within(centers @ normal - height, plane.exempt))
+        for k, wall in np.argwhere(np.hstack(near)):
+            name, solid, where = walls[wall]
+            if _deep(shapes[k].geometry, self._at(k), solid, where):
+                found.append((shapes[k].name, name))
+        return found
+
+    def _at(self, index: int) -> pin.SE3:
+        return self._data.oMi[self._joints[index]] * self._shapes[index].placement
+
+    def _within(self, away: Array, exempt: Collection[int]) -> Array:
+        """Whether the ball around each shape reaches a body that is so far away, as a column."""
+        allowed = np.array([joint not in exempt for joint in self._joints])
+        return np.asarray((away <= self._reach) & allowed)[:, None]
+
+
+def mesh_collisions(
+    robot: Robot, shapes: RobotShapes, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[Plane] = ()
+) -> list[tuple[str, str]]:
+    """Return what collides at one posture; see :class:`MeshCheck`."""
+    return MeshCheck(robot, shapes).collisions(q, obstacles, planes)
 
 
 def _deep(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> bool:

@@ -142,8 +142,11 @@ def _fitted(body: Body, loaded: Geometry) -> SweptHull:
 
 def _stored(hull: SweptHull) -> StoredHull:
     vertices = tuple((float(x), float(y), float(z)) for x, y, z in hull.vertices)
-    return StoredHull(hull.name, hull.link, hull.joint, vertices, hull.radius)
+    faces = tuple((int(a), int(b), int(c)) for a, b, c in hull.faces)
+    return StoredHull(hull.name, hull.link, hull.joint, vertices, hull.radius, faces)
 
 
 def _hull(stored: StoredHull) -> SweptHull:
-    return SweptHull(stored.name, stored.link, stored.joint, np.array(stored.vertices, dtype=float), stored.radius)
+    faces = np.array(stored.faces, dtype=int).reshape(-1, 3)
+    vertices = np.array(stored.vertices, dtype=float)
+    return SweptHull(stored.name, stored.link, stored.joint, vertices, stored.radius, faces)

@@ -32,6 +32,7 @@ class SweptHull:
         joint: Index of the joint in the model; 0 is the world.
         vertices: Corners of the hull in the axes of the joint, shape (k, 3) with k ≤ 40, m.
         radius: Sweep radius, m.
+        known_faces: The ``faces``, if they are known.
     """
 
     name: str
@@ -39,6 +40,7 @@ class SweptHull:
     joint: int
     vertices: Array
     radius: float
+    known_faces: Array | None = None
 
     @cached_property
     def center(self) -> Array:
@@ -53,6 +55,8 @@ class SweptHull:
     @cached_property
     def faces(self) -> Array:
         """Triangles of the hull as indices into ``vertices``, shape (n, 3); none for a point or a segment."""
+        if self.known_faces is not None:
+            return self.known_faces
         from scipy.spatial import ConvexHull, QhullError
 
         if len(self.vertices) < 4:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task_formulation import (
     TaskFormulation,
     aerial_formulation,
@@ -26,7 +28,7 @@ _BUILD: dict[str, Callable[[Robot, JointPosture], TaskFormulation]] = {
 
 
 def default_formulation(
-    robot: Robot, kind: ControllerKind, objective: ImpactObjective | None = None
+    robot: Robot, kind: ControllerKind, objective: ImpactObjective | None = None, *, flow: bool = False
 ) -> TaskFormulation:
     """Return the formulation of a kind of robot with default gains.
 
@@ -34,6 +36,7 @@ def default_formulation(
         robot: The robot.
         kind: ``aerial``, ``legged`` or ``arm``.
         objective: The objective whose gradient the posture task follows; ``None`` for a posture task without one.
+        flow: Follow it by a reference flow, and not by the impact-robust term.
 
     Raises:
         InputError: The robot is of another kind.
@@ -44,9 +47,12 @@ def default_formulation(
         posture = JointPosture(robot, kp=kp, weight=weight, base_weight=base)
     else:
         found = objective
-        posture = ImpactRobustPosture(
-            robot, lambda q: (found.value(q), found.gradient(q)), kp=kp, weight=weight, base_weight=base
-        )
+
+        def gradient(q: Array) -> tuple[float, Array]:
+            return found.value(q), found.gradient(q)
+
+        law = ReferenceFlowPosture if flow else ImpactRobustPosture
+        posture = law(robot, gradient, kp=kp, weight=weight, base_weight=base)
     try:
         return _BUILD[kind](robot, posture)
     except InputError as error:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pinocchio as pin
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike
 from impact_posture.arrays import Array
 from impact_posture.codegen.reader import check_library, check_robot
 from impact_posture.controller_export.manifest import Manifest, build_controller, read_controller
-from impact_posture.errors import InputError, MetricError, PostureError, SpecError
+from impact_posture.errors import ContactError, InputError, MetricError, PostureError, SpecError
 from impact_posture.libraries import library_path, load_library
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.controller import Command, Report, Status
@@ -22,6 +23,9 @@ from impact_posture.tsid.relaxation import Relaxed
 
 # Statuses in the order of their numbers in C.
 _STATUSES = tuple(Status)
+_FUNCTIONS = (
+    "init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release",
+)  # fmt: skip
 # Numbers of a target: set, position, rotation, velocity, acceleration.
 _TARGET = 25
 
@@ -52,32 +56,23 @@ class CompiledController:
             ("dynamics", 1),
             ("level", 1),
             ("value", 1),
+            ("target", manifest.nq),
         ]
-        self._report, self._diagnosis = _structure(rows, ["status", "iterations"])
+        self._report, self._diagnosis = _structure(rows, ["status", "iterations", "resting", "flow_failures"])
         self._given, self.parameters = _structure([*manifest.parameters.items()], [])
         bytes_ = ctypes.c_ulong.in_dll(library, f"{prefix}_context_bytes").value
         self._context = ctypes.create_string_buffer(bytes_)
         tasks = len(manifest.tasks)
         memory = memoryview(self._context)
         targets = np.frombuffer(memory, dtype=float, count=_TARGET * tasks).reshape(tasks, _TARGET)
+        # The level stands behind the targets; C has no arrays of length zero.
+        self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * _TARGET * max(1, tasks))
         self._targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
         doubles = ctypes.POINTER(ctypes.c_double)
         self._pointers = [x.ctypes.data_as(doubles) for x in (self._q, self._v, self._force)]
-        self._functions = {
-            name: getattr(library, f"{prefix}_{name}")
-            for name in (
-                "init",
-                "reset",
-                "tick",
-                "last_report",
-                "move_to",
-                "lead_posture",
-                "brace",
-                "contact",
-                "release",
-            )
-        }
+        names = (*_FUNCTIONS, *(["brace_before"] if sizes.get("FLOW") else []))
+        self._functions = {name: getattr(library, f"{prefix}_{name}") for name in names}
         getattr(library, f"{prefix}_default_params")(ctypes.byref(self._given))
         self._ready = False
 
@@ -117,9 +112,11 @@ class CompiledController:
         Raises:
             InputError: A parameter is out of range; names it.
             PostureError: ``q`` is no configuration of the robot, or ``v`` is no velocity.
-            MetricError: The gradient of the impact-robust term does not exist there, or vanishes.
+            MetricError: The gradient that the posture task follows does not exist there, or vanishes.
+            ContactError: A sole stands on its edge.
         """
         targets = {name: row.copy() for name, row in self._targets.items()}
+        self._ready = False
         refused = self._call("init", ctypes.byref(self._given))
         if refused < 0:
             raise SpecError("has too little memory for the relaxation", where="controller", hint="run codegen again")
@@ -135,6 +132,8 @@ class CompiledController:
             raise PostureError(
                 "no state of the robot", where="reset", hint="give finite numbers and unit quaternions"
             )
+        if code == 3:
+            raise ContactError("the sole stands on its edge", where="contact", hint="put the sole on the ground")
         if code:
             raise MetricError("the objective vanishes with its curvature", where="reset", hint="start elsewhere")
         self._ready = True
@@ -244,25 +243,58 @@ class CompiledController:
         if self._call("lead_posture", *self._pointers[:2], pointer):
             raise InputError("is no reference", where="lead_posture", hint="give a posture and finite numbers")
 
-    def brace(self) -> None:
-        """Switch the impact-robust term on."""
-        self._enter("brace")
+    @property
+    def target(self) -> Array:
+        """``q_des`` of the posture task at the last tick, shape (nq,)."""
+        self._call("last_report", ctypes.byref(self._report))
+        return self._diagnosis["target"].copy()
 
-    def contact(self) -> None:
-        """Hold the reached posture during the impact, or keep the term on if it is live."""
-        self._enter("contact")
+    @property
+    def flow_failures(self) -> int:
+        """Steps since the reset that the solver of a reference flow did not find.  The flow then comes to rest."""
+        self._call("last_report", ctypes.byref(self._report))
+        return int(self._report.flow_failures)
 
-    def release(self) -> None:
-        """Switch the impact-robust term off and hold the reached posture."""
-        self._enter("release")
+    def brace(self, t: float = -math.inf, *, t_impact: float | None = None) -> None:
+        """Switch the impact-robust term on, or let the reference flow go, from the first tick at ``t``, s, or later.
+
+        Args:
+            t: Time on the clock of the ticks, s.
+            t_impact: Time from then until the impact, s, before which a reference flow comes to rest.
+
+        Raises:
+            InputError: This phase does not follow the present one, or ``t`` is before that of a
+                phase that waits; or the time is not finite, or there is no flow.
+        """
+        if t_impact is None:
+            self._enter("brace", t)
+        elif not math.isfinite(t_impact) or "brace_before" not in self._functions:
+            raise InputError("no flow can rest before that time", where="brace", hint="give finite seconds")
+        elif self._call("brace_before", ctypes.c_double(t), ctypes.c_double(t_impact)):
+            self._refuse("brace", t)
+
+    def contact(self, t: float = -math.inf) -> None:
+        """Hold the reached posture during the impact, or keep the term on if it is live; as :meth:`brace`."""
+        self._enter("contact", t)
+
+    def release(self, t: float = -math.inf) -> None:
+        """Switch the impact-robust term or the flow off and hold the reached posture; as :meth:`brace`."""
+        self._enter("release", t)
+
+    @property
+    def level(self) -> float:
+        """Level of the impact-robust term, 0 to 1, or whether the flow may move."""
+        return float(self._level[0])
 
     # ---- parts --------------------------------------------------------------------------------------------------
 
-    def _enter(self, phase: str) -> None:
-        if self._call(phase):
-            raise InputError(
-                f"'{phase}' does not follow the present phase", where="controller", hint="reset it first"
-            )
+    def _enter(self, phase: str, t: float) -> None:
+        if self._call(phase, ctypes.c_double(t)):
+            self._refuse(phase, t)
+
+    def _refuse(self, phase: str, t: float) -> NoReturn:
+        words = f"'{phase}' at {t:g} s does not follow the phase before it"
+        raise InputError(words, where="controller", hint="give phases in the order of their times, or reset it")
 
     def _target(self, task: str) -> Array:
         if task not in self._targets:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -66,6 +67,27 @@ def daqp_sources(given: Path | None = None) -> dict[str, bytes]:
             return _checked(lambda name: _from_archive(tar, name), str(archive), again)
     except (OSError, EOFError, tarfile.TarError) as error:
         raise InputError(f"cannot be read ({error})", where=str(archive), hint=again) from None
+
+
+def renamed(sources: dict[str, bytes], prefix: str) -> dict[str, str]:
+    """Return a header and a source that give all functions of DAQP names of their own.
+
+    Two controllers in one program, and a DAQP of the program itself, then share and collide in nothing.
+
+    Args:
+        sources: From :func:`daqp_sources`.
+        prefix: Beginning of the new names.
+    """
+    headers = "".join(sources[name].decode() for name in _HEADERS)
+    names = re.findall(r"^(?:void|int|c_float) (\w+)\(", headers, re.MULTILINE)
+    renames = "".join(f"#define {name} {prefix}_{name}\n" for name in sorted(names))
+    header = f"""/* DAQP {VERSION}.  Its functions have names of this controller unless a library is linked. */
+#ifndef {prefix.upper()}_INSTALLED_DAQP
+{renames}#endif
+#include "daqp.h"
+"""
+    includes = "".join(f'#include "{name}"\n' for name in SOURCES)
+    return {f"{prefix}_daqp.h": header, f"{prefix}_daqp.c": f'#include "{prefix}_daqp.h"\n{includes}'}
 
 
 def _checked(read: Callable[[str], bytes | None], where: str, hint: str) -> dict[str, bytes]:

@@ -17,7 +17,7 @@ from impact_posture.codegen.manifest import configuration_names
 from impact_posture.codegen.naming import c_identifier, check_prefix
 from impact_posture.codegen.reader import identity
 from impact_posture.controller_export.compiled_controller import CompiledController
-from impact_posture.controller_export.daqp_sources import FILES, SOURCES, VERSION, daqp_sources
+from impact_posture.controller_export.daqp_sources import FILES, VERSION, daqp_sources, renamed
 from impact_posture.controller_export.manifest import SCHEMA, build_controller
 from impact_posture.controller_export.parameters import Field, parameters
 from impact_posture.controller_export.render import render
@@ -84,7 +84,7 @@ def export_controller(
         robot: The robot.
         formulation: Tasks of this package, contacts and limits.
         out: The folder; ``./<prefix>-c`` by default.
-        objective: The objective whose gradient an impact-robust posture task follows.
+        objective: The objective whose gradient an impact-robust posture task or a reference flow follows.
         prefix: Beginning of the C names; by default, the robot and ``controller``.
         period: Expected time between ticks, s.
         daqp: Folder of the sources of DAQP, where they cannot be downloaded.
@@ -98,19 +98,17 @@ def export_controller(
     """
     prefix = c_identifier(robot.name, "controller") if prefix is None else check_prefix(prefix)
     structure = structure_of(robot, formulation)
-    if (structure.robust is None) != (objective is None):
-        what = (
-            "the impact-robust posture task has no objective" if objective is None else "no task uses the objective"
-        )
-        hint = "give the objective of its gradient" if objective is None else "give an impact-robust posture task"
+    if (structure.robust is None and structure.flow is None) != (objective is None):
+        what = "the posture task has no objective" if objective is None else "no task uses the objective"
+        hint = "give the objective of its gradient" if objective is None else "give a posture task that follows one"
         raise InputError(what, where="controller export", hint=hint)
     sources = daqp_sources(daqp)
     fields = parameters(structure, period)
     manifest = _manifest(structure, fields, prefix)
     metric = f"{prefix}_metric" if objective is not None else None
     own = [f"{prefix}_relaxation.c", *([] if metric is None else [f"{metric}.c"])]
-    manifest["sources"] = [*own, *(f"daqp/{name}" for name in SOURCES)]
-    texts = render(structure, fields, prefix, identity(manifest), metric)
+    manifest["sources"] = [*own, f"{prefix}_daqp.c"]
+    texts = render(structure, fields, prefix, identity(manifest), metric) | renamed(sources, prefix)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     texts["Makefile"], texts["CMakeLists.txt"] = _makefile(manifest), _cmake(manifest)
     out = Path(f"{prefix}-c") if out is None else out
@@ -213,7 +211,7 @@ clean:
 
 def _cmake(manifest: dict[str, Any]) -> str:
     prefix = manifest["prefix"]
-    here = [name for name in manifest["sources"] if not name.startswith("daqp/")]
+    here = [name for name in manifest["sources"] if name != f"{prefix}_daqp.c"]
     return f"""# add_subdirectory(<this folder>), then target_link_libraries(<program> PRIVATE {prefix}::{prefix})
 cmake_minimum_required(VERSION 3.16)
 project({prefix} LANGUAGES C)
@@ -228,9 +226,9 @@ add_library({prefix}::{prefix} ALIAS {prefix}_library)
 set({prefix}_DAQP "" CACHE STRING "installed library of DAQP {VERSION}; empty: the sources here")
 if({prefix}_DAQP)
   target_link_libraries({prefix}_library PUBLIC ${{{prefix}_DAQP}})
+  target_compile_definitions({prefix}_library PRIVATE {prefix.upper()}_INSTALLED_DAQP)
 else()
-  file(GLOB daqp "${{CMAKE_CURRENT_SOURCE_DIR}}/daqp/*.c")
-  target_sources({prefix}_library PRIVATE ${{daqp}})
+  target_sources({prefix}_library PRIVATE {prefix}_daqp.c)
 endif()
 target_include_directories({prefix}_library PUBLIC "${{CMAKE_CURRENT_SOURCE_DIR}}")
 target_include_directories({prefix}_library SYSTEM PRIVATE "${{CMAKE_CURRENT_SOURCE_DIR}}/daqp")

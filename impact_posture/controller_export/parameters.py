@@ -14,9 +14,9 @@ from impact_posture.tsid.frame_tasks import FrameTask
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.ranges import JointRanges
 
-Rule = Literal["finite", "nonnegative", "positive", "limit"]
+Rule = Literal["finite", "nonnegative", "positive", "limit", "amount", "share"]
 # Numbers of the rules in C.
-RULES: dict[Rule, int] = {"finite": 0, "nonnegative": 1, "positive": 2, "limit": 3}
+RULES: dict[Rule, int] = {"finite": 0, "nonnegative": 1, "positive": 2, "limit": 3, "amount": 4, "share": 5}
 
 
 class Field(NamedTuple):
@@ -24,7 +24,7 @@ class Field(NamedTuple):
 
     Attributes:
         name: Name in the C structure.
-        rule: What ``init`` accepts; ``limit`` may be infinite.
+        rule: What ``init`` accepts; ``limit`` and ``positive`` may be infinite, and a ``share`` is at most 1.
         text: Meaning, with the unit.
         value: Value in the exported formulation, flat.
     """
@@ -101,6 +101,22 @@ def _fields(s: Structure, period: float) -> Iterator[Field]:
     for name in ("approach", "rate", "deceleration", "acceleration"):
         yield field(f"law_{name}", "positive", f"{name} of the law of the joint limits", getattr(law, name))
     yield field("law_margin", "nonnegative", "distance kept from the position limits", law.margin)
+    if s.flow is not None:
+        for name, rule, text in (
+            ("speed", "amount", "largest speed of an entry of q_r, rad/s or m/s"),
+            ("acceleration", "amount", "largest acceleration, rad/s2 or m/s2"),
+            ("rho", "nonnegative", "pull of the joints towards the start, 1/rad2"),
+            ("mu", "amount", "least curvature, 1/rad2"),
+            ("epsilon", "amount", "predicted decrease of H/H0 below which the flow rests"),
+            ("joint_margin", "nonnegative", "distance from the joint limits, rad or m"),
+            ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
+            ("share", "share", "share of the limits of the actuators that rest may take"),
+            ("haste", "share", "share of what is left of them that accelerating may take"),
+            ("tracking", "amount", "error of the joints at which the flow waits, rad or m"),
+        ):
+            yield field(f"flow_{name}", rule, f"{text}, of the flow", getattr(s.flow.options, name))  # type: ignore[arg-type]
+        if s.flow._path:
+            yield field("flow_path", "finite", "postures that the flow visits first", s.flow._path)
     if robust is not None:
         springs = ("keep", "release", "follow")
         yield field("robust_gain", "nonnegative", "K, 1/s2", robust.K)

@@ -26,10 +26,13 @@ from impact_posture.escape import c_comment
 from impact_posture.impact.contact import point_on
 from impact_posture.version import __version__
 
-# Files in c/, in the order in which one source has them.
+# Files in c/, in the order in which one source has them, and those that follow objectives and flow add.
 _CORE = (
-    "algebra.c", "tasks.c", "posture.c", "qp.c", "rank.c", "solve.c", "give_way.c", "init.c", "tick.c", "report.c",
+    "vector.c", "algebra.c", "tasks.c", "posture.c", "qp.c", "rank.c", "solve.c", "give_way.c", "init.c", "tick.c",
+    "report.c",
 )  # fmt: skip
+_FOLLOW = ("eigen.c",)
+_FLOW = ("reference_flow_space.c", "reference_flow_direction.c", "reference_flow.c", "reference_flow_motion.c")
 # Parameters that init compares with others.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
 # Bytes of variables, saved registers and return addresses of all functions below a tick, beside the arrays.
@@ -117,9 +120,11 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
         "GAVE": 1 + sizes["LEVELS"],
         "RELAXATION": _relaxation_room(n, m, 1 + sizes["LEVELS"]),
     }
+    held, rows = sizes["HELD"], sizes["FLOW_ROWS"]
+    more["FLOW_WORK"] = max(2 * held * held + held * nv, 2 * nv * nv, rows * nv)
     room = {name: max(1, value) for name, value in (sizes | more).items()}
     n += 1
-    solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * bounds) + 2048
+    solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * max(bounds, 2 * rows)) + 2048
     tables = [(name, *_table(values)) for name, values in s.tables.items()]
     tables.append(("gravity", *_table(np.array(robot.model.gravity.linear, dtype=float))))
     allocation = s.actuators.G[: sizes["BASE"], : sizes["ROTORS"]]
@@ -134,7 +139,7 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
         "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
         "constants": code.constants, "blocks": code.blocks, "angles": code.angles, "work": code.work,
         "places": _braced(map(str, code.angles)), "outputs": code.outputs, "constant_outputs": code.constant_outputs,
-        "core": "\n".join(_own(name) for name in _CORE),
+        "core": "\n".join(_own(name) for name in _files(sizes)),
     }  # fmt: skip
     environment = Environment(
         loader=PackageLoader("impact_posture.controller_export"), undefined=StrictUndefined, trim_blocks=True,
@@ -152,17 +157,24 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
     return {name: named(text, prefix) for name, text in texts.items()} | _relaxation(prefix)
 
 
+def _files(sizes: dict[str, int]) -> tuple[str, ...]:
+    """Return the files of ``c/`` that a structure needs."""
+    after = _CORE.index("init.c")
+    follow = _FOLLOW if sizes["ROBUST"] or sizes["FLOW"] else ()
+    return (_CORE[0], *follow, *_CORE[1:after], *(_FLOW if sizes["FLOW"] else ()), *_CORE[after:])
+
+
 def _relaxation_room(n: int, m: int, levels: int) -> int:
     """Return a bound on the doubles in the memory of the relaxation, which ``init`` checks."""
     entries, active = n + m, 2 * n + m + 2
-    matrices = 4 * n * n + m * n + 2 * entries * n + active * (active + 1) // 2
+    matrices = 2 * n * n + m * n + 3 * entries * n + active * (active + 1) // 2
     return matrices + 16 * n + 7 * active + (20 + levels) * entries + 64
 
 
 def _relaxation(prefix: str) -> dict[str, str]:
     """Return the files of the relaxation, with names that another controller in the program does not have."""
     texts = {f"{prefix}_relaxation.{end}": _own(f"relaxation.{end}") for end in ("h", "c")}
-    return {name: re.sub(r"\brelaxation([_.][a-z])", rf"{prefix}_relaxation\1", text) for name, text in texts.items()}
+    return {name: re.sub(r"\b(daqp\.h|relaxation[_.][a-z])", rf"{prefix}_\1", text) for name, text in texts.items()}
 
 
 def named(text: str, prefix: str) -> str:

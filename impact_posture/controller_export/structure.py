@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,13 @@ from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.ranges import JointRanges
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task import Task
 from impact_posture.tsid.task_formulation import TaskFormulation
 
 # Kinds of tasks in the order of their numbers in C.
 _KINDS: tuple[type[Task], ...] = (Tilt, BaseOrientation, CenterOfMass, FramePosition, FramePose, FrameAligned)
-_POSTURES = (JointPosture, ImpactRobustPosture)
+_POSTURES = (JointPosture, ImpactRobustPosture, ReferenceFlowPosture)
 # Families of joints in the order of their numbers in C.
 _FAMILIES = {"revolute": 0, "prismatic": 0, "continuous": 1, "free-flyer": 2, "spherical": 3}
 
@@ -59,6 +61,12 @@ class Structure:
         return posture if isinstance(posture, ImpactRobustPosture) else None
 
     @property
+    def flow(self) -> ReferenceFlowPosture | None:
+        """The posture task with a reference flow, if it is one."""
+        posture = self.formulation.posture
+        return posture if isinstance(posture, ReferenceFlowPosture) else None
+
+    @property
     def turning(self) -> frozenset[Point]:
         """Points whose rotation a task or a sole needs."""
         tasks = [t.point for t in self.tasks if isinstance(t, FramePose | FrameAligned)]
@@ -77,7 +85,10 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     actuators = Actuators(robot)
     strict = tuple(task for level in formulation.levels for task in level)
     tasks, contacts, points = (*strict, *formulation.weighted), formulation.contacts, formulation.points
-    assembly = Assembly(robot, formulation, actuators)
+    # An assembly moves the targets of its tasks into its own buffers, and a controller may run with these tasks.
+    levels = tuple(tuple(map(copy, level)) for level in formulation.levels)
+    copies = replace(formulation, levels=levels, weighted=tuple(map(copy, formulation.weighted)))
+    assembly = Assembly(robot, copies, actuators)
     nv, rotors, spare = robot.nv, actuators.rotors, actuators.spare.shape[1]
     law, posture = formulation.law, formulation.posture
     momentum = _is_diagonal_in_momentum(robot, formulation)
@@ -139,6 +150,7 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
         "level_rows": [rows.stop - rows.start for _, rows in assembly.levels],
     }
     sizes |= {"UNITS": len(tables["unit"]) // 2, "LEVELS": len(tables["level_rows"])}
+    _add_flow(robot, formulation, sizes, tables)
     doubles: dict[str, Any] = {
         "inverse": actuators.inverse,
         "blind": actuators.blind if rotors else np.eye(actuators.base),
@@ -148,6 +160,37 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     found: dict[str, NDArray[Any]] = {name: np.array(v, dtype=np.int64) for name, v in tables.items()}
     found |= {name: np.array(values, dtype=float).ravel() for name, values in doubles.items()}
     return Structure(robot, formulation, actuators, tasks, points, sizes, found)
+
+
+def _add_flow(
+    robot: Robot, formulation: TaskFormulation, sizes: dict[str, int], tables: dict[str, list[int]]
+) -> None:
+    """Add sizes and tables of a reference flow.
+
+    ``HELD`` rows stay where they are: contacts, tasks and joints.  ``flow_led`` counts the tasks that the flow leads
+    instead, and is zero for the others.
+    """
+    posture = formulation.posture
+    flow = posture if isinstance(posture, ReferenceFlowPosture) else None
+    strict = sum(len(level) for level in formulation.levels)
+    tasks = [task for task in formulation.tasks if task is not posture]
+    leads = [k >= strict and isinstance(task, CenterOfMass | BaseOrientation) for k, task in enumerate(tasks)]
+    held = [task.size for task, leading in zip(tasks, leads, strict=True) if not leading]
+    fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
+    edges = max(4, 4 * sizes["CONTACTS"]) if sizes["CONTACTS"] else 0
+    size = int(flow is not None)
+    if flow is not None:
+        tables["flow_led"] = [sum(leads[: k + 1]) if leading else 0 for k, leading in enumerate(leads)]
+        tables["flow_fixed"] = fixed
+    rows = sizes["FORCES"] + sum(held) + len(fixed)
+    sizes |= {
+        "FLOW": size,
+        "HELD": size * rows,
+        "LARGEST": max(sizes["NV"], rows),
+        "EDGES": size * edges,
+        "FLOW_ROWS": size * (sizes["NV"] - sizes["BASE"] + edges + sizes["CONTROLS"]),
+        "PATH": 0 if flow is None else len(flow._path),
+    }
 
 
 def _is_diagonal_in_momentum(robot: Robot, formulation: TaskFormulation) -> bool:
@@ -174,6 +217,8 @@ def _check(robot: Robot, formulation: TaskFormulation) -> None:
         known = _POSTURES if task is formulation.posture else _KINDS
         if type(task) not in known:
             raise refuse(f"task '{task.name}' ({type(task).__name__}) has no C code")
+    if isinstance(formulation.posture, ReferenceFlowPosture) and formulation.contacts and not robot.floating:
+        raise refuse(f"'{formulation.posture.name}' with contacts and a fixed base has no C code")
     if formulation.row_limits:
         raise refuse(f"'{formulation.row_limits[0].name}' ({type(formulation.row_limits[0]).__name__}) has no C code")
     for slot in Chart(robot.model).slots:

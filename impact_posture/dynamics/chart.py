@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -49,6 +50,12 @@ class Chart:
         self.nx = start
         self.nq, self.nv = int(model.nq), int(model.nv)
         self._model = model
+
+    @staticmethod
+    @lru_cache(maxsize=16)
+    def of(model: pin.Model) -> Chart:
+        """Return the chart of a model, made once for the models used last."""
+        return Chart(model)
 
     def configuration(self, x: ca.SX) -> ca.SX:
         """Return ``q(x)``, shape (nq, 1)."""

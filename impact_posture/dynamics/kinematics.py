@@ -38,6 +38,11 @@ class PointOnLink:
     position: NDArray[np.float64]
     rotation: NDArray[np.float64]
 
+    @cached_property
+    def placement(self) -> pin.SE3:
+        """Placement of the frame in the axes of the joint."""
+        return pin.SE3(self.rotation, self.position)
+
 
 class Kinematics:
     """A ``pin.Model`` at the configuration ``q`` (``SX``), with optional extra inertias on its links.

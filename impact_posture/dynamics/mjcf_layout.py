@@ -11,6 +11,7 @@ The two differ in these points:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -70,7 +71,7 @@ class MjcfLayout:
         copied: list[tuple[int, int]] = []
         angles: list[tuple[int, int]] = []
         self._quaternions: list[tuple[slice, slice]] = []
-        # The velocity map before the linear parts are rotated.
+        # The velocity map before the linear parts are rotated, and the place in qvel of each entry of v.
         self._permutation = np.zeros((self.nv, self.nv))
         for slot in self.slots:
             self._permutation[slot.qvel, slot.joint.v] = np.eye(slot.joint.kind.nv)
@@ -83,6 +84,7 @@ class MjcfLayout:
                 self._quaternions.append((slice(order[-4], order[-1] + 1), theirs))
                 order = [*order[:-4], order[-1], *order[-4:-1]]
             copied += zip(order, range(slot.qpos.start, slot.qpos.stop), strict=False)
+        self._rates = self._permutation.argmax(axis=0)
         self._q, self._qpos = np.array(copied, dtype=int).reshape(-1, 2).T
         self._cosine, self._angle = np.array(angles, dtype=int).reshape(-1, 2).T
         self._moved = [slot for slot in self.slots if slot.moved]
@@ -102,9 +104,10 @@ class MjcfLayout:
         """Return the configuration, shape (nq,), of a ``qpos``, shape (nqpos,), with quaternions normalized."""
         found = np.zeros(self.nq)
         found[self._q] = qpos[self._qpos]
-        found[self._cosine], found[self._cosine + 1] = np.cos(qpos[self._angle]), np.sin(qpos[self._angle])
+        if self._angle.size:
+            found[self._cosine], found[self._cosine + 1] = np.cos(qpos[self._angle]), np.sin(qpos[self._angle])
         for ours, theirs in self._quaternions:
-            found[ours] /= np.linalg.norm(qpos[theirs])
+            found[ours] /= math.sqrt(qpos[theirs].dot(qpos[theirs]))
         for slot in self._moved:
             pose = slot.placement.actInv(pin.XYZQUATToSE3(found[slot.joint.q]))
             found[slot.joint.q] = pin.SE3ToXYZQUAT(pose)
@@ -128,8 +131,13 @@ class MjcfLayout:
 
     def state(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
         """Return the Pinocchio configuration, shape (nq,), and velocity, shape (nv,)."""
-        q = self.q(qpos)
-        return q, np.asarray(self.velocity_map(q).T @ qvel)
+        # A simulation does this in every tick, so the linear parts are turned without the whole map.
+        q, v = self.q(qpos), qvel[self._rates]
+        for slot in self._turning:
+            turn = _turn(slot, q[slot.joint.q])
+            start, begin = slot.joint.v.start, slot.qvel.start
+            v[start : start + len(turn)] = qvel[begin : begin + len(turn)] @ turn
+        return q, v
 
 
 def _turn(slot: MjcfSlot, piece: Array) -> Array:

@@ -27,7 +27,7 @@ class Numeric:
         self.model.armature, self.locked = finite_armature(model)
         self.data = self.model.createData()
         self.q = pin.neutral(model)
-        self._zero = np.zeros(model.nv)
+        self._zero, self._below = np.zeros(model.nv), np.tril_indices(model.nv, -1)
 
     def at(self, q: Array) -> Numeric:
         """Move to ``q``, shape (nq,)."""
@@ -37,12 +37,13 @@ class Numeric:
 
     def mass_matrix(self) -> Array:
         """Return ``M(q)``, shape (nv, nv), armature included, as if no joint were locked."""
-        upper = np.triu(pin.crba(self.model, self.data, self.q))
-        return np.asarray(upper + np.triu(upper, 1).T)
+        M = np.array(pin.crba(self.model, self.data, self.q)).reshape(2 * (self.model.nv,))
+        M[self._below] = M.T[self._below]
+        return M
 
     def placement(self, point: PointOnLink) -> pin.SE3:
         """Return the world placement of the frame of a point."""
-        return self.data.oMi[point.joint] * pin.SE3(point.rotation, point.position)
+        return self.data.oMi[point.joint] * point.placement
 
     def jacobian(self, point: PointOnLink) -> Array:
         """Return ``J``, shape (6, nv), of the world linear and angular velocity (LOCAL_WORLD_ALIGNED)."""
@@ -98,6 +99,8 @@ def hold_locked(locked: NDArray[np.bool_], M: Array, *jacobians: Array) -> tuple
 
     The diagonal of ``M`` is one there, so that systems with ``M`` stay regular.
     """
+    if not locked.any():
+        return M, *jacobians
     mobile = ~locked
     return np.where(np.outer(mobile, mobile), M, np.diag(locked.astype(float))), *(J * mobile for J in jacobians)
 

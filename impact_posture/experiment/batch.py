@@ -16,6 +16,7 @@ from impact_posture.errors import ImpactPostureError, InputError, MetricError, O
 from impact_posture.experiment.jobs import Job, controller_factory, execute, lost
 from impact_posture.libraries import source_key
 from impact_posture.output_folder import is_ours, write_record, write_whole
+from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.processes import fork_map
 from impact_posture.simulation.controller_factory import CONTROLLERS
@@ -25,7 +26,17 @@ from impact_posture.version import __version__
 
 Document = dict[str, Any]
 Progress = Callable[[int, int], None]
-_PARTS = ("robot", "dynamics", "impact", "posture", "codegen", "tsid", "simulation", "experiment")
+_PARTS = (
+    "robot",
+    "dynamics",
+    "impact",
+    "posture",
+    "codegen",
+    "tsid",
+    "controller_export",
+    "simulation",
+    "experiment",
+)
 
 
 class Store:
@@ -116,7 +127,7 @@ def _source() -> str:
 @cache
 def _scenario(scenario: str) -> str:
     """Return the text of the file, and the hash of its robot."""
-    model = controller_factory(scenario).setup.robot.model_sha256
+    model = controller_factory(scenario, False).setup.robot.model_sha256
     return f"{scenario_path(scenario).read_text(encoding='utf-8')}\0{model}"
 
 
@@ -127,6 +138,8 @@ def run_batch(
     store: Store | None = None,
     keep_series: Callable[[Job], bool] = lambda job: False,
     progress: Progress | None = None,
+    compile: CompileMode = "auto",
+    seeds: int = 1,
 ) -> list[Document]:
     """Run the jobs that are not stored yet, and return all documents in the order of the jobs.
 
@@ -139,6 +152,8 @@ def run_batch(
         store: Folder where finished jobs are kept and found.
         keep_series: Whether the store keeps the time series of a job, too.
         progress: Callback with (done, all).
+        compile: Whether controllers run as machine code.
+        seeds: Number of runs of each controller that compiling has to pay for.
 
     Raises:
         ImpactPostureError: A scenario cannot be set up, or there is no such controller.
@@ -161,7 +176,7 @@ def run_batch(
 
     def work(index: int) -> Document:
         job = jobs[waiting[index]]
-        return _run(job, store if keep_series(job) else None)
+        return _run(job, store if keep_series(job) else None, compile, seeds)
 
     with one_blas_thread(), fork_map(work, len(waiting), processes) as results:
         for index, document in results:
@@ -174,9 +189,9 @@ def run_batch(
     return [done[k] for k in range(len(jobs))]
 
 
-def _run(job: Job, store: Store | None) -> Document:
+def _run(job: Job, store: Store | None, compile: CompileMode, seeds: int) -> Document:
     try:
-        runs, document = execute(job)
+        runs, document = execute(job, compile=compile, runs=seeds)
     except ImpactPostureError as error:
         if isinstance(error, InputError) and not isinstance(error, MetricError):
             # A mistake of the user is the same for all seeds, and no result.

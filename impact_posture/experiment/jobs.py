@@ -12,6 +12,7 @@ from pydantic_core import to_jsonable_python
 
 from impact_posture.errors import InputError
 from impact_posture.escape import file_name
+from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.result import versions
 from impact_posture.simulation.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.metrics import Metrics, measure
@@ -80,23 +81,29 @@ def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
     return ControllerFactory(set_up(read_scenario(scenario)), free)
 
 
-def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[Run, ...], dict[str, Any]]:
+def execute(
+    job: Job, factory: ControllerFactory | None = None, *, compile: CompileMode = "auto", runs: int = 1
+) -> tuple[tuple[Run, ...], dict[str, Any]]:
     """Run a job and return its runs and its document.
 
     Args:
         job: The job.
-        factory: A variation of its scenario to run instead.
+        factory: A variation of its scenario to run instead, which then says by itself what to compile.
+        compile: Whether controllers run as machine code, as of :class:`ControllerFactory`.
+        runs: Number of runs of each controller that compiling has to pay for.
 
     Raises:
         ImpactPostureError: As :func:`impact_posture.simulation.run.run`, or the scenario cannot be set up.
     """
-    factory = controller_factory(job.scenario, job.free) if factory is None else factory
+    if factory is None:
+        factory = controller_factory(job.scenario, job.free)
+        factory.compile, factory.runs = compile, runs
     scenario = factory.setup.scenario
     if job.sign is not None and job.sign not in scenario.signs:
         raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, hint="leave --sign out")
-    runs = run(factory, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
-    metrics = [measure(factory.setup, one) for one in runs]
-    parts = [_run_document(factory, one, measured) for one, measured in zip(runs, metrics, strict=True)]
+    found = run(factory, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
+    metrics = [measure(factory.setup, one) for one in found]
+    parts = [_run_document(factory, one, measured) for one, measured in zip(found, metrics, strict=True)]
     status = gravest(part["status"] for part in parts)
     completed = status == "completed"
     goes_to = job.controller.removesuffix("-stiff")
@@ -121,7 +128,7 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         "model_sha256": factory.setup.robot.model_sha256,
         "versions": versions() | {"mujoco": metadata.version("mujoco")},
     }
-    return runs, jsonable(document)
+    return found, jsonable(document)
 
 
 def lost(job: Job, error: Exception) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from impact_posture.experiment.batch import Document, Progress, Store, run_batch
 from impact_posture.experiment.jobs import Job, jsonable, parse_controller
 from impact_posture.experiment.paper import PAPER, RECOMMENDED
 from impact_posture.experiment.statistics import Interval, Row, row_of
+from impact_posture.posture.compiled import CompileMode
 from impact_posture.simulation.controller_factory import CONTROLLERS
 
 SCHEMA, COMPARISON_SCHEMA = "impact-posture/reproduction/3", "impact-posture/comparison/3"
@@ -143,7 +144,13 @@ class Reproduction:
 
 
 def reproduce(
-    plan: Plan, *, seeds: int = 10, processes: int = 1, store: Store | None = None, progress: Progress | None = None
+    plan: Plan,
+    *,
+    seeds: int = 10,
+    processes: int = 1,
+    store: Store | None = None,
+    progress: Progress | None = None,
+    compile: CompileMode = "auto",
 ) -> Reproduction:
     """Run every controller in its scenarios with every seed.
 
@@ -153,6 +160,7 @@ def reproduce(
         processes: Number of processes.
         store: Folder where finished runs are kept, with the time series of the first seed.
         progress: Callback with (done, all).
+        compile: Whether controllers run as machine code: where that pays, always or never.
 
     Raises:
         ImpactPostureError: A scenario cannot be set up, there is no such controller, MuJoCo is not installed, or the
@@ -165,6 +173,8 @@ def reproduce(
         store=store,
         keep_series=lambda job: store is not None and job.seed == 0,
         progress=progress,
+        compile=compile,
+        seeds=seeds,
     )
     rows: list[Row] = []
     for scenario, labels in plan.items():

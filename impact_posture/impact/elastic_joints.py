@@ -24,7 +24,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from impact_posture.arrays import Array
 from impact_posture.errors import ContactError, InputError

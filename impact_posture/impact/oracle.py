@@ -21,6 +21,8 @@ from impact_posture.impact.impact_case import ImpactCase
 _RANK = 1e-9
 # A contact whose 1/m_eff along the normal is below this share of the largest mobility cannot move along it.
 _BLOCKED = 1e-12
+# Postures whose factorization is kept, because a search comes back to its starts.
+_KEPT = 32
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,18 @@ class ImpactQuantities:
         return self.G <= _BLOCKED * float(np.linalg.eigvalsh(self.mobility)[-1])
 
 
+@dataclass(eq=False)
+class _Factorized:
+    """What an oracle knows of a posture; the quantities follow when they are needed."""
+
+    M: Array
+    J: Array
+    Js: Array
+    kkt: Array
+    n: Array
+    quantities: ImpactQuantities | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Answer:
     """Jump of the robot under a generalized impulse, or under several.
@@ -87,30 +101,40 @@ class ImpactOracle:
         self.point = case.point
         self.feet = [(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
         self.compliance = case.compliance
-        self._q: Array | None = None
-        self._quantities: ImpactQuantities | None = None
+        self._nv = case.robot.nv
+        self._key = b""
+        self._known: dict[bytes, _Factorized] = {}
 
     def at(self, q: Array) -> ImpactOracle:
-        """Move to ``q`` and factorize there."""
-        if self._q is not None and np.array_equal(q, self._q):
-            return self
-        self._q, self._quantities = np.array(q, dtype=float), None
-        num = self.numeric.at(self._q)
-        parts = [num.jacobian(point)[:rows] for point, rows in self.feet]
-        Js = np.vstack(parts) if parts else np.zeros((0, self.robot.nv))
-        self.M, self.J, self.Js = hold_locked(num.locked, num.mass_matrix(), num.jacobian(self.point)[:3], Js)
-        rows, nv = self.Js.shape
-        self._kkt = np.block([[self.M, -self.Js.T], [self.Js, self.compliance * np.eye(rows)]])
-        self.n = self._normals(None)[1]
-        self._nv = nv
+        """Move to ``q`` and factorize there, unless it is one of the last postures."""
+        q = np.array(q, dtype=float)
+        if (key := q.tobytes()) != self._key:
+            self.numeric.at(q)
+            # The newest posture stands last.
+            self._known[key] = known = self._known.pop(key, None) or self._factorized()
+            if len(self._known) > _KEPT:
+                del self._known[next(iter(self._known))]
+            self.M, self.J, self.Js, self._kkt, self.n = known.M, known.J, known.Js, known.kkt, known.n
+            self._key = key
         return self
+
+    def _factorized(self) -> _Factorized:
+        num = self.numeric
+        parts = [num.jacobian(point)[:rows] for point, rows in self.feet]
+        Js = np.vstack(parts) if parts else np.zeros((0, self._nv))
+        M, J, Js = hold_locked(num.locked, num.mass_matrix(), num.jacobian(self.point)[:3], Js)
+        kkt = np.zeros((self._nv + len(Js),) * 2)
+        kkt[: self._nv, : self._nv], kkt[: self._nv, self._nv :], kkt[self._nv :, : self._nv] = M, -Js.T, Js
+        np.fill_diagonal(kkt[self._nv :, self._nv :], self.compliance)
+        return _Factorized(M, J, Js, kkt, self._normals(None)[1])
 
     def answer(self, tau: Array, slip: Array | None = None) -> Answer:
         """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for vectors or columns; the slip is zero by default."""
-        shape = (len(self.Js), *tau.shape[1:])
-        moving = (tau.T * ~self.numeric.locked).T
-        rhs = np.concatenate([moving, np.zeros(shape) if slip is None else slip])
-        found = np.linalg.solve(self._kkt, rhs)
+        rhs: Array = np.zeros((len(self._kkt), *tau.shape[1:]))
+        rhs[: self._nv] = (tau.T * ~self.numeric.locked).T
+        if slip is not None:
+            rhs[self._nv :] = slip
+        found = np.asarray(np.linalg.solve(self._kkt, rhs), dtype=np.float64)
         return Answer(found[: self._nv], found[self._nv :])
 
     def solve(self, tau: Array) -> Array:
@@ -124,10 +148,10 @@ class ImpactOracle:
         return np.asarray((self.metric.diagonal(self._nv) * a.T).T)
 
     def quantities(self, q: Array) -> ImpactQuantities:
-        """Return all quantities at ``q``, computed once for the last posture."""
-        self.at(q)
-        if self._quantities is not None:
-            return self._quantities
+        """Return all quantities at ``q``, computed once for each of the last postures."""
+        known = self.at(q)._known[self._key]
+        if known.quantities is not None:
+            return known.quantities
         answers = self.answer(self.J.T)
         A = answers.a
         mobility = self.J @ A
@@ -140,7 +164,7 @@ class ImpactOracle:
         if held.can_move(self.n):
             found, s = held.answer(velocity=self.n)
             stuck = found.a
-        self._quantities = ImpactQuantities(
+        known.quantities = ImpactQuantities(
             H=H,
             G=G,
             V=H / G**2 if G > 0 else float("inf"),
@@ -154,7 +178,7 @@ class ImpactOracle:
             normal=self.n.copy(),
             support_impulse=np.asarray(answers.f @ self.n),
         )
-        return self._quantities
+        return known.quantities
 
     def with_support_impulses(self, a: Array) -> Array:
         """Return ``a`` and its support impulses ``−J_s a/ε`` at the last posture, as one vector."""

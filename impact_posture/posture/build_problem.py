@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
-import scipy
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
@@ -32,6 +31,7 @@ from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.regular import pin_undetermined, regularize
 from impact_posture.posture.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.setting import tilt_of
 from impact_posture.settings import Vector3
 
@@ -93,7 +93,10 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
 
 
 def retarget(
-    problem: PostureProblem, position: Vector3 | None, quaternion: tuple[float, float, float, float] | None
+    problem: PostureProblem,
+    position: Vector3 | None,
+    quaternion: tuple[float, float, float, float] | None,
+    numeric: Numeric | None = None,
 ) -> PostureProblem:
     """Return the problem with another target of its only contact; all else stays, so its program fits as it is.
 
@@ -101,14 +104,15 @@ def retarget(
         problem: A problem with one contact.
         position: Position of the contact frame, world, meters; ``None`` for its initial position.
         quaternion: Its orientation, x y z w; ``None`` for its initial orientation.
+        numeric: The model, if the caller has it; it is moved to the given posture.
 
     Raises:
         InputError: The contact pose takes no target, or the quaternion has no unit length.
     """
     requirements = replace(problem.requirements, target_position=position, target_quaternion=quaternion)
-    _check(problem.robot, requirements)
+    _check_target(requirements)
     (contact,) = problem.objective.contacts
-    numeric = Numeric(problem.robot.model).at(problem.given)
+    numeric = (numeric or Numeric(problem.robot.model)).at(problem.given)
     made = _contact_constraints(problem.robot, contact, numeric, requirements, requirements.contact_pose)
     # The constraints of the contact follow those of the feet.
     first = len(problem.objective.supports)
@@ -154,6 +158,12 @@ def _check(robot: Robot, requirements: Requirements) -> None:
         raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
     if requirements.hold_force and not requirements.holdable:
         raise InputError("does nothing without `holdable=True`", where="hold_force", hint="leave out one of them")
+    for joint in requirements.hold:
+        robot.joint_id(joint)
+    _check_target(requirements)
+
+
+def _check_target(requirements: Requirements) -> None:
     quaternion = requirements.target_quaternion
     if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):
         raise InputError(
@@ -167,8 +177,6 @@ def _check(robot: Robot, requirements: Requirements) -> None:
         )
     if requirements.target_position is not None and not np.isfinite(requirements.target_position).all():
         raise InputError("is not finite", where="target_position", hint="give three numbers")
-    for joint in requirements.hold:
-        robot.joint_id(joint)
 
 
 def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constraint:
@@ -286,17 +294,14 @@ def _com_constraint(
             for sy in (-1, 1):
                 corner = placement.act(np.array([sx * support.size[0], sy * support.size[1], 0.0]))
                 corners.append(corner[:2])
-    try:
-        equations = scipy.spatial.ConvexHull(np.array(corners)).equations
-    except (scipy.spatial.QhullError, ValueError):
+    edges = polygon_edges(corners)
+    if edges is None:
         raise InputError(
             "the feet span no area to keep the center of mass above",
             where="com_over_feet",
             hint="give three feet or soles with a size, or set com_over_feet = false, or `com=False`",
-        ) from None
-    # One row for each edge: qhull repeats the equation of an edge that it met in pieces.
-    unique = np.unique(np.round(equations, 12), axis=0)
-    return CenterOfMassOverFeet(unique[:, :2], -unique[:, 2], margin)
+        )
+    return CenterOfMassOverFeet(*edges, margin)
 
 
 def _bounds(robot: Robot, chart: Chart, given: Array, requirements: Requirements) -> tuple[Array, Array]:

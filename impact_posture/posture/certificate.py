@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -92,7 +91,13 @@ class Certificate:
         return {key: value for key, value in json_block(self).items() if key != "active"}
 
 
-def certify(problem: PostureProblem, q: Array, scale: float, auxiliaries: Array | None = None) -> Certificate:
+def certify(
+    problem: PostureProblem,
+    q: Array,
+    scale: float,
+    auxiliaries: Array | None = None,
+    numeric: Numeric | None = None,
+) -> Certificate:
     """Certify ``q``.
 
     Args:
@@ -100,25 +105,36 @@ def certify(problem: PostureProblem, q: Array, scale: float, auxiliaries: Array 
         q: The posture, shape (nq,).
         scale: The initial objective f₀.
         auxiliaries: Auxiliaries of the constraints at ``q``; by default the guesses of the constraints.
+        numeric: The model, if the caller has it; it is moved to ``q``.
     """
-    numeric = Numeric(problem.robot.model)
+    numeric = (numeric or Numeric(problem.robot.model)).at(q)
     gradients, gaps = objective_gradients(problem, q, scale)
-    numeric.at(q)
     errors = [c.pose_error(numeric) for c in problem.constraints]
     own = problem.guess(numeric).values if auxiliaries is None else auxiliaries
-    parts = [c.linearize(numeric, z) for c, z in zip(problem.constraints, problem.split(numeric, own), strict=True)]
-    rows = _Rows(problem.robot.nv, parts)
+    parts = [c.linearize(numeric, z) for c, z in zip(problem.constraints, problem.split(own), strict=True)]
+    rows = Linearization.joined(parts, problem.robot.nv)
+    jacobian = np.hstack([rows.posture, rows.auxiliary])
+    violation = float(np.maximum(rows.lower - rows.value, rows.value - rows.upper).max(initial=0.0))
+    equal = rows.lower == rows.upper
+
+    def padded(tangent: Array) -> Array:
+        """Add zeros for the auxiliaries to tangent rows, or to one."""
+        return np.concatenate([tangent, np.zeros((*tangent.shape[:-1], rows.auxiliary.shape[1]))], axis=-1)
+
     limits, limit_violation = _limits(problem, q)
-    near = [*rows.near(), *(replace(row, outward=rows.pad(row.outward)) for row in limits)]
-    if rows.violation() > _HOPELESS:
-        # No multiplier makes this a solution, and to find the best ones takes long.
-        near = []
-    held = rows.pad(held_rows(problem.robot, problem.requirements.hold))
-    weights, multipliers, residual = _multipliers(rows.pad(gradients), np.vstack([held, rows.equalities()]), near)
+    near: list[_Near] = []
+    # No multiplier makes a posture that is far outside a solution, and to find the best ones takes long.
+    if violation <= _HOPELESS:
+        for row in np.flatnonzero(~equal):
+            bounds = rows.value[row], rows.lower[row], rows.upper[row]
+            near += _near_bounds(rows.names[row], *bounds, jacobian[row])
+        near += [replace(limit, outward=padded(limit.outward)) for limit in limits]
+    equalities = np.vstack([padded(held_rows(problem.robot, problem.requirements.hold)), jacobian[equal]])
+    weights, multipliers, residual = _multipliers(padded(gradients), equalities, near)
     products = [abs(float(m) * row.slack) for row, m in zip(near, multipliers, strict=True)]
     return Certificate(
         stationarity=float(np.abs(residual).max()),
-        primal=max(rows.violation(), limit_violation),
+        primal=max(violation, limit_violation),
         complementarity=max([*products, float(weights @ gaps)]),
         pose_error_m=max((e[0] for e in errors), default=0.0),
         pose_error_rad=max((e[1] for e in errors), default=0.0),
@@ -147,7 +163,7 @@ def objective_gradients(problem: PostureProblem, q: Array, scale: float) -> tupl
     gradients = found.gradients / scale
     weight = problem.requirements.regularization
     if weight:
-        gradients = gradients + weight * distance_gradient(Chart(problem.robot.model), q, problem.given)
+        gradients = gradients + weight * distance_gradient(Chart.of(problem.robot.model), q, problem.given)
     return gradients, found.gaps / scale
 
 
@@ -167,55 +183,9 @@ def _near_bounds(name: str, value: float, low: float, high: float, gradient: Arr
     return [side for side in sides if side.slack < _ACTIVE]
 
 
-class _Rows:
-    """Rows of all constraints over the tangent space and the auxiliaries.
-
-    Args:
-        nv: Dimension of the tangent space.
-        parts: Rows of each constraint.
-    """
-
-    def __init__(self, nv: int, parts: Sequence[Linearization]) -> None:
-        self._parts, self._nv = parts, nv
-        ends = np.cumsum([nv, *[part.auxiliary.shape[1] for part in parts]])
-        self._width = int(ends[-1])
-        self._at = [slice(start, stop) for start, stop in pairwise(ends)]
-
-    def pad(self, tangent: Array) -> Array:
-        """Return tangent rows, or one row, with zeros for the auxiliaries."""
-        zeros = np.zeros((*tangent.shape[:-1], self._width - self._nv))
-        return np.concatenate([tangent, zeros], axis=-1)
-
-    def _jacobian(self, index: int) -> Array:
-        rows = self.pad(self._parts[index].posture)
-        rows[:, self._at[index]] = self._parts[index].auxiliary
-        return rows
-
-    def equalities(self) -> Array:
-        """Return the Jacobian of all equalities."""
-        found = [np.zeros((0, self._width))]
-        found += [self._jacobian(k)[part.lower == part.upper] for k, part in enumerate(self._parts)]
-        return np.vstack(found)
-
-    def near(self) -> list[_Near]:
-        """Return the inequalities near their bounds."""
-        found: list[_Near] = []
-        for k, part in enumerate(self._parts):
-            jacobian = self._jacobian(k)
-            for row in np.flatnonzero(part.lower != part.upper):
-                bounds = part.value[row], part.lower[row], part.upper[row]
-                found += _near_bounds(part.names[row], *bounds, jacobian[row])
-        return found
-
-    def violation(self) -> float:
-        """Return the largest violation."""
-        outside = [np.maximum(part.lower - part.value, part.value - part.upper) for part in self._parts]
-        return float(np.concatenate([np.zeros(1), *outside]).max())
-
-
 def _limits(problem: PostureProblem, q: Array) -> tuple[list[_Near], float]:
     """Joint limits that are near, and the largest violation of all limits."""
-    chart = Chart(problem.robot.model)
+    chart = Chart.of(problem.robot.model)
     x, unit = chart.to_x(q), np.eye(problem.robot.nv)
     near: list[_Near] = []
     worst = 0.0

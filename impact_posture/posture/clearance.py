@@ -6,10 +6,10 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Self
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
-import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
@@ -38,7 +38,7 @@ class Clearance(Constraint):
         separators: The pairs.
         words: Description in one line.
         active: Pairs in the program, by index, with the corners that have rows there.
-        lifted: Equations of pairs by index and tree, which all constraints share that one grows into.
+        lifted: Equations of pairs by tree and index, which all constraints share that one grows into.
     """
 
     projected = False
@@ -50,11 +50,11 @@ class Clearance(Constraint):
         separators: Sequence[Separator],
         words: str,
         active: Mapping[int, Corners] | None = None,
-        lifted: dict[tuple[int, int], tuple[Tree, LiftedRows]] | None = None,
+        lifted: WeakKeyDictionary[Tree, dict[int, LiftedRows]] | None = None,
     ) -> None:
         self.name, self._separators, self._words = name, tuple(separators), words
         self.active: Mapping[int, Corners] = active or {}
-        self._lifted = {} if lifted is None else lifted
+        self._lifted = WeakKeyDictionary[Tree, dict[int, LiftedRows]]() if lifted is None else lifted
         self.parameters = np.zeros(0)
         self.lower, self.upper = np.zeros(len(self._separators)), np.full(len(self._separators), np.inf)
         bodies: dict[int, Body] = {}
@@ -65,6 +65,13 @@ class Clearance(Constraint):
         self._first = np.array([where[id(one.a)] for one in self._separators], dtype=int)
         self._margins = np.array([one.margin for one in self._separators])
         self._second = np.array([where[id(one.b)] for one in self._separators], dtype=int)
+        self._centers = [body.center for body in self._bodies]
+        self._reach = np.array([0.0 if body.hull is None else body.hull.reach for body in self._bodies])
+        self._planes = [
+            (k, self._second == k, body.normal, body.offset)
+            for k, body in enumerate(self._bodies)
+            if body.normal is not None
+        ]
 
     def describe(self) -> str:
         """See :class:`Constraint`."""
@@ -86,28 +93,20 @@ class Clearance(Constraint):
 
     # ---- numbers ----------------------------------------------------------------------------------------------
 
-    def _placed(self, model: Numeric) -> tuple[list[pin.SE3], Array]:
-        """Return the placements of the bodies, and lower bounds on all distances from a sphere around each body."""
-        at = [body.placement(model) for body in self._bodies]
-        centers, reach = np.zeros((len(at), 3)), np.zeros(len(at))
-        for k, (body, placement) in enumerate(zip(self._bodies, at, strict=True)):
-            centers[k] = placement.translation if body.hull is None else placement.act(body.hull.center)
-            reach[k] = 0.0 if body.hull is None else body.hull.reach
+    def _bounds(self, model: Numeric) -> Array:
+        """Return lower bounds on all distances from a sphere around each body."""
+        centers = np.array([body.place(model, own) for body, own in zip(self._bodies, self._centers, strict=True)])
         apart = centers[self._first] - centers[self._second]
         bound = np.linalg.norm(apart, axis=1)
-        for k in {int(k) for k in self._second}:
-            body = self._bodies[k]
-            if body.normal is not None:
-                mine = self._second == k
-                bound[mine] = apart[mine] @ (at[k].rotation @ body.normal) - body.offset
-        return at, bound - reach[self._first] - reach[self._second] - self._margins
+        for k, mine, normal, offset in self._planes:
+            bound[mine] = apart[mine] @ (self._bodies[k].placement(model).rotation @ normal) - offset
+        return np.asarray(bound - self._reach[self._first] - self._reach[self._second] - self._margins)
 
     def _distances(self, model: Numeric, within: float) -> tuple[Array, dict[int, tuple[Array, Array]]]:
         """Return all distances, exact below ``within`` and else lower bounds, and normal and points of the former."""
-        at, values = self._placed(model)
-        found = {}
+        values, found = self._bounds(model), {}
         for k in map(int, np.flatnonzero(values < within)):
-            values[k], normal, points = self._separators[k].distance_at(at[self._first[k]], at[self._second[k]])
+            values[k], normal, points = self._separators[k].distance(model)
             found[k] = normal, points
         return values, found
 
@@ -127,7 +126,7 @@ class Clearance(Constraint):
 
     def closest(self, model: Numeric) -> tuple[str, float]:
         """Return the pair that is closest, and its distance less the clearance, m."""
-        bounds, found = self._placed(model)[1], ("", np.inf)
+        bounds, found = self._bounds(model), ("", np.inf)
         for k in np.argsort(bounds, kind="stable"):
             if bounds[k] >= found[1]:
                 break
@@ -156,11 +155,11 @@ class Clearance(Constraint):
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
         """See :class:`Constraint`; a pair keeps its equations while others, and more corners, come in."""
-        pieces = []
+        pieces, lifted = [], self._lifted.setdefault(tree, {})
         for k, one, corners in self._program:
-            if (k, id(tree)) not in self._lifted:
-                self._lifted[k, id(tree)] = tree, one.lift(tree, f"{self.name}{k}")
-            pair = self._lifted[k, id(tree)][1]
+            if k not in lifted:
+                lifted[k] = one.lift(tree, f"{self.name}{k}")
+            pair = lifted[k]
             pieces.append(replace(pair, sides=one.sides(pair.variables, corners)))
         return LiftedRows.joined(pieces)
 
@@ -173,6 +172,11 @@ class Clearance(Constraint):
             for side in (0, 1)
         )
         return lower, upper
+
+    @property
+    def unknowns(self) -> int:
+        """See :class:`Constraint`."""
+        return sum(one.count for _, one, _ in self._program)
 
     def guess(self, model: Numeric) -> Guess:
         """See :class:`Constraint`."""

@@ -112,7 +112,7 @@ def _key(problem: PostureProblem) -> str:
         # Placements of frames on links are no part of the dynamics, but of every expression of a point.
         *[f"{f.name} {f.parentJoint} {f.placement.homogeneous.tolist()}" for f in problem.robot.model.frames],
         problem.objective.structure,
-        *[f"{c.structure}:{problem.carried(i)}" for i, c in enumerate(problem.constraints)],
+        problem.structure,
     ]
     return source_key(content, "dynamics", "impact", "posture")
 

@@ -1,8 +1,9 @@
 """Constraints on a posture, each as an expression and in Pinocchio's numbers.
 
 To add a constraint, derive from :class:`ExpressionConstraint` and implement ``symbolic`` and ``evaluate``; with
-unknowns of its own, from :class:`Constraint` and implement ``lift``, ``guess``, ``linearize`` and ``evaluate``.  The
-program, the search for feasible starts, the certificate and the elastic diagnosis need nothing else.
+unknowns of its own, from :class:`Constraint` and implement ``lift``, ``unknowns``, ``guess``, ``linearize`` and
+``evaluate``.  The program, the search for feasible starts, the certificate and the elastic diagnosis need nothing
+else.
 """
 
 from __future__ import annotations
@@ -141,6 +142,11 @@ class Constraint(ABC):
     def lifted_bounds(self) -> tuple[Array, Array]:
         """Bounds of the rows of :meth:`lift`, shape (m,) each."""
         return self.lower, self.upper
+
+    @property
+    def unknowns(self) -> int:
+        """Number of auxiliaries."""
+        return 0
 
     def guess(self, model: Numeric) -> Guess:
         """Return the auxiliaries to start from at ``model.q``, with their bounds."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 
 import casadi as ca
@@ -44,21 +45,28 @@ class ElasticAnswer:
     at_limits: tuple[str, ...]
 
 
-def elastic(problem: PostureProblem, seed: int = 0, tries: int = _TRIES) -> ElasticAnswer:
-    """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures."""
-    chart = Chart(problem.robot.model)
+def elastic(
+    problem: PostureProblem, seed: int = 0, tries: int = _TRIES, program: ElasticProgram | None = None
+) -> ElasticAnswer:
+    """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures.
+
+    Args:
+        problem: The posture problem.
+        seed: Seed of the postures.
+        tries: Most postures to begin from.
+        program: The program of the same problem with another target, or of one that grew into it.
+    """
+    chart = Chart.of(problem.robot.model)
     rng = np.random.default_rng(seed)
-    program = _Elastic(problem, chart)
-    solver = program.solver(problem)
+    program = program or ElasticProgram(problem)
     best: ElasticAnswer | None = None
     for attempt in range(tries):
         start = problem.given if attempt == 0 else random_posture(problem, chart, rng, near=attempt % 2 == 1)
         for _ in range(_ROUNDS):
-            found = _relax(problem, chart, solver, start)
+            found = _relax(problem, chart, program, start)
             if found.problem is problem:
                 break
             problem = found.problem
-            solver = program.solver(problem)
         if best is None or sum(found.conflicts.values()) < sum(best.conflicts.values()):
             best = found
         if not best.conflicts:
@@ -67,13 +75,14 @@ def elastic(problem: PostureProblem, seed: int = 0, tries: int = _TRIES) -> Elas
     return best
 
 
-def _relax(problem: PostureProblem, chart: Chart, solver: ca.Function, start: Array) -> ElasticAnswer:
+def _relax(problem: PostureProblem, chart: Chart, program: ElasticProgram, start: Array) -> ElasticAnswer:
     """Minimize the slack from one posture; the answer's problem has grown if the program lacked parts."""
     lower_rows, upper_rows = problem.row_bounds
     rows = len(lower_rows)
     norms = np.zeros(len(chart.quaternion_slices()))
     x = np.clip(chart.to_x(start), problem.lower, problem.upper)
     guess = problem.guess(Numeric(problem.robot.model).at(chart.to_q(x)))
+    solver, busy = program.solver(problem), time.process_time()
     answer = run_solver(
         solver,
         x0=np.concatenate([x, np.full(2 * rows, 0.1), guess.values]),
@@ -83,14 +92,25 @@ def _relax(problem: PostureProblem, chart: Chart, solver: ca.Function, start: Ar
         lbg=np.concatenate([norms, lower_rows]),
         ubg=np.concatenate([norms, upper_rows]),
     )
+    program.cpu_s += time.process_time() - busy
     q = chart.to_q(np.array(answer["x"]).reshape(-1)[: chart.nx])
     return _judge(problem.grown([q]), chart, q)
 
 
-class _Elastic:
-    """The elastic program, most of whose expressions stay while the problem grows."""
+class ElasticProgram:
+    """The elastic program, most of whose expressions stay while the problem grows.
 
-    def __init__(self, problem: PostureProblem, chart: Chart) -> None:
+    Args:
+        problem: The problem before it grows.
+
+    Attributes:
+        problem: The problem as far as it has grown.
+        cpu_s: Processor time within the solver so far, s.
+    """
+
+    def __init__(self, problem: PostureProblem) -> None:
+        self.problem, self.cpu_s, chart = problem, 0.0, Chart.of(problem.robot.model)
+        self._latest: tuple[str, ca.Function] | None = None
         self._x, self._reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
         tree = Tree(problem.robot.model, chart.configuration(self._x), self._x)
         self._rows = ProgramRows(self._x, tree, problem)
@@ -99,7 +119,13 @@ class _Elastic:
         self._own = Derivatives.of(ca.vertcat(self._away, self._norms), self._x)
 
     def solver(self, problem: PostureProblem) -> ca.Function:
-        """Return ``nlpsol`` for a problem that grew out of the first."""
+        """Return ``nlpsol`` for the first problem, also with another target, or one that grew out of it."""
+        self.problem, structure = problem, problem.structure
+        if self._latest is None or self._latest[0] != structure:
+            self._latest = structure, self._solver(problem)
+        return self._latest[1]
+
+    def _solver(self, problem: PostureProblem) -> ca.Function:
         lifted = self._rows.lift(problem)
         k, z, nx = lifted.rows.numel(), lifted.variables.numel(), self._x.numel()
         up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)

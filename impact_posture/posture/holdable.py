@@ -79,9 +79,13 @@ class Holdable(Constraint):
         shares = np.full(len(self._names), -1.0) if found.unbalanced else np.abs(found.shares) - 1
         return np.append(found.unbalanced, shares), found.jacobian
 
+    def value(self, model: Numeric) -> Array:
+        """See :class:`Constraint`; at the limits of all actuators where even forces show that it holds."""
+        return np.zeros(self.rows) if self._rest.spares(model.q, 0.0) else self.evaluate(model)[0]
+
     def grown(self, model: Numeric) -> Self:
         """See :class:`Constraint`."""
-        if self.active or self._rest.spares(model.q, _NEAR) or self.evaluate(model)[0].max() <= _KEPT:
+        if self.active or self.value(model).max() <= _KEPT:
             return self
         return type(self)(self._load, self._rest, self._words, active=True)
 
@@ -106,6 +110,11 @@ class Holdable(Constraint):
         z = ca.SX.sym("z", load.count)
         own = tree if tree.model is load.model else Tree(load.model, tree.q)
         return LiftedRows(_rows(rest.rows) @ load.symbolic(own, z) + rest.offset, z)
+
+    @property
+    def unknowns(self) -> int:
+        """See :class:`Constraint`."""
+        return self._rest.load.count if self.active else 0
 
     def guess(self, model: Numeric) -> Guess:
         """See :class:`Constraint`."""

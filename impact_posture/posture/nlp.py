@@ -50,6 +50,9 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.bound_relax_factor": 0.0,
     "ipopt.honor_original_bounds": "yes",
     "ipopt.mu_strategy": "adaptive",
+    # The rows of a program are of like size.  To scale and permute each matrix takes MUMPS longer than it saves.
+    "ipopt.mumps_scaling": 0,
+    "ipopt.mumps_permuting_scaling": 0,
     "ipopt.max_iter": 300,
     "print_time": False,
     "calc_lam_p": False,
@@ -135,18 +138,19 @@ class PostureNLP:
         """
         problem, nx = self.problem, self.chart.nx
         x = np.clip(self.chart.to_x(start), problem.lower, problem.upper)
-        scale = scale or problem.objective.value(self.chart.to_q(x))
-        guess = problem.objective.guess(self.chart.to_q(x), scale, attempt)
-        own = problem.guess(self.program.numeric.at(self.chart.to_q(x)))
+        q = self.chart.to_q(x)
+        scale = scale or problem.objective.value(q)
+        guess = problem.objective.guess(q, scale, attempt)
+        own = problem.guess(self.program.numeric.at(q))
         lower = np.concatenate([problem.lower, guess.lower, own.lower])
         upper = np.concatenate([problem.upper, np.full(guess.values.size, np.inf), own.upper])
-        began, busy = time.perf_counter(), time.process_time()
         p = parameters(problem, self.chart, scale, price)
         x0 = np.concatenate([x, guess.values, own.values])
-        answer = run_solver(self.solver, x0=x0, lbx=lower, ubx=upper, p=p, **_row_bounds(problem, self))
-        elapsed, busy = time.perf_counter() - began, time.process_time() - busy
+        began, busy = time.perf_counter(), time.process_time()
+        answer = run_solver(self.solver, x0=x0, lbx=lower, ubx=upper, p=p, **self._row_bounds)
         stats = self.solver.stats()
-        found = np.array(answer["x"]).reshape(-1)
+        elapsed, busy = time.perf_counter() - began, time.process_time() - busy
+        found = np.array(answer["x"].nonzeros())
         return SolveRecord(
             q=self.chart.to_q(found[:nx]),
             status=str(stats["return_status"]),
@@ -156,6 +160,16 @@ class PostureNLP:
             auxiliaries=found[nx + guess.values.size :],
             minimized=float(answer["f"]),
         )
+
+    @cached_property
+    def _row_bounds(self) -> dict[str, Array]:
+        norms = np.zeros(len(self.chart.quaternion_slices()))
+        lower, upper = (np.concatenate([norms, bounds]) for bounds in self.problem.row_bounds)
+        # The other rows belong to the objective: first equations, then inequalities that bound it from below.
+        lifted = np.zeros(self.solver.size1_in("lbg") - len(lower))
+        below = lifted.copy()
+        below[lifted.size - self.program.bounded :] = -np.inf
+        return {"lbg": np.concatenate([lower, below]), "ubg": np.concatenate([upper, lifted])}
 
 
 class _CasadiOpenBLAS(threadpoolctl.OpenBLASController):  # type: ignore[misc]
@@ -226,7 +240,7 @@ class Program:
     """
 
     def __init__(self, problem: PostureProblem) -> None:
-        self.chart = chart = Chart(problem.robot.model)
+        self.chart = chart = Chart.of(problem.robot.model)
         self.numeric = Numeric(problem.robot.model)
         self._x = x = ca.SX.sym("x", chart.nx)
         own = ca.SX.sym("own", len(problem.objective.parameters))
@@ -300,13 +314,3 @@ def parameters(problem: PostureProblem, chart: Chart, scale: float, price: float
             *[c.parameters for c in problem.constraints],
         ]
     )
-
-
-def _row_bounds(problem: PostureProblem, nlp: PostureNLP) -> dict[str, Array]:
-    norms = np.zeros(len(nlp.chart.quaternion_slices()))
-    lower, upper = (np.concatenate([norms, bounds]) for bounds in problem.row_bounds)
-    # The other rows belong to the objective: first equations, then inequalities that bound it from below.
-    lifted = np.zeros(nlp.solver.size1_in("lbg") - len(lower))
-    below = lifted.copy()
-    below[lifted.size - nlp.program.bounded :] = -np.inf
-    return {"lbg": np.concatenate([lower, below]), "ubg": np.concatenate([upper, lifted])}

@@ -29,11 +29,15 @@ class HeldPosition(ExpressionConstraint):
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
-        return model.placement(self.point).translation - self.parameters, model.jacobian(self.point)[:3]
+        return self.value(model), model.jacobian(self.point)[:3]
+
+    def value(self, model: Numeric) -> Array:
+        """See :class:`Constraint`."""
+        return np.asarray(model.placement(self.point).translation - self.parameters)
 
     def pose_error(self, model: Numeric) -> tuple[float, float]:
         """See :class:`Constraint`."""
-        return float(np.linalg.norm(self.evaluate(model)[0])), 0.0
+        return float(np.linalg.norm(self.value(model))), 0.0
 
 
 class PositionBox(HeldPosition):
@@ -54,7 +58,7 @@ class PositionBox(HeldPosition):
 
     def pose_error(self, model: Numeric) -> tuple[float, float]:
         """Return the distance outside the box."""
-        outside = np.maximum(np.abs(self.evaluate(model)[0]) - self.upper, 0.0)
+        outside = np.maximum(np.abs(self.value(model)) - self.upper, 0.0)
         return float(np.linalg.norm(outside)), 0.0
 
 

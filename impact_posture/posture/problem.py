@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -128,6 +129,11 @@ class PostureProblem:
         return list(self.rows[index]) if self.rows else list(range(len(self.constraints[index].lifted_bounds[0])))
 
     @property
+    def structure(self) -> str:
+        """Text that distinguishes the rows that the program carries, apart from parameters and bounds."""
+        return "\n".join(f"{c.structure}:{self.carried(k)}" for k, c in enumerate(self.constraints))
+
+    @property
     def row_bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of all rows that the program carries."""
         carried = [(*c.lifted_bounds, self.carried(i)) for i, c in enumerate(self.constraints)]
@@ -147,10 +153,10 @@ class PostureProblem:
             np.concatenate([empty, *above]),
         )
 
-    def split(self, numeric: Numeric, auxiliaries: Array) -> list[Array]:
+    def split(self, auxiliaries: Array) -> list[Array]:
         """Return the auxiliaries of each constraint."""
-        counts = [c.guess(numeric).values.size for c in self.constraints]
-        return np.split(auxiliaries, np.cumsum(counts)[:-1]) if counts else []
+        ends = list(accumulate((c.unknowns for c in self.constraints), initial=0))
+        return [auxiliaries[start:stop] for start, stop in pairwise(ends)]
 
     @property
     def grows(self) -> bool:

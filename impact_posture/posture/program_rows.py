@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.dynamics.tree import Tree
-from impact_posture.posture.constraint import Constraint, LiftedRows
+from impact_posture.posture.constraint import LiftedRows
 from impact_posture.posture.problem import PostureProblem
 
 
@@ -61,20 +61,22 @@ class ProgramRows:
     def __init__(self, x: ca.SX, tree: Tree, problem: PostureProblem) -> None:
         self._x, self._tree = x, tree
         self.parameters = [ca.SX.sym(f"p{k}", len(c.parameters)) for k, c in enumerate(problem.constraints)]
-        # Kept with the constraints, because an identity may later be that of another object.
-        self._lifted: dict[int, tuple[Constraint, LiftedRows]] = {}
+        self._lifted: dict[tuple[int, str, tuple[int, ...]], LiftedRows] = {}
         self._blocks: list[tuple[Derivatives, list[LiftedRows]]] = []
 
     def lift(self, problem: PostureProblem) -> LiftedRows:
         """Return the rows that the program of a problem carries, by constraint."""
         found = []
         for index, constraint in enumerate(problem.constraints):
-            if id(constraint) not in self._lifted:
+            carried = problem.carried(index)
+            # Constraints with another target have the same expressions.
+            key = index, constraint.structure, tuple(carried)
+            if key not in self._lifted:
                 lifted = constraint.lift(self._tree, self.parameters[index])
                 if not lifted.pieces:
-                    lifted = LiftedRows(lifted.rows[problem.carried(index)], lifted.variables, lifted.slack)
-                self._lifted[id(constraint)] = constraint, lifted
-            found.append(self._lifted[id(constraint)][1])
+                    lifted = LiftedRows(lifted.rows[carried], lifted.variables, lifted.slack)
+                self._lifted[key] = lifted
+            found.append(self._lifted[key])
         return LiftedRows.joined(found)
 
     def derivatives(self, lifted: LiftedRows) -> Derivatives:

@@ -24,6 +24,8 @@ Progress = Callable[[int, int], None]
 FEASIBLE = 1e-8
 # Starts that run before the others, and most rounds in which the program grows.
 _FIRST, _ROUNDS = 2, 8
+# A fork takes as long as the runs of programs with so many unknowns in all.
+_FORK = 200
 # Price of a meter of slack for runs that ended in a trap.
 HIGH_PRICE = 20 * SLACK_PRICE
 
@@ -37,7 +39,9 @@ class Run:
         record: Result of the solver; ``None`` if the objective does not exist at its end.
         objective: Objective at the end.
         minimized: Objective in units of the initial one, with the regularization.
-        certificate: Certificate of the end.
+        certificate: Certificate of the end; ``None`` while the program lacks parts.
+        lacks: Whether the program lacks parts at the end.
+        trapped: Whether the end violates something although the program lacks nothing, for the first time.
     """
 
     start: Array | None = None
@@ -45,6 +49,8 @@ class Run:
     objective: float = np.inf
     minimized: float = np.inf
     certificate: Certificate | None = None
+    lacks: bool = False
+    trapped: bool = False
 
     @property
     def good(self) -> bool:
@@ -54,16 +60,24 @@ class Run:
 
 @one_blas_thread()
 def run_start(
-    nlp: PostureNLP, start: Array, scale: float, price: float = SLACK_PRICE
+    nlp: PostureNLP, start: Array, scale: float, price: float = SLACK_PRICE, first: SolveRecord | None = None
 ) -> tuple[SolveRecord, Certificate]:
-    """Solve from a feasible start and certify the end; try the other guesses of the objective if it fails."""
-    record = nlp.solve(start, scale=scale, price=price)
-    certificate = certify(nlp.problem, record.q, scale, record.auxiliaries)
+    """Solve from a feasible start and certify the end; try the other guesses of the objective if it fails.
+
+    Args:
+        nlp: The program.
+        start: The start, shape (nq,).
+        scale: The initial objective.
+        price: Price of a meter of slack.
+        first: Result of the first guess, if it is known.
+    """
+    record = first or nlp.solve(start, scale=scale, price=price)
+    certificate = certify(nlp.problem, record.q, scale, record.auxiliaries, nlp.program.numeric)
     for attempt in range(1, nlp.problem.objective.attempts):
         if certificate.holds():
             break
         again = nlp.solve(start, scale=scale, attempt=attempt, price=price)
-        certificate = certify(nlp.problem, again.q, scale, again.auxiliaries)
+        certificate = certify(nlp.problem, again.q, scale, again.auxiliaries, nlp.program.numeric)
         record = replace(
             again,
             iterations=record.iterations + again.iterations,
@@ -111,19 +125,16 @@ class Search:
         waiting, later = list(range(starts)), []
         if self.problem.grows and starts > _FIRST:
             waiting, later = waiting[:_FIRST], waiting[_FIRST:]
-        for _ in range(_ROUNDS):
-            for index, run in self._round(waiting, jobs):
+        for left in reversed(range(_ROUNDS)):
+            for index, run in self._round(waiting, jobs, last=not left):
                 runs[index] = run
                 if progress:
                     progress(min(len(runs), starts), starts)
-            records = {k: runs[k].record for k in waiting}
-            ends = {k: record.q for k, record in records.items() if record is not None and record.converged}
-            lacking = {k: q for k, q in ends.items() if self.problem.grown([q]) is not self.problem}
-            # An end that lacks nothing and still violates something is a trap, and a higher price may lead out of it.
-            again = {k: q for k, q in ends.items() if k not in lacking and k not in self._trapped}
-            trapped = {k for k, q in again.items() if not feasible(self.problem, q)}
-            self._trapped |= trapped
-            self._ends |= lacking | {k: ends[k] for k in trapped}
+            lacking = {k: r.q for k in waiting if (r := runs[k].record) is not None and runs[k].lacks}
+            # A higher price may lead out of a trap.
+            trapped = {k: r.q for k in waiting if (r := runs[k].record) is not None and runs[k].trapped}
+            self._trapped |= set(trapped)
+            self._ends |= lacking | trapped
             waiting = sorted({*lacking, *trapped, *later})
             if lacking:
                 self.problem = self.problem.grown(list(lacking.values()))
@@ -134,21 +145,33 @@ class Search:
             later = []
         return [runs[index] for index in range(starts)]
 
-    def _round(self, waiting: list[int], jobs: int) -> Iterator[tuple[int, Run]]:
-        # A fork takes longer than three starts.
-        with fork_map(lambda k: self._run(waiting[k]), len(waiting), jobs if len(waiting) > 3 else 1) as results:
+    def _round(self, waiting: list[int], jobs: int, *, last: bool) -> Iterator[tuple[int, Run]]:
+        unknowns = len(waiting) * int(self.nlp.solver.size1_in("x0"))
+        with fork_map(
+            lambda k: self._run(waiting[k], last=last), len(waiting), jobs if unknowns > _FORK else 1
+        ) as results:
+            if around := self.problem.surroundings:
+                # The last word needs the shapes themselves, and this process would only wait.
+                _ = around.shapes.geometry
             for k, run in results:
                 yield waiting[k], run
 
-    def _run(self, index: int) -> Run:
+    @one_blas_thread()
+    def _run(self, index: int, *, last: bool) -> Run:
+        """Run one start; an end that the program lacks parts for is certified in the last round only."""
         nlp, scale, problem = self.nlp, self._scale, self.problem
         start = self._ends.get(index)
         if start is None:
             start = self._known[index] if index < len(self._known) else feasible_start(problem, index, self._seed)
         if start is None:
             return Run()
+        price = HIGH_PRICE if index in self._trapped else SLACK_PRICE
         try:
-            record, certificate = run_start(nlp, start, scale, HIGH_PRICE if index in self._trapped else SLACK_PRICE)
+            record = nlp.solve(start, scale=scale, price=price)
+            lacks = record.converged and problem.grown([record.q]) is not problem
+            if lacks and not last:
+                return Run(start, record, lacks=True)
+            record, certificate = run_start(nlp, start, scale, price, record)
             objective = problem.objective.value(record.q)
         except MetricError:
             # This start led to a posture where the objective does not exist.  The other starts go on.
@@ -156,7 +179,8 @@ class Search:
         minimized = objective / scale
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
-        return Run(start, record, objective, minimized, certificate)
+        trapped = record.converged and index not in self._trapped and not feasible(problem, record.q)
+        return Run(start, record, objective, minimized, certificate, lacks, trapped and not lacks)
 
 
 def feasible(problem: PostureProblem, q: Array) -> bool:

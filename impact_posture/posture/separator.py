@@ -73,6 +73,18 @@ class Body:
         found = model.placement(self.point)
         return found if self.turns else pin.SE3(np.eye(3), found.translation)
 
+    @property
+    def center(self) -> Array:
+        """Middle of the body, or the origin of the plane, in the axes of the joint or of the world, shape (3,)."""
+        center = np.zeros(3) if self.hull is None else self.hull.center
+        return np.asarray(self.point.placement.act(center)) if self.turns else center
+
+    def place(self, model: Numeric, center: Array) -> Array:
+        """Return the place of the :attr:`center` in the world, shape (3,), m."""
+        if self.turns:
+            return np.asarray(model.data.oMi[self.point.joint].act(center))
+        return np.asarray(model.data.oMi[self.point.joint].act(self.point.position) + center)
+
     def rates(self, model: Numeric, direction: Array, positions: Array) -> Array:
         """Return the tangent gradients of the heights of points of the body, shape (k, nv).
 
@@ -176,11 +188,8 @@ class Separator:
         return R, p - tree.position(self.b.point)
 
     def distance(self, model: Numeric) -> tuple[float, Array, Array]:
-        """See :meth:`distance_at`."""
-        return self.distance_at(self.a.placement(model), self.b.placement(model))
-
-    def distance_at(self, at_a: pin.SE3, at_b: pin.SE3) -> tuple[float, Array, Array]:
         """Return the distance less the clearance, the normal from b to a, the closest points (2, 3), in the world."""
+        at_a, at_b = self.a.placement(model), self.b.placement(model)
         if self.b.hull is not None:
             assert self.a.hull is not None  # noqa: S101 (narrows a type)
             found = separation(self.a.hull, at_a, self.b.hull, at_b)

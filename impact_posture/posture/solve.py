@@ -258,7 +258,7 @@ def distinct(problem: PostureProblem, ends: list[tuple[Array, float]]) -> tuple[
 def wrapped_difference(problem: PostureProblem, one: Array, other: Array) -> Array:
     """Return ``other ⊖ one`` without full turns of revolute joints."""
     step = np.array(pin.difference(problem.robot.model, one, other))
-    for slot in Chart(problem.robot.model).slots:
+    for slot in Chart.of(problem.robot.model).slots:
         if slot.kind.family == "revolute":
             step[slot.v] = (step[slot.v] + np.pi) % (2 * np.pi) - np.pi
     return step

@@ -44,9 +44,9 @@ class Projector:
     def __init__(self, problem: PostureProblem) -> None:
         self.problem = problem
         self.numeric = Numeric(problem.robot.model)
-        self.chart = Chart(problem.robot.model)
+        self.chart = Chart.of(problem.robot.model)
         self._held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
-        self._to_v = _bounded_entries(self.chart)
+        self._in_v, self._in_x = _bounded_entries(self.chart)
 
     def clip(self, q: Array) -> Array:
         """Clamp ``q`` to the bounds."""
@@ -100,12 +100,11 @@ class Projector:
 
     def _blocked(self, q: Array, direction: Array) -> NDArray[np.bool_]:
         """Joints on a limit that the descent direction would violate."""
-        x = self.chart.to_x(q)
+        x, along = self.chart.to_x(q)[self._in_x], direction[self._in_v]
+        at_low = (x <= self.problem.lower[self._in_x] + 1e-12) & (along < 0)
+        at_high = (x >= self.problem.upper[self._in_x] - 1e-12) & (along > 0)
         blocked = np.zeros(self.problem.robot.nv, dtype=bool)
-        for v, k in self._to_v:
-            at_low = x[k] <= self.problem.lower[k] + 1e-12 and direction[v] < 0
-            at_high = x[k] >= self.problem.upper[k] - 1e-12 and direction[v] > 0
-            blocked[v] = at_low or at_high
+        blocked[self._in_v] = at_low | at_high
         return blocked
 
 
@@ -159,10 +158,8 @@ def random_posture(problem: PostureProblem, chart: Chart, rng: np.random.Generat
     return np.asarray(q)
 
 
-def _bounded_entries(chart: Chart) -> list[tuple[int, int]]:
-    """Pairs (tangent index, chart index) of coordinates that equal their tangent entry."""
-    pairs = []
-    for slot in chart.slots:
-        if slot.kind.family in ("revolute", "prismatic", "translation"):
-            pairs += list(zip(range(slot.v.start, slot.v.stop), range(slot.x.start, slot.x.stop), strict=True))
-    return pairs
+def _bounded_entries(chart: Chart) -> tuple[list[int], list[int]]:
+    """Tangent indices and chart indices of coordinates that equal their tangent entry."""
+    slots = [slot for slot in chart.slots if slot.kind.family in ("revolute", "prismatic", "translation")]
+    in_v = [k for slot in slots for k in range(slot.v.start, slot.v.stop)]
+    return in_v, [k for slot in slots for k in range(slot.x.start, slot.x.stop)]

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.collision.mesh_check import mesh_collisions
+from impact_posture.collision.mesh_check import MeshCheck
 from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import load_shapes
 from impact_posture.collision.swept_hull import SweptHull
@@ -192,10 +192,17 @@ class Surroundings:
     def collisions(self, q: Array) -> list[tuple[str, str]]:
         """Return the original shapes that touch each other, the surface, the ground or an obstacle at ``q``."""
         planes, solids = self.walls_at(q)
-        return mesh_collisions(self.robot, self.shapes, q, solids, planes)
+        return self._meshes.collisions(q, solids, planes)
 
-    def walls_at(self, q: Array) -> tuple[list[HalfSpace], list[tuple[SweptHull, frozenset[int]]]]:
-        """Return the planes and the bodies that the links stay clear of at ``q``, each with its exempt joints."""
+    @cached_property
+    def _meshes(self) -> MeshCheck:
+        return MeshCheck(self.robot, self.shapes)
+
+    def walls_at(self, q: Array) -> tuple[list[HalfSpace], list[tuple[SweptHull, pin.SE3, frozenset[int]]]]:
+        """Return the planes and the bodies, with their placements, that the links stay clear of at ``q``.
+
+        Each comes with its exempt joints.
+        """
         numeric = Numeric(self.robot.model).at(q)
         planes, solids = [], []
         for wall in self._walls:
@@ -204,9 +211,7 @@ class Surroundings:
                 n = at.rotation @ wall.body.normal
                 planes.append(HalfSpace(wall.body.name, at.translation + wall.body.offset * n, n, wall.exempt))
             elif wall.body.hull is not None:
-                hull = wall.body.hull
-                corners = hull.vertices @ at.rotation.T + at.translation
-                solids.append((SweptHull(hull.name, hull.link, 0, corners, hull.radius), wall.exempt))
+                solids.append((wall.body.hull, at, wall.exempt))
         return planes, solids
 
     def _stands_behind(self, plane: Body, exempt: frozenset[int]) -> str:

@@ -82,12 +82,12 @@ def write_page(folder: Path, content: Content, scene: Scene) -> Path:
 
 def render(content: Content, scene: Scene, pictures: Sequence[tuple[str, str]]) -> str:
     """Return the page.  Each text of it is escaped, and it may load nothing and run nothing but its own viewer."""
-    packed, arrays = scene.pack()
+    packed, arrays = scene.packed
     names = ("viewer.min.js", "loader.js", "page.css")
     viewer, loader, style = ((_VIEWER / name).read_text(encoding="utf-8") for name in names)
     # Scripts end at "</", wherever it stands.
     data = packed.replace("<", "\\u003c")
-    text: str = _template().render(
+    text: str = load_template().render(
         content=content, scene=scene, pictures=pictures, data=data, arrays=arrays, style=style, loader=loader,
         viewer=zipped(viewer.encode()), license=viewer.partition("*/")[0].partition("/*!")[2].strip(),
         version=__version__, charts=[_charts(track) for track in scene.tracks],
@@ -121,7 +121,8 @@ def _hash(text: str) -> str:
 
 
 @cache
-def _template() -> Any:
+def load_template() -> Any:
+    """Return the template of a page, which takes long for the first time."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 

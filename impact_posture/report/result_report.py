@@ -25,7 +25,13 @@ _MOST = 121
 
 
 def write_result_report(
-    folder: Path, prepared: Prepared, view: ResultView, document: dict[str, Any], *, meshes: bool = False
+    folder: Path,
+    prepared: Prepared,
+    view: ResultView,
+    document: dict[str, Any],
+    *,
+    meshes: bool = False,
+    scene: Scene | None = None,
 ) -> Path:
     """Write ``report.html`` of a result into its folder; return its path.
 
@@ -35,11 +41,12 @@ def write_result_report(
         view: Its solution.
         document: The content of ``result.json``.
         meshes: Pass on the meshes of the user's own URDF, too.
+        scene: What :func:`result_scene` returns, if it is known.
 
     Raises:
         OutputError: It cannot be written.
     """
-    scene = result_scene(prepared, view, meshes)
+    scene = scene or result_scene(prepared, view, meshes)
     return write_page(folder, _content(folder, prepared, view, document), scene)
 
 
@@ -55,7 +62,7 @@ def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> 
             at = numeric.placement(point_on(view.robot, one.frame, one.offset))
             turn = at.rotation if one.normal_frame == "contact" else np.eye(3)
             planes.append(("surface", at.translation, turn @ one.normal))
-    bodies = tuple(hull.vertices for hull, _ in solids)
+    bodies = tuple(hull.vertices @ at.rotation.T + at.translation for hull, at, _ in solids)
     return Scene(
         draw_robot(view.robot, meshes), view.objective, (_track(prepared, view),), tuple(planes), bodies, True
     )

@@ -7,6 +7,7 @@ import gzip
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -21,7 +22,8 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.impact.quantity_table import quantities
 from impact_posture.plot.shapes import root
-from impact_posture.report.shapes import DrawnRobot, Solid, hull_of
+from impact_posture.report.shapes import DrawnRobot, hull_of
+from impact_posture.report.solid import Solid
 from impact_posture.robot.robot import Robot
 
 _TYPES = {"uint16": "u2", "uint32": "u4", "float32": "f4"}
@@ -78,8 +80,9 @@ class Scene:
     bodies: tuple[Array, ...]
     ghost: bool
 
-    def pack(self) -> tuple[str, str]:
-        """Return the scene as JSON, and its arrays as base64 of a gzipped buffer into which the JSON points."""
+    @cached_property
+    def packed(self) -> tuple[str, str]:
+        """The scene as JSON, and its arrays as base64 of a gzipped buffer into which the JSON points."""
         model, tracks = self.objective.robot.model, [self._track(track) for track in self.tracks]
         low, high = self._box()
         size, center = float(np.linalg.norm(high - low)), (low + high) / 2

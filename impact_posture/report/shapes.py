@@ -9,15 +9,16 @@ from functools import lru_cache
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
-from impact_posture.collision.geometry import load_geometry
+from impact_posture.collision.geometry import geometry_key, load_geometry
 from impact_posture.collision.mesh_triangles import Triangles, hull_surface
 from impact_posture.collision.parts import surface_of
 from impact_posture.collision.shape_points import shape_points
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.libraries import source_key
 from impact_posture.report.mesh_license import MeshLicense, license_of
+from impact_posture.report.solid import PlacedSolids, Solid
 from impact_posture.robot.robot import Robot
 
 # Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
@@ -31,28 +32,6 @@ _DARKEST = 0.2
 _HEAD = 200_000
 
 Color = tuple[float, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Solid:
-    """A triangle mesh with whole coordinates.
-
-    Attributes:
-        corners: Corners as multiples of ``step`` from ``low``, shape (k, 3).
-        faces: Triangles as indices, shape (n, 3).
-        low: Least coordinates, m, shape (3,).
-        step: Length of a unit, m.
-    """
-
-    corners: NDArray[np.uint16]
-    faces: Triangles
-    low: Array
-    step: float
-
-    @property
-    def points(self) -> Array:
-        """Corners, m, shape (k, 3)."""
-        return self.low + self.step * self.corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,28 +60,41 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
         meshes: Pass on the meshes of the user's own URDF, too.
     """
     described, warnings = read_urdf_shapes(robot, "visual")
+    by_name = {shape.name: shape for shape in described}
+    known = {shape.name: license_of(shape.mesh) for shape in described if shape.mesh is not None}
+    hulls = {name for name, terms in known.items() if not (meshes or (terms and terms.allows))}
+    key = source_key([geometry_key(robot, described), repr(sorted(hulls))], "report")
+    found = PlacedSolids.stored(key)
+    if found is None:
+        found = _placed_solids(robot, described, hulls)
+        found.store(key)
+    parts = [(joint, k, at, _color(by_name[name])) for name, joint, k, at in found.places]
+    drawn = {name for name, *_ in found.places}
+    licenses = {terms.package: terms for name, terms in known.items() if terms and name in drawn - hulls}
+    notes = [*warnings, *found.warnings]
+    if hulls & drawn:
+        notes.append("meshes are drawn as their convex hulls, because a page passes them on (`meshes`)")
+    solids = list(found.solids)
+    if not parts:
+        solids, parts = _sticks(robot)
+        notes.append("the robot has no shapes that can be drawn: sticks join its joints")
+    return DrawnRobot(tuple(solids), tuple(parts), tuple(licenses.values()), tuple(notes))
+
+
+def _placed_solids(robot: Robot, described: list[UrdfShape], hulls: set[str]) -> PlacedSolids:
+    """Return the meshes of shapes, or their hulls, where they can be loaded."""
     loaded = load_geometry(robot, described)
     by_name = {shape.name: shape for shape in described}
-    licenses: dict[str, MeshLicense] = {}
     solids: dict[tuple[object, ...], Solid] = {}
-    parts, notes = [], [*warnings, *loaded.warnings]
+    places = []
     for placed in loaded.model.geometryObjects:
-        shape = by_name[placed.name]
-        known = None if shape.mesh is None else license_of(shape.mesh)
-        hull = shape.mesh is not None and not (meshes or (known and known.allows))
-        if known and not hull:
-            licenses[known.package] = known
+        shape, hull = by_name[placed.name], placed.name in hulls
         # The same file at the same scale is the same mesh; an address in memory would name another one later.
         key = (shape.kind, shape.sizes, shape.mesh, hull)
         if key not in solids:
             solids[key] = hull_of(shape_points(placed.geometry)) if hull else _quantized(*surface_of(placed.geometry))
-        parts.append((int(placed.parentJoint), list(solids).index(key), placed.placement, _color(shape)))
-    if any(key[-1] for key in solids):
-        notes.append("meshes are drawn as their convex hulls, because a page passes them on (`meshes`)")
-    if not parts:
-        solids, parts = _sticks(robot)
-        notes.append("the robot has no shapes that can be drawn: sticks join its joints")
-    return DrawnRobot(tuple(_reduced(list(solids.values()))), tuple(parts), tuple(licenses.values()), tuple(notes))
+        places.append((placed.name, int(placed.parentJoint), list(solids).index(key), placed.placement))
+    return PlacedSolids(tuple(_reduced(list(solids.values()))), tuple(places), loaded.warnings)
 
 
 def hull_of(points: Array) -> Solid:
@@ -132,7 +124,7 @@ def _welded(solid: Solid, bits: int) -> Solid:
 
 def _reduced(solids: list[Solid]) -> list[Solid]:
     """Weld the corners within a length that grows until all meshes together have few enough triangles."""
-    length = max(solid.step for solid in solids)
+    length = max((solid.step for solid in solids), default=0.0)
     while sum(len(solid.faces) for solid in solids) > _MOST_TRIANGLES:
         length *= 2
         bits = [max(int(np.log2(length / solid.step)), 0) for solid in solids]
@@ -140,14 +132,12 @@ def _reduced(solids: list[Solid]) -> list[Solid]:
     return solids
 
 
-def _sticks(robot: Robot) -> tuple[dict[tuple[object, ...], Solid], list[tuple[int, int, pin.SE3, Color]]]:
+def _sticks(robot: Robot) -> tuple[list[Solid], list[tuple[int, int, pin.SE3, Color]]]:
     """Return rods from each joint to the next ones."""
     model = robot.model
     spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
     ball = shape_points(coal.Sphere(0.02 * max(0.1, *(float(np.linalg.norm(span)) for _, span in spans))))
-    rods: dict[tuple[object, ...], Solid] = {
-        (k,): hull_of(np.vstack([ball, ball + span])) for k, (_, span) in enumerate(spans)
-    }
+    rods = [hull_of(np.vstack([ball, ball + span])) for _, span in spans]
     return rods, [(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
 
 

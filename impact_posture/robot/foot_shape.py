@@ -15,6 +15,7 @@ from impact_posture.arrays import Array
 from impact_posture.robot.guess import joints_to, upright_frames
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import SupportSpec
+from impact_posture.robot.support_polygon import polygon_edges
 
 # Points of a foot within this distance (m) of its lowest one touch the ground with it.
 _PATCH = 2e-3
@@ -57,8 +58,6 @@ def foot_specs(robot: Robot, feet: Sequence[str], urdf: Path) -> list[SupportSpe
 
 def support_depth(robot: Robot, feet: Sequence[SupportSpec]) -> float:
     """Return the depth of the center of mass in the support polygon, m; negative outside or without a polygon."""
-    from scipy.spatial import ConvexHull, QhullError
-
     model, q = robot.model, robot.posture()
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
@@ -68,11 +67,8 @@ def support_depth(robot: Robot, feet: Sequence[SupportSpec]) -> float:
         for foot in feet
         for x, y in product((-1, 1), repeat=2)
     ]
-    try:
-        hull = ConvexHull(np.array(corners))
-    except QhullError:
-        return -1.0
-    return -float(np.max(hull.equations[:, :2] @ center + hull.equations[:, 2]))
+    edges = polygon_edges(corners)
+    return -1.0 if edges is None else float(np.min(edges[1] - edges[0] @ center))
 
 
 def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Array:

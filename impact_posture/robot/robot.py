@@ -145,11 +145,17 @@ class Robot:
         Raises:
             FrameNotFound: There is no such frame; carries the nearest names.
         """
-        found = [i for i, frame in enumerate(self.model.frames) if frame.name == name]
-        links = [i for i in found if self.model.frames[i].type == pin.FrameType.BODY]
-        if not links and (not found or name == "universe"):
+        if name not in self._frames:
             raise FrameNotFound(name, self.frame_names, where=self.name)
-        return (links or found)[0]
+        return self._frames[name]
+
+    @cached_property
+    def _frames(self) -> dict[str, int]:
+        frames = list(enumerate(self.model.frames))
+        links = [(i, frame.name) for i, frame in frames if frame.type == pin.FrameType.BODY]
+        others = [(i, frame.name) for i, frame in frames if frame.name != "universe"]
+        # The first of a name counts, and a link before what is none.
+        return {name: i for i, name in reversed([*links, *others])}
 
     def joint_id(self, name: str) -> int:
         """Return the index of the joint ``name`` in the model.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from impact_posture.arrays import Array
 from impact_posture.settings import Vector3
@@ -39,8 +40,7 @@ class Push:
     offset: Vector3 = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Truth:
+class Truth(NamedTuple):
     """True state of a world.
 
     Attributes:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from impact_posture.arrays import Array
 
+# Rows of a contact with friction, and the row that a contact without it has.
+_ROWS, _FIRST = np.arange(3), np.arange(3) == 0
+# Places of the factors of a vector product.
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
-@dataclass(frozen=True, eq=False)
-class ShapeTruth:
+
+class ShapeTruth(NamedTuple):
     """Contact of a shape with all surfaces.
 
     Attributes:
@@ -31,6 +35,19 @@ class ShapeTruth:
     peak: float
     began: float | None
     slip: float
+
+
+class _Pairs(NamedTuple):
+    """Contacts of geoms: which shape each belongs to, the way it pushes, and whether it is one on the ground.
+
+    All three have shape (shapes, contacts).  ``bodies`` and ``roots`` are those of the second geoms.
+    """
+
+    of_shape: Array
+    signed: Array
+    on_ground: Array
+    bodies: Array
+    roots: Array
 
 
 class ContactLog:
@@ -53,51 +70,61 @@ class ContactLog:
         self.forces: Array = np.zeros((count, 3))
         self._normal, self._impulses, self._peaks = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
         self._began = np.full(count, np.nan)
+        # The same geoms touch for many steps: what only depends on which ones do, by their pairs.
+        self._pairs: dict[bytes, _Pairs] = {}
+        self.pushing = False
+        """Whether a surface pushed a shape in the last step."""
 
     def reset(self) -> None:
         """Set everything to zero."""
         for values in (self.forces, self._normal, self._impulses, self._peaks):
             values[:] = 0.0
         self._began[:] = np.nan
+        self.pushing = False
 
     def step(self, data: Any) -> None:
         """Add the forces of a step from ``data.time − timestep`` to ``data.time``."""
-        self.forces[:] = 0.0
-        self._normal[:] = 0.0
         if not data.ncon:
+            if self.pushing:
+                self.forces[:], self._normal[:], self.pushing = 0.0, 0.0, False
             return
         contact = data.contact
-        # A contact just outside the surface does not push and has no address.
-        pushing = contact.efc_address >= 0
-        first, (one, other) = contact.efc_address[pushing], self._shape_of[contact.geom[pushing]].T
-        shapes, side = np.maximum(one, other), np.where(other >= 0, 1.0, -1.0)
-        local = np.zeros((first.size, 3))
-        local[:, 0] = data.efc_force[first]
+        first, geoms, sizes = contact.efc_address, contact.geom, contact.dim
+        frames = contact.frame.reshape(-1, 3, 3)
+        if first.min() < 0:
+            # A contact just outside the surface does not push and has no address.
+            there = first >= 0
+            first, geoms, sizes, frames = first[there], geoms[there], sizes[there], frames[there]
         # A contact has one number without friction, else three.
-        rough = np.flatnonzero(contact.dim[pushing] == 3)
-        local[rough, 1] = data.efc_force[first[rough] + 1]
-        local[rough, 2] = data.efc_force[first[rough] + 2]
+        rough = (sizes == 3)[:, None]
+        local = data.efc_force[first[:, None] + _ROWS * rough] * (rough | _FIRST)
+        pairs = self._known(geoms)
         # The rows of a contact frame are its axes, the normal first.
-        frames = contact.frame[pushing].reshape(-1, 3, 3)
-        np.add.at(self.forces, shapes, side[:, None] * (local[:, None, :] @ frames)[:, 0])
-        np.add.at(self._normal, shapes, local[:, 0])
+        self.forces[:] = pairs.signed @ (local[:, None, :] @ frames)[:, 0]
+        self._normal[:] = pairs.of_shape @ local[:, 0]
         self._impulses += self._step * self.forces
         np.maximum(self._peaks, self._normal, out=self._peaks)
-        fresh = (self._normal > 0) & np.isnan(self._began)
-        self._began[fresh] = data.time - self._step
+        pushed = self._normal > 0
+        self.pushing = bool(pushed.any())
+        fresh = pushed & np.isnan(self._began)
+        if fresh.any():
+            self._began[fresh] = data.time - self._step
 
     def look(self, data: Any) -> tuple[ShapeTruth, ...]:
         """Return the contact of every shape, and begin new peaks and new first touches."""
-        slips = self._slips(data)
+        slips, pushed = self._slips(data).tolist(), (self._normal > 0).tolist()
+        peaks, began = self._peaks.tolist(), self._began.tolist()
+        # One copy for all shapes, whose rows nobody writes.
+        forces, impulses = self.forces.copy(), self._impulses.copy()
         found = tuple(
             ShapeTruth(
                 frame=frame,
-                touching=bool(self._normal[k] > 0),
-                force=self.forces[k].copy(),
-                impulse=self._impulses[k].copy(),
-                peak=float(self._peaks[k]),
-                began=None if np.isnan(self._began[k]) else float(self._began[k]),
-                slip=float(slips[k]),
+                touching=pushed[k],
+                force=forces[k],
+                impulse=impulses[k],
+                peak=peaks[k],
+                began=None if math.isnan(began[k]) else began[k],
+                slip=slips[k],
             )
             for k, frame in enumerate(self._frames)
         )
@@ -106,16 +133,26 @@ class ContactLog:
 
     def _slips(self, data: Any) -> Array:
         """Return tangential speeds, shape (shapes,), of the shapes that were pushed in the last step."""
-        slips = np.zeros(len(self._frames))
-        if not (data.ncon and self._normal.any()):
-            return slips
-        # A ball is no place to slide on.
-        contact, grounds = data.contact, self._body_of[data.contact.geom[:, 0]] == 0
-        geoms, places, normals = contact.geom[grounds, 1], contact.pos[grounds], contact.frame[grounds, :3]
-        bodies = self._body_of[geoms]
-        twists, arms = data.cvel[bodies], places - data.subtree_com[self._root_of[bodies]]
-        velocities = twists[:, 3:] + np.cross(twists[:, :3], arms)
-        velocities -= np.sum(normals * velocities, axis=1, keepdims=True) * normals
-        np.maximum.at(slips, self._shape_of[geoms], np.linalg.norm(velocities, axis=1))
-        slips[self._normal <= 0] = 0.0
-        return slips
+        if not (data.ncon and self.pushing):
+            return np.zeros(len(self._frames))
+        contact = data.contact
+        pairs, normals = self._known(contact.geom), contact.frame[:, :3]
+        twists, arms = data.cvel[pairs.bodies], contact.pos - data.subtree_com[pairs.roots]
+        spins = twists[:, :3]
+        velocities = twists[:, 3:] + spins[:, _NEXT] * arms[:, _LAST] - spins[:, _LAST] * arms[:, _NEXT]
+        velocities -= (normals * velocities).sum(axis=1, keepdims=True) * normals
+        slips = (pairs.on_ground * np.sqrt((velocities * velocities).sum(axis=1))).max(axis=1)
+        return np.asarray(slips * (self._normal > 0))
+
+    def _known(self, geoms: Array) -> _Pairs:
+        """Return what depends on the geoms of the contacts alone, shape (contacts, 2)."""
+        key = geoms.tobytes()
+        if key not in self._pairs:
+            one, other = self._shape_of[geoms].T
+            shapes, bodies = np.maximum(one, other), self._body_of[geoms[:, 1]]
+            of_shape = (shapes == np.arange(len(self._frames))[:, None]).astype(float)
+            # A ball is no place to slide on.
+            ground = (self._body_of[geoms[:, 0]] == 0) & (other >= 0)
+            signed, on_ground = of_shape * np.where(other >= 0, 1.0, -1.0), of_shape * ground
+            self._pairs[key] = _Pairs(of_shape, signed, on_ground, bodies, self._root_of[bodies])
+        return self._pairs[key]

@@ -8,9 +8,14 @@ from functools import cached_property
 from importlib import metadata
 from typing import Literal, get_args
 
+import numpy as np
+
+from impact_posture.arrays import Array
+from impact_posture.controller_export.structure import structure_of
 from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.path.posture_path import PosturePath, check_package, posture_path
+from impact_posture.posture.compiled import CompileMode
 from impact_posture.progress import tell
 from impact_posture.settings import ObjectiveKind
 from impact_posture.simulation.baselines import (
@@ -20,6 +25,7 @@ from impact_posture.simulation.baselines import (
     resting_posture,
     spring_of_term,
 )
+from impact_posture.simulation.compiled_tick import CompiledTick, compiled_tick
 from impact_posture.simulation.driver import Driver, FlowDriver, PostureDriver, RobustDriver
 from impact_posture.simulation.impact_baselines import ImpactAwareDriver, InvariantDriver, ReferenceSpreadingDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
@@ -27,8 +33,10 @@ from impact_posture.simulation.path_driver import PathDriver
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
 from impact_posture.simulation.task_formulations import nominal_posture, posture_options
+from impact_posture.toolchain import find_compiler
 from impact_posture.tsid.activation import Activation
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
+from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 
 Mode = Literal["live", "held"]
@@ -59,6 +67,11 @@ _PLAIN = {
     "reference-spreading": ReferenceSpreadingDriver,
     "impact-aware": ImpactAwareDriver,
 }
+# Drivers that a controller in C can serve.
+_IN_C = (Driver, RobustDriver, FlowDriver, PostureDriver)
+# Runs from which building pays: a humanoid's library takes about 10 s, and saves 4 s of each run.  The cache does not
+# count, because a run would then depend on what ran before, and differ from another one by amplified rounding.
+_PAYS = 3
 _KINDS: dict[str, ObjectiveKind] = {
     "robust-speed": "speed",
     "robust-sticking": "sticking",
@@ -76,13 +89,18 @@ class ControllerFactory:
         setup: The experiment.
         free: Whether gradients and the offline optimum ignore the feet.
         gradient_of: Makes the gradient of an objective, compiled or interpreted.
-        warnings: Why gradients of the last driver are interpreted although they should have been compiled.
+        compile: Whether controllers run as machine code: ``auto`` where building it pays, always, or never.
+        runs: Number of runs of each controller that building has to pay for.
+        warnings: What of the last driver is not compiled although it should have been, and why.
     """
 
     setup: Setup
     free: bool = False
     gradient_of: Callable[[ImpactObjective], Gradient] = compiled
+    compile: CompileMode = "never"
+    runs: int = 1
     warnings: list[str] = field(default_factory=list)
+    _fault: str = ""
     _objectives: dict[ObjectiveKind, ImpactObjective] = field(default_factory=dict)
     _gradients: dict[ObjectiveKind, tuple[Gradient, tuple[str, ...]]] = field(default_factory=dict)
 
@@ -104,6 +122,13 @@ class ControllerFactory:
         found, warnings = self._gradients[kind]
         self.warnings += warnings
         return found
+
+    @cached_property
+    def metric(self) -> Callable[[Array], float]:
+        """``q → H``, the objective in the CasADi interpreter, which is ready at once."""
+        tell("building the expressions")
+        function, normal = self.objective().value_fun(), np.array(self.objective().contact.normal, dtype=float)
+        return lambda q: float(function(q, normal))
 
     @cached_property
     def offline(self) -> OfflinePosture:
@@ -137,10 +162,18 @@ class ControllerFactory:
         modes = get_args(Mode)
         if mode not in modes:
             raise InputError(f"there is no mode '{mode}'", where="--mode", hint=f"one of: {', '.join(modes)}")
+        if self.compile not in (choices := get_args(CompileMode)):
+            raise InputError(f"no mode '{self.compile}'", where="compile", hint=f"choose from {', '.join(choices)}")
         if name.removesuffix(_STIFF) not in CONTROLLERS:
             return self._driver_from_outside(name, mode, gain)
         if mode == "held" and not (name.startswith("robust") or name == "walker"):
             raise InputError(f"'{name}' has no term to hold", where="--mode", hint="only robust… and walker have one")
+        driver = self._made(name, mode, gain)
+        driver.compiled = self._compiled(driver, name)
+        return driver
+
+    def _made(self, name: str, mode: Mode, gain: float | None) -> Driver:
+        """Make a controller of this package."""
         setup, robot = self.setup, self.setup.robot
         if name == "stiff":
             return self._stiffened("nominal", "robust", gain)
@@ -168,6 +201,34 @@ class ControllerFactory:
         driver = WalkerDriver if name == "walker" else RobustDriver
         return driver(setup, posture, robust)
 
+    def _compiled(self, driver: Driver, name: str) -> CompiledTick | None:
+        """Return the controller of a driver as machine code, or ``None`` where Python runs it.
+
+        Other drivers look into their controller, and only Python has one to look into.
+        """
+        always, controller = self.compile == "always", driver.controller
+        if not always and (self.compile == "never" or self.runs < _PAYS or self._fault or find_compiler() is None):
+            return None
+        try:
+            if type(driver) not in _IN_C:
+                raise InputError(f"'{name}' has no C code", where="compile", hint="run it with auto or never")
+            structure = structure_of(controller.robot, controller.formulation)
+        except InputError:
+            if always:
+                raise
+            return None
+        plain = type(controller.formulation.posture) is JointPosture
+        objective = None if plain else self.objective(_KINDS.get(name.removesuffix(_STIFF), "impulse"))
+        try:
+            return compiled_tick(controller, structure, objective)
+        except InputError as error:
+            if always:
+                raise
+            # What fails once, such as a download, is not tried again for each run.
+            self._fault = f"the controller runs in Python, not in C, which is slower: {error.line}"
+            self.warnings.append(self._fault)
+            return None
+
     def _stiffened(self, name: str, at: str, gain: float | None) -> Driver:
         """Make a controller with the spring that the term of ``robust`` is in the posture that ``at`` braces to."""
         robust = self.driver("robust", gain=gain)
@@ -176,7 +237,7 @@ class ControllerFactory:
         reached = resting_posture(robust, seconds)
         if at != "robust":
             reached = resting_posture(self.driver(at), seconds)
-        driver, strength = self.driver(name), robust.term.K / robust.term.scale
+        driver, strength = self._made(name, "live", None), robust.term.K / robust.term.scale
         driver.posture.stiffen(spring_of_term(self.setup.robot, self.gradient(), reached, strength))
         return driver
 

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
+from impact_posture.simulation.compiled_tick import CompiledTick
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.sensor_noise import Reading
@@ -30,7 +31,10 @@ class Driver:
         setup: The experiment.
         posture: The posture task.
         controller: The controller.
+        compiled: The same controller as machine code, which then gives the commands.
     """
+
+    compiled: CompiledTick | None = None
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
         """Build the tasks of the scenario around a posture task."""
@@ -51,14 +55,17 @@ class Driver:
             task.target_velocity = task.target_acceleration = np.zeros(task.size)
         for body_task in self._body_tasks:
             body_task.target = None
-        command = self.controller.reset(q, np.zeros(self.setup.robot.nv))
+        at_rest = np.zeros(self.setup.robot.nv)
+        command = self.controller.reset(q, at_rest)
         self._home = None if task is None else task.target
-        return command
+        return command if self.compiled is None else self.compiled.reset(q, at_rest)
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
         """Return the command, where ``reference`` is the target of the end effector along its way in."""
         if reference is not None:
             self._follow(reference)
+        if self.compiled is not None:
+            return self.compiled.tick(reading)
         return self.controller.tick(reading.t, reading.q, reading.v, reading.force)
 
     def brace(self) -> None:
@@ -73,7 +80,11 @@ class Driver:
     @property
     def level(self) -> float:
         """Level of the term that prepares for the impact, 0 to 1."""
-        return self.posture.level
+        return self.posture.level if self.compiled is None else self.compiled.library.level
+
+    def _tell(self, posture: JointPosture, method: str, *given: Any, **named: Any) -> None:
+        """Call a method of a posture task, or that of its counterpart in C."""
+        getattr(posture if self.compiled is None else self.compiled.library, method)(*given, **named)
 
     def _follow(self, reference: ReferencePoint) -> None:
         task, home = self._end_effector, self._home
@@ -99,11 +110,13 @@ class RobustDriver(Driver):
 
     def brace(self) -> None:
         """Switch the term on."""
-        self.term.brace()
+        self._tell(self.term, "brace")
 
     def hold(self) -> None:
         """Hold the present posture, center of mass and base orientation, and switch the term off."""
-        self.term.contact()
+        self._tell(self.term, "contact")
+        if self.compiled is not None:
+            self.compiled.catch_up()
         for task in self._body_tasks:
             task.target = None
             task.reset(self.controller.state)
@@ -111,7 +124,7 @@ class RobustDriver(Driver):
     @property
     def level(self) -> float:
         """Activation of the term, 0 to 1."""
-        return self.term.activation.level
+        return self.term.level if self.compiled is None else self.compiled.library.level
 
 
 class FlowDriver(Driver):
@@ -127,16 +140,16 @@ class FlowDriver(Driver):
 
     def brace(self) -> None:
         """Let the posture flow."""
-        self.posture.brace()
+        self._tell(self.posture, "brace")
 
     def hold(self) -> None:
         """Hold the posture that the flow has reached."""
-        self.posture.contact()
+        self._tell(self.posture, "contact")
 
     def expect(self, t: float) -> None:
         """Rest early enough before an impact at a time, s."""
-        if self.posture.flow.on:
-            self.posture.brace(t - self._now)
+        if self.level > 0:
+            self._tell(self.posture, "brace", t_impact=t - self._now)
 
 
 class PostureDriver(Driver):
@@ -157,7 +170,7 @@ class PostureDriver(Driver):
 
     def brace(self) -> None:
         """Move posture, center of mass and base orientation to the goal within :data:`MOVE`."""
-        self.posture.move_to(self._goal, MOVE)
+        self._tell(self.posture, "move_to", self._goal, MOVE)
         model = self.setup.robot.model
         for task in self._body_tasks:
             # The feet stay in place, because the goal was found with them there.

@@ -10,7 +10,7 @@ from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.sensor_noise import Reading
-from impact_posture.tsid.body_tasks import lead
+from impact_posture.tsid.body_tasks import BodyTaskLead
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.posture_tasks import JointPosture
 
@@ -30,7 +30,7 @@ class PathDriver(Driver):
         super().__init__(setup, posture)
         self.path = path
         self._since: float | None = None
-        self._workspace = setup.robot.model.createData()
+        self._body = BodyTaskLead(setup.robot.model)
 
     def reset(self, q: np.ndarray) -> Command:
         """Begin at rest."""
@@ -67,4 +67,4 @@ class PathDriver(Driver):
             q = np.asarray(pin.interpolate(model, path.q[k], path.q[k + 1], share))
             v, a = ((1 - share) * x[k] + share * x[k + 1] for x in (path.v, path.a))
         self.posture.lead(q, v, a)
-        lead(self._body_tasks, model, self._workspace, q, v, a)
+        self._body.lead(self._body_tasks, q, v, a)

@@ -31,8 +31,7 @@ class Rotors:
     def __init__(self, propulsion: PropulsionSpec, timestep: float) -> None:
         thrust_limits(propulsion)
         self._lowest, self._highest = propulsion.speed_min, propulsion.speed_max
-        self._up = -np.expm1(-timestep / propulsion.time_constant_up)
-        self._down = -np.expm1(-timestep / propulsion.time_constant_down)
+        self._up, self._down = -timestep / propulsion.time_constant_up, -timestep / propulsion.time_constant_down
         self._coefficient = propulsion.thrust_coefficient
         self.speeds: Array = np.full(len(propulsion.rotors), self._lowest)
 
@@ -49,18 +48,20 @@ class Rotors:
 
     def within(self, command: Array) -> Array:
         """Return a command cut to the limits."""
-        return np.asarray(np.clip(command, self._lowest, self._highest))
+        return np.asarray(np.minimum(np.maximum(command, self._lowest), self._highest))
 
-    def step(self, command: Array) -> Array:
-        """Take a time step under a command within the limits.  Return the thrusts at its end, N, shape (rotors,)."""
+    def steps(self, command: Array, count: int) -> Array:
+        """Take time steps under one command within the limits.  Return the speeds, shape (count, rotors)."""
         away = command - self.speeds
-        self.speeds = self.speeds + np.where(away > 0, self._up, self._down) * away
-        return self.thrusts
+        # A speed never passes its command, so its time constant does not change in between.
+        gone = np.expm1(np.where(away > 0, self._up, self._down) * np.arange(1.0, count + 1)[:, None])
+        speeds = self.speeds - gone * away
+        self.speeds = speeds[-1]
+        return np.asarray(speeds)
 
-    @property
-    def thrusts(self) -> Array:
-        """Thrusts ``c_f ω²``, N, shape (rotors,)."""
-        return np.asarray(self._coefficient * self.speeds**2)
+    def thrusts(self, speeds: Array) -> Array:
+        """Return thrusts ``c_f ω²``, N, in the shape of the speeds."""
+        return np.asarray(self._coefficient * speeds**2)
 
 
 class Vibration:
@@ -97,9 +98,11 @@ class Vibration:
         self._inverse = np.linalg.inv(M + np.triu(M, 1).T)
         self.phases = np.array(phases)
 
-    def step(self, speeds: Array, timestep: float) -> None:
-        """Turn the propellers for a time step."""
-        self.phases = self.phases + 2 * np.pi * timestep * speeds
+    def steps(self, speeds: Array, timestep: float) -> Array:
+        """Turn the propellers for time steps, with speeds and angles of shape (count, rotors)."""
+        phases = self.phases + 2 * np.pi * timestep * speeds.cumsum(axis=0)
+        self.phases = phases[-1]
+        return np.asarray(phases)
 
     def twist(self, speeds: Array, phases: Array) -> Array:
         """Return the error of the measured base twist, base axes, shape (6,)."""

@@ -17,7 +17,6 @@ from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.recorder import Recorder
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush
-from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.simulation.series import RECOVERY, Series, Window
 from impact_posture.simulation.throw import FLIGHT, Throw
 
@@ -97,8 +96,7 @@ class _Loop:
             )
         command = driver.reset(setup.q)
         self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
-        tell("building the expressions")
-        self.recorder = Recorder(setup, interpreted(factory.objective()))
+        self.recorder = Recorder(setup, factory.metric)
         self.away: float | None = None
 
     @property

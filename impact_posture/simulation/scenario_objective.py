@@ -66,8 +66,8 @@ def compiled(objective: ImpactObjective) -> Gradient:
         OutputError: The cache folder cannot be written, or other users can write it.
         SpecError: The library cannot be loaded, for example because another machine built it.
     """
-    folder = cache_folder("gradients") / _key(objective)
-    with _locked(folder.with_suffix(".lock")):
+    folder = cache_folder("gradients") / objective_key(objective)
+    with locked(folder.with_suffix(".lock")):
         if not is_cached(library_path(folder, "impact")):
             if find_compiler() is None:
                 raise no_compiler("gradient")
@@ -76,7 +76,7 @@ def compiled(objective: ImpactObjective) -> Gradient:
     return ImpactGradient.load(folder, robot=objective.robot).objective
 
 
-def _key(objective: ImpactObjective) -> str:
+def objective_key(objective: ImpactObjective) -> str:
     """Return a hash of everything that the C code depends on."""
     point = objective.robot.model.frames[objective.robot.frame_id(objective.contact.frame)]
     held = [objective.robot.model.frames[objective.robot.frame_id(s.frame)] for s in objective.supports]
@@ -91,7 +91,7 @@ def _key(objective: ImpactObjective) -> str:
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
     """Let one process in at a time.  The others then find the work done."""
     try:
         file = path.open("w")

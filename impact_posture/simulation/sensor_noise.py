@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.scene import Sensors
 
@@ -29,6 +31,23 @@ class Reading:
     q: Array
     v: Array
     force: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """True state after a step, which the sensors see, with speeds and angles of the propellers and the felt force."""
+
+    layout: MjcfLayout
+    qpos: Array
+    qvel: Array
+    speeds: Array
+    phases: Array
+    force: Array
+
+    @cached_property
+    def state(self) -> tuple[Array, Array]:
+        """The Pinocchio ``(q, ν)``, which callers must copy."""
+        return self.layout.state(self.qpos, self.qvel)
 
 
 class SensorNoise:

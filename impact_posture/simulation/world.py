@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.mjcf import import_mujoco
-from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import hover
@@ -20,7 +19,7 @@ from impact_posture.simulation.actuator_command import ActuatorCommand, Push, Tr
 from impact_posture.simulation.contact_forces import ContactLog
 from impact_posture.simulation.rotors import Rotors, Vibration
 from impact_posture.simulation.scene import Scene
-from impact_posture.simulation.sensor_noise import Reading, SensorNoise
+from impact_posture.simulation.sensor_noise import Reading, Sample, SensorNoise
 from impact_posture.simulation.throw import Ball, Throw
 from impact_posture.simulation.world_builder import BuiltScene, build_scene
 from impact_posture.tsid.controller import Command
@@ -28,23 +27,6 @@ from impact_posture.tsid.state import checked_velocity
 
 # No robot is so far away or so fast, m, m/s, rad/s, and no torque so large, N·m.
 _RUNAWAY = 1e6
-
-
-@dataclass(frozen=True, eq=False)
-class _Sample:
-    """What the sensors see after a step."""
-
-    layout: MjcfLayout
-    qpos: Array
-    qvel: Array
-    speeds: Array
-    phases: Array
-    force: Array
-
-    @cached_property
-    def state(self) -> tuple[Array, Array]:
-        """The Pinocchio ``(q, ν)``, which callers must copy."""
-        return self.layout.state(self.qpos, self.qvel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +79,8 @@ class World:
         self._felt = None if sensors.force_frame is None else frames.index(sensors.force_frame)
         self._smoothing = -np.expm1(-2 * np.pi * sensors.force_cutoff * self.timestep)
         self._force: Array = np.zeros(3)
-        self._past: deque[_Sample] = deque(maxlen=1 + round(sensors.delay / self.timestep))
+        self._feels = False
+        self._past: deque[Sample] = deque(maxlen=1 + round(sensors.delay / self.timestep))
         self._pushes: list[_ActivePush] = []
         self._steps = 0
         limited = np.array(self._model.jnt_limited, dtype=bool)
@@ -132,13 +115,15 @@ class World:
         if self._vibration is not None:
             self._vibration.reset(q, self._generator.uniform(0, 2 * np.pi, self._count))
         self._log.reset()
-        self._force[:] = 0.0
+        self._force[:], self._feels = 0.0, False
         self._torques = np.zeros(self._effort.size)
         self._pushes.clear()
         self._steps = 0
         self._mujoco.mj_step1(self._model, self._data)
         self._past.clear()
-        self._past.append(self._sample())
+        speeds = np.zeros(0) if self._rotors is None else self._rotors.speeds
+        phases = np.zeros(0) if self._vibration is None else self._vibration.phases
+        self._past.append(self._sample(speeds, phases))
 
     @property
     def time(self) -> float:
@@ -190,32 +175,41 @@ class World:
         before = self._mujoco.get_mju_user_warning()
         self._mujoco.set_mju_user_warning(lambda message: None)
         try:
-            for _ in range(count):
-                self._advance(speed)
+            self._advance(speed, count)
         finally:
             self._mujoco.set_mju_user_warning(before)
-        if not (np.abs(self._data.qvel).max() < _RUNAWAY and np.abs(self._data.qpos).max() < _RUNAWAY):
+        places, rates = self._data.qpos, self._data.qvel
+        # The largest number is computed only where the sum of squares does not settle it.
+        if not places.dot(places) + rates.dot(rates) < _RUNAWAY**2 and not (
+            np.abs(rates).max() < _RUNAWAY and np.abs(places).max() < _RUNAWAY
+        ):
             raise SimulationDiverged(self.time, where=self.robot.name)
-        if self._past.maxlen == 1:
-            self._past.append(self._sample())
 
-    def _advance(self, speed: Array) -> None:
-        """Take one physics step."""
-        mujoco, model, data = self._mujoco, self._model, self._data
-        if self._rotors is not None:
-            data.ctrl[: self._count] = self._rotors.step(speed)
-            if self._vibration is not None:
-                self._vibration.step(self._rotors.speeds, self.timestep)
-        self._apply_pushes()
-        mujoco.mj_step2(model, data)
-        self._steps += 1
-        self._log.step(data)
-        if self._felt is not None:
-            self._force += self._smoothing * (self._log.forces[self._felt] - self._force)
-        # Now positions, contacts and velocities are those of the new state, and forces those of the step.
-        mujoco.mj_step1(model, data)
-        if self._past.maxlen != 1:
-            self._past.append(self._sample())
+    def _advance(self, command: Array, count: int) -> None:
+        """Take physics steps under rotor speeds within the limits."""
+        model, data, first, second = self._model, self._data, self._mujoco.mj_step1, self._mujoco.mj_step2
+        rotors, vibration, speeds, phases = self._rotors, self._vibration, np.zeros((count, 0)), np.zeros((count, 0))
+        if rotors is not None:
+            # Propellers feel nothing of the robot, so all their steps are taken at once.
+            speeds = rotors.steps(command, count)
+            thrusts = rotors.thrusts(speeds)
+            phases = phases if vibration is None else vibration.steps(speeds, self.timestep)
+        control = data.ctrl[: self._count]
+        for k in range(count):
+            if rotors is not None:
+                control[:] = thrusts[k]
+            if self._pushes:
+                self._apply_pushes()
+            second(model, data)
+            self._steps += 1
+            self._log.step(data)
+            self._feels = self._feels or self._log.pushing
+            if self._felt is not None and self._feels:
+                self._force += self._smoothing * (self._log.forces[self._felt] - self._force)
+            # Now positions, contacts and velocities are those of the new state, and forces those of the step.
+            first(model, data)
+            if self._past.maxlen != 1 or k == count - 1:
+                self._past.append(self._sample(speeds[k], phases[k]))
 
     def read(self) -> Reading:
         """Return what the sensors measure now.  Every call draws new noise."""
@@ -232,29 +226,25 @@ class World:
         self._check_ready()
         q, v = (part.copy() for part in self._past[-1].state)
         values = self._data.qpos[self._limited]
-        stopped = np.flatnonzero((values <= self._low) | (values >= self._high))
+        stopped = ((values <= self._low) | (values >= self._high)).nonzero()[0]
         rotors = self._rotors
         return Truth(
             t=self.time,
             q=q,
             v=v,
             rotor_speeds=np.zeros(0) if rotors is None else rotors.speeds,
-            thrusts=np.zeros(0) if rotors is None else rotors.thrusts,
+            thrusts=np.zeros(0) if rotors is None else rotors.thrusts(rotors.speeds),
             torques=self._torques,
             shapes=self._log.look(self._data),
             at_stops=tuple(self._limited_names[k] for k in stopped),
         )
 
-    def _sample(self) -> _Sample:
-        speeds = np.zeros(0) if self._rotors is None else self._rotors.speeds
-        phases = np.zeros(0) if self._vibration is None else self._vibration.phases
+    def _sample(self, speeds: Array, phases: Array) -> Sample:
         data = self._data
         qpos, qvel = data.qpos[: self._layout.nqpos].copy(), data.qvel[: self._layout.nv].copy()
-        return _Sample(self._layout, qpos, qvel, speeds, phases, self._force.copy())
+        return Sample(self._layout, qpos, qvel, speeds, phases, self._force.copy())
 
     def _apply_pushes(self) -> None:
-        if not self._pushes:
-            return
         data = self._data
         data.qfrc_applied[:] = 0.0
         self._pushes = [push for push in self._pushes if push.end > self._steps]
@@ -270,10 +260,13 @@ class World:
                 where="command",
                 hint=f"give {self._count} and {self._effort.size}",
             )
-        if not (np.isfinite(speed).all() and np.isfinite(torque).all()):
+        # A sum of finite numbers is finite as long as they are not absurd.
+        if not math.isfinite(speed.sum() + torque.sum()) and not (
+            np.isfinite(speed).all() and np.isfinite(torque).all()
+        ):
             raise InputError("is not finite", where="command", hint="hold the last one instead")
-        torque = np.clip(torque, -self._effort, self._effort)
-        if not np.abs(torque).max(initial=0.0) < _RUNAWAY:
+        torque = np.minimum(np.maximum(torque, -self._effort), self._effort)
+        if not torque.dot(torque) < _RUNAWAY**2 and not np.abs(torque).max(initial=0.0) < _RUNAWAY:
             raise InputError("has an endless torque", where="command", hint="give the joints effort limits")
         return speed if self._rotors is None else self._rotors.within(speed), torque
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.resolved_impact import resolve
@@ -23,7 +24,7 @@ from impact_posture.sweep.point_search import Place, Timer, Walk
 from impact_posture.sweep.sweep_file import OFFSETS, Case
 
 # Problems and programs that a process keeps.  Both are small beside the solver itself.
-_TEMPLATES, _PROGRAMS = 64, 16
+_TEMPLATES, _PROGRAMS = 16, 16
 
 _Value = TypeVar("_Value")
 
@@ -64,16 +65,20 @@ class CaseSolver:
         key = objective.structure, tuple(objective.parameters), made.problem.requirements
         return replace(kept(self._known, key, lambda: made, _TEMPLATES), impact=made.impact)
 
-    def target(self, prepared: Prepared, values: Mapping[str, Any]) -> Place:
+    def target(self, values: Mapping[str, Any]) -> Place:
         """Return the position and orientation of the contact frame at values of the grid."""
         position = values.get("target_position", self._case.settings.target_position)
         quaternion = values.get("target_quaternion", self._case.settings.target_quaternion)
         if any(name in values for name in OFFSETS):
-            if position is None:
-                frame = point_on(self.robot, prepared.impact.contact.frame)
-                position = Numeric(self.robot.model).at(prepared.impact.q).placement(frame).translation
-            position = tuple(float(v) for v in np.array(position) + [values.get(name, 0.0) for name in OFFSETS])
+            position = self._home if position is None else position
+            position = tuple(float(v) + values.get(name, 0.0) for v, name in zip(position, OFFSETS, strict=True))
         return position, quaternion
+
+    @cached_property
+    def _home(self) -> Array:
+        impact = self.template(*self.normal_and_speed({})).impact
+        frame = point_on(self.robot, impact.contact.frame)
+        return np.array(Numeric(self.robot.model).at(impact.q).placement(frame).translation)
 
     def check(self, grid: Grid) -> None:
         """Check that the targets of the grid fit the problem.
@@ -84,15 +89,14 @@ class CaseSolver:
         for axis in grid.axes:
             for value in axis.values if axis.name.startswith("target") else axis.values[:1]:
                 prepared = self.template(*self.normal_and_speed({axis.name: value}))
-                retarget(prepared.problem, *self.target(prepared, {axis.name: value}))
+                retarget(prepared.problem, *self.target({axis.name: value}))
 
     def program(self, problem: PostureProblem) -> PostureNLP:
         """Return the program of a problem, built anew only if its expressions are new.
 
         A program never grows out of another here, so its rounding depends on its problem alone.
         """
-        rows = [f"{c.structure}:{problem.carried(k)}" for k, c in enumerate(problem.constraints)]
-        key = "\n".join([problem.objective.structure, *rows])
+        key = f"{problem.objective.structure}\n{problem.structure}"
         made = kept(self._programs, key, lambda: build_nlp(problem, compile="never"), _PROGRAMS)
         return replace(made, problem=problem)
 

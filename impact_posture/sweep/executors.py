@@ -7,7 +7,9 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from impact_posture.errors import InputError
@@ -85,14 +87,27 @@ class SlurmJobs(Executor):
 
     def __init__(self, folder: Path, options: dict[str, Any], cluster: str | None = None) -> None:
         check_package("submitit", "slurm")
+        self._folder, self._options, self._cluster = folder, options, cluster
+        # submitit makes its folder at once, and what is refused leaves nothing behind.
+        with TemporaryDirectory() as place:
+            try:
+                self._executor(Path(place))
+            except (NameError, TypeError, ValueError, AssertionError) as error:
+                raise InputError(
+                    str(error), where="--slurm", hint="name parameters of submitit.AutoExecutor"
+                ) from None
+        self._waiting = ThreadPoolExecutor(1 << 10)
+
+    def _executor(self, folder: Path) -> Any:
         import submitit
 
-        self._jobs = submitit.AutoExecutor(folder, cluster=cluster)
-        try:
-            self._jobs.update_parameters(**options)
-        except (NameError, TypeError, ValueError, AssertionError) as error:
-            raise InputError(str(error), where="--slurm", hint="name parameters of submitit.AutoExecutor") from None
-        self._waiting = ThreadPoolExecutor(1 << 10)
+        made = submitit.AutoExecutor(folder, cluster=self._cluster)
+        made.update_parameters(**self._options)
+        return made
+
+    @cached_property
+    def _jobs(self) -> Any:
+        return self._executor(self._folder)
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
         """Submit one call as a job."""

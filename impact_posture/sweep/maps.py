@@ -263,7 +263,9 @@ def _label(axis: Any, own: Axis) -> None:
     """Label an axis of a panel with a few of its values."""
     count = len(own.values)
     shown = np.unique(np.linspace(0, count - 1, min(count, _TICKS)).round().astype(int))
-    axis.set_ticks(shown, [plot_label(_short(own.values[k])) for k in shown])
+    # Entries of a vector stand below each other on the axis across, where long labels would meet.
+    space = "\n" if axis.axis_name == "x" and isinstance(own.values[0], tuple) else " "
+    axis.set_ticks(shown, [plot_label(_short(own.values[k])).replace(" ", space) for k in shown])
     axis.set_label_text(plot_label(own.name + (" offset, m" if own.name in "xyz" else "")))
 
 

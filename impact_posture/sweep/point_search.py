@@ -12,7 +12,7 @@ from impact_posture.arrays import Array
 from impact_posture.errors import ImpactPostureError, Infeasible
 from impact_posture.posture.build_problem import retarget
 from impact_posture.posture.certificate import Certificate, certify
-from impact_posture.posture.elastic import elastic
+from impact_posture.posture.elastic import ElasticAnswer, ElasticProgram, elastic
 from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.search import FEASIBLE, HIGH_PRICE
@@ -66,11 +66,24 @@ class Walk:
     ) -> None:
         # The template is kept, because a shard knows it by its identity.
         self._template, self._build, self.settings, self.timer = template, build, settings, timer
+        self._relaxed: ElasticProgram | None = None
         self.grow(template)
 
     def grow(self, problem: PostureProblem) -> None:
         """Go on with the parts that a point needed."""
         self.problem, self.nlp = problem, self._build(problem)
+
+    def at(self, problem: PostureProblem, place: Place) -> PostureProblem:
+        """Return a problem with its target at a place."""
+        return retarget(problem, *place, self.nlp.program.numeric)
+
+    def relax(self, place: Place, tries: int) -> ElasticAnswer:
+        """Relax the constraints at a place, with the parts that the places before needed for it."""
+        program = self._relaxed = self._relaxed or ElasticProgram(self.problem)
+        before = program.cpu_s
+        found = elastic(self.at(program.problem, place), self.settings.seed, tries, program)
+        self.timer.solver_s += program.cpu_s - before
+        return found
 
 
 def search(walk: Walk, place: Place, guesses: Sequence[Array], *, few: bool = False) -> PointResult:
@@ -87,7 +100,7 @@ def search(walk: Walk, place: Place, guesses: Sequence[Array], *, few: bool = Fa
         if (found := attempt.certified(guesses)) is not None:
             return found
         # Either this finds the constraints that conflict, or a posture to start from.
-        relaxed = elastic(attempt.problem, walk.settings.seed, 1 if few else _TRIES)
+        relaxed = walk.relax(place, 1 if few else _TRIES)
         if relaxed.conflicts:
             return attempt.without("infeasible", Infeasible(relaxed.conflicts).what)
         if (found := attempt.certified([relaxed.q])) is not None:
@@ -129,7 +142,7 @@ class _Attempt:
     """
 
     def __init__(self, walk: Walk, place: Place, others: int) -> None:
-        self.problem, self.runs, self.fault = retarget(walk.problem, *place), 0, "no run converged"
+        self.problem, self.runs, self.fault = walk.at(walk.problem, place), 0, "no run converged"
         self._walk, self._others = walk, others
 
     def certified(self, guesses: Sequence[Array], *, alone: bool = False) -> PointResult | None:
@@ -150,7 +163,7 @@ class _Attempt:
                 ends += [self._run(nlp, start, scale, price) for start in self._random_starts()]
             found = _optima(problem, ends)
             for end in found:
-                certificate = certify(problem, end.q, scale, end.auxiliaries)
+                certificate = certify(problem, end.q, scale, end.auxiliaries, nlp.program.numeric)
                 if certificate.holds() and self._is_clear(end.q):
                     return self._answer(end, certificate, len(found))
                 self.fault = f"stationarity {certificate.stationarity:.1e}, violation {certificate.primal:.1e}"

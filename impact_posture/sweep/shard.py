@@ -83,7 +83,7 @@ def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
         values = sweep.grid.values(point)
         prepared = solver.template(*solver.normal_and_speed(values))
         walk = kept(walks, id(prepared.problem), partial(solver.walk, prepared.problem), _KEPT_WALKS)
-        return walk, solver.target(prepared, values)
+        return walk, solver.target(values)
 
     last: tuple[Walk, Any] | None = None
     for point in points:

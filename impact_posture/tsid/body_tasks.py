@@ -110,15 +110,27 @@ class CenterOfMass(TargetTask[Array]):
         return state.center_of_mass()[2]
 
 
-def lead(
-    tasks: Iterable[BaseOrientation | CenterOfMass], model: pin.Model, data: pin.Data, q: Array, v: Array, a: Array
-) -> None:
-    """Set the targets of body tasks to what they are in a motion at ``q``, ``ν``, ``ν̇``.  ``data`` is workspace."""
-    pin.centerOfMass(model, data, q, v, a, False)
-    for task in tasks:
-        if isinstance(task, CenterOfMass):
-            task.target = np.array(data.com[0])
-            task.target_velocity, task.target_acceleration = data.vcom[0], data.acom[0]
-        else:
-            task.target = pin.Quaternion(q[3:7]).matrix()
-            task.target_velocity, task.target_acceleration = v[3:6], a[3:6]
+class BodyTaskLead:
+    """Sets the targets of body tasks to what they are in a motion.
+
+    Args:
+        model: The robot's model.
+    """
+
+    def __init__(self, model: pin.Model) -> None:
+        self._model, self._data = model, model.createData()
+        # Pinocchio writes here; asking it again takes longer than its computation.
+        data = self._data
+        self._com, self._rotation = (data.com[0], data.vcom[0], data.acom[0]), data.oMi[1].rotation
+
+    def lead(self, tasks: Iterable[BaseOrientation | CenterOfMass], q: Array, v: Array, a: Array) -> None:
+        """Set the targets at ``q``, ``ν`` and ``ν̇``."""
+        pin.centerOfMass(self._model, self._data, q, v, a, False)
+        position, velocity, acceleration = self._com
+        for task in tasks:
+            if isinstance(task, CenterOfMass):
+                task.target = position.copy()
+                task.target_velocity, task.target_acceleration = velocity, acceleration
+            else:
+                task.target = self._rotation.copy()
+                task.target_velocity, task.target_acceleration = v[3:6], a[3:6]

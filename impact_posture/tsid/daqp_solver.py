@@ -7,9 +7,10 @@ import numpy as np
 
 from impact_posture.tsid.qp import QP, Solved
 
-# Exit flag of DAQP for a program without a solution; 1 and 2 (soft constraints are active) are solutions.  -6
-# (dependent equations) does not count, because DAQP also returns it for bounds that were active before.
-_NONE = -1
+# Exit flags of DAQP for a solution (2: soft constraints are active) and for a program without one.  4 is an answer
+# that violates bounds after it went in circles.  -6 (dependent equations) does not count, because DAQP also returns
+# it for bounds that were active before.
+_SOLVED, _NONE = (1, 2), -1
 # Flag of a program that could not be solved for another reason.
 FAILED = 0
 # Largest violation of a bound, and largest number of iterations for one program.
@@ -43,8 +44,8 @@ class DaqpSolver:
         if self._flag >= 0:
             z, _, self._flag, info = self._model.solve()
         # The active set of a failed attempt is useless.
-        self._cold = self._flag <= 0
-        if self._flag <= 0:
+        self._cold = self._flag not in _SOLVED
+        if self._cold:
             return None
         return Solved(z, info["lam"], int(info["iterations"]))
 

@@ -30,27 +30,29 @@ class Redundancy:
     Attributes:
         basis: ``Z``, orthonormal, shape (nv, r).
         inverse: ``J⁺`` of the held directions, shape (nv, rows).
-        springs: ``k JZ`` of nearly dependent constraints, shape (rows, r).
-        stiffness: Their stiffness ``k s²`` along each column of ``Z``, shape (r,).
+        springs: ``k JZ`` of nearly dependent constraints, shape (rows, r); ``None`` where there are none.
+        stiffness: Their stiffness ``k s²`` along each column of ``Z``, shape (r,), or ``None``.
     """
 
     basis: Array
     inverse: Array
-    springs: Array
-    stiffness: Array
+    springs: Array | None = None
+    stiffness: Array | None = None
 
     @classmethod
     def of(cls, J: Array) -> Redundancy:
         """Decompose ``J``, shape (rows, nv)."""
         rows, nv = J.shape
         if not rows:
-            return cls(np.eye(nv), np.zeros((nv, 0)), np.zeros((0, nv)), np.zeros(nv))
+            return cls(np.eye(nv), np.zeros((nv, 0)))
         U, s, Vt = np.linalg.svd(J)
         rank = int(np.count_nonzero(s > _SOFT * s[0]))
-        Z = Vt[rank:].T
-        springs, stiffness = np.zeros((rows, Z.shape[1])), np.zeros(Z.shape[1])
-        springs[:, : s.size - rank] = U[:, rank : s.size] * (_STIFFNESS * s[rank:])
-        stiffness[: s.size - rank] = _STIFFNESS * s[rank:] ** 2
+        Z, soft = Vt[rank:].T, s[rank:]
+        springs = stiffness = None
+        if soft.size:
+            springs, stiffness = np.zeros((rows, Z.shape[1])), np.zeros(Z.shape[1])
+            springs[:, : soft.size] = U[:, rank : s.size] * (_STIFFNESS * soft)
+            stiffness[: soft.size] = _STIFFNESS * soft**2
         return cls(Z, (Vt[:rank].T / s[:rank]) @ U[:, :rank].T, springs, stiffness)
 
 
@@ -68,6 +70,7 @@ class FlowDirection:
         B: Curvature of ``H/H₀`` on the constraints, shape (nv, nv).
         T: Slope of the static controls (:class:`StaticControls`), shape (controls, nv).
         gain: Decrease of ``H/H₀`` that the last step predicts.
+        failures: Number of steps that the solver did not find.  They are zero.
     """
 
     def __init__(self, robot: Robot, edges: Array, controls: int, *, rho: float, mu: float, margin: float) -> None:
@@ -89,21 +92,22 @@ class FlowDirection:
         # The pull towards the start acts on joints.  Others lead the base.
         self._pull = np.full(nv, rho)
         self._pull[: 6 if robot.floating else 0] = 0.0
-        self.B, self.T, self.gain = np.zeros((nv, nv)), np.zeros((controls, nv)), 0.0
+        self.B, self.gain, self.failures = np.zeros((nv, nv)), 0.0, 0
         # The sizes never change.  Directions that the constraints take keep columns of zeros.
         self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + controls)
         self._solver = DaqpSolver(nv, self._qp.m)
         self._rows = np.zeros((self._qp.m, nv))
         self._rows[np.arange(self._joints.size), self._joints] = 1.0
+        self.T = self._rows[self._qp.m - controls :]
 
     def learn(self, z: Array, curvature: Array, slope: Array) -> None:
         """Learn the curvature of ``H/H₀`` and the slope of the static controls along a unit vector, shape (nv,)."""
         missing = curvature - self.B @ z
         missing -= z @ missing / 2 * z
-        outer = np.outer(missing, z)
+        outer = np.multiply.outer(missing, z)
         self.B += outer
         self.B += outer.T
-        self.T += np.outer(slope - self.T @ z, z)
+        self.T += np.multiply.outer(slope - self.T @ z, z)
 
     def limit(self, state: State, rooms: Array, shares: Array, coasting: Array) -> None:
         """Set the rows for a state at ``ν = 0``, less what the flow needs to brake.
@@ -121,7 +125,6 @@ class FlowDirection:
         if k:
             np.matmul(self._edges, state.center_of_mass()[1][:2], out=self._rows[count : count + k])
             upper[count : count + k] = rooms
-        self._rows[count + k :] = self.T
         upper[count + k :] = 1.0 - shares
         lower[count + k :] = -1.0 - shares
         ahead = self._rows @ coasting
@@ -139,9 +142,11 @@ class FlowDirection:
             error: Error of the constraints, shape (rows,).
         """
         Z, root = space.basis, math.sqrt(max(abs(value), _LEAST))
-        slope = Z.T @ (gradient / root + self._pull * offset) - space.springs.T @ error
+        slope = Z.T @ (gradient / root + self._pull * offset)
         curvature = Z.T @ (self.B / root) @ Z + (Z.T * self._pull) @ Z
-        curvature.flat[:: slope.size + 1] += space.stiffness
+        if space.springs is not None:
+            slope -= space.springs.T @ error
+            curvature.flat[:: slope.size + 1] += space.stiffness
         values, vectors = np.linalg.eigh(curvature)
         way = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
         step = self._solve(way, way.T @ (Z @ slope))
@@ -176,7 +181,7 @@ class FlowDirection:
         self._solver.reset()
         solved = self._solver.solve(qp)
         if solved is None:
-            self.gain = 0.0
+            self.gain, self.failures = 0.0, self.failures + 1
             return np.zeros(way.shape[0])
         y = solved.z[:r]
         self.gain = -float(slope @ y + y @ y / 2)

@@ -101,8 +101,8 @@ class PointKinematics:
             for k, point in enumerate(points)
         }
 
-    def update(self, v: Array) -> None:
-        """Move to the configuration of the data and to ν, shape (nv,)."""
+    def update(self, v: Array | None) -> None:
+        """Move to the configuration of the data and to ν, shape (nv,); ``None`` for zero, which is faster."""
         if not self._moving:
             return
         for R, t, offset, turn, position, rotation in self._moving:
@@ -120,6 +120,10 @@ class PointKinematics:
         self._shift += _EYE
         np.matmul(self._shift_rows, self._J, out=self._jacobian)
         self._jacobian *= self._rows_mask
+        if v is None:
+            for part in (self._velocity, self._spatial, self._drift):
+                part.fill(0.0)
+            return
         np.matmul(self._jacobian, v, out=self._velocity)
         np.multiply(self._mask, v, out=self._masked)
         np.matmul(self._masked, self._dJ_transposed, out=self._world)

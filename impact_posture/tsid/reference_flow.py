@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -32,6 +33,10 @@ _RETURN = 0.1
 _REACHED = 0.02
 # Speed below which a flow that is off stands still, rad/s (m/s).
 _STILL = 1e-5
+# Square of the length below which a direction is none.
+_EMPTY = 1e-24
+# Length of what is new in a direction below which once more makes it exact.
+_NEW = 0.1
 # Pull to zero of the base's share in a motion that the joints do not determine.
 _IDLE = 1e-9
 
@@ -130,6 +135,7 @@ class ReferenceFlow:
         self._static = StaticControls(actuators, self._contacts, options.share)
         self.q, self.velocity, self.acceleration = robot.posture(), np.zeros(nv), np.zeros(nv)
         self.robot, self._path = robot, tuple(path)
+        self._mixed, self._seen = mixed_directions(nv), np.zeros((nv, nv))
 
     def reset(self, q: Array) -> None:
         """Begin at rest at a posture, shape (nq,), and measure the curvature there.
@@ -140,7 +146,7 @@ class ReferenceFlow:
         options, state = self.options, self._state
         self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
         self._first, self._here = self.q.copy(), self.q.copy()
-        self._wanted, self._flow, self._still = np.zeros((3, self.velocity.size))
+        self._wanted, self._flow = np.zeros((2, self.velocity.size))
         self._phase, self._next, self._visited, self._elapsed, self._clock = 0, 0, 0, 0.0, 0.0
         self._deadline = np.inf
         self.on, self.resting, self.failed = False, False, False
@@ -162,8 +168,7 @@ class ReferenceFlow:
             raise MetricError("the objective vanishes or does not exist", where="reset", hint="start elsewhere")
         self.start = abs(self.value)
         self._look()
-        for k in range(self._space.basis.shape[1]):
-            self._next = k
+        for _ in range(self._space.basis.shape[1]):
             self._probe(1.0)
             self._probe(-1.0)
         self._next = 0
@@ -211,17 +216,26 @@ class ReferenceFlow:
         Z = self._space.basis
         if self.failed or not Z.shape[1]:
             return
-        z = Z[:, self._next % Z.shape[1]]
+        k = self._next % Z.shape[1]
+        z = self._seen[k]
+        if sign > 0:
+            # The columns of Z are as good as any others of that space.  What a fixed direction has in it is unique.
+            seen, z[:] = self._seen[:k], self._mixed[k]
+            for _ in range(2):
+                z[:] = Z @ (Z.T @ (z - (seen @ z) @ seen))
+                length = math.sqrt(max(float(z @ z), _EMPTY))
+                z /= length
+                if length > _NEW:
+                    break
         # Both sides of the posture of the last look, because the flow has moved on since.
         q = pin.integrate(self._model, self._here, sign * _STEP * z)
         _, slope = self._evaluate(q)
         self._place(q)
         found = slope - self._J.T @ self._multipliers, self._static.shares(self._state, self._J)
         if sign > 0:
-            self._ahead = z, *found
+            self._ahead = found
         elif not self.failed:
-            z, *ahead = self._ahead
-            curvature, controls = ((a - b) / (2 * _STEP) for a, b in zip(ahead, found, strict=True))
+            curvature, controls = ((a - b) / (2 * _STEP) for a, b in zip(self._ahead, found, strict=True))
             self.direction.learn(z, curvature, controls)
             self._next += 1
 
@@ -231,9 +245,9 @@ class ReferenceFlow:
         if self.failed:
             return
         if self._visited < len(self._path):
-            way = pin.difference(self._model, self.q, self._path[self._visited])
+            way, before = pin.difference(self._model, self.q, self._path[self._visited]), self.direction.failures
             self._wanted[:] = self.direction.towards(self._space.basis, way)
-            self._visited += int(np.abs(self._wanted).max() < _REACHED)
+            self._visited += int(self.direction.failures == before and np.abs(self._wanted).max() < _REACHED)
             return
         offset = pin.difference(self._model, self._first, self.q)
         self._wanted[:] = self.direction.newton(self._space, self._slope, self.value / self.start, offset, self.error)
@@ -244,6 +258,9 @@ class ReferenceFlow:
         """Limit speed and acceleration, and return to contacts and tasks."""
         options, Z = self.options, self._space.basis
         period, self._elapsed = self._elapsed, 0.0
+        if not period > 0:
+            # A clock that stands still.
+            return
         error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         fastest = min(fastest, options.acceleration * max(self._deadline - self._clock, 0.0))
@@ -268,13 +285,13 @@ class ReferenceFlow:
             stop = self._flow * (np.abs(self._flow).max() / (2 * options.acceleration))
             step = limited(self.direction.downhill(Z, self._slope, self._flow, stop, step), most)
         known = (self._flow + back - self.velocity) / period
-        step *= self._static.permitted(self._state, self._J, known, step / period, self.shares, options.haste)
+        step *= self._static.permitted(self._state.M, known, step / period, self.shares, options.haste)
         self._flow += step
         self.acceleration[:] = known + step / period
 
     def _place(self, q: Array) -> None:
         """Evaluate the Jacobian of the constraints at a posture."""
-        state = self._state.update(q, self._still)
+        state = self._state.update(q, None)
         for task, J in self._turning:
             J[:] = task.jacobian(state)
 
@@ -288,6 +305,15 @@ class ReferenceFlow:
             # A user's function may raise anything, but the tick must go on.  `failed` reports it.
             self.failed = True
         return (np.nan, np.zeros(self.velocity.size)) if self.failed else (float(value), found)
+
+
+def mixed_directions(nv: int) -> Array:
+    """Return directions in which no entry is left out, shape (nv, nv), bit for bit the same on every machine.
+
+    The fractions of ``k² φ``, φ the golden ratio in 32 bits, are spread like random numbers.
+    """
+    k = np.arange(1, nv * nv + 1, dtype=np.uint32)
+    return np.asarray((k * k * np.uint32(2654435769) / 2.0**32 - 0.5).reshape(nv, nv))
 
 
 PHASES: tuple[Callable[[ReferenceFlow], None], ...] = (

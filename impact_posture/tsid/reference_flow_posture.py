@@ -12,7 +12,7 @@ from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
-from impact_posture.tsid.body_tasks import lead
+from impact_posture.tsid.body_tasks import BodyTaskLead
 from impact_posture.tsid.impact_robust import Gradient, gradient_of
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.reference_flow import FlowOptions, ReferenceFlow
@@ -61,7 +61,7 @@ class ReferenceFlowPosture(JointPosture):
         visited = np.zeros((0, robot.nq)) if path is None else np.atleast_2d(np.asarray(path, dtype=float))
         self._path = [robot.check_posture(q, limits=False) for q in visited]
         self._flow: ReferenceFlow | None = None
-        self._data = robot.model.createData()
+        self._lead = BodyTaskLead(robot.model)
         slowest = float(self.kp[6 if robot.floating else 0 :].min(initial=np.inf))
         self.settle = 4.0 / np.sqrt(slowest) if 0 < slowest < np.inf else 0.0
 
@@ -125,4 +125,4 @@ class ReferenceFlowPosture(JointPosture):
         self.value = flow.value
         self.lead(flow.q, flow.velocity, flow.acceleration)
         if flow.led:
-            lead(flow.led, self._model, self._data, flow.q, flow.velocity, flow.acceleration)
+            self._lead.lead(flow.led, flow.q, flow.velocity, flow.acceleration)

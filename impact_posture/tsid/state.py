@@ -72,11 +72,14 @@ class State:
         """Dimension of ν."""
         return self.v.size
 
-    def update(self, q: ArrayLike, v: ArrayLike) -> State:
-        """Move to ``(q, ν)`` of shapes (nq,) and (nv,), which are finite and have quaternions near unit norm."""
+    def update(self, q: ArrayLike, v: ArrayLike | None) -> State:
+        """Move to ``(q, ν)`` of shapes (nq,) and (nv,), which are finite and have quaternions near unit norm.
+
+        ``None`` for ν is zero, which is faster.
+        """
         model, data = self._model, self._data
         self.q[:] = q
-        self.v[:] = v
+        self.v[:] = 0.0 if v is None else v
         self._com = None
         for unit in self._units:
             square = float(unit.dot(unit))
@@ -89,8 +92,11 @@ class State:
         self.least_room = self.rooms.item(self.rooms.argmin())
         pin.crba(model, data, self.q)
         pin.nonLinearEffects(model, data, self.q, self.v)
-        pin.computeJointJacobiansTimeVariation(model, data, self.q, self.v)
-        self._kinematics.update(self.v)
+        if v is None:
+            pin.computeJointJacobians(model, data, self.q)
+        else:
+            pin.computeJointJacobiansTimeVariation(model, data, self.q, self.v)
+        self._kinematics.update(None if v is None else self.v)
         return self
 
     def push(self, force: Array | None) -> None:

@@ -45,6 +45,14 @@ class StaticControls:
         self._inverse[: actuators.rotors, :base] = actuators.inverse
         self._inverse[actuators.rotors :, base:] = np.eye(actuators.controls - actuators.rotors)
         self._inverse = self._inverse[self.limited] / self._half[:, None]
+        # Forces on the contacts that carry the base, times -Jᵀ: what they take from generalized forces.
+        self._carried = np.zeros((actuators.G.shape[0], base))
+        if contacts:
+            # Imported here, because SciPy takes long to import.  For six unknowns it takes a third of NumPy's time.
+            from scipy.linalg.lapack import dposv
+
+            self._solve = dposv
+        self._central, self._pair = self._middle / self._half, np.zeros((actuators.G.shape[0], 2))
 
     def shares(self, state: State, J: Array) -> Array:
         """Return the shares at a state with ``ν = 0``, shape (m,); within ±1 the posture can be held.
@@ -53,27 +61,6 @@ class StaticControls:
             state: The state, whose ``h`` is gravity.
             J: Jacobian whose first rows are those of the contacts, shape (≥ contact rows, nv).
         """
-        return np.asarray(self._needed(state.h, J) - self._middle / self._half)
-
-    def permitted(self, state: State, J: Array, known: Array, more: Array, shares: Array, most: float) -> float:
-        """Return the share of ``more``, 0 to 1, that accelerations permit which take ``most`` of what rest leaves.
-
-        Args:
-            state: The state, whose ``M`` is taken.
-            J: As for :meth:`shares`.
-            known: Acceleration that is not to change, shape (nv,).
-            more: Acceleration to add, shape (nv,).
-            shares: Static controls at the state, shape (m,).
-            most: Share of what the static controls leave of the limits.
-        """
-        taken, added = self._needed(state.M @ np.stack([known, more], axis=1), J).T
-        side = np.sign(added)
-        left = most * np.maximum(self._whole - side * shares, self._least) - side * taken
-        return float(np.clip(left / np.maximum(np.abs(added), _TINY), 0.0, 1.0).min(initial=1.0))
-
-    def _needed(self, force: Array, J: Array) -> Array:
-        """Return the shares that make generalized forces, shape (m,) for (nv,) or (m, k) for (nv, k)."""
-        force = np.array(force)
         if self._count:
             J = J[: self._count]
             A = J[:, : self._base].T
@@ -81,7 +68,33 @@ class StaticControls:
             square = eased @ A.T
             # Feet on a line carry no moment about it.
             square.flat[:: self._base + 1] += _TINY * square.trace()
-            force -= J.T @ (eased.T @ np.linalg.solve(square, force[: self._base]))
+            _, found, wrong = self._solve(square, eased)
+            if not wrong:
+                np.matmul(J.T, found.T, out=self._carried)
+        return np.asarray(self._needed(state.h) - self._central)
+
+    def permitted(self, M: Array, known: Array, more: Array, shares: Array, most: float) -> float:
+        """Return the share of ``more``, 0 to 1, that accelerations permit which take ``most`` of what rest leaves.
+
+        The contacts are those of the last :meth:`shares`.
+
+        Args:
+            M: Mass matrix, shape (nv, nv).
+            known: Acceleration that is not to change, shape (nv,).
+            more: Acceleration to add, shape (nv,).
+            shares: Static controls at the state, shape (m,).
+            most: Share of what the static controls leave of the limits.
+        """
+        self._pair[:, 0], self._pair[:, 1] = known, more
+        taken, added = self._needed(M @ self._pair).T
+        side = np.sign(added)
+        left = most * np.maximum(self._whole - side * shares, self._least) - side * taken
+        return max(float((left / np.maximum(np.abs(added), _TINY)).min(initial=1.0)), 0.0)
+
+    def _needed(self, force: Array) -> Array:
+        """Return the shares that make generalized forces, shape (m,) for (nv,) or (m, k) for (nv, k)."""
+        if self._count:
+            force = force - self._carried @ force[: self._base]
         return np.asarray(self._inverse @ force)
 
 

@@ -24,7 +24,8 @@ def lines(request: Request) -> Iterator[str]:
     """A row for each robot."""
     yield from (machine("daqp"), "")
     yield (
-        "Processor time of a call, the shortest of ten, `-O2`; each starts from the active rows of the tick before.\n"
+        "Processor time of a call, the shortest of ten in five passes, `-O2`; "
+        "each starts from the active rows of the tick before.\n"
         f"Over budget: with {request.count} iterations.  Distance: largest relative stationarity residual."
     )
     yield ""
@@ -35,11 +36,14 @@ def lines(request: Request) -> Iterator[str]:
 
 def _row(relaxation: Relaxation, name: str, request: Request) -> list[str]:
     ticks, standing = pushed(name)
-    relaxation.forget()
-    answers = [relaxation.solve(tick, repeats=10) for tick in ticks]
+    runs = []
+    for _ in range(5):
+        relaxation.forget()
+        answers = [relaxation.solve(tick, repeats=2) for tick in ticks]
+        runs.append([1e6 * answer.seconds for answer in answers])
     relaxation.forget()
     late = np.array([relaxation.solve(tick, budget=request.count).code == BUDGET for tick in ticks])
-    times, counts = [1e6 * a.seconds for a in answers], [a.iterations for a in answers]
+    times, counts = np.min(runs, axis=0), [answer.iterations for answer in answers]
     distances = np.array([stationarity(tick, answer.z) for tick, answer in zip(ticks, answers, strict=True)])
     theirs = np.array([stationarity(tick, tick.z) for tick in ticks])
     p99, hard = np.percentile(times, 99), max(missed(t, a.z)[0] for t, a in zip(ticks, answers, strict=True))

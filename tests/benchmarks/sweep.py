@@ -2,10 +2,13 @@
 
 A Dask cluster that loses a worker, MPI ranks, Slurm jobs on this machine, and a parent that is killed at random
 times give the bytes of the pool.  Then the speed, the memory of a long run, and the overhead of a task.
+``python -m tests.benchmarks.sweep FOLDER ROBOT POINTS`` solves a large sweep, or goes on with it.
 """
 
 from __future__ import annotations
 
+import math
+import multiprocessing
 import os
 import random
 import resource
@@ -16,10 +19,12 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 
+from impact_posture.sweep.atlas import open_atlas
 from impact_posture.sweep.executors import SlurmJobs, dask_cluster, process_pool
 from impact_posture.sweep.run import SweepRun, run_sweep
 from impact_posture.sweep.sweep_file import Sweep, read_sweep
@@ -35,6 +40,25 @@ normal = [[0, 0, 1], [0, 0.2, 1], [0, 0.4, 1], [0.2, 0, 1], [0.4, 0, 1], [0.3, 0
 x = { from = -0.1, to = 0.1, count = 10 }
 z = { from = -0.1, to = 0.1, count = 10 }
 """
+TALOS = """
+shard = 16
+[problem]
+robot = "talos"
+frame = "gripper_right_base_link"
+normal = [-1, 0, 0]
+starts = 4
+[grid]
+x = { from = -0.15, to = 0.15, count = COUNT }
+z = { from = -0.15, to = 0.15, count = COUNT }
+"""
+
+
+def tilted(count: int) -> str:
+    """A sweep over tilts of the surface and of the tool of the aerial manipulator, ``count`` of each."""
+    tilts = [(k / (count - 1) - 0.5, 3.1 * k / (count - 1) - 1.35) for k in range(count)]
+    normals = [[0.0, math.sin(tilt), math.cos(tilt)] for tilt, _ in tilts]
+    turns = [[math.cos(tilt / 2), 0.0, -math.sin(tilt / 2), 0.0] for _, tilt in tilts]
+    return f'[problem]\nrobot = "tilthex_arm"\n[grid]\nnormal = {normals}\ntarget_quaternion = {turns}\n'
 
 
 def shards(folder: Path) -> dict[str, bytes]:
@@ -151,9 +175,37 @@ def speed(folder: Path, points: int) -> None:
     print(f"{size / solved:.0f} bytes a problem")
 
 
-def _resident() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+def _resident(process: int | str = "self") -> float:
+    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 1e6
+
+
+def atlas(folder: Path, name: str, points: int) -> None:
+    """Solve a large sweep by two processes, or go on with it, and print what it took and what it found."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file, count = folder / f"{name}.toml", max(2, round(points**0.5))
+    file.write_text(tilted(count) if name == "tilthex_arm" else TALOS.replace("COUNT", str(count)))
+    sweep, began, seen = read_sweep(file), time.perf_counter(), list[tuple[int, float]]()
+
+    def progress(done: int, count: int) -> None:
+        workers = [child.pid for child in multiprocessing.active_children()]
+        seen.append((done, max([0.0, *[_resident(pid) for pid in workers if pid]])))
+
+    with process_pool(2) as pool:
+        found = run_sweep(sweep, folder / name, pool, progress=progress, in_hand=4)
+    solved, took = sum(found.counts.values()), time.perf_counter() - began
+    print(f"{name}: {solved} of {found.points} problems in this run, {took:.0f} s, {solved / took:.1f} a second")
+    if solved:
+        share = f"{100 * found.solver_s / found.total_s:.1f} % of it within IPOPT"
+        print(f"processor time {1e3 * found.total_s / solved:.2f} ms each, {share}")
+        tenths = [f"{mb:.0f}" for _, mb in seen[:: max(1, len(seen) // 12)]]
+        print("resident memory of the larger worker, MB:", *tenths)
+    table = open_atlas(folder / name).to_table(columns=["status", "reason"]).to_pylist()
+    for status, count in Counter(row["status"] for row in table).most_common():
+        print(f"{status}: {count} ({100 * count / len(table):.1f} %)")
+    conflicts = Counter(row["reason"].partition(" (off by")[0] for row in table if row["reason"])
+    for reason, count in conflicts.most_common(8):
+        print(f"  {count} × {reason} first")
 
 
 def task_overhead() -> None:
@@ -177,6 +229,9 @@ def task_overhead() -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) == 4:
+        atlas(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))
+        sys.exit()
     with tempfile.TemporaryDirectory() as place:
         parts = sys.argv[1:] or ["robustness", "speed", "overhead"]
         if "parent" in parts:

@@ -53,7 +53,7 @@ def test_what_was_interrupted_goes_on(aerial: Path, tmp_path: Path, monkeypatch:
     # The same job has the same answer (above): each is run once.
     real = functools.cache(batch.execute)
 
-    def counted(job: Job) -> Any:
+    def counted(job: Job, **options: Any) -> Any:
         if len(ran) == 2:
             raise KeyboardInterrupt
         ran.append(job.seed)
@@ -63,7 +63,7 @@ def test_what_was_interrupted_goes_on(aerial: Path, tmp_path: Path, monkeypatch:
     with pytest.raises(KeyboardInterrupt):
         run_batch(jobs, store=store)
     assert ran == [0, 1]
-    monkeypatch.setattr(batch, "execute", lambda job: (ran.append(job.seed), real(job))[1])
+    monkeypatch.setattr(batch, "execute", lambda job, **options: (ran.append(job.seed), real(job))[1])
     whole = run_batch(jobs, store=store)
     assert ran == [0, 1, 2]
     assert whole == run_batch(jobs)
@@ -119,7 +119,7 @@ def test_a_damaged_file_is_run_anew(aerial: Path, tmp_path: Path, damage: str) -
 def test_a_damaged_series_is_run_anew(
     push: Path, tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch, "execute", lambda job: _kept_run(str(push)))
+    monkeypatch.setattr(batch, "execute", lambda job, **options: _kept_run(str(push)))
     store, job = Store(tmp_path / "kept"), Job(str(push), "nominal")
     run_batch([job], store=store, keep_series=lambda job: True)
     path = store.series(job, -1)
@@ -127,7 +127,7 @@ def test_a_damaged_series_is_run_anew(
     # Nothing is run where all is well.
     monkeypatch.setattr(batch, "execute", None)
     run_batch([job], store=store, keep_series=lambda job: True)
-    monkeypatch.setattr(batch, "execute", lambda job: _kept_run(str(push)))
+    monkeypatch.setattr(batch, "execute", lambda job, **options: _kept_run(str(push)))
     path.unlink()
     if damage != "missing":
         middle = len(whole) // 3
@@ -143,7 +143,7 @@ def _kept_run(path: str) -> Any:
 
 
 def test_a_robot_that_ran_away_is_a_result(aerial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def away(job: Job) -> Any:
+    def away(job: Job, **options: Any) -> Any:
         raise SimulationDiverged(1.0, where="it")
 
     monkeypatch.setattr(batch, "execute", away)

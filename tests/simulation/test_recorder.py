@@ -22,8 +22,8 @@ def _mujoco() -> None:
     needs_mujoco()
 
 
-def metric(q: Any) -> tuple[float, Any]:
-    return 7.0, np.zeros(9)
+def metric(q: Any) -> float:
+    return 7.0
 
 
 def truth(t: float, *, began: float | None = None, touching: bool = False, stops: tuple[str, ...] = ()) -> Truth:
@@ -76,11 +76,11 @@ def test_columns_are_what_was_true_then() -> None:
 def test_the_metric_is_taken_every_tenth_tick_and_may_be_undefined() -> None:
     calls = []
 
-    def sometimes(q: Any) -> tuple[float, Any]:
+    def sometimes(q: Any) -> float:
         calls.append(1)
         if len(calls) == 2:
             raise MetricError("does not exist there", where="S", hint="move")
-        return 2.0, np.zeros(9)
+        return 2.0
 
     recorder = Recorder(factory("aerial-vertical").setup, sometimes)
     for k in range(25):
@@ -92,7 +92,7 @@ def test_the_metric_is_taken_every_tenth_tick_and_may_be_undefined() -> None:
 
 def test_a_push_acts_from_its_begin_to_its_end() -> None:
     setup = factory("solo8-push").setup
-    recorder = Recorder(setup, lambda q: (1.0, np.zeros(14)))
+    recorder = Recorder(setup, lambda q: 1.0)
     recorder.pushed(np.array([6.5, 0, 0]), 0.1 + 0.2, 0.1 + 0.2 + 0.003)
     ticks = [0.299, 0.3, 0.301, 0.302, 0.303, 0.304]
     for t in ticks:

@@ -3,23 +3,6 @@
 /* Families of joints in ip_joint_family. */
 enum { IP_DIRECT, IP_CONTINUOUS, IP_FREE_FLYER, IP_SPHERICAL };
 
-static double ip_dot(const double *a, const double *b, int n)
-{
-  /* Sums that do not wait for each other. */
-  double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
-  int i;
-  for (i = 0; i + 3 < n; i += 4) {
-    s0 += a[i] * b[i];
-    s1 += a[i + 1] * b[i + 1];
-    s2 += a[i + 2] * b[i + 2];
-    s3 += a[i + 3] * b[i + 3];
-  }
-  for (; i < n; ++i) {
-    s0 += a[i] * b[i];
-  }
-  return (s0 + s1) + (s2 + s3);
-}
-
 static void ip_cross(const double *a, const double *b, double *out)
 {
   out[0] = a[1] * b[2] - a[2] * b[1];
@@ -236,52 +219,3 @@ static int ip_cholesky(double *A, int n)
   }
   return 1;
 }
-
-#if IP_ROBUST
-/* Eigenvalues of the symmetric n x n matrix A on its diagonal and eigenvectors in the columns of V, by the cyclic
- * method of Jacobi (Golub and Van Loan, Matrix Computations, section 8.5). */
-static void ip_eigen(double *A, double *V, int n)
-{
-  int i, j, k, sweep;
-  for (i = 0; i < n * n; ++i) {
-    V[i] = i % (n + 1) == 0 ? 1.0 : 0.0;
-  }
-  for (sweep = 0; sweep < 30; ++sweep) {
-    double off = 0.0, all = 0.0;
-    for (i = 0; i < n; ++i) {
-      for (j = 0; j < n; ++j) {
-        all += A[i * n + j] * A[i * n + j];
-        off += i == j ? 0.0 : A[i * n + j] * A[i * n + j];
-      }
-    }
-    if (!(off > 1e-32 * all)) {
-      return;
-    }
-    for (i = 0; i < n; ++i) {
-      for (j = i + 1; j < n; ++j) {
-        const double a = A[i * n + j], half = 0.5 * (A[j * n + j] - A[i * n + i]);
-        double t, c, s;
-        if (a == 0.0) {
-          continue;
-        }
-        t = (half < 0.0 ? -1.0 : 1.0) * fabs(a) / (fabs(half) + sqrt(half * half + a * a));
-        t = a < 0.0 ? -t : t;
-        c = 1.0 / sqrt(1.0 + t * t);
-        s = t * c;
-        for (k = 0; k < n; ++k) {
-          const double x = A[k * n + i], y = A[k * n + j];
-          A[k * n + i] = c * x - s * y;
-          A[k * n + j] = s * x + c * y;
-        }
-        for (k = 0; k < n; ++k) {
-          const double x = A[i * n + k], y = A[j * n + k], u = V[k * n + i], w = V[k * n + j];
-          A[i * n + k] = c * x - s * y;
-          A[j * n + k] = s * x + c * y;
-          V[k * n + i] = c * u - s * w;
-          V[k * n + j] = s * u + c * w;
-        }
-      }
-    }
-  }
-}
-#endif

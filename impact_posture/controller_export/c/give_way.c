@@ -5,6 +5,10 @@
 /* Miss that counts, relative to the terms of a row. */
 #define IP_OFF 1e-6
 
+/* Force on one of several contacts that compares with an acceleration of 1, relative to the mass of the robot.  The
+ * least iterations of pushed robots, 0.03 to 10 tried. */
+#define IP_FORCE_UNIT 0.1
+
 /* Write what gave way: the largest violation of a bound on a joint, then the norm of the miss of each level. */
 static void ip_list_gave_way(ip_context *c, const double *lower, const double *upper)
 {
@@ -58,7 +62,7 @@ static int ip_relax(ip_context *c)
   }
 #endif
   for (i = 0; i < N; ++i) {
-    unit[i] = i < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
+    unit[i] = i < IP_NV + IP_SPARE ? 1.0 : IP_FORCE_UNIT * c->m.M[0];
     level[i] = 0;
     lower[i] = -INFINITY;
     upper[i] = INFINITY;
@@ -93,8 +97,8 @@ static int ip_relax(ip_context *c)
   problem.H = H;
   problem.g = g;
   problem.unit = unit;
-  flag = relaxation_solve(&problem, c->relaxation, IP_RELAXED_ITERATIONS, c->z, &report);
-  c->iterations = report.iterations;
+  flag = relaxation_solve(&problem, c->relaxation, IP_ITERATIONS, c->z, &report);
+  c->iterations += report.iterations;
   memset(c->multipliers, 0, sizeof c->multipliers);
   if (flag > 0) {
     ip_list_gave_way(c, lower, upper);

@@ -17,6 +17,10 @@ static int ip_holds(int rule, double x)
     return isfinite(x) && x >= 0.0;
   case 2:
     return x > 0.0;
+  case 4:
+    return isfinite(x) && x > 0.0;
+  case 5:
+    return x > 0.0 && x <= 1.0;
   default:
     return !isnan(x);
   }

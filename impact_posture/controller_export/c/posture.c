@@ -12,6 +12,11 @@ static void ip_fade_to(ip_context *c, const double *q, double over)
   c->over = over;
 }
 
+#if IP_FLOW
+static double ip_flow_settle(const ip_params *p);
+static void ip_flow_lead(ip_context *c, double dt);
+#endif
+
 #if IP_ROBUST
 /* Evaluate the term at q; keep the previous one where the gradient does not exist. */
 static void ip_evaluate(ip_context *c)
@@ -106,7 +111,7 @@ static int ip_normalize(ip_context *c)
   for (k = 0; k < free_count; ++k) {
     double z[N];
     for (i = 0; i < N; ++i) {
-      z[i] = V[i * N + at[k]];
+      z[i] = V[at[k] * N + i];
     }
     for (j = 0; j < 2; ++j) {
       ip_integrate(c->q, z, j ? -1e-5 : 1e-5, q);
@@ -117,7 +122,7 @@ static int ip_normalize(ip_context *c)
     for (i = 0; i < free_count; ++i) {
       double sum = 0.0;
       for (j = 0; j < N; ++j) {
-        sum += V[j * N + at[i]] * (g[0][j] - g[1][j]) / 2e-5;
+        sum += V[at[i] * N + j] * (g[0][j] - g[1][j]) / 2e-5;
       }
       B[i * free_count + k] = sum;
     }
@@ -152,6 +157,7 @@ static void ip_reset_posture(ip_context *c)
   c->blend = 1.0;
   c->x = c->level = c->goal = 0.0;
   c->phase = IP_FREE;
+  c->waiting = 0;
   c->count = c->hold = c->failed = 0;
   c->value = NAN;
   memset(c->term, 0, sizeof c->term);
@@ -181,6 +187,9 @@ static void ip_advance(ip_context *c, double dt)
       c->blend = 1.0;
     }
   }
+#if IP_FLOW
+  ip_flow_lead(c, dt);
+#endif
 #if IP_ROBUST
   ip_activate(c, dt);
   if (c->level <= 0.0) {
@@ -234,22 +243,43 @@ static void ip_posture_wanted(ip_context *c)
 #endif
 }
 
-static int ip_enter(ip_context *c, int phase)
+/* Let a phase begin with the first tick at a time or later. */
+static int ip_announce(ip_context *c, int phase, double t)
 {
-  const int fits = phase == IP_BRACE ? c->phase == IP_FREE || c->phase == IP_RELEASE
-                   : phase == IP_CONTACT ? c->phase == IP_BRACE : c->phase == IP_BRACE || c->phase == IP_CONTACT;
-  const double was = c->goal;
-  if (!c->ready || !IP_ROBUST || !fits) {
+  const int before = c->waiting > 0 ? c->entering[c->waiting - 1] : c->phase;
+  const int fits = phase == IP_BRACE ? before == IP_FREE || before == IP_RELEASE
+                   : phase == IP_CONTACT ? before == IP_BRACE : before == IP_BRACE || before == IP_CONTACT;
+  /* A reference flow stops and goes in any order. */
+  if (!c->ready || !(IP_FLOW || (IP_ROBUST && fits)) || isnan(t) || c->waiting == IP_WAITING
+      || (c->waiting > 0 && t < c->since[c->waiting - 1])) {
     return 1;
   }
-#if IP_ROBUST
-  {
-    const int live = c->p.robust_live[0] > 0.0;
-    c->goal = phase == IP_BRACE || (phase == IP_CONTACT && live) ? 1.0 : 0.0;
-    c->hold = phase == IP_CONTACT ? !live : phase == IP_RELEASE ? c->hold || was > 0.0 : c->hold;
+  c->entering[c->waiting] = phase;
+  c->since[c->waiting++] = t;
+  return 0;
+}
+
+/* Begin the first phase that waits. */
+static void ip_enter(ip_context *c)
+{
+#if IP_FLOW
+  c->flow.on = c->entering[0] == IP_BRACE;
+  c->level = c->flow.on;
+  if (c->flow.on) {
+    c->flow.deadline = c->flow.clock + c->impact[0] - ip_flow_settle(&c->p);
   }
 #endif
-  (void)was;
-  c->phase = phase;
-  return 0;
+#if IP_ROBUST
+  const int live = c->p.robust_live[0] > 0.0, phase = c->entering[0];
+  const double was = c->goal;
+  c->goal = phase == IP_BRACE || (phase == IP_CONTACT && live) ? 1.0 : 0.0;
+  c->hold = phase == IP_CONTACT ? !live : phase == IP_RELEASE ? c->hold || was > 0.0 : c->hold;
+#endif
+  c->phase = c->entering[0];
+  --c->waiting;
+  memmove(c->entering, c->entering + 1, sizeof c->entering - sizeof c->entering[0]);
+  memmove(c->since, c->since + 1, sizeof c->since - sizeof c->since[0]);
+#if IP_FLOW
+  memmove(c->impact, c->impact + 1, sizeof c->impact - sizeof c->impact[0]);
+#endif
 }

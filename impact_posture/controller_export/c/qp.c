@@ -34,7 +34,15 @@ static void ip_whiten(const ip_context *c, const double *row, double *restrict o
 #elif IP_MOMENTUM
   const double *M = c->m.M, *R = c->m.base, scale = 1.0 / M[0];
   const double x = row[0] * scale, y = row[1] * scale, z = row[2] * scale;
-  for (i = 0; i < IP_JOINTS_V; ++i) {
+  i = 0;
+#if defined(__GNUC__)
+  for (; i + 1 < IP_JOINTS_V; i += 2) {
+    j = IP_BASE + i;
+    IP_PUT_PAIR(out + i, (IP_PAIR(row + j) - x * IP_PAIR(M + j) - y * IP_PAIR(M + IP_NV + j)
+                          - z * IP_PAIR(M + 2 * IP_NV + j)) * IP_PAIR(c->ease + i));
+  }
+#endif
+  for (; i < IP_JOINTS_V; ++i) {
     j = IP_BASE + i;
     out[i] = (row[j] - x * M[j] - y * M[IP_NV + j] - z * M[2 * IP_NV + j]) * c->ease[i];
   }
@@ -59,13 +67,10 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
   double *row = c->M[r], length = ip_dot(row, row, IP_VARIABLES), scale;
   const double shift = ip_dot(row, c->center, IP_NV);
   const int at = IP_SIMPLE + r;
-  int j;
-  /* Finite while all numbers are. */
+  /* Finite while all are. */
   c->sum += length + shift + (isnan(lower) || isnan(upper) ? NAN : 0.0);
   scale = length > IP_NOTHING * IP_NOTHING ? 1.0 / sqrt(length) : 1.0;
-  for (j = 0; j < IP_VARIABLES; ++j) {
-    row[j] *= scale;
-  }
+  ip_scaled(row, scale, row, IP_VARIABLES);
   c->scaling[at] = scale;
   c->high[at] = upper;
   c->low[at] = lower;
@@ -149,26 +154,27 @@ static void ip_factorize(ip_context *c)
 }
 
 /* The row of s'(M v + h - J'f), of so many entries from the first on; return s'h. */
-static double ip_force_row(ip_context *c, const double *s, int first, int count, double *row)
+static double ip_force_row(const ip_context *c, const double *s, int first, int count, double *restrict row)
 {
-  double bias = 0.0;
+  double bias = s[0] * c->free_force[first];
   int i, j, k;
-  memset(row, 0, sizeof(double) * IP_VARIABLES);
-  for (i = 0; i < count; ++i) {
-    const double t = s[i];
-    const double *M = c->m.M + (first + i) * IP_NV;
-    if (t == 0.0) {
-      continue;
-    }
+  ip_scaled(c->m.M + first * IP_NV, s[0], row, IP_NV);
+  for (i = 1; i < count; ++i) {
+    const double t = s[i], *M = c->m.M + (first + i) * IP_NV;
     bias += t * c->free_force[first + i];
-    for (j = 0; j < IP_NV; ++j) {
+    for (j = 0; j < IP_NV && t != 0.0; ++j) {
       row[j] += t * M[j];
     }
-    for (k = 0; k < IP_CONTACTS; ++k) {
-      const double *J = c->m.jacobian[ip_contact_point[k]] + first + i;
-      for (j = 0; j < ip_contact_row[k + 1] - ip_contact_row[k]; ++j) {
-        row[IP_NV + IP_SPARE + ip_contact_row[k] + j] -= t * J[j * IP_NV];
+  }
+  memset(row + IP_NV, 0, sizeof(double) * IP_SPARE);
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    const double *J = c->m.jacobian[ip_contact_point[k]] + first;
+    for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j, J += IP_NV) {
+      double sum = s[0] * J[0];
+      for (i = 1; i < count; ++i) {
+        sum += s[i] * J[i];
       }
+      row[IP_NV + IP_SPARE + j] = -sum;
     }
   }
   return bias;

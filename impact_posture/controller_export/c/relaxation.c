@@ -15,6 +15,8 @@
 /* Largest violation of a bound, and the violation that counts, relative to the numbers of the problem. */
 #define EXACT 1e-9
 #define COUNTS 1e-7
+/* Least relative decrease of a sum of squares. */
+#define PROGRESS 1e-9
 /* Largest violation of level 0 in the end. */
 #define WRONG 1e-7
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
@@ -22,8 +24,8 @@
 /* Length of a row that cannot move any more, and least pivot of an elimination, relative to the row's own length. */
 #define FLAT 1e-12
 #define PIVOT 1e-8
-/* Tried in order: added to the reduced cost, relative to its largest entry, where it is too flat. */
-static const double PROXIMAL[] = {0.0, 1e-6, 1e-3};
+/* Tried in order: added to the reduced cost, relative to its largest entry. */
+static const double PROXIMAL[] = {1e-5, 1e-3};
 
 typedef struct {
     const relaxation_problem *p;
@@ -33,15 +35,15 @@ typedef struct {
     int *first, *last, *held;    /* range of a row's entries that are not zero; whether an entry is eliminated */
     double *goal;                /* values that listed rows are to have */
     double *B, *v, *tau, *rhs, *step, *column; /* of an elimination */
-    int *rows, *lead;            /* listed rows; those whose reflection is the k-th */
+    int *rows, *lead, *own;      /* exact rows; those whose reflection is the k-th; rows to come near */
+    int exact, near, rank;       /* their numbers, and the number of coordinates that the exact rows take */
     double *L, *wanted;          /* Cholesky factor of the reduced cost, and its minimum in whitened coordinates */
     DAQPWorkspace daqp;
     DAQPSettings settings;
     double *M, *size;            /* normalized rows of a least-distance program, and their former lengths */
     int *entry, count;           /* entries of these rows */
-    int soft;                    /* coordinates that the exact rows of an elimination take */
-    int *proximal;               /* the proximal term of the cost that the last solution needed */
     int *warm;                   /* levels + 2 times entries: active rows of each program at the last solution */
+    double square;               /* sum of squares that a level missed after its last whole move */
     double tolerance, scale;     /* violation that DAQP may leave; size of the point, in `unit` */
 } Relaxation;
 
@@ -147,77 +149,108 @@ static void least_squares(double *B, int stride, int rows, int columns, double *
     }
 }
 
-static void swap_rows(Relaxation *r, int i, int k) {
-    double *a = r->B + i * r->n, *b = r->B + k * r->n;
-    for (int j = 0; j < r->n; j++) {
+/* Turn a row into the coordinates of the first reflections. */
+static void turn_row(const Relaxation *r, double *row) {
+    for (int k = 0; k < r->rank; k++) reflect(r->v + k * r->n, r->tau[k], row + k, r->n - r->fixed - k);
+}
+
+static void clear_rows(Relaxation *r) { r->exact = r->near = r->rank = 0; }
+
+/* List a row that reaches its goal exactly: in the turned coordinates, only the first ones move the exact rows. */
+static void add_exact(Relaxation *r, int entry) {
+    const int n = r->n, rank = r->rank, free = n - r->fixed;
+    double *b = r->B + r->exact * n, *v = r->v + rank * n;
+    memcpy(b, motion(r, entry), (size_t)free * sizeof *b);
+    turn_row(r, b);
+    if (rank < free && norm(b + rank, free - rank) > PIVOT * r->length[entry]) {
+        r->tau[rank] = reflector(v, b + rank, free - rank);
+        reflect(v, r->tau[rank], b + rank, free - rank);
+        for (int i = 0; i < r->near; i++) reflect(v, r->tau[rank], r->M + i * n + rank, free - rank);
+        r->lead[r->rank++] = r->exact;
+    }
+    r->rows[r->exact++] = entry;
+}
+
+/* List a row that comes near its goal (least squares).  The rows of the last program, in M, are not needed any more. */
+static void add_near(Relaxation *r, int entry) {
+    double *b = r->M + r->near * r->n;
+    memcpy(b, motion(r, entry), (size_t)(r->n - r->fixed) * sizeof *b);
+    turn_row(r, b);
+    r->own[r->near++] = entry;
+}
+
+static void swap(double *a, double *b, int count) {
+    for (int j = 0; j < count; j++) {
         const double x = a[j];
         a[j] = b[j];
         b[j] = x;
     }
-    const int row = r->rows[i];
-    const double rhs = r->rhs[i];
-    r->rows[i] = r->rows[k], r->rows[k] = row;
-    r->rhs[i] = r->rhs[k], r->rhs[k] = rhs;
 }
 
-/* Find coordinates of which the first ones alone move the listed rows, and return their number.  r->step becomes the
- * move by which the first `exact` rows reach their goals, and the others come near theirs (least squares).  The first
- * `kept` rows are those of the last call. */
-static int turn(Relaxation *r, int kept, int exact, int all) {
-    const int n = r->n, free = n - r->fixed;
-    double *B = r->B, *step = r->step, longest = 0;
-    int rank = kept ? r->soft : 0;
+/* Make r->step the move by which the listed rows reach, or come near, their goals.  Return how many of the turned
+ * coordinates it takes; those after r->rank are led by the first rows in r->own. */
+static int find_step(Relaxation *r) {
+    const int n = r->n, rank = r->rank, free = n - r->fixed, rest = free - rank;
+    double *step = r->step, *C = r->L, *rhs = r->rhs, *square = r->column, longest = 0;
+    int found = 0;
     memset(step, 0, (size_t)n * sizeof *step);
-    for (int i = 0; i < all; i++) {
-        r->rhs[i] = r->goal[r->rows[i]] - r->value[r->rows[i]];
-        if (i >= exact) longest = fmax(longest, r->length[r->rows[i]]);
-        if (i < kept) continue;
-        memcpy(B + i * n, motion(r, r->rows[i]), (size_t)free * sizeof *B);
-        for (int k = 0; k < rank; k++) reflect(r->v + k * n, r->tau[k], B + i * n + k, free - k);
-    }
     for (int k = 0; k < rank; k++) {
-        const double *b = B + r->lead[k] * n;
-        step[k] = (r->rhs[r->lead[k]] - dot(b, step, k)) / b[k];
+        const int i = r->lead[k], entry = r->rows[i];
+        step[k] = (r->goal[entry] - r->value[entry] - dot(r->B + i * n, step, k)) / r->B[i * n + k];
     }
-    r->soft = -1;
-    for (int k = kept; k < all && rank < free; k++) {
-        if (k >= exact) {
-            int best = k;
-            double most = -1;
-            for (int i = k; i < all; i++) {
-                const double s = norm(B + i * n + rank, free - rank);
-                if (s > most) most = s, best = i;
-            }
-            if (best != k) swap_rows(r, k, best);
-            if (r->soft < 0) r->soft = rank;
+    for (int i = 0; i < r->near; i++) {
+        const double *b = r->M + i * n;
+        memcpy(C + i * n, b + rank, (size_t)rest * sizeof *C);
+        rhs[i] = r->goal[r->own[i]] - r->value[r->own[i]] - dot(b, step, rank);
+        square[i] = dot(b + rank, b + rank, rest);
+        longest = fmax(longest, r->length[r->own[i]]);
+    }
+    for (; found < r->near && found < rest; found++) {
+        double *c = C + found * n, *v = r->v + (rank + found) * n, *tau = r->tau + rank + found;
+        int best = found;
+        for (int i = found; i < r->near; i++)
+            if (square[i] > square[best]) best = i;
+        if (best != found) {
+            const int row = r->own[found];
+            r->own[found] = r->own[best], r->own[best] = row;
+            swap(c, C + best * n, rest);
+            swap(r->M + found * n, r->M + best * n, free);
+            swap(rhs + found, rhs + best, 1);
+            swap(square + found, square + best, 1);
         }
-        double *b = B + k * n, *v = r->v + rank * n;
-        if (norm(b + rank, free - rank) <= PIVOT * (k < exact ? r->length[r->rows[k]] : longest)) {
-            if (k < exact) continue;
-            break;
+        if (norm(c + found, rest - found) <= PIVOT * longest) break;
+        *tau = reflector(v, c + found, rest - found);
+        for (int i = found; i < r->near; i++) {
+            double *b = C + i * n + found;
+            reflect(v, *tau, b, rest - found);
+            /* The difference keeps few digits where a row nearly depends on those before. */
+            if (b[0] * b[0] < (1 - 1e-6) * square[i])
+                square[i] -= b[0] * b[0];
+            else
+                square[i] = dot(b + 1, b + 1, rest - found - 1);
         }
-        r->tau[rank] = reflector(v, b + rank, free - rank);
-        for (int i = k; i < all; i++) reflect(v, r->tau[rank], B + i * n + rank, free - rank);
-        if (k < exact) step[rank] = (r->rhs[k] - dot(b, step, rank)) / b[rank];
-        r->lead[rank++] = k;
     }
-    if (r->soft < 0) r->soft = rank;
-    const int soft = r->soft;
-    if (rank > soft) {
-        for (int i = exact; i < all; i++) r->rhs[i] -= dot(B + i * n, step, soft);
-        double *at = B + exact * n + soft;
-        least_squares(at, n, all - exact, rank - soft, r->rhs + exact, step + soft, r->column);
-    }
-    turn_back(r, step, rank);
-    return rank;
+    if (found < r->near)
+        least_squares(C, n, r->near, found, rhs, step + rank, square);
+    else
+        for (int k = 0; k < found; k++)
+            step[rank + k] = (rhs[k] - dot(C + k * n, step + rank, k)) / C[k * n + k];
+    turn_back(r, step, rank + found);
+    return rank + found;
+}
+
+/* Mark listed rows as held, or as free. */
+static void hold_rows(Relaxation *r, int held) {
+    for (int i = 0; i < r->exact; i++) r->held[r->rows[i]] = held;
+    for (int i = 0; i < r->near; i++) r->held[r->own[i]] = held;
 }
 
 /* Move by r->step until a row of the program stops it.  Return that row's entry, or -1 where none does. */
-static int move(Relaxation *r, int all) {
+static int move(Relaxation *r) {
     const int n = r->n, free = n - r->fixed;
     double part = 1;
     int stop = -1;
-    for (int i = 0; i < all; i++) r->held[r->rows[i]] = 1;
+    hold_rows(r, 1);
     for (int j = 0; j < r->count; j++) {
         const int i = r->entry[j];
         if (r->held[i]) continue;
@@ -228,44 +261,48 @@ static int move(Relaxation *r, int all) {
         else if (r->value[i] + part * by < lower - room)
             part = (lower - r->value[i]) / by, stop = i;
     }
-    for (int i = 0; i < all; i++) r->held[r->rows[i]] = 0;
+    hold_rows(r, 0);
     for (int i = 0; i < n; i++) r->z[i] += part * dot(r->Z + i * n + r->fixed, r->step, free);
     update_values(r);
     if (stop >= 0) r->goal[stop] = dot(motion(r, stop), r->step, free) > 0 ? r->upper[stop] : r->lower[stop];
     return stop;
 }
 
-/* Drop the rows that the answer does not need from the list of turn(), after its move: exact rows without a multiplier
- * or with one of the wrong sign, and inequalities that hold.  Return whether there are any. */
-static int drop_rows(Relaxation *r, int *exact, int *all) {
-    double *force = r->column, most = 0;
-    const int first = *exact;
-    int kept = 0;
-    memset(force, 0, (size_t)r->soft * sizeof *force);
-    memset(r->rhs, 0, (size_t)first * sizeof *r->rhs);
-    for (int i = first; i < *all; i++) {
-        const double miss = r->goal[r->rows[i]] - r->value[r->rows[i]];
-        if (fabs(miss) <= least(r, r->rows[i])) continue;
-        add(force, miss, r->B + i * r->n, r->soft);
-        most = fmax(most, fabs(miss) * r->length[r->rows[i]]);
+/* Drop the rows that the answer does not need from the lists, after a whole move: exact rows without a multiplier or
+ * with one of the wrong sign, and inequalities that hold.  Return whether there are any. */
+static int drop_rows(Relaxation *r) {
+    double *force = r->column, most = 0, square = 0;
+    const int exact = r->exact, near = r->near;
+    int exacts = 0, nears = 0;
+    memset(force, 0, (size_t)r->rank * sizeof *force);
+    memset(r->rhs, 0, (size_t)exact * sizeof *r->rhs);
+    for (int i = 0; i < near; i++) {
+        const double miss = r->goal[r->own[i]] - r->value[r->own[i]];
+        if (fabs(miss) <= least(r, r->own[i])) continue;
+        add(force, miss, r->M + i * r->n, r->rank);
+        most = fmax(most, fabs(miss) * r->length[r->own[i]]);
+        square += miss * miss;
     }
-    for (int k = r->soft - 1; k >= 0; k--) {
+    for (int k = r->rank - 1; k >= 0; k--) {
         const int i = r->lead[k];
         const double *b = r->B + i * r->n, multiplier = force[k] / b[k];
         add(force, -multiplier, b, k);
         r->rhs[i] = multiplier * r->length[r->rows[i]];
     }
-    for (int i = 0; i < *all; i++) {
+    for (int i = 0; i < exact; i++) {
         const int row = r->rows[i];
         const double pushes = r->goal[row] == r->upper[row] ? r->rhs[i] : -r->rhs[i];
-        if (i < first ? most > 0 && pushes > COUNTS * most : is_equation(r, row) || violation(r, row) > least(r, row))
-            r->rows[kept++] = row;
-        else if (i < first)
-            --*exact;
+        if (most > 0 && pushes > COUNTS * most) r->rows[exacts++] = row;
     }
-    const int dropped = *all - kept;
-    *all = kept;
-    return dropped;
+    for (int i = 0; i < near; i++)
+        if (is_equation(r, r->own[i]) || violation(r, r->own[i]) > least(r, r->own[i])) r->own[nears++] = r->own[i];
+    /* Inequalities at their very bounds would be dropped and stop the move again without end. */
+    if (exacts + nears == exact + near || (exacts == exact && !(square < (1 - PROGRESS) * r->square))) return 0;
+    r->square = square;
+    clear_rows(r);
+    for (int i = 0; i < exacts; i++) add_exact(r, r->rows[i]);
+    for (int i = 0; i < nears; i++) add_near(r, r->own[i]);
+    return 1;
 }
 
 /* Leave out the first `rank` of the coordinates of turn(). */
@@ -371,53 +408,59 @@ static void keep_active(Relaxation *r, int level) {
     for (int j = 0; j < r->count; j++) warm[r->entry[j]] = r->daqp.sense[j] & (DAQP_ACTIVE | DAQP_LOWER);
 }
 
-/* List what determines the level's answer: the active rows of the levels above, then the level's own equations and
- * violated rows.  Return the number of the former; `all` is that of both. */
-static int list_held(Relaxation *r, int level, int missed, int *all) {
-    int exact = 0;
-    for (int j = 0; j < r->daqp.n_active && missed; j++) {
+/* List the active rows of a program that are not soft. */
+static void list_active(Relaxation *r) {
+    clear_rows(r);
+    for (int j = 0; j < r->daqp.n_active; j++) {
         const int at = r->daqp.WS[j], i = r->entry[at];
         if (r->daqp.sense[at] & DAQP_SOFT) continue;
         r->goal[i] = (r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i];
-        r->rows[exact++] = i;
+        add_exact(r, i);
     }
-    *all = exact;
+}
+
+/* List what determines the level's answer: the active rows of the levels above, then the level's own equations and
+ * violated rows, which stay where they are if there is nothing to find. */
+static void list_held(Relaxation *r, int level, int missed) {
+    clear_rows(r);
+    if (missed) list_active(r);
     for (int i = 0; i < r->entries; i++) {
         if (r->held[i] || r->p->level[i] != level || !(is_equation(r, i) || violation(r, i) > least(r, i))) continue;
         r->goal[i] = r->value[i] > r->upper[i] ? r->upper[i] : r->lower[i];
-        r->rows[(*all)++] = i;
+        add_near(r, i);
     }
-    return exact;
 }
 
 /* Find the exact answer of a level from nearly the right rows, and return how many coordinates they take. */
-static int finish_level(Relaxation *r, int level, int missed, int *all) {
-    int exact = list_held(r, level, missed, all), last = -1, kept = 0;
-    for (int k = 0; k < MOST_MOVES && r->left > 1; k++) {
-        const int rank = turn(r, kept, exact, *all), stop = move(r, *all);
-        r->left -= (int)(MOVE_COST * *all);
-        if (stop < 0 && !drop_rows(r, &exact, all)) return rank;
-        kept = stop < 0 ? 0 : exact;
+static int finish_level(Relaxation *r, int level, int missed) {
+    int last = -1;
+    r->square = INFINITY;
+    list_held(r, level, missed);
+    for (int k = 0; k < MOST_MOVES; k++) {
+        const int cost = (int)(MOVE_COST * (r->exact + r->near));
+        if (r->left <= cost) break;
+        r->left -= cost;
+        const int rank = find_step(r), stop = move(r);
+        if (stop < 0 && !drop_rows(r)) return rank;
         if (stop < 0) continue;
         if (stop == last) break;
         last = stop;
-        r->rows[*all] = stop;
-        if (r->p->level[stop] < level || level == 0) {
-            r->rows[*all] = r->rows[exact];
-            r->rows[exact++] = stop;
-        }
-        ++*all;
+        if (r->p->level[stop] < level || level == 0)
+            add_exact(r, stop);
+        else
+            add_near(r, stop);
     }
     /* The point is good, if not the best: its rows stay as they are. */
-    list_held(r, level, missed, all);
-    for (int i = 0; i < *all; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
-    return turn(r, 0, 0, *all);
+    list_held(r, level, missed);
+    for (int i = 0; i < r->exact; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
+    for (int i = 0; i < r->near; i++) r->goal[r->own[i]] = r->value[r->own[i]];
+    return find_step(r);
 }
 
 /* Bring the point as near to a level as the levels above permit, then keep it there. */
 static int solve_level(Relaxation *r, int level) {
     const int free = r->n - r->fixed;
-    int missed = 0, all = 0, same = 0;
+    int missed = 0, same = 0;
     list_rows(r, level, NULL);
     for (int k = 0; k < MOST_STEPS && !same && r->count; k++) {
         const double unit = set_bounds(r, NULL);
@@ -439,10 +482,11 @@ static int solve_level(Relaxation *r, int level) {
             missed = (r->daqp.sense[j] & DAQP_SOFT) && violation(r, r->entry[j]) > least(r, r->entry[j]);
         same = !missed || (k && left - r->left == 1);
     }
-    const int rank = finish_level(r, level, missed, &all);
+    const int rank = finish_level(r, level, missed);
     /* A dependent row may still move by rounding: an inequality goes on as one. */
-    for (int i = 0; i < all; i++) r->held[r->rows[i]] = is_equation(r, r->rows[i]);
-    for (int k = 0; k < rank; k++) r->held[r->rows[r->lead[k]]] = 1;
+    for (int i = 0; i < r->exact; i++) r->held[r->rows[i]] = is_equation(r, r->rows[i]);
+    for (int i = 0; i < r->near; i++) r->held[r->own[i]] = is_equation(r, r->own[i]);
+    for (int k = 0; k < rank; k++) r->held[k < r->rank ? r->rows[r->lead[k]] : r->own[k - r->rank]] = 1;
     eliminate(r, rank);
     /* The point is a solution, whatever rounding makes of its rows. */
     for (int i = 0; i < r->entries; i++)
@@ -495,30 +539,29 @@ static void unwhiten(const Relaxation *r, double *y) {
 }
 
 /* Move to the minimum of the cost with the active rows of its program held, where a proximal term has kept it off. */
-static void finish_cost(Relaxation *r, int active) {
+static void finish_cost(Relaxation *r) {
     for (int k = 0; k < MOST_MOVES; k++) {
-        const int rank = turn(r, 0, active, active);
-        for (int i = 0; i < active; i++) r->held[r->rows[i]] = 1;
-        eliminate(r, rank);
+        hold_rows(r, 1);
+        eliminate(r, r->rank);
         const int free = r->n - r->fixed;
         if (!free || !factorize(r, 0)) return;
         memcpy(r->step, r->wanted, (size_t)free * sizeof *r->step);
         unwhiten(r, r->step);
-        const int stop = move(r, 0);
+        clear_rows(r);
+        const int stop = move(r);
         if (stop < 0) return;
-        r->rows[0] = stop;
-        active = 1;
+        add_exact(r, stop);
     }
 }
 
-/* Minimize the cost in the coordinates that are left.  What is too flat once starts with a proximal term afterwards,
- * because DAQP notices a cycle only after many iterations. */
+/* Minimize the cost in the coordinates that are left.  Its active rows are found with a proximal term, because the cost
+ * may be too flat; then the point moves to its minimum. */
 static int solve_cost(Relaxation *r) {
     const int n = r->n, free = n - r->fixed;
-    int flag = 0, active = 0;
+    int flag = 0;
     if (!free) return 1;
-    for (; *r->proximal < (int)(sizeof PROXIMAL / sizeof *PROXIMAL); ++*r->proximal) {
-        if (!factorize(r, PROXIMAL[*r->proximal])) continue;
+    for (int k = 0; k < (int)(sizeof PROXIMAL / sizeof *PROXIMAL); ++k) {
+        if (!factorize(r, PROXIMAL[k])) continue;
         list_rows(r, r->p->levels + 1, r->L);
         const double unit = set_bounds(r, r->wanted);
         flag = start(r);
@@ -529,17 +572,12 @@ static int solve_cost(Relaxation *r) {
         unwhiten(r, r->wanted);
         for (int i = 0; i < n; i++) r->z[i] += dot(r->Z + i * n + r->fixed, r->wanted, free);
         update_values(r);
-        for (; active < r->daqp.n_active; active++) {
-            const int at = r->daqp.WS[active], i = r->entry[at];
-            r->goal[i] = (r->daqp.sense[at] & DAQP_LOWER) ? r->lower[i] : r->upper[i];
-            r->rows[active] = i;
-        }
-        turn(r, 0, active, active);
-        move(r, active);
-        if (*r->proximal) finish_cost(r, active);
+        list_active(r);
+        find_step(r);
+        move(r);
+        finish_cost(r);
         return 1;
     }
-    *r->proximal = 0;
     return flag;
 }
 
@@ -559,14 +597,14 @@ static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels
         {&r->Z, n * n}, {&r->T, m * n}, {&r->z, n}, {&r->value, e}, {&r->lower, e}, {&r->upper, e},
         {&r->length, e}, {&r->B, e * n}, {&r->v, n * n}, {&r->tau, n}, {&r->rhs, e}, {&r->goal, e}, {&r->step, n},
         {&r->column, e},
-        {&r->L, n * n}, {&r->wanted, n}, {&r->M, e * n}, {&r->size, e}, {&r->daqp.dupper, e}, {&r->daqp.dlower, e},
+        {&r->L, e * n}, {&r->wanted, n}, {&r->M, e * n}, {&r->size, e}, {&r->daqp.dupper, e}, {&r->daqp.dlower, e},
         {&r->daqp.scaling, e}, {&r->daqp.Mu, e}, {&r->daqp.rho_ls, e}, {&r->daqp.rho_us, e}, {&r->daqp.w_ls, e},
         {&r->daqp.lam, active}, {&r->daqp.lam_star, active}, {&r->daqp.D, active}, {&r->daqp.xldl, active},
         {&r->daqp.zldl, active}, {&r->daqp.L, active * (active + 1) / 2}, {&r->daqp.u, n}, {&r->daqp.xold, n},
     };
     const struct { int **array; size_t count; } ints[] = {
-        {&r->proximal, 1}, {&r->warm, (levels + 2) * e}, {&r->first, m}, {&r->last, m}, {&r->held, e}, {&r->rows, e},
-        {&r->lead, n}, {&r->entry, e},
+        {&r->warm, (levels + 2) * e}, {&r->first, m}, {&r->last, m}, {&r->held, e}, {&r->rows, e},
+        {&r->lead, n}, {&r->own, e}, {&r->entry, e},
         {&r->daqp.sense, e}, {&r->daqp.WS, active}, {&r->daqp.prox_mask, n},
     };
     /* The active rows, which outlive a solution, come first. */
@@ -617,18 +655,18 @@ static void begin(Relaxation *r, const relaxation_problem *p, char *work, int bu
 
 int relaxation_solve(const relaxation_problem *p, void *work, int budget, double *z, relaxation_report *report) {
     Relaxation r;
-    int always = 0, flag = 1;
+    int flag = 1;
     begin(&r, p, work, budget);
     update_values(&r);
     for (int i = 0; i < r.entries; i++)
         if (!p->level[i] && is_equation(&r, i)) {
             r.goal[i] = p->lower[i];
-            r.rows[always++] = i;
+            add_exact(&r, i);
         }
-    const int rank = turn(&r, 0, always, always);
-    move(&r, always);
-    for (int i = 0; i < always; i++) r.held[r.rows[i]] = 1;
-    eliminate(&r, rank);
+    find_step(&r);
+    move(&r);
+    hold_rows(&r, 1);
+    eliminate(&r, r.rank);
     for (int level = p->levels ? 1 : 0; level <= p->levels && flag > 0 && r.fixed < r.n; level++)
         flag = solve_level(&r, level);
     if (flag > 0) {

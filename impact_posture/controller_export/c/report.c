@@ -7,11 +7,16 @@ void ip_last_report(const ip_context *c, ip_report *report)
   report->status = c->status;
   report->level = c->level;
   report->value = c->value;
+  memcpy(report->target, c->posture, sizeof report->target);
+#if IP_FLOW
+  report->flow_failures = c->flow.failures;
+  report->resting = c->flow.resting;
+#endif
   report->dynamics = NAN;
+  report->iterations = c->iterations;
   if (c->held_now) {
     return;
   }
-  report->iterations = c->iterations;
   memcpy(report->relaxed, c->gave, sizeof report->relaxed);
   memcpy(report->deficient, c->missed, sizeof report->deficient);
   memcpy(report->multipliers, c->multipliers, sizeof report->multipliers);

@@ -72,72 +72,90 @@ static void ip_decode(ip_context *c, DAQPWorkspace *w)
     for (j = 0; at >= IP_SIMPLE && j < IP_VARIABLES; ++j) {
       x[j] -= c->M[at - IP_SIMPLE][j] * w->xldl[i];
     }
-    if (at < IP_SIMPLE) {
+    if (IP_SIMPLE && at < IP_SIMPLE) {
       x[at] -= w->xldl[i];
     }
   }
   ip_add_turned(c, x, c->z);
 }
 
+/* Memory of DAQP on the stack, for both programs of a tick. */
+typedef struct {
+  double lam[IP_VARIABLES + 1], lam_star[IP_VARIABLES + 1], xldl[IP_VARIABLES + 1], zldl[IP_VARIABLES + 1];
+  double D[IP_VARIABLES + 1], L[(IP_VARIABLES + 1) * (IP_VARIABLES + 2) / 2], xold[IP_VARIABLES];
+  double Mu[IP_GENERAL > IP_FLOW_ROWS ? IP_GENERAL : IP_FLOW_ROWS];
+  int WS[IP_VARIABLES + 1], prox[IP_VARIABLES];
+  DAQPSettings settings;
+} ip_memory;
+
+/* Prepare a program of n variables, `simple` bounds and m bounds and rows.  The caller sets rows and bounds. */
+static void ip_prepare(ip_memory *s, int n, int simple, int m, double *u, DAQPWorkspace *w)
+{
+  memset(w, 0, sizeof *w);
+  memset(s->prox, 0, sizeof s->prox);
+  memset(&s->settings, 0, sizeof s->settings);
+  s->settings.primal_tol = 1e-9;
+  s->settings.dual_tol = DAQP_DEFAULT_DUAL_TOL;
+  s->settings.zero_tol = DAQP_DEFAULT_ZERO_TOL;
+  s->settings.pivot_tol = DAQP_DEFAULT_PIVOT_TOL;
+  s->settings.progress_tol = DAQP_DEFAULT_PROG_TOL;
+  s->settings.cycle_tol = DAQP_DEFAULT_CYCLE_TOL;
+  s->settings.iter_limit = IP_ITERATIONS;
+  s->settings.fval_bound = DAQP_INF;
+  s->settings.rho_soft = DAQP_DEFAULT_RHO_SOFT;
+  s->settings.sing_tol = DAQP_DEFAULT_SING_TOL;
+  s->settings.refactor_tol = DAQP_DEFAULT_REFACTOR_TOL;
+  s->settings.eq_reduction = DAQP_EQ_REDUCTION_OFF;
+  w->settings = &s->settings;
+  w->n = n;
+  w->m = m;
+  w->ms = simple;
+  w->Mu = s->Mu;
+  w->lam = s->lam;
+  w->lam_star = s->lam_star;
+  w->WS = s->WS;
+  w->D = s->D;
+  w->L = s->L;
+  w->xldl = s->xldl;
+  w->zldl = s->zldl;
+  w->u = w->x = u;
+  w->xold = s->xold;
+  w->prox_mask = s->prox;
+  w->outer_iter = 1;
+  memset(u, 0, sizeof(double) * (size_t)n);
+}
+
 /* Solve from the present active set.  Return the flag of DAQP, positive for a solution. */
 static int ip_solve_warm(ip_context *c)
 {
-  enum { N = IP_VARIABLES, M = IP_SIMPLE + IP_GENERAL };
-  double lam[N + 1], lam_star[N + 1], xldl[N + 1], zldl[N + 1], D[N + 1], L[(N + 1) * (N + 2) / 2], xold[N], Mu[IP_GENERAL];
-  int WS[N + 1], prox[N], i, flag;
-  DAQPSettings settings;
+  enum { M = IP_SIMPLE + IP_GENERAL };
+  ip_memory memory;
   DAQPWorkspace w;
+  int i, flag;
   for (i = 0; i < M; ++i) {
     if (c->upper[i] - c->lower[i] < -1e-9 * c->scaling[i]) {
       return DAQP_EXIT_INFEASIBLE;
     }
   }
-  memset(&w, 0, sizeof w);
-  memset(prox, 0, sizeof prox);
-  memset(&settings, 0, sizeof settings);
-  settings.primal_tol = 1e-9;
-  settings.dual_tol = DAQP_DEFAULT_DUAL_TOL;
-  settings.zero_tol = DAQP_DEFAULT_ZERO_TOL;
-  settings.pivot_tol = DAQP_DEFAULT_PIVOT_TOL;
-  settings.progress_tol = DAQP_DEFAULT_PROG_TOL;
-  settings.cycle_tol = DAQP_DEFAULT_CYCLE_TOL;
-  settings.iter_limit = IP_ITERATIONS;
-  settings.fval_bound = DAQP_INF;
-  settings.rho_soft = DAQP_DEFAULT_RHO_SOFT;
-  settings.sing_tol = DAQP_DEFAULT_SING_TOL;
-  settings.refactor_tol = DAQP_DEFAULT_REFACTOR_TOL;
-  settings.eq_reduction = DAQP_EQ_REDUCTION_OFF;
-  w.settings = &settings;
-  w.n = N;
-  w.m = M;
-  w.ms = IP_SIMPLE;
+  ip_prepare(&memory, IP_VARIABLES, IP_SIMPLE, M, c->u, &w);
   w.M = c->M[0];
   w.dupper = c->upper;
   w.dlower = c->lower;
   w.scaling = c->scaling;
   w.sense = c->sense;
-  w.Mu = Mu;
-  w.lam = lam;
-  w.lam_star = lam_star;
-  w.WS = WS;
-  w.D = D;
-  w.L = L;
-  w.xldl = xldl;
-  w.zldl = zldl;
-  w.u = w.x = c->u;
-  w.xold = xold;
-  w.prox_mask = prox;
-  w.outer_iter = 1;
-  memset(c->u, 0, sizeof c->u);
   flag = daqp_reactivate_constraints(&w);
   flag = flag < 0 ? flag : daqp_ldp(&w);
-  c->iterations = w.iterations;
+  c->iterations += w.iterations;
+  if (w.state & DAQP_STATE_NOISE_FLOOR) {
+    /* It went in circles and then took violated bounds for rounding. */
+    flag = DAQP_EXIT_CYCLE;
+  }
   memset(c->multipliers, 0, sizeof c->multipliers);
   if (flag > 0) {
     ip_decode(c, &w);
   }
   for (i = 0; flag > 0 && i < w.n_active; ++i) {
-    c->multipliers[WS[i]] = w.lam_star[i] * c->scaling[WS[i]];
+    c->multipliers[w.WS[i]] = w.lam_star[i] * c->scaling[w.WS[i]];
   }
   if (flag <= 0) {
     ip_cool(c);

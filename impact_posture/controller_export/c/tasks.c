@@ -2,6 +2,8 @@
 
 /* Kinds of tasks in ip_task_kind. */
 enum { IP_TILT, IP_BASE_TURN, IP_MASS_CENTER, IP_POSITION, IP_POSE, IP_ALIGNED };
+/* Least length of a heading across a normal. */
+#define IP_ACROSS 1e-6
 /* Phases in c->phase. */
 enum { IP_FREE, IP_BRACE, IP_CONTACT, IP_RELEASE };
 
@@ -34,24 +36,24 @@ static void ip_read_state(ip_context *c, const double *q, const double *v)
   ip_dynamics(c->q, c->v, &c->m);
 }
 
-/* Position, Jacobian (rows of NV) and drift of the center of mass, from the rows of the base in M and h. */
-static void ip_center_of_mass(const ip_context *c, double *position, double *J, double *drift)
+/* Position, Jacobian (rows of NV) and drift of the center of mass at q, from the rows of the base in M and h. */
+static void ip_center_of_mass(const ip_model *m, const double *q, double *position, double *J, double *drift)
 {
 #if IP_BASE == 6
-  const double *M = c->m.M, *R = c->m.base;
+  const double *M = m->M, *R = m->base;
   const double mass = M[0], lever[3] = {M[IP_NV + 5], -M[5], M[4]};
   int i, j;
   ip_turn(R, lever, 0, position);
-  ip_turn(R, c->m.h, 0, drift);
+  ip_turn(R, m->h, 0, drift);
   for (i = 0; i < 3; ++i) {
-    position[i] = c->q[i] + position[i] / mass;
+    position[i] = q[i] + position[i] / mass;
     drift[i] = drift[i] / mass + ip_gravity[i];
     for (j = 0; J && j < IP_NV; ++j) {
       J[i * IP_NV + j] = (R[3 * i] * M[j] + R[3 * i + 1] * M[IP_NV + j] + R[3 * i + 2] * M[2 * IP_NV + j]) / mass;
     }
   }
 #else
-  (void)c, (void)position, (void)J, (void)drift, (void)ip_gravity;
+  (void)m, (void)q, (void)position, (void)J, (void)drift, (void)ip_gravity;
 #endif
 }
 
@@ -93,7 +95,7 @@ static void ip_present(const ip_context *c, int k, ip_target *target)
     memcpy(target->rotation, c->m.base, sizeof target->rotation);
     break;
   case IP_MASS_CENTER:
-    ip_center_of_mass(c, target->position, NULL, drift);
+    ip_center_of_mass(&c->m, c->q, target->position, NULL, drift);
     break;
   default:
     memcpy(target->position, c->m.position[point], sizeof target->position);
@@ -102,54 +104,53 @@ static void ip_present(const ip_context *c, int k, ip_target *target)
   target->set = 1.0;
 }
 
-/* Rows J and right-hand sides a of one task, with a = y''* - J'v. */
-static void ip_task_rows(ip_context *c, int k)
+/* Make log6 of the way to a pose, in world axes, of e, the way of its origin, and both rotations. */
+static void ip_pose_error(const double *R, const double *wanted, double *e)
 {
-  const int row = ip_task_row[k], size = ip_task_row[k + 1] - row, point = ip_task_point[k];
-  const ip_target *target = &c->target[k];
+  double way[9], w[3], p[3], linear[3];
+  ip_relative(R, wanted, way);
+  ip_log3(way, w);
+  ip_turn(R, e, 1, p);
+  ip_log6_linear(w, p, linear);
+  ip_turn(R, linear, 0, e);
+  ip_turn(R, w, 0, e + 3);
+}
+
+/* Error e, rows J that are not constant, and drift of one task with the quantities m of the robot at q. */
+static void ip_task_output(const ip_target *target, int k, const ip_model *m, const double *q, double *J, double *e,
+                           double *drift)
+{
+  const int point = ip_task_point[k];
   const double *axis = ip_task_axis + 9 * k;
-  double e[6], drift[6] = {0}, more[6] = {0}, R[9], w[3], p[3], *J = c->J[row];
+  double R[9], w[3] = {0}, p[3];
   int i, j;
   switch (ip_task_kind[k]) {
   case IP_TILT:
-    ip_turn(c->m.base, target->position, 1, w);
+    ip_turn(m->base, target->position, 1, w);
     ip_shortest(w, e);
     break;
   case IP_BASE_TURN:
-    ip_relative(c->m.base, target->rotation, R);
+    ip_relative(m->base, target->rotation, R);
     ip_log3(R, e);
     break;
   case IP_MASS_CENTER:
-    ip_center_of_mass(c, p, J, drift);
+    ip_center_of_mass(m, q, p, J, drift);
     for (i = 0; i < 3; ++i) {
       e[i] = target->position[i] - p[i];
     }
     break;
   default:
     for (i = 0; i < 3; ++i) {
-      e[i] = target->position[i] - c->m.position[point][i];
+      e[i] = target->position[i] - m->position[point][i];
     }
-    memcpy(J, c->m.jacobian[point], sizeof(double) * 3 * IP_NV);
-    memcpy(drift, c->m.drift[point], sizeof drift);
-    if (c->pushed && ip_task_impedance[k]) {
-      for (i = 0; i < 6; ++i) {
-        more[i] = c->p.task_softness[6 * k + i] * c->force[i];
-      }
-    }
+    memcpy(J, m->jacobian[point], sizeof(double) * 3 * IP_NV);
+    memcpy(drift, ip_task_kind[k] == IP_POSE ? m->spatial[point] : m->drift[point], sizeof(double) * 6);
   }
   if (ip_task_kind[k] == IP_POSE) {
-    double linear[3];
-    const double *turned = c->m.rotation[point];
-    ip_relative(turned, target->rotation, R);
-    ip_log3(R, w);
-    ip_turn(turned, e, 1, p);
-    ip_log6_linear(w, p, linear);
-    ip_turn(turned, linear, 0, e);
-    ip_turn(turned, w, 0, e + 3);
-    memcpy(J + 3 * IP_NV, c->m.jacobian[point] + 3 * IP_NV, sizeof(double) * 3 * IP_NV);
-    memcpy(drift, c->m.spatial[point], sizeof drift);
+    ip_pose_error(m->rotation[point], target->rotation, e);
+    memcpy(J + 3 * IP_NV, m->jacobian[point] + 3 * IP_NV, sizeof(double) * 3 * IP_NV);
   } else if (ip_task_kind[k] == IP_ALIGNED) {
-    const double *turned = c->m.rotation[point];
+    const double *turned = m->rotation[point];
     double wanted[3], across[2][3], cross[3], sine, cosine;
     ip_turn(target->rotation, axis, 0, p);
     ip_turn(turned, p, 1, wanted);
@@ -169,17 +170,32 @@ static void ip_task_rows(ip_context *c, int k)
     }
     for (i = 0; i < 2; ++i) {
       w[i] = ip_dot(across[i], drift + 3, 3);
-      p[i] = ip_dot(across[i], more + 3, 3);
       for (j = 0; j < IP_NV; ++j) {
-        const double *angular = c->m.jacobian[point] + 3 * IP_NV + j;
+        const double *angular = m->jacobian[point] + 3 * IP_NV + j;
         J[(3 + i) * IP_NV + j] = across[i][0] * angular[0] + across[i][1] * angular[IP_NV]
                                  + across[i][2] * angular[2 * IP_NV];
       }
     }
-    for (i = 0; i < 2; ++i) {
-      drift[3 + i] = w[i];
-      more[3 + i] = p[i];
-    }
+    memcpy(drift + 3, w, sizeof(double) * 2);
+  }
+}
+
+/* Rows J and right-hand sides a of one task, with a = y''* - J'v. */
+static void ip_task_rows(ip_context *c, int k)
+{
+  const int row = ip_task_row[k], size = ip_task_row[k + 1] - row, point = ip_task_point[k];
+  const ip_target *target = &c->target[k];
+  double e[6], drift[6] = {0}, more[6] = {0}, *J = c->J[row];
+  int i;
+  ip_task_output(target, k, &c->m, c->q, J, e, drift);
+  for (i = 0; c->pushed && ip_task_impedance[k] && i < 6; ++i) {
+    more[i] = c->p.task_softness[6 * k + i] * c->force[i];
+  }
+  if (c->pushed && ip_task_kind[k] == IP_ALIGNED) {
+    double local[3];
+    ip_turn(c->m.rotation[point], more + 3, 1, local);
+    more[3] = ip_dot(ip_task_axis + 9 * k + 3, local, 3);
+    more[4] = ip_dot(ip_task_axis + 9 * k + 6, local, 3);
   }
   for (i = 0; i < size; ++i) {
     const double rate = ip_dot(J + i * IP_NV, c->v, IP_NV);
@@ -210,6 +226,21 @@ static void ip_contact_rows(ip_context *c)
   }
 }
 
+/* Whether the heading of a sole points along the normal of its ground. */
+static int ip_on_edge(const ip_context *c)
+{
+  int k;
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    const double *R = c->m.rotation[ip_contact_point[k]], heading[3] = {R[0], R[3], R[6]};
+    double across[3];
+    if (ip_contact_row[k + 1] - ip_contact_row[k] == 6
+        && ip_across(c->p.contact_normal + 3 * k, heading, across) < IP_ACROSS) {
+      return 1;
+    }
+  }
+  return 0;
+}
+
 /* Hold the contacts where they are, with friction cones in world axes (friction.py has the formulas). */
 static void ip_hold_contacts(ip_context *c)
 {
@@ -218,22 +249,18 @@ static void ip_hold_contacts(ip_context *c)
     const int point = ip_contact_point[k], size = ip_contact_row[k + 1] - ip_contact_row[k];
     const double *n = c->p.contact_normal + 3 * k, *R = c->m.rotation[point];
     const double mu = c->p.contact_friction[k] / sqrt(2.0), X = c->p.contact_half[2 * k], Y = c->p.contact_half[2 * k + 1];
-    double heading[3] = {1.0, 0.0, 0.0}, axes[9], along, length, local[17][6] = {{0}};
+    double heading[3] = {1.0, 0.0, 0.0}, axes[9], length, local[17][6] = {{0}};
     memcpy(c->home_position[k], c->m.position[point], sizeof c->home_position[k]);
     memcpy(c->home_rotation[k], R, sizeof c->home_rotation[k]);
     for (i = 0; size == 6 && i < 3; ++i) {
       heading[i] = R[3 * i];
     }
     for (b = 0; b < 2; ++b) {
-      along = ip_dot(n, heading, 3);
-      for (i = 0; i < 3; ++i) {
-        axes[i] = heading[i] - n[i] * along;
-      }
-      length = sqrt(ip_dot(axes, axes, 3));
-      if (!(length < 1e-6)) {
+      length = ip_across(n, heading, axes);
+      if (!(length < IP_ACROSS)) {
         break;
       }
-      /* The heading points along the normal: take the world axis that is least so. */
+      /* A point has any heading: take the world axis that is least so. */
       j = fabs(n[1]) < fabs(n[0]) ? 1 : 0;
       j = fabs(n[2]) < fabs(n[j]) ? 2 : j;
       for (i = 0; i < 3; ++i) {
@@ -274,12 +301,13 @@ static void ip_hold_contacts(ip_context *c)
 static void ip_bounds(const ip_context *c, int i, double *to)
 {
   const ip_params *p = &c->p;
-  const double margin = fmin(p->law_margin[0], (p->joint_upper[i] - p->joint_lower[i]) / 4.0);
+  const double margin = ip_least(p->law_margin[0], (p->joint_upper[i] - p->joint_lower[i]) / 4.0);
   int s;
   for (s = 0; s < 2; ++s) {
     const double way = c->room[s][i] - margin, room = fabs(way);
-    double speed = fmin(fmin(p->law_approach[0] * room, sqrt(2.0 * p->law_deceleration[0] * room)), p->joint_velocity[i]);
+    double speed = sqrt(2.0 * p->law_deceleration[0] * room);
+    speed = ip_least(ip_least(p->law_approach[0] * room, speed), p->joint_velocity[i]);
     speed = copysign(speed, way) * p->law_rate[0] + (s ? 1.0 : -1.0) * p->law_rate[0] * c->v[i];
-    to[s] = i < IP_BASE ? speed : fmin(fmax(speed, -p->law_acceleration[0]), p->law_acceleration[0]);
+    to[s] = i < IP_BASE ? speed : ip_least(ip_most(speed, -p->law_acceleration[0]), p->law_acceleration[0]);
   }
 }

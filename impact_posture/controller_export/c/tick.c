@@ -3,6 +3,8 @@
 #define IP_LONGEST 10.0
 /* Largest sum of squares of a measurement (1e8 m, rad/s or N). */
 #define IP_ABSURD 1e16
+/* Times that differ by less are equal, s, because sums of periods are not exact. */
+#define IP_SAME 1e-9
 
 /* Whether a quaternion, or a cosine with its sine, is far from unit length. */
 static int ip_turned_wrong(const double *q)
@@ -32,7 +34,7 @@ static void ip_write(ip_context *c, const double *u, int status, ip_command *out
     out->forces[i] = c->held_now ? 0.0 : c->z[IP_NV + IP_SPARE + i];
   }
   out->status = status;
-  out->iterations = c->held_now ? 0 : c->iterations;
+  out->iterations = c->iterations;
 }
 
 /* Give the previous command, with damping of the joints whose rates are finite. */
@@ -95,10 +97,9 @@ static void ip_answer(ip_context *c, ip_command *out)
   }
   for (i = 0; i < IP_CONTROLS; ++i) {
     const int r = IP_EQUATIONS + i;
-    double beyond;
-    u[i] = c->known[i] + ip_dot(c->rows[r], c->z, IP_VARIABLES);
-    beyond = u[i] - fmin(fmax(u[i], c->p.control_lower[i]), c->p.control_upper[i]);
-    over += beyond * beyond;
+    const double exact = c->known[i] + ip_dot(c->rows[r], c->z, IP_VARIABLES);
+    u[i] = ip_least(ip_most(exact, c->p.control_lower[i]), c->p.control_upper[i]);
+    over += (exact - u[i]) * (exact - u[i]);
   }
   /* Not ">", which is false for a NaN. */
   if (!(over <= c->excess * c->excess)) {
@@ -128,8 +129,11 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   if (!ip_measured(q, v, NULL)) {
     return 1;
   }
-  c->pushed = 0;
+  c->pushed = c->iterations = 0;
   ip_read_state(c, q, v);
+  if (ip_on_edge(c)) {
+    return 3;
+  }
   for (k = 0; k < IP_TASKS; ++k) {
     ip_constant_rows(c, k);
     if (c->target[k].set <= 0.0) {
@@ -143,6 +147,11 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   ip_build(c);
 #if IP_ROBUST
   if (!ip_normalize(c)) {
+    return 2;
+  }
+#endif
+#if IP_FLOW
+  if (!ip_flow_begin(c)) {
     return 2;
   }
 #endif
@@ -177,6 +186,7 @@ int ip_tick(ip_context *c, double t, const double q[IP_NQ], const double v[IP_NV
     out->status = IP_UNSOLVED;
     return IP_UNSOLVED;
   }
+  c->iterations = 0;
   if (!isfinite(t) || !ip_measured(q, v, force)) {
     ip_hold(c, IP_NON_FINITE, v, out);
     return out->status;
@@ -188,6 +198,9 @@ int ip_tick(ip_context *c, double t, const double q[IP_NQ], const double v[IP_NV
     memcpy(c->force, force, sizeof c->force);
   }
   ip_read_state(c, q, v);
+  while (c->waiting > 0 && t >= c->since[0] - IP_SAME) {
+    ip_enter(c);
+  }
   ip_advance(c, dt);
   ip_build(c);
   ip_assemble(c);
@@ -217,17 +230,32 @@ int ip_lead_posture(ip_context *c, const double q[IP_NQ], const double v[IP_NV],
   return 0;
 }
 
-int ip_brace(ip_context *c)
+int ip_brace(ip_context *c, double t)
 {
-  return ip_enter(c, IP_BRACE);
+#if IP_FLOW
+  return ip_brace_before(c, t, INFINITY);
+#else
+  return ip_announce(c, IP_BRACE, t);
+#endif
 }
 
-int ip_contact(ip_context *c)
+#if IP_FLOW
+int ip_brace_before(ip_context *c, double t, double t_impact)
 {
-  return ip_enter(c, IP_CONTACT);
+  if (isnan(t_impact) || ip_announce(c, IP_BRACE, t)) {
+    return 1;
+  }
+  c->impact[c->waiting - 1] = t_impact;
+  return 0;
+}
+#endif
+
+int ip_contact(ip_context *c, double t)
+{
+  return ip_announce(c, IP_CONTACT, t);
 }
 
-int ip_release(ip_context *c)
+int ip_release(ip_context *c, double t)
 {
-  return ip_enter(c, IP_RELEASE);
+  return ip_announce(c, IP_RELEASE, t);
 }

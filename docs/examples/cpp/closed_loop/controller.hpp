@@ -42,7 +42,7 @@ public:
     controller_tick(context_.get(), t, q, v, force ? wrench : nullptr, &command_);
   }
 
-  void brace(double) { controller_brace(context_.get()); }
+  void brace(double t) { controller_brace(context_.get(), t); }
 
   // Lead the tip along a direction: distance, speed and acceleration.
   void lead(const double *direction, const std::array<double, 3> &reference)

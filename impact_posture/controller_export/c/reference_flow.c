@@ -1,0 +1,169 @@
+/* The reference flow: a posture q_r that goes down the gradient on contacts and tasks, limited in speed and acceleration,
+ * before the posture task follows it.  An update takes five ticks, one part each.  The formulas are in
+ * impact_posture/tsid/reference_flow.py. */
+
+/* Step of the differences, rad; step below which a posture on the way is reached, rad (m). */
+#define IP_PROBE 1e-4
+#define IP_REACHED 0.02
+/* Length of what is new in a direction below which it is taken twice. */
+#define IP_NEW 0.1
+
+static double ip_largest(const double *x, int first)
+{
+  double most = 0.0;
+  int i;
+  for (i = first; i < IP_NV; ++i) {
+    most = fmax(most, fabs(x[i]));
+  }
+  return most;
+}
+
+/* Model and rows of the constraints at a posture at rest; their errors too, where they are wanted. */
+static void ip_flow_place(ip_context *c, const double *q, double *error)
+{
+  static const double still[IP_NV] = {0};
+  ip_flow *f = &c->flow;
+  double e[6], drift[6];
+  int i, k, row = 0, size;
+  ip_dynamics(q, still, &f->m);
+  for (k = 0; k < IP_CONTACTS; ++k, row += size) {
+    const int point = ip_contact_point[k];
+    size = ip_contact_row[k + 1] - ip_contact_row[k];
+    memcpy(f->J[row], f->m.jacobian[point], sizeof(double) * (size_t)size * IP_NV);
+    for (i = 0; i < 3; ++i) {
+      e[i] = c->home_position[k][i] - f->m.position[point][i];
+    }
+    if (size == 6) {
+      ip_pose_error(f->m.rotation[point], c->home_rotation[k], e);
+    }
+    for (i = 0; error && i < size; ++i) {
+      error[row + i] = e[i];
+    }
+  }
+  for (k = 0; k < IP_TASKS; ++k) {
+    if (ip_flow_led[k]) {
+      continue;
+    }
+    size = ip_task_row[k + 1] - ip_task_row[k];
+    ip_task_output(&c->target[k], k, &f->m, q, f->J[row], e, drift);
+    for (i = 0; error && i < size; ++i) {
+      error[row + i] = e[i];
+    }
+    row += size;
+  }
+}
+
+/* The objective and its gradient over H0 at a posture; zero where they do not exist. */
+static void ip_flow_evaluate(ip_flow *f, const double *q, double *slope)
+{
+  double value;
+  int i;
+  f->failed = IP_GRADIENT(q, &value, slope) != 0 || !isfinite(value + ip_dot(slope, slope, IP_NV));
+  f->found = f->failed ? NAN : value;
+  for (i = 0; i < IP_NV; ++i) {
+    slope[i] = f->failed ? 0.0 : slope[i] / f->start;
+  }
+}
+
+/* Evaluate objective, constraints and limits at q_r. */
+static void ip_flow_look(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  int i;
+  memcpy(f->here, f->q, sizeof f->here);
+  ip_flow_place(c, f->q, f->error);
+  ip_flow_evaluate(f, f->q, f->slope);
+  f->value = f->found;
+  ip_flow_space(f);
+  memset(f->multiplier, 0, sizeof f->multiplier);
+  for (i = 0; i < IP_NV; ++i) {
+    ip_add(f->multiplier, f->slope[i], f->inverse + i * IP_HELD, IP_HELD);
+  }
+  ip_flow_shares(c, f->shares);
+  ip_flow_limits(c);
+}
+
+/* A direction of the redundancy that does not depend on its basis: what is new of a fixed one. */
+static void ip_flow_aim(ip_flow *f)
+{
+  double *z = f->seen[f->probed], *was = f->work, s;
+  int i, k, again;
+  for (i = 0; i < IP_NV; ++i) {
+    const uint32_t j = (uint32_t)(f->probed * IP_NV + i + 1);
+    z[i] = (double)(uint32_t)(j * j * UINT32_C(2654435769)) / 4294967296.0 - 0.5;
+  }
+  /* Where little of the direction is new, once more makes it exact. */
+  for (again = 0, s = 0.0; again < 2 && s < IP_NEW; ++again) {
+    memcpy(was, z, sizeof(double) * IP_NV);
+    for (k = 0; k < f->probed; ++k) {
+      ip_add(z, -ip_dot(f->seen[k], was, IP_NV), f->seen[k], IP_NV);
+    }
+    ip_flow_project(f, z);
+    s = sqrt(fmax(ip_dot(z, z, IP_NV), 1e-24));
+    for (i = 0; i < IP_NV; ++i) {
+      z[i] /= s;
+    }
+  }
+}
+
+/* Evaluate the reduced gradient and the static controls beside q_r, and learn from both sides. */
+static void ip_flow_probe(ip_context *c, double sign)
+{
+  ip_flow *f = &c->flow;
+  double q[IP_NQ], slope[IP_NV], shares[IP_CONTROLS];
+  int i;
+  if (f->failed || !f->left) {
+    return;
+  }
+  if (sign > 0.0) {
+    f->probed = f->next % f->left;
+    ip_flow_aim(f);
+  }
+  /* Both sides of the posture of the last look, because the flow has moved on since. */
+  ip_integrate(f->here, f->seen[f->probed], sign * IP_PROBE, q);
+  ip_flow_evaluate(f, q, slope);
+  ip_flow_place(c, q, NULL);
+  for (i = 0; i < IP_HELD; ++i) {
+    ip_add(slope, -f->multiplier[i], f->J[i], IP_NV);
+  }
+  ip_flow_shares(c, shares);
+  if (sign > 0.0) {
+    memcpy(f->ahead_slope, slope, sizeof slope);
+    memcpy(f->ahead_shares, shares, sizeof shares);
+  } else if (!f->failed) {
+    for (i = 0; i < IP_NV; ++i) {
+      slope[i] = (f->ahead_slope[i] - slope[i]) / (2.0 * IP_PROBE);
+    }
+    for (i = 0; i < IP_CONTROLS; ++i) {
+      shares[i] = (f->ahead_shares[i] - shares[i]) / (2.0 * IP_PROBE);
+    }
+    ip_flow_learn(f, slope, shares);
+    ++f->next;
+  }
+}
+
+/* Find the step, and whether it is worth moving. */
+static void ip_flow_direct(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  memset(f->wanted, 0, sizeof f->wanted);
+  if (f->failed) {
+    return;
+  }
+#if IP_PATH
+  if (f->visited < IP_PATH) {
+    const int before = f->failures;
+    double way[IP_NV], slope[IP_NV];
+    int k;
+    ip_difference(f->q, c->p.flow_path + f->visited * IP_NQ, way);
+    for (k = 0; k < f->left; ++k) {
+      slope[k] = -ip_dot(f->Z[k], way, IP_NV);
+    }
+    ip_flow_solve(f, f->Z, slope, f->wanted);
+    f->visited += f->failures == before && ip_largest(f->wanted, 0) < IP_REACHED;
+    return;
+  }
+#endif
+  ip_flow_newton(c);
+  f->resting = f->gain < (f->resting ? 4.0 : 1.0) * c->p.flow_epsilon[0];
+}

@@ -1,0 +1,182 @@
+/* Direction of the reference flow: a saddle-free Newton step on the constraints, as a QP with limits.  The formulas are
+ * in impact_posture/tsid/flow_direction.py. */
+
+/* Least H/H0 whose root counts. */
+#define IP_LEAST_VALUE 1e-8
+
+/* Bounds of the rows on the step, at the model of the flow, less what the flow needs to brake. */
+static void ip_flow_limits(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  const ip_params *p = &c->p;
+  double position[3], J[3 * IP_NV], drift[3], coasting[IP_NV];
+  int i, j, k, r;
+  for (i = 0; i < IP_NV; ++i) {
+    coasting[i] = f->flow[i] * p->flow_speed[0] / p->flow_acceleration[0] / 2.0;
+  }
+  ip_center_of_mass(&f->m, f->q, position, J, drift);
+  for (r = 0; r < IP_FLOW_ROWS; ++r) {
+    double high = INFINITY, low = -INFINITY, ahead = 0.0;
+    if (r < IP_JOINTS_V) {
+      const double upper = p->joint_upper[IP_BASE + r], lower = p->joint_lower[IP_BASE + r];
+      const double at = f->q[ip_limit_q[IP_BASE + r]], margin = fmin(p->flow_joint_margin[0], (upper - lower) / 8.0);
+      ahead = coasting[IP_BASE + r];
+      if (isfinite(upper) && isfinite(lower)) {
+        high = upper - at - margin;
+        low = -(at - lower - margin);
+      }
+    } else if (r < IP_JOINTS_V + IP_EDGES) {
+      k = r - IP_JOINTS_V;
+      memset(f->row[k], 0, sizeof f->row[k]);
+      if (k < f->edges) {
+        for (j = 0; j < IP_NV; ++j) {
+          f->row[k][j] = f->edge[k][0] * J[j] + f->edge[k][1] * J[IP_NV + j];
+        }
+        high = -f->offset[k] - p->flow_com_margin[0] - ip_dot(f->edge[k], position, 2);
+        ahead = ip_dot(f->row[k], coasting, IP_NV);
+      }
+    } else {
+      k = r - IP_JOINTS_V - IP_EDGES;
+      if (ip_flow_half(p, k) > 0.0) {
+        high = 1.0 - f->shares[k];
+        low = -1.0 - f->shares[k];
+        ahead = ip_dot(f->T[k], coasting, IP_NV);
+      }
+    }
+    f->high[r] = fmax(high - fmax(ahead, 0.0), 0.0);
+    f->low[r] = fmin(low - fmin(ahead, 0.0), 0.0);
+  }
+}
+
+/* The step with the least |y|^2/2 + slope y, step = sum of y[k] way[k] over the redundancy; zero if the solver fails.
+ * With u = y + slope this is the least |u|^2. */
+APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *slope, double *step)
+{
+  enum { N = IP_NV, M = IP_FLOW_ROWS };
+  double u[N], upper[M], lower[M], scaling[M], *rows = f->work;
+  int sense[M], k, r;
+  const int n = f->left;
+  ip_memory memory;
+  DAQPWorkspace w;
+  memset(step, 0, sizeof(double) * IP_NV);
+  f->gain = 0.0;
+  if (n == 0) {
+    return;
+  }
+  for (r = 0; r < M; ++r) {
+    double *row = rows + r * n, length, shift;
+    for (k = 0; k < n; ++k) {
+      row[k] = r < IP_JOINTS_V            ? way[k][IP_BASE + r]
+               : r < IP_JOINTS_V + IP_EDGES ? ip_dot(f->row[r - IP_JOINTS_V], way[k], N)
+                                            : ip_dot(f->T[r - IP_JOINTS_V - IP_EDGES], way[k], N);
+    }
+    length = ip_dot(row, row, n);
+    shift = ip_dot(row, slope, n);
+    scaling[r] = length >= IP_NOTHING ? 1.0 / sqrt(length) : 1.0;
+    for (k = 0; k < n; ++k) {
+      row[k] *= scaling[r];
+    }
+    upper[r] = (f->high[r] + shift) * scaling[r];
+    lower[r] = (f->low[r] + shift) * scaling[r];
+    /* A row of zeros bounds nothing. */
+    sense[r] = length >= IP_NOTHING ? 0 : DAQP_IMMUTABLE;
+  }
+  ip_prepare(&memory, n, 0, M, u, &w);
+  w.M = rows;
+  w.dupper = upper;
+  w.dlower = lower;
+  w.scaling = scaling;
+  w.sense = sense;
+  if (daqp_reactivate_constraints(&w) < 0 || daqp_ldp(&w) <= 0) {
+    ++f->failures;
+    return;
+  }
+  for (k = 0; k < n; ++k) {
+    const double y = u[k] - slope[k];
+    f->gain -= slope[k] * y + y * y / 2.0;
+    ip_add(step, y, way[k], N);
+  }
+  if (!isfinite(ip_dot(step, step, N))) {
+    ++f->failures;
+    f->gain = 0.0;
+    memset(step, 0, sizeof(double) * IP_NV);
+  }
+}
+
+/* The Newton step of 2 sqrt(H/H0) + rho/2 |q - q0|^2 into f->wanted, and the decrease that it predicts into f->gain. */
+static void ip_flow_newton(ip_context *c)
+{
+  enum { N = IP_NV };
+  ip_flow *f = &c->flow;
+  double *C = f->work, *V = C + N * N, offset[N], full[N], slope[N], turned[N];
+  const double root = sqrt(fmax(fabs(f->value / f->start), IP_LEAST_VALUE)), rho = c->p.flow_rho[0];
+  const int n = f->left;
+  int i, j, k;
+  ip_difference(f->first, f->q, offset);
+  for (i = 0; i < N; ++i) {
+    full[i] = f->slope[i] / root + (i < IP_BASE ? 0.0 : rho * offset[i]);
+  }
+  for (k = 0; k < n; ++k) {
+    slope[k] = ip_dot(f->Z[k], full, N);
+    for (i = 0; i < N; ++i) {
+      offset[i] = ip_dot(f->B + i * N, f->Z[k], N) / root + (i < IP_BASE ? 0.0 : rho * f->Z[k][i]);
+    }
+    for (j = 0; j <= k; ++j) {
+      C[k * n + j] = C[j * n + k] = ip_dot(f->Z[j], offset, N);
+    }
+  }
+  for (i = 0; f->soft && i < IP_HELD; ++i) {
+    /* Nearly dependent constraints are springs. */
+    for (k = 0; k < n; ++k) {
+      slope[k] -= IP_SPRING * f->spring[i][k] * f->error[i];
+      ip_add(C + k * n, IP_SPRING * f->spring[i][k], f->spring[i], n);
+    }
+  }
+  ip_eigen(C, V, n);
+  for (k = 0; k < n; ++k) {
+    const double ease = 1.0 / sqrt(fmax(fabs(C[k * (n + 1)]), c->p.flow_mu[0]));
+    memset(f->way[k], 0, sizeof f->way[k]);
+    for (j = 0; j < n; ++j) {
+      ip_add(f->way[k], ease * V[k * n + j], f->Z[j], N);
+    }
+    turned[k] = ease * ip_dot(V + k * n, slope, n);
+  }
+  ip_flow_solve(f, f->way, turned, f->wanted);
+  f->gain *= root;
+}
+
+/* Learn the curvature and the slope of the static controls along the direction of the last probe. */
+static void ip_flow_learn(ip_flow *f, const double *curvature, const double *controls)
+{
+  const double *z = f->seen[f->probed];
+  double missing[IP_NV], along;
+  int i;
+  for (i = 0; i < IP_NV; ++i) {
+    missing[i] = curvature[i] - ip_dot(f->B + i * IP_NV, z, IP_NV);
+  }
+  along = ip_dot(z, missing, IP_NV) / 2.0;
+  ip_add(missing, -along, z, IP_NV);
+  for (i = 0; i < IP_NV; ++i) {
+    ip_add(f->B + i * IP_NV, missing[i], z, IP_NV);
+    ip_add(f->B + i * IP_NV, z[i], missing, IP_NV);
+  }
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    ip_add(f->T[i], controls[i] - ip_dot(f->T[i], z, IP_NV), z, IP_NV);
+  }
+}
+
+/* Take out of a step of the flow the part by which H would rise where the flow can stop. */
+static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
+{
+  double uphill[IP_NV], climb, square;
+  int i;
+  for (i = 0; i < IP_NV; ++i) {
+    uphill[i] = f->slope[i] + ip_dot(f->B + i * IP_NV, stop, IP_NV);
+  }
+  ip_flow_project(f, uphill);
+  climb = ip_dot(uphill, f->flow, IP_NV) + ip_dot(uphill, step, IP_NV);
+  square = ip_dot(uphill, uphill, IP_NV);
+  if (climb > 0.0) {
+    ip_add(step, -climb / square, uphill, IP_NV);
+  }
+}

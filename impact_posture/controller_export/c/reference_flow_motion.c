@@ -1,0 +1,211 @@
+/* How the reference flow moves: its governor, its beginning, and what it leads. */
+
+/* Time constant of the return to contacts and tasks, s; speed of a flow that stands still, rad/s (m/s). */
+#define IP_RETURN 0.1
+#define IP_STILL 1e-5
+/* Pull to zero of the base's share in a motion that the joints do not determine. */
+#define IP_IDLE 1e-9
+
+/* Shorten x so that no entry exceeds a number. */
+static void ip_shorten(double *x, double most)
+{
+  const double size = ip_largest(x, 0);
+  int i;
+  for (i = 0; i < IP_NV && size > most; ++i) {
+    x[i] *= most / size;
+  }
+}
+
+/* The velocity that brings q_r back to contacts and tasks; of all such motions that of the base and not of the joints. */
+static void ip_flow_back(ip_context *c, double *back)
+{
+  ip_flow *f = &c->flow;
+  double rate[IP_LARGEST];
+  int i, k, row;
+  for (i = 0; i < IP_HELD; ++i) {
+    rate[i] = f->error[i] / IP_RETURN;
+  }
+  for (k = 0, row = IP_FORCES; k < IP_TASKS; ++k) {
+    for (i = 0; !ip_flow_led[k] && i < ip_task_row[k + 1] - ip_task_row[k]; ++i) {
+      rate[row++] += c->target[k].velocity[i];
+    }
+  }
+  for (i = 0; i < IP_NV; ++i) {
+    back[i] = ip_dot(f->inverse + i * IP_HELD, rate, IP_HELD);
+  }
+#if IP_BASE
+  {
+    double *square = f->work, x[IP_NV];
+    const int n = f->left;
+    for (k = 0; k < n; ++k) {
+      for (i = 0; i <= k; ++i) {
+        square[i * n + k] = ip_dot(f->Z[i] + IP_BASE, f->Z[k] + IP_BASE, IP_JOINTS_V) + (i == k ? IP_IDLE : 0.0);
+      }
+      x[k] = ip_dot(f->Z[k] + IP_BASE, back + IP_BASE, IP_JOINTS_V);
+    }
+    if (n && ip_cholesky(square, n)) {
+      ip_solve_factor(square, n, x);
+      for (k = 0; k < n; ++k) {
+        ip_add(back, -x[k], f->Z[k], IP_NV);
+      }
+    }
+  }
+#endif
+}
+
+/* Limit speed and acceleration, and return to contacts and tasks. */
+static void ip_flow_govern(ip_context *c)
+{
+  enum { N = IP_NV };
+  ip_flow *f = &c->flow;
+  const ip_params *p = &c->p;
+  const double period = f->elapsed, most = p->flow_acceleration[0] * period;
+  double e[N], back[N], step[N], known[N], more[N], fastest, part;
+  int i;
+  f->elapsed = 0.0;
+  if (!(period > 0.0)) {
+    return;
+  }
+  ip_difference(c->q, f->q, e);
+  fastest = p->flow_speed[0] * fmax(1.0 - ip_largest(e, IP_BASE) / p->flow_tracking[0], 0.0);
+  fastest = fmin(fastest, p->flow_acceleration[0] * fmax(f->deadline - f->clock, 0.0));
+  fastest = !f->on || f->resting ? 0.0 : fastest;
+  ip_flow_back(c, back);
+  ip_flow_project(f, f->flow);
+  /* Each joint turns as fast as it can, and then all stay on the constraints. */
+  for (i = 0; i < N; ++i) {
+    step[i] = f->wanted[i] * p->flow_acceleration[0] / p->flow_speed[0];
+  }
+  ip_shorten(step, fastest);
+  for (i = 0; i < N; ++i) {
+    step[i] = fmin(fmax(step[i] - f->flow[i], -most), most);
+  }
+  ip_flow_project(f, step);
+  ip_shorten(step, most);
+  if (fastest > 0.0 && f->visited == IP_PATH) {
+    const double stop = ip_largest(f->flow, 0) / (2.0 * p->flow_acceleration[0]);
+    for (i = 0; i < N; ++i) {
+      e[i] = f->flow[i] * stop;
+    }
+    ip_flow_downhill(f, e, step);
+    ip_shorten(step, most);
+  }
+  for (i = 0; i < N; ++i) {
+    known[i] = (f->flow[i] + back[i] - f->velocity[i]) / period;
+    more[i] = step[i] / period;
+  }
+  part = ip_flow_permitted(c, known, more);
+  ip_add(f->flow, part, step, N);
+  ip_add(known, part, more, N);
+  memcpy(f->acceleration, known, sizeof known);
+}
+
+/* Time at rest before a known impact, s: four time constants of the slowest joint. */
+static double ip_flow_settle(const ip_params *p)
+{
+  double slowest = INFINITY;
+  int i;
+  for (i = IP_BASE; i < IP_NV; ++i) {
+    slowest = fmin(slowest, p->posture_kp[i]);
+  }
+  return slowest > 0.0 && isfinite(slowest) ? 4.0 / sqrt(slowest) : 0.0;
+}
+
+/* Begin at rest at the present posture, and measure the curvature there.  Return 0 where there is none. */
+static int ip_flow_begin(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  int i, k, row = IP_FORCES;
+  memset(f, 0, sizeof *f);
+  memset(c->posture_velocity, 0, sizeof c->posture_velocity);
+  memset(c->posture_acceleration, 0, sizeof c->posture_acceleration);
+  memcpy(f->q, c->q, sizeof f->q);
+  memcpy(f->first, c->q, sizeof f->first);
+  f->deadline = INFINITY;
+  ip_dynamics_constants(&f->m);
+  ip_dynamics_constants(&f->ahead);
+  for (k = 0; k < IP_TASKS; ++k) {
+    for (i = 0; !ip_flow_led[k] && i < ip_task_row[k + 1] - ip_task_row[k] && row < IP_HELD; ++i, ++row) {
+      if (ip_task_kind[k] <= IP_BASE_TURN) {
+        f->J[row][3 + i] = 1.0;
+      }
+    }
+  }
+  for (i = 0; row < IP_HELD; ++i, ++row) {
+    f->J[row][ip_flow_fixed[i]] = 1.0;
+  }
+#if IP_CONTACTS
+  ip_flow_polygon(c);
+#endif
+  f->start = 1.0;
+  ip_flow_evaluate(f, f->q, f->slope);
+  if (f->failed || f->found == 0.0) {
+    return 0;
+  }
+  f->start = fabs(f->found);
+  ip_flow_look(c);
+  for (k = 0; k < f->left; ++k) {
+    ip_flow_probe(c, 1.0);
+    ip_flow_probe(c, -1.0);
+  }
+  f->next = 0;
+  c->value = f->value;
+  return 1;
+}
+
+/* Advance the flow by dt seconds, and move the targets of the posture task and of the tasks that it leads. */
+static void ip_flow_lead(ip_context *c, double dt)
+{
+  ip_flow *f = &c->flow;
+  double position[3], J[3 * IP_NV], drift[3];
+  int i, k;
+  if (!f->on && !(ip_largest(f->velocity, 0) > IP_STILL)) {
+    return;
+  }
+  f->clock += dt;
+  f->elapsed += dt;
+  k = f->phase;
+  f->phase = (f->phase + 1) % 5;
+  switch (k) {
+  case 0:
+    ip_flow_look(c);
+    break;
+  case 1:
+  case 2:
+    ip_flow_probe(c, k == 1 ? 1.0 : -1.0);
+    break;
+  case 3:
+    ip_flow_direct(c);
+    break;
+  default:
+    ip_flow_govern(c);
+  }
+  ip_add(f->velocity, dt, f->acceleration, IP_NV);
+  ip_integrate(f->q, f->velocity, dt, f->q);
+  c->value = f->value;
+  memcpy(c->posture, f->q, sizeof c->posture);
+  memcpy(c->posture_velocity, f->velocity, sizeof c->posture_velocity);
+  memcpy(c->posture_acceleration, f->acceleration, sizeof c->posture_acceleration);
+  for (k = 0; k < IP_TASKS; ++k) {
+    ip_target *target = &c->target[k];
+    if (!ip_flow_led[k]) {
+      continue;
+    }
+    if (ip_flow_led[k] == 1) {
+      /* The first of them: the others read the same. */
+      ip_dynamics(f->q, f->velocity, &f->ahead);
+    }
+    if (ip_task_kind[k] == IP_MASS_CENTER) {
+      ip_center_of_mass(&f->ahead, f->q, position, J, drift);
+      for (i = 0; i < 3; ++i) {
+        target->position[i] = position[i];
+        target->velocity[i] = ip_dot(J + i * IP_NV, f->velocity, IP_NV);
+        target->acceleration[i] = ip_dot(J + i * IP_NV, f->acceleration, IP_NV) + drift[i];
+      }
+    } else {
+      memcpy(target->rotation, f->ahead.base, sizeof target->rotation);
+      memcpy(target->velocity, f->velocity + 3, sizeof(double) * 3);
+      memcpy(target->acceleration, f->acceleration + 3, sizeof(double) * 3);
+    }
+  }
+}

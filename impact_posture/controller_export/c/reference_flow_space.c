@@ -1,0 +1,256 @@
+/* What contacts and tasks leave to the reference flow, and what the actuators need to hold it, as
+ * impact_posture/tsid/flow_direction.py (Redundancy) and static_controls.py have them. */
+
+/* Singular value of the constraints, relative to the largest, below which they are springs, and their stiffness relative
+ * to H0, 1/m2. */
+#define IP_SLACK 2e-2
+#define IP_SPRING 3e4
+/* Weight of a moment (N m) relative to that of a force (N), and a share that makes equations solvable. */
+#define IP_MOMENT 100.0
+#define IP_TINY 1e-12
+/* Least share of the half range of a control that counts as left. */
+#define IP_LEFT 0.1
+
+#if IP_BASE
+/* Solve R'R x = b in place, R upper triangular in n x n. */
+static void ip_solve_factor(const double *R, int n, double *b)
+{
+  int i, j;
+  for (i = 0; i < n; ++i) {
+    b[i] /= R[i * (n + 1)];
+    for (j = i + 1; j < n; ++j) {
+      b[j] -= R[i * n + j] * b[i];
+    }
+  }
+  for (i = n - 1; i >= 0; --i) {
+    for (j = i + 1; j < n; ++j) {
+      b[i] -= R[i * n + j] * b[j];
+    }
+    b[i] /= R[i * (n + 1)];
+  }
+}
+#endif
+
+/* Decompose J = U S V': the inverse of the directions that it holds, and an orthonormal basis of the others, by the rows
+ * of Z.  A Gram matrix is exact enough, because what counts has singular values above 2 %. */
+static void ip_flow_space(ip_flow *f)
+{
+  enum { N = IP_NV, M = IP_HELD };
+  double *G = f->work, *U = G + M * M, *held = U + M * M, beta[IP_LARGEST], most = 0.0;
+  int i, j, k, rank = 0;
+  for (i = 0; i < M; ++i) {
+    for (j = 0; j <= i; ++j) {
+      G[i * M + j] = G[j * M + i] = ip_dot(f->J[i], f->J[j], N);
+    }
+  }
+  ip_eigen(G, U, M);
+  for (i = 0; i < M; ++i) {
+    most = fmax(most, G[i * (M + 1)]);
+  }
+  memset(f->inverse, 0, sizeof f->inverse);
+  for (k = 0; k < M && rank < N; ++k) {
+    const double value = G[k * (M + 1)];
+    double *row = held + rank * N;
+    if (!(value > IP_SLACK * IP_SLACK * most)) {
+      continue;
+    }
+    memset(row, 0, sizeof(double) * N);
+    for (j = 0; j < M; ++j) {
+      ip_add(row, U[k * M + j], f->J[j], N);
+    }
+    for (i = 0; i < N; ++i) {
+      ip_add(f->inverse + i * M, row[i] / value, U + k * M, M);
+      row[i] /= sqrt(value);
+    }
+    ++rank;
+  }
+  /* Reflections that take these rows to the first entries take the other entries to Z. */
+  for (k = 0; k < rank; ++k) {
+    double *v = held + k * N, size = sqrt(ip_dot(v + k, v + k, N - k));
+    v[k] += v[k] < 0.0 ? -size : size;
+    beta[k] = 1.0 / (size * fabs(v[k]));
+    for (i = k + 1; i < rank; ++i) {
+      double *row = held + i * N + k;
+      ip_add(row, -beta[k] * ip_dot(v + k, row, N - k), v + k, N - k);
+    }
+  }
+  f->left = N - rank;
+  f->soft = rank < (M < N ? M : N);
+  for (i = 0; i < f->left; ++i) {
+    double *z = f->Z[i];
+    memset(z, 0, sizeof f->Z[i]);
+    z[rank + i] = 1.0;
+    for (k = rank - 1; k >= 0; --k) {
+      const double *v = held + k * N + k;
+      ip_add(z + k, -beta[k] * ip_dot(v, z + k, N - k), v, N - k);
+    }
+  }
+  for (i = 0; f->soft && i < M; ++i) {
+    for (k = 0; k < f->left; ++k) {
+      f->spring[i][k] = ip_dot(f->J[i], f->Z[k], N);
+    }
+  }
+}
+
+/* x = Z Z' x. */
+static void ip_flow_project(const ip_flow *f, double *x)
+{
+  double out[IP_NV] = {0};
+  int k;
+  for (k = 0; k < f->left; ++k) {
+    ip_add(out, ip_dot(f->Z[k], x, IP_NV), f->Z[k], IP_NV);
+  }
+  memcpy(x, out, sizeof out);
+}
+
+/* Forces on the contacts that carry the base with the least weighted norm: J' times them, by the base's entries. */
+static void ip_flow_carry(ip_flow *f)
+{
+#if IP_CONTACTS
+  double square[36] = {0}, trace = 0.0, s[6];
+  int i, k, row;
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    for (row = ip_contact_row[k]; row < ip_contact_row[k + 1]; ++row) {
+      const double ease = row - ip_contact_row[k] < 3 ? 1.0 : 1.0 / IP_MOMENT;
+      for (i = 0; i < 6; ++i) {
+        ip_add(square + 6 * i, ease * f->J[row][i], f->J[row], 6);
+      }
+    }
+  }
+  for (i = 0; i < 6; ++i) {
+    trace += square[7 * i];
+  }
+  for (i = 0; i < 6; ++i) {
+    /* Feet on a line carry no moment about it. */
+    square[7 * i] += IP_TINY * trace;
+  }
+  memset(f->carried, 0, sizeof f->carried);
+  if (!ip_cholesky(square, 6)) {
+    f->failed = 1;
+    return;
+  }
+  for (k = 0; k < IP_CONTACTS; ++k) {
+    for (row = ip_contact_row[k]; row < ip_contact_row[k + 1]; ++row) {
+      const double ease = row - ip_contact_row[k] < 3 ? 1.0 : 1.0 / IP_MOMENT;
+      for (i = 0; i < 6; ++i) {
+        s[i] = ease * f->J[row][i];
+      }
+      ip_solve_factor(square, 6, s);
+      for (i = 0; i < IP_NV; ++i) {
+        ip_add(f->carried[i], f->J[row][i], s, 6);
+      }
+    }
+  }
+#else
+  (void)f;
+#endif
+}
+
+/* Half of the share of a control's range that rest may take; 0 where the control has no limits. */
+static double ip_flow_half(const ip_params *p, int i)
+{
+  const double half = p->flow_share[0] * (p->control_upper[i] - p->control_lower[i]) / 2.0;
+  return isfinite(half) ? half : 0.0;
+}
+
+/* Controls that make a generalized force, in units of ip_flow_half. */
+static void ip_flow_needed(const ip_context *c, const double *force, double *shares)
+{
+  double rest[IP_NV];
+  int i, j;
+  for (i = 0; i < IP_NV; ++i) {
+    rest[i] = force[i];
+    for (j = 0; j < 6 && IP_CONTACTS; ++j) {
+      rest[i] -= c->flow.carried[i][j] * force[j];
+    }
+  }
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    const double half = ip_flow_half(&c->p, i);
+    const double s = i < IP_ROTORS ? ip_dot(ip_inverse + i * IP_BASE, rest, IP_BASE) : rest[IP_BASE + i - IP_ROTORS];
+    shares[i] = half > 0.0 ? s / half : 0.0;
+  }
+}
+
+/* Static controls at the model of the flow, from the middle of their range. */
+static void ip_flow_shares(ip_context *c, double *shares)
+{
+  int i;
+  ip_flow_carry(&c->flow);
+  ip_flow_needed(c, c->flow.m.h, shares);
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    const double half = ip_flow_half(&c->p, i);
+    shares[i] -= half > 0.0 ? (c->p.control_upper[i] + c->p.control_lower[i]) / 2.0 / half : 0.0;
+  }
+}
+
+/* The part of `more`, 0 to 1, that accelerations permit which take `flow_haste` of what rest leaves. */
+static double ip_flow_permitted(const ip_context *c, const double *known, const double *more)
+{
+  const ip_flow *f = &c->flow;
+  double force[2][IP_NV], taken[IP_CONTROLS], added[IP_CONTROLS], part = 1.0;
+  int i;
+  for (i = 0; i < IP_NV; ++i) {
+    force[0][i] = ip_dot(f->m.M + i * IP_NV, known, IP_NV);
+    force[1][i] = ip_dot(f->m.M + i * IP_NV, more, IP_NV);
+  }
+  ip_flow_needed(c, force[0], taken);
+  ip_flow_needed(c, force[1], added);
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    const double side = added[i] < 0.0 ? -1.0 : 1.0;
+    const double room = fmax(1.0 / c->p.flow_share[0] - side * f->shares[i], IP_LEFT / c->p.flow_share[0]);
+    if (added[i] != 0.0) {
+      part = fmin(part, (c->p.flow_haste[0] * room - side * taken[i]) / fmax(fabs(added[i]), IP_TINY));
+    }
+  }
+  return fmax(part, 0.0);
+}
+
+#if IP_CONTACTS
+/* Outward normals n and offsets b of the polygon n c + b <= 0 of the feet on level ground.  Feet that span no area allow
+ * no motion of the center of mass: each direction is then an edge out of reach. */
+static void ip_flow_polygon(ip_context *c)
+{
+  enum { COUNT = 4 * IP_CONTACTS };
+  ip_flow *f = &c->flow;
+  double x[COUNT][2];
+  int i, j, start = 0, at, next, edges = 0;
+  for (i = 0; i < COUNT; ++i) {
+    const double *R = c->m.rotation[ip_contact_point[i / 4]], *half = c->p.contact_half + 2 * (i / 4);
+    const int sole = ip_contact_row[i / 4 + 1] - ip_contact_row[i / 4] == 6;
+    for (j = 0; j < 2; ++j) {
+      x[i][j] = c->m.position[ip_contact_point[i / 4]][j];
+      /* Points have no rotation in the model. */
+      x[i][j] += sole ? (i & 1 ? 1.0 : -1.0) * half[0] * R[3 * j] + (i & 2 ? 1.0 : -1.0) * half[1] * R[3 * j + 1] : 0.0;
+    }
+    start = x[i][0] < x[start][0] || (x[i][0] == x[start][0] && x[i][1] < x[start][1]) ? i : start;
+  }
+  for (at = start; edges < IP_EDGES; at = next) {
+    double way[2] = {0.0, 0.0}, length = 0.0;
+    for (i = 0, next = at; i < COUNT; ++i) {
+      const double step[2] = {x[i][0] - x[at][0], x[i][1] - x[at][1]}, far = hypot(step[0], step[1]);
+      const double turn = way[0] * step[1] - way[1] * step[0];
+      if (far > 1e-9 && (next == at || turn < -IP_TINY || (turn <= IP_TINY && far > length))) {
+        next = i;
+        length = far;
+        memcpy(way, step, sizeof way);
+      }
+    }
+    if (next == at) {
+      break;
+    }
+    f->edge[edges][0] = way[1] / length;
+    f->edge[edges][1] = -way[0] / length;
+    f->offset[edges] = -ip_dot(f->edge[edges], x[at], 2);
+    ++edges;
+    if (hypot(x[next][0] - x[start][0], x[next][1] - x[start][1]) <= 1e-9) {
+      break;
+    }
+  }
+  for (i = 0; edges < 3 && i < 4; ++i) {
+    f->edge[i][0] = i % 2 ? 0.0 : i < 2 ? 1.0 : -1.0;
+    f->edge[i][1] = i % 2 ? (i < 2 ? 1.0 : -1.0) : 0.0;
+    f->offset[i] = INFINITY;
+  }
+  f->edges = edges < 3 ? 4 : edges;
+}
+#endif

@@ -1,0 +1,50 @@
+"""Support polygon of feet on level ground."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from impact_posture.arrays import Array
+
+# Points nearer to a line than this (m) lie on it, and places are rounded to it.
+_ROUNDING, _DIGITS = 1e-9, 12
+
+
+def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
+    """Return the edges ``n·p ≤ b`` of the convex hull of points of the plane; ``None`` if they span no area.
+
+    Each chain of the hull goes along the sorted points and leaves out those that do not turn left (A. M. Andrew,
+    "Another efficient algorithm for convex hulls in two dimensions", Inf. Process. Lett. 1979).  SciPy has convex
+    hulls as well, but takes longer to import than many problems take to solve.
+
+    Args:
+        points: Points, shape (2,) each, m.
+
+    Returns:
+        Outward unit normals ``n``, shape (k, 2), and offsets ``b``, m, shape (k,).
+    """
+    ordered = sorted({(float(x), float(y)) for x, y in points})
+    corners: list[Array] = []
+    for chain in (ordered, ordered[::-1]):
+        hull: list[Array] = []
+        for point in map(np.array, chain):
+            while len(hull) > 1 and _height(hull[-2], point, hull[-1]) < _ROUNDING:
+                hull.pop()
+            hull.append(point)
+        corners += hull[:-1]
+    if len(corners) < 3:
+        return None
+    steps = np.roll(corners, -1, axis=0) - corners
+    normals = np.column_stack([steps[:, 1], -steps[:, 0]]) / np.linalg.norm(steps, axis=1)[:, None]
+    offsets = (normals * corners).sum(axis=1)
+    # Rounded and sorted, so that feet in another order give the same edges.
+    edges = np.unique(np.round(np.column_stack([normals, offsets]), _DIGITS), axis=0)
+    return edges[:, :2], edges[:, 2]
+
+
+def _height(start: Array, end: Array, point: Array) -> float:
+    """Distance of a point to the right of a line, m; negative to the left of it."""
+    along, off = end - start, point - start
+    return float((along[1] * off[0] - along[0] * off[1]) / np.linalg.norm(along))

@@ -1,0 +1,82 @@
+"""Controllers that run as C in a simulation: the runs of Python, and when they are built."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impact_posture.errors import CompilerError, InputError
+from impact_posture.libraries import cache_path
+from impact_posture.simulation.compiled_tick import CompiledTick
+from impact_posture.simulation.controller_factory import ControllerFactory
+from impact_posture.simulation.metrics import measure
+from tests.daqp import sources_or_skip
+from tests.simulation.factories import driven, factory, needs_mujoco
+
+# Totals of Python's run and of C's: a wall amplifies the last digits, the ground does not.
+BANDS = {"solo8-push": 1e-6, "aerial-vertical": 2e-2}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _built(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A cache of these tests alone, in which compilers do not optimize."""
+    needs_mujoco()
+    sources_or_skip()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CFLAGS", "-O0")
+        own, used = tmp_path_factory.mktemp("cache"), cache_path()
+        for file in used.glob("daqp-*"):
+            shutil.copy(file, own)
+        patch.setenv("IMPACT_POSTURE_CACHE", str(own))
+        yield
+
+
+def in_c(name: str, **options: Any) -> ControllerFactory:
+    return replace(factory(name), **{"compile": "always", "warnings": [], "_fault": "", **options})
+
+
+@pytest.mark.parametrize(
+    ("name", "controller", "mode"), [("solo8-push", "robust", "held"), ("aerial-vertical", "nominal", "live")]
+)
+def test_a_run_in_c_is_that_of_python(name: str, controller: str, mode: Any) -> None:
+    made = in_c(name)
+    assert isinstance(made.driver(controller, mode).compiled, CompiledTick)
+    ours, theirs = driven(factory(name), controller, mode=mode), driven(made, controller, mode=mode)
+    wanted, found = (measure(made.setup, one) for one in (ours, theirs))
+    assert found.q_total_impact == pytest.approx(wanted.q_total_impact, rel=BANDS[name])
+    assert found.peak_jump == pytest.approx(wanted.peak_jump, rel=BANDS[name])
+    assert (found.contacts, found.failed_ticks) == (wanted.contacts, wanted.failed_ticks)
+    np.testing.assert_array_equal(ours.series.level, theirs.series.level)
+    # Until the impact, both are the same to rounding.
+    calm = slice(0, 300)
+    np.testing.assert_allclose(theirs.series.q[calm], ours.series.q[calm], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(theirs.series.torque[calm], ours.series.torque[calm], rtol=0, atol=1e-7)
+
+
+def test_auto_builds_where_runs_pay_for_it() -> None:
+    assert in_c("solo8-push", compile="auto").driver("nominal").compiled is None
+    assert in_c("solo8-push", compile="never", runs=9).driver("robust").compiled is None
+    assert in_c("solo8-push", compile="auto", runs=3).driver("robust").compiled is not None
+    # Looks into its controller.
+    assert in_c("solo8-push", compile="auto", runs=3).driver("walker").compiled is None
+
+
+def test_what_cannot_run_in_c_is_named_or_runs_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="'walker' has no C code"):
+        in_c("solo8-push").driver("walker")
+    with pytest.raises(InputError, match="no mode 'sometimes'"):
+        in_c("solo8-push", compile="sometimes").driver("nominal")
+    monkeypatch.setenv("CC", "false")
+    with pytest.raises(CompilerError):
+        in_c("solo8-push").driver("nominal")
+    made = in_c("solo8-push", compile="auto", runs=3)
+    assert made.driver("nominal").compiled is None
+    (warning,) = made.warnings
+    assert warning.startswith("the controller runs in Python")
+    # Once is enough.
+    assert made.driver("nominal").compiled is None
+    assert made.warnings == []

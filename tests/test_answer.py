@@ -1,0 +1,163 @@
+"""What makes answers fast and must not change them: caches by content, polygons of feet, rounds of a search."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull, QhullError
+
+from impact_posture.codegen import code as code_module
+from impact_posture.codegen.code import build_code
+from impact_posture.codegen.emitter import DOUBLE, FLOAT
+from impact_posture.codegen.functions import named_objectives
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture import search as search_module
+from impact_posture.posture.load_cases import load_cases
+from impact_posture.posture.problem_settings import prepare
+from impact_posture.posture.search import Search
+from impact_posture.report import shapes as report_shapes
+from impact_posture.report.shapes import DrawnRobot, draw_robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.robot.support_polygon import polygon_edges
+from impact_posture.settings import ProblemSettings
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
+    draw_robot.cache_clear()
+    return tmp_path
+
+
+points = st.lists(
+    st.tuples(*[st.floats(-1, 1).map(lambda x: round(x, 2))] * 2), min_size=0, max_size=14
+)  # fmt: skip
+
+
+@given(points)
+@settings(max_examples=60, deadline=None)
+def test_the_polygon_of_the_feet_is_the_convex_hull(corners: list[tuple[float, float]]) -> None:
+    found = polygon_edges([np.array(corner) for corner in corners])
+    try:
+        hull = ConvexHull(np.array(corners).reshape(-1, 2))
+    except (QhullError, ValueError):
+        assert found is None
+        return
+    assert found is not None
+    normals, offsets = found
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
+    # As many edges as corners of the hull, and the same half-planes.
+    expected = np.unique(np.round(hull.equations, 7), axis=0)
+    assert len(normals) == len(expected)
+    for *n, b in hull.equations:
+        assert np.abs(np.column_stack([normals, -offsets]) - [*n, b]).max(axis=1).min() < 1e-6
+
+
+def _objective(robot: str, frame: str) -> ImpactObjective:
+    problem = prepare(ProblemSettings(robot=robot, frame=frame, normal=(0.0, 0.0, 1.0), collision=False)).problem
+    return problem.impact
+
+
+@pytest.mark.parametrize("robot, frame", [("tilthex_arm", "ee"), ("z1", "link06")])
+def test_code_from_the_cache_is_the_code(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, robot: str, frame: str
+) -> None:
+    objective, generate, count = _objective(robot, frame), code_module._generate, []
+    monkeypatch.setattr(code_module, "_generate", lambda *a, **k: count.append(1) or generate(*a, **k))
+
+    def texts(**changed: object) -> list[str]:
+        exported = named_objectives([changed.pop("objective", objective)], "a")
+        code = build_code(exported, "a", changed.pop("real", DOUBLE), **changed)
+        from impact_posture.codegen.manifest import build_manifest
+        from impact_posture.codegen.render import render
+
+        manifest = build_manifest([v.objective for v in exported][:1], "a", None, None, DOUBLE, code.stack_bytes)
+        return list(render(exported, "a", manifest, code, DOUBLE).values())
+
+    first = texts()
+    assert texts() == first and len(count) == 1
+    # Whatever shapes the code gives another key.
+    other = replace(objective, contact=replace(objective.contact, normal=(0.0, 0.6, 0.8)))
+    for changed in ({"objective": other}, {"real": FLOAT}, {"portable": True}):
+        assert texts(**changed) != first
+    assert len(count) == 4
+    (kept, *_) = sorted((cache / "code").glob("*.json"), key=os.path.getmtime)
+    kept.write_text(kept.read_text()[:-9])
+    assert texts() == first and len(count) == 5
+
+
+def _numbers(drawn: DrawnRobot) -> list[object]:
+    solids = [(s.corners.tolist(), s.faces.tolist(), s.low.tolist(), s.step) for s in drawn.solids]
+    parts = [(joint, k, at.homogeneous.tolist(), color) for joint, k, at, color in drawn.parts]
+    return [solids, parts, drawn.licenses, drawn.notes]
+
+
+@pytest.mark.parametrize(
+    "robot, damage", [("hextilt", ""), ("tilthex_arm", ""), ("tilthex_arm", "cut"), ("tilthex_arm", "other")]
+)
+def test_drawn_shapes_from_the_cache_are_the_shapes(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, robot: str, damage: str
+) -> None:
+    first = _numbers(draw_robot(load_robot(robot)))
+    (kept,) = (cache / "solids").glob("*.json")
+    if damage:
+        kept.write_text({"cut": kept.read_text()[:-9], "other": "{}"}[damage])
+    else:
+        monkeypatch.setattr(report_shapes, "load_geometry", None)
+    draw_robot.cache_clear()
+    assert _numbers(draw_robot(load_robot(robot))) == first
+
+
+def test_an_end_that_lacks_parts_is_certified_in_the_last_round_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = prepare(ProblemSettings(robot="panda", frame="panda_hand_tcp", normal=(-1.0, 0.0, 0.0))).problem
+    scale = problem.objective.value(problem.given)
+    search = Search(problem, (problem.given,), scale, starts=2, seed=0, compile="never")
+    runs = [search._run(index, last=False) for index in range(2)]
+    lacking = [index for index, run in enumerate(runs) if run.lacks]
+    # Without such an end the test shows nothing.
+    assert lacking
+    for index, run in enumerate(runs):
+        assert (run.certificate is None) == run.lacks
+        if run.lacks:
+            ended = search._run(index, last=True)
+            assert ended.certificate is not None and not ended.good
+    monkeypatch.setattr(search_module, "_ROUNDS", 1)
+    assert [run.good for run in search.run(1, None)][lacking[0]] is False
+
+
+def test_what_even_forces_hold_needs_no_linear_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = prepare(
+        ProblemSettings(robot="talos", frame="gripper_right_base_link", normal=(-1.0, 0.0, 0.0))
+    ).problem
+    held = [c for c in problem.constraints if c.name == "holding at rest"]
+    assert len(held) == 1 and load_cases(problem.objective, problem.given, problem.requirements).cases
+    model = Numeric(problem.robot.model).at(problem.given)
+    exact = held[0].evaluate(model)[0]
+    monkeypatch.setattr(held[0], "evaluate", None)
+    # Both say that nothing is violated.
+    assert (exact <= 1e-8).all() and (held[0].value(model) <= held[0].upper).all()
+
+
+def test_an_answer_of_a_small_robot_imports_no_part_of_scipy() -> None:
+    """A part of SciPy takes longer to import than such a problem takes to solve."""
+    program = """if True:
+        import sys
+        from impact_posture.front_door import PostureProblem, optimize
+        from impact_posture.posture.problem_settings import prepare
+        from impact_posture.settings import ProblemSettings
+
+        prepared = prepare(ProblemSettings(robot="tilthex_arm", frame="ee", normal=(0, 0, 1)))
+        assert optimize(PostureProblem.of(prepared), starts=2, jobs=1).document
+        print([part for part in ("linalg", "spatial", "optimize") if f"scipy.{part}" in sys.modules])
+        """
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("[]\n", "")

@@ -1,0 +1,137 @@
+"""The reference flow of an exported controller goes as in Python, and ends as it should where Python never gets."""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.arrays import Array
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.reader import read_manifest
+from impact_posture.controller_export.builtin import default_formulation
+from impact_posture.controller_export.compiled_controller import CompiledController
+from impact_posture.controller_export.structure import structure_of
+from impact_posture.errors import InputError
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.libraries import library_path, load_library
+from impact_posture.toolchain import find_compiler
+from impact_posture.tsid.controller import Controller, Status
+from impact_posture.tsid.impact_robust import gradient_of
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
+from impact_posture.tsid.task_formulation import arm_formulation
+from tests.exported_controller import KINDS, exported, impact_of
+from tests.helpers import robot
+from tests.test_controller_export_hostile import STRICT
+
+IMPACTS = {"tilthex_arm": ("ee", (0.0, 0.0, 1.0)), "panda": ("panda_hand_tcp", (0.0, 0.0, 1.0)),
+           "solo8": ("base_link", (1.0, 0.0, 0.0))}  # fmt: skip
+# The arm of panda turns about the line from shoulder to wrist.
+ELBOW = (0.3, -0.7, 0.3, -2.3, 0.1, 1.6, 0.9, 0.035, 0.035)
+DT = 2e-3
+
+
+@functools.cache
+def objective_of(name: str) -> ImpactObjective:
+    return impact_of(robot(name), *IMPACTS[name])
+
+
+def both(name: str, path: tuple[float, ...] = ()) -> tuple[Controller, ReferenceFlowPosture, CompiledController]:
+    """Return the controllers in Python and in C after a reset, with the same gradient."""
+    r, objective = robot(name), objective_of(name)
+    folder = exported(name, objective, path=path)
+    gradient = ImpactGradient(load_library(library_path(folder, "ctl")), read_manifest(folder / "ctl_metric.json")[0])
+    formulation = default_formulation(r, KINDS[name], objective, flow=True)
+    posture = formulation.posture
+    assert isinstance(posture, ReferenceFlowPosture)
+    posture._function, posture._path = gradient_of(gradient), [np.array(path)] if path else []
+    ours, theirs = Controller(r, formulation), CompiledController.load(folder, robot=r)
+    for controller in (ours, theirs):
+        controller.reset(r.posture(), np.zeros(r.nv))
+    return ours, posture, theirs
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "ticks"), [("tilthex_arm", (), 300), ("solo8", (), 300), ("panda", ELBOW, 300)]
+)
+def test_the_reference_goes_as_in_python(name: str, path: tuple[float, ...], ticks: int) -> None:
+    """Each controller moves a robot of its own, through all phases."""
+    r = robot(name)
+    ours, posture, theirs = both(name, path)
+    states = [(r.posture(), np.zeros(r.nv)) for _ in range(2)]
+    first = posture.value
+    for k in range(ticks):
+        for phase, at in (("brace", 0), ("contact", ticks // 2), ("brace", ticks // 2 + 20), ("release", ticks - 10)):
+            if k == at:
+                for target in (posture, theirs):
+                    # The second time, the flow has to rest before an impact.
+                    getattr(target, phase)(**({"t_impact": posture.settle + 0.1} if phase == "brace" and k else {}))
+        for i, controller in enumerate((ours, theirs)):
+            q, v = states[i]
+            command = controller.tick(k * DT, q, v)
+            assert command.status is Status.SOLVED
+            v = v + DT * command.acceleration
+            states[i] = np.asarray(pin.integrate(r.model, q, DT * v)), v
+        np.testing.assert_allclose(theirs.target, posture.target, rtol=0, atol=1e-9)
+        report = theirs.report()
+        assert report.level == posture.level and report.objective == pytest.approx(posture.value, rel=1e-7)
+    away = np.abs(pin.difference(r.model, r.posture(), theirs.target)).max()
+    assert away > 0.02 and theirs.flow_failures == 0
+    assert path or posture.value < 0.95 * first
+    assert np.abs(posture.flow.velocity).max() < 0.02
+
+
+def test_a_step_that_is_not_found_leaves_the_reference_at_rest_and_is_counted() -> None:
+    r = robot("panda")
+    _, _, theirs = both("panda", ELBOW)
+    theirs.parameters["flow_path"][:] = 1e300
+    theirs.reset(r.posture(), np.zeros(r.nv))
+    theirs.brace()
+    for k in range(20):
+        assert theirs.tick(k * DT, r.posture(), np.zeros(r.nv)).status is Status.SOLVED
+    assert theirs.flow_failures == 4
+    np.testing.assert_allclose(theirs.target, r.posture(), atol=1e-6)
+
+
+def test_a_clock_that_stands_still_moves_nothing() -> None:
+    r = robot("panda")
+    ours, posture, theirs = both("panda", ELBOW)
+    posture.brace()
+    theirs.brace()
+    ours.tick(0.0, r.posture(), np.zeros(r.nv))
+    theirs.tick(0.0, r.posture(), np.zeros(r.nv))
+    for _ in range(12):
+        for controller in (ours, theirs):
+            assert controller.tick(0.0, r.posture(), np.zeros(r.nv)).status is Status.SOLVED
+        np.testing.assert_allclose(theirs.target, posture.target, rtol=0, atol=1e-9)
+
+
+def test_what_is_no_time_no_parameter_and_no_task_is_refused() -> None:
+    r = robot("panda")
+    _, _, theirs = both("panda", ELBOW)
+    at_rest: tuple[Array, Array] = (r.posture(), np.zeros(r.nv))
+    with pytest.raises(InputError, match="no flow can rest"):
+        theirs.brace(t_impact=float("nan"))
+    for name, wrong in (("flow_share", 1.5), ("flow_speed", np.inf), ("flow_mu", 0.0), ("flow_rho", -1.0)):
+        before = theirs.parameters[name].copy()
+        theirs.parameters[name][:] = wrong
+        with pytest.raises(InputError, match=name):
+            theirs.reset(*at_rest)
+        theirs.parameters[name][:] = before
+
+    class Mine(ReferenceFlowPosture):
+        pass
+
+    with pytest.raises(InputError, match=r"'flow posture' \(Mine\) has no C code"):
+        structure_of(r, arm_formulation(r, Mine(r, lambda q: (1.0, q[: r.nv]))))
+
+
+@pytest.mark.parametrize("name", list(IMPACTS))
+def test_the_code_has_no_warnings(name: str) -> None:
+    folder = exported(name, objective_of(name), path=ELBOW if name == "panda" else ())
+    command = [*(find_compiler() or ["cc"]), "-std=c99", "-isystem", "daqp", *STRICT, "-fsyntax-only", "ctl.c"]
+    found = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
