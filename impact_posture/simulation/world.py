@@ -171,6 +171,8 @@ class World:
         self._check_ready()
         speed, self._torques = self._checked(command)
         self._data.ctrl[self._count :] = self._torques
+        if not count:
+            return
         # MuJoCo itself would write a warning to a log file in the working directory.  The state shows the problem.
         before = self._mujoco.get_mju_user_warning()
         self._mujoco.set_mju_user_warning(lambda message: None)

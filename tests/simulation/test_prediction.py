@@ -17,7 +17,7 @@ from impact_posture.simulation.recorder import Recorder
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_file import read_scenario
-from impact_posture.simulation.scenario_objective import interpreted, scenario_objective
+from impact_posture.simulation.scenario_objective import scenario_objective
 from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors
 from impact_posture.simulation.series import Window
 from impact_posture.simulation.world import build_world
@@ -51,7 +51,7 @@ def drop(law: ContactLaw, q: Vector, speed: float = 0.5, timestep: float = 2.5e-
     v = np.zeros(9)
     v[:3] = pin.Quaternion(q[3:7]).matrix().T @ np.array([0, 0, -speed])
     world.reset(q, v)
-    recorder = Recorder(setup, interpreted(objective))
+    recorder = Recorder(setup, objective.value)
     rest = Command(np.zeros(3), np.zeros(3), NONE, Status.SOLVED, np.zeros(9), NONE)
     for _ in range(60):
         world.step(ActuatorCommand(np.zeros(3), NONE), round(1e-3 / timestep))
