@@ -19,6 +19,7 @@ from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.settings import ContactPose, ProblemSettings
+from impact_posture.simulation.controller_factory import CONTROLLERS
 from impact_posture.simulation.scenario import ScenarioTable
 from impact_posture_cli.app import COMMANDS, build
 from tests.settings import make_settings
@@ -186,3 +187,10 @@ def power(text: str) -> float:
     found = re.fullmatch(r"\$10\^\{(-\d+)\}\$", text)
     assert found, text
     return float(f"1e{found[1]}")
+
+
+def test_every_controller_is_in_the_help_and_on_the_page() -> None:
+    option = next(p for p in build("simulate").params if p.name == "controller")
+    named = set(re.findall(r"[a-z-]+", str(getattr(option, "help", ""))))
+    page = set(re.findall(r"^\| `([a-z-]+)` \|", (DOCS / "experiments.md").read_text(encoding="utf-8"), re.MULTILINE))
+    assert set(CONTROLLERS) <= named & page

@@ -19,7 +19,7 @@ from impact_posture.tsid.flow_direction import FlowDirection, Redundancy, limite
 from impact_posture.tsid.frame_tasks import FramePose, FramePosition
 from impact_posture.tsid.qp import stacked_rows
 from impact_posture.tsid.state import State
-from impact_posture.tsid.static_controls import StaticControls, polygon_edges
+from impact_posture.tsid.static_controls import StaticControls, support_edges
 from impact_posture.tsid.task import Task
 from impact_posture.tsid.task_formulation import TaskFormulation
 
@@ -157,7 +157,7 @@ class ReferenceFlow:
             task.reset(state)
             self._J[rows] = task.jacobian(state)
         self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
-        self._edges, self._offsets = polygon_edges(state, self._contacts)
+        self._edges, self._offsets = support_edges(state, self._contacts)
         self.direction = FlowDirection(
             self.robot, self._edges, self._static.limited.size,
             rho=options.rho, mu=options.mu, margin=options.joint_margin,

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from impact_posture.arrays import Array
+from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.contacts import SupportContact
 from impact_posture.tsid.state import State
@@ -98,13 +99,11 @@ class StaticControls:
         return np.asarray(self._inverse @ force)
 
 
-def polygon_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:
+def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:
     """Return ``n`` (k, 2) and ``b`` (k,) of the support polygon ``n·c + b ≤ 0`` of feet on level ground, m.
 
     Feet that span no area allow no motion of the center of mass: each direction then is an edge out of reach.
     """
-    from scipy.spatial import ConvexHull, QhullError
-
     corners = []
     for contact in contacts:
         here = state.at(contact.point)
@@ -113,9 +112,7 @@ def polygon_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
             corners.append((here.position + here.rotation @ corner)[:2])
     if not corners:
         return np.zeros((0, 2)), np.zeros(0)
-    try:
-        found = ConvexHull(np.array(corners)).equations
-    except QhullError:
+    edges = polygon_edges(corners)
+    if edges is None:
         return np.vstack([np.eye(2), -np.eye(2)]), np.full(4, np.inf)
-    found = np.unique(np.round(found, 12), axis=0)
-    return found[:, :2], found[:, 2]
+    return edges[0], -edges[1]

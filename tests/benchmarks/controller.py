@@ -257,6 +257,7 @@ def _measure(
         speeds[-1].append("{:.1f} / {:.1f}".format(*times(*flowing(name, 4 * ticks), BUILDS["-O2"], False)))
         found = None if peer is None else controller_peer.times(peer, name, recorded)
         speeds[-1].append("–" if found is None else "{:.1f} / {:.1f}".format(*found))
+        print(*speeds[-1], flush=True)
         if name in IMPACTS:
             ratios.append(robust_over_nominal(name, IMPACTS[name], recorded))
 
