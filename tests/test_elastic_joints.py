@@ -54,7 +54,7 @@ class Setup(NamedTuple):
     stiffness: float
 
 
-def setup(name: str) -> Setup:
+def case_of(name: str) -> Setup:
     """Robots with and without a free base, feet, dampers; stiff, locked and unstated joints; all metrics."""
     generator = rng(name, "elastic")
     rigid, locked = JointTransmissionSpec("rigid"), JointTransmissionSpec("locked")
@@ -166,7 +166,7 @@ def stepped(case: ImpactCase, q: Vector, stiffness: float, speed: float) -> Step
 
 @pytest.mark.parametrize("name", CASES)
 def test_time_stepping_finds_the_same(name: str) -> None:
-    case, q, stiffness = setup(name)
+    case, q, stiffness = case_of(name)
     speed = 0.7
     found, other = elastic_response(case, q, stiffness, speed), stepped(case, q, stiffness, speed)
     assert found.duration == pytest.approx(other.duration, rel=1e-8)
@@ -184,7 +184,7 @@ def test_time_stepping_finds_the_same(name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_work_of_the_contact_is_energy_and_loss(name: str) -> None:
-    case, q, stiffness = setup(name)
+    case, q, stiffness = case_of(name)
     other = stepped(case, q, stiffness, 1.0)
     found = elastic_response(case, q, stiffness)
     # Free flight goes on at the approach speed, so that its force times this speed is the power.
@@ -194,7 +194,7 @@ def test_work_of_the_contact_is_energy_and_loss(name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_gradient_is_that_of_differences(name: str) -> None:
-    case, q, stiffness = setup(name)
+    case, q, stiffness = case_of(name)
     elastic = ElasticImpact(case)
     value = elastic.value(q, stiffness)
     assert value == pytest.approx(elastic.response(q, stiffness, 0.3).value, rel=1e-12)
@@ -205,7 +205,7 @@ def test_gradient_is_that_of_differences(name: str) -> None:
 @pytest.mark.parametrize("name", ["panda", "arm", "tilthex_arm"])
 def test_limits_are_the_joint_models(name: str) -> None:
     """Stiff contacts meet links, soft contacts and stiff springs links and rotors, each in proportion to a number."""
-    case, q, _ = setup(name)
+    case, q, _ = case_of(name)
     case = replace(case, metric=Metric(), robot=on_springs(case.robot, springs(5e3 if name == "panda" else 150.0)))
     elastic, stiff = ElasticImpact(case), {}
     links = ImpactOracle(replace(case, robot=with_joint_model(case.robot, "link"))).quantities(q).V
@@ -222,7 +222,7 @@ def test_limits_are_the_joint_models(name: str) -> None:
 
 
 def test_dampers_hold_rotors_to_links() -> None:
-    case, q, stiffness = setup("arm")
+    case, q, stiffness = case_of("arm")
     case = replace(case, metric=Metric())
     both = ImpactOracle(case).quantities(q).V
     held = replace(case, robot=on_springs(case.robot, springs(150.0, 1e5)))
@@ -232,7 +232,7 @@ def test_dampers_hold_rotors_to_links() -> None:
 def test_first_greatest_compression_of_many() -> None:
     """Soft wrists let the compression rise, stall and rise again; the first standstill counts, not a later one."""
     generator, close = rng("first root"), 0
-    case, _, _ = setup("arm")
+    case, _, _ = case_of("arm")
     case = replace(case, metric=Metric())
     for _ in range(25):
         soft = {
@@ -249,7 +249,7 @@ def test_first_greatest_compression_of_many() -> None:
 
 
 def test_ratio_is_that_of_duration_and_springs() -> None:
-    case, q, stiffness = setup("arm")
+    case, q, stiffness = case_of("arm")
     found = elastic_response(case, q, stiffness)
     oracle = ImpactOracle(replace(case, robot=with_joint_model(case.robot, "link"))).at(q)
     j = oracle.n @ oracle.J
@@ -259,7 +259,7 @@ def test_ratio_is_that_of_duration_and_springs() -> None:
 
 def test_ratio_of_a_robot_on_its_feet() -> None:
     """The base gives way through the springs of the legs, while feet and rotors hold."""
-    case, q, stiffness = setup("solo12")
+    case, q, stiffness = case_of("solo12")
     oracle = ElasticImpact(case).oracle.at(q)
     Js, j = oracle.Js, oracle.n @ oracle.J
     K = np.diag([0.0] * 6 + [30.0] * 12)
@@ -271,7 +271,7 @@ def test_ratio_of_a_robot_on_its_feet() -> None:
 
 
 def test_contact_that_no_spring_takes() -> None:
-    case, q, stiffness = setup("arm")
+    case, q, stiffness = case_of("arm")
     rigid = {f"joint_{k}": JointTransmissionSpec("rigid") for k in range(6)}
     held = replace(
         case,
@@ -283,7 +283,7 @@ def test_contact_that_no_spring_takes() -> None:
 
 
 def test_numbers_are_proportional_to_the_speed() -> None:
-    case, q, stiffness = setup("mixed arm")
+    case, q, stiffness = case_of("mixed arm")
     slow, fast = (elastic_response(case, q, stiffness, speed) for speed in (0.5, 1.5))
     same = {"stiffness", "duration", "compliance_ratio", "value"}
     for field in fields(ElasticResponse):
@@ -292,7 +292,7 @@ def test_numbers_are_proportional_to_the_speed() -> None:
 
 
 def test_joints_without_a_spring() -> None:
-    case, q, stiffness = setup("mixed arm")
+    case, q, stiffness = case_of("mixed arm")
     found = elastic_response(case, q, stiffness)
     rigid, locked, soft = 1, 3, [0, 2, 4, 5, 6]
     assert found.jump[locked] == found.rotor_jump[locked] == 0.0 != found.jump[rigid] == found.rotor_jump[rigid]
@@ -301,7 +301,7 @@ def test_joints_without_a_spring() -> None:
 
 
 def test_armature_is_that_stated_whatever_the_joint_model() -> None:
-    case, q, stiffness = setup("panda")
+    case, q, stiffness = case_of("panda")
     linked = replace(case, robot=with_joint_model(case.robot, "link"))
     assert elastic_response(linked, q, stiffness).value == elastic_response(case, q, stiffness).value
 
@@ -311,14 +311,14 @@ def test_armature_is_that_stated_whatever_the_joint_model() -> None:
 
 @pytest.mark.parametrize("stiffness", [0.0, -1e5, float("nan"), float("inf"), 1e30, 0.5])
 def test_stiffness_out_of_range(stiffness: float) -> None:
-    case, q, _ = setup("arm")
+    case, q, _ = case_of("arm")
     with pytest.raises(InputError, match=r"^contact_stiffness: is .* N/m; give 1 to 1e\+12 N/m$"):
         elastic_response(case, q, stiffness)
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
 def test_speed_out_of_range(speed: float) -> None:
-    case, q, stiffness = setup("arm")
+    case, q, stiffness = case_of("arm")
     with pytest.raises(InputError, match=r"^approach speed: is .*; give m/s above zero"):
         elastic_response(case, q, stiffness, speed)
 
@@ -327,7 +327,7 @@ def test_speed_out_of_range(speed: float) -> None:
     "table", [TransmissionSpec(), TransmissionSpec("elastic"), TransmissionSpec("rigid", 1e4), springs(1e4)]
 )
 def test_no_rotor_on_a_spring(table: TransmissionSpec) -> None:
-    case, _, _ = setup("arm")
+    case, _, _ = case_of("arm")
     model = pin.Model(case.robot.model)
     if table.kind == "elastic" and table.stiffness:
         model.armature = np.zeros(model.nv)
@@ -339,7 +339,7 @@ def test_no_rotor_on_a_spring(table: TransmissionSpec) -> None:
 
 
 def test_springs_too_stiff_for_a_soft_contact() -> None:
-    case, q, _ = setup("arm")
+    case, q, _ = case_of("arm")
     stiff = replace(case, robot=on_springs(case.robot, springs(1e300)))
     with pytest.raises(InputError, match="joints are too stiff or too damped for a contact as soft as this one"):
         elastic_response(stiff, q, 1e5)
@@ -354,7 +354,7 @@ def test_contact_that_cannot_move() -> None:
 
 def test_extreme_but_allowed_numbers_answer() -> None:
     """Soft and stiff at both ends: a finite answer, or one line."""
-    case, q, _ = setup("arm")
+    case, q, _ = case_of("arm")
     for inertia in (1e-14, 1e-9, 1e6, 1e18, 1e40):
         model = pin.Model(case.robot.model)
         model.armature = np.full(model.nv, inertia)
