@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from impact_posture_cli.options import CompileMode
 from impact_posture_cli.output import Page
 
 if TYPE_CHECKING:
@@ -13,7 +14,6 @@ if TYPE_CHECKING:
 
 RUN = "Run"
 Mode = Literal["live", "held"]
-CompileMode = Literal["auto", "always", "never"]
 
 ScenarioName = Annotated[
     str,

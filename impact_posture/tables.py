@@ -56,10 +56,17 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
         raise SpecError(f"key '{path}': {what}", where=where, hint=hint) from None
 
 
-def json_block(value: Any) -> dict[str, object]:
-    """Return the fields of a dataclass as JSON content, with arrays as lists."""
-    found = {field.name: getattr(value, field.name) for field in fields(value)}
-    return {name: entry.tolist() if hasattr(entry, "tolist") else entry for name, entry in found.items()}
+def json_block(value: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as JSON content: arrays as lists, and parts by their own ``to_dict``."""
+    return {field.name: _json(getattr(value, field.name)) for field in fields(value)}
+
+
+def _json(entry: Any) -> Any:
+    if isinstance(entry, tuple):
+        return [_json(part) for part in entry]
+    if hasattr(entry, "to_dict"):
+        return entry.to_dict()
+    return entry.tolist() if hasattr(entry, "tolist") else entry
 
 
 def _plain(value: Any) -> Any:

@@ -22,7 +22,7 @@ from impact_posture.codegen.functions import casadi_reference, oracle_reference
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.render import Verbatim, _environment
 from impact_posture.escape import c_comment
-from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot_loader import load_robot
@@ -49,7 +49,7 @@ class Case:
 
     def build(self) -> ImpactObjective:
         robot = load_robot(self.robot)
-        supports = tuple(Support.from_spec(s) for s in robot.spec.supports) if self.supported else ()
+        supports = robot.spec.supports if self.supported else ()
         metric = (
             Metric("weighted", tuple(np.linspace(0.5, 2.0, robot.nv)), "test")
             if self.metric == "weighted"

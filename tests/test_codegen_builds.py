@@ -20,7 +20,7 @@ from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest import sample_postures
 from impact_posture.codegen.naming import products
 from impact_posture.errors import CompilerError, InputError, OutputError
-from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.output_folder import RECORD
@@ -164,7 +164,7 @@ def test_stack_stays_below_its_bound(arm: ImpactObjective, tmp_path: Path, real:
 def test_stack_of_a_robot_that_stands(tmp_path: Path, tool: str) -> None:
     need(tool)
     solo8 = load_robot("solo8")
-    feet = tuple(Support.from_spec(s) for s in solo8.spec.supports)
+    feet = solo8.spec.supports
     objective = ImpactObjective(solo8, ImpactContact("base_link", (1, 0, 0)), supports=feet)
     bound = export(objective, tmp_path, prefix="solo8", check=False).manifest["stack_bytes"]
     deepest = deepest_stack(tmp_path, "solo8", tool, "-O3 -mavx512f -mfma")

@@ -17,7 +17,7 @@ from impact_posture.codegen.export import export
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.cone import cone_axes, worst_normal
 from impact_posture.impact.cone_symbolic import worst_normal_symbolic
-from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.normal_cone import NormalCone
@@ -193,7 +193,7 @@ def test_ties_are_flagged() -> None:
 @pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo8"])
 def test_gradient_where_the_worst_normal_is_unique(name: str, kind: ObjectiveKind) -> None:
     found = robot(name)
-    feet = tuple(Support.from_spec(s) for s in found.spec.supports) if kind == "impulse" else ()
+    feet = found.spec.supports if kind == "impulse" else ()
     for degrees, metric, axes in ((5.0, "kinetic", "contact"), (45.0, "euclidean", "world")):
         contact = ImpactContact(ROBOTS[name], tuple(unit(rng(name, axes, kind))), (0.02, 0, 0.01), axes)  # type: ignore[arg-type]
         objective = ImpactObjective(found, contact, Metric(metric), kind, feet, normal_cone_deg=degrees)  # type: ignore[arg-type]

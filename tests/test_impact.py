@@ -45,7 +45,7 @@ STEP = 2e-4
 def supports_of(found: Robot) -> tuple[Support, ...]:
     """The robot's feet; where it has none, a point brace a third of the way to the contact."""
     if found.spec.supports:
-        return tuple(Support.from_spec(s) for s in found.spec.supports)
+        return found.spec.supports
     assert found.spec.contact.frame is not None
     path = list(found.model.supports[found.model.frames[found.frame_id(found.spec.contact.frame)].parentJoint])[1:]
     braced = path[len(path) // 3]

@@ -177,7 +177,7 @@ def test_subgradients_at_a_mirror_symmetric_posture(name: str, frames: tuple[str
 
 def test_both_hands_of_talos_by_hand() -> None:
     found = robot("talos")
-    feet = tuple(Support.from_spec(s) for s in found.spec.supports)
+    feet = found.spec.supports
     right, left = (
         ImpactContact(frame, (-1.0, 0.0, 0.2), impulse=i) for frame, i in zip(HANDS, (1.0, 2.0), strict=True)
     )

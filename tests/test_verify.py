@@ -7,7 +7,7 @@ import importlib.util
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -343,7 +343,7 @@ def test_the_document() -> None:
 
 
 def report_like(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [Row(**row).to_dict() for row in rows]
+    return [asdict(Row(**row)) for row in rows]
 
 
 def test_a_failure_is_exit_code_1_and_one_line(

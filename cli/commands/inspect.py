@@ -122,7 +122,6 @@ def _constraints(constraints: dict[str, Any]) -> str:
 
 
 def _joints(page: Page, summary: dict[str, Any]) -> None:
-
     def limits(joint: dict[str, Any]) -> str:
         if joint["lower"] is None and joint["upper"] is None:
             return "none"
@@ -171,7 +170,6 @@ def _postures(page: Page, summary: dict[str, Any]) -> None:
 
 
 def _actuation(page: Page, actuation: dict[str, Any]) -> None:
-
     page.gap()
     condition = number(actuation["condition"], missing="infinite")
     page.title(

@@ -140,7 +140,6 @@ def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
 
 
 def _announce(page: Page, prepared: Prepared) -> None:
-
     if page.quiet:
         return
     impact, problem = prepared.impact, prepared.problem

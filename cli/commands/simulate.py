@@ -127,7 +127,6 @@ def _export_world(page: Page, scenario: str, out: Path, force: bool) -> None:
 
 
 def _rigid(prediction: dict[str, Any]) -> str:
-
     if prediction["sticking"] is None:
         return f"{number(prediction['frictionless'], missing='–')} if nobody controlled"
     named = {"frictionless": "without friction", "coulomb": "with the surface's", "sticking": "sticking"}
@@ -135,7 +134,6 @@ def _rigid(prediction: dict[str, Any]) -> str:
 
 
 def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> None:
-
     page.title(f"{document['scenario']}, {label}", f"seed {document['seed']}")
     runs = document["runs"]
     rows = [("status", document["status"])]

@@ -247,16 +247,8 @@ class ImpactOracle:
 
         Row k uses the adjoint ``M p − J_sᵀr = 0, J_s p + εr = −e_k``: ``∂f_k = pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)``.
         """
-        self.at(q)
-        x = self.answer(self.J.T @ self.n)
-        rows = len(self.Js)
-        adjoints = self.answer(np.zeros((self._nv, rows)), -np.eye(rows))
-        found = [
-            self.coupling(np.array(self.contact.normal), p, self.case.in_contact_frame)
-            - self.inertial(Answer(p, r), x)
-            for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
-        ]
-        return np.array(found).reshape(rows, self._nv)
+        rows = len(self.at(q).Js)
+        return self._adjoint_rows(self.answer(np.zeros((self._nv, rows)), -np.eye(rows)))
 
     def jump_gradient(self, q: Array) -> Array:
         """Return the tangent Jacobian of ``a = M⁻¹Jᵀn``, shape (nv, nv).
@@ -264,14 +256,16 @@ class ImpactOracle:
         Row k is ``∂a_k = p_kᵀ∂(Jᵀn − M a)`` with ``M p_k = e_k``.
         """
         self.at(q)
-        x = self.answer(self.J.T @ self.n)
-        adjoints = self.answer(np.eye(self._nv))
-        own = np.array(self.contact.normal)
+        return self._adjoint_rows(self.answer(np.eye(self._nv)))
+
+    def _adjoint_rows(self, adjoints: Answer) -> Array:
+        """Return ``pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)`` for each adjoint ``p, r``, shape (k, nv)."""
+        own, x = np.array(self.contact.normal), self.answer(self.J.T @ self.n)
         rows = [
             self.coupling(own, p, self.case.in_contact_frame) - self.inertial(Answer(p, r), x)
             for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
         ]
-        return np.array(rows)
+        return np.array(rows).reshape(-1, self._nv)
 
     def coupling(self, direction: Array, v: Array, in_frame: bool) -> Array:
         """Return ``∂_q directionᵀJ v``, shape (nv,), for a direction in world axes or fixed in the frame."""

@@ -31,24 +31,11 @@ CASADI, COMPILED, DIFFERENCES, MUJOCO = "CasADi", "compiled C", "finite differen
 NO_COMPILER = f"no C compiler: {GET_ONE}"
 
 
-@dataclass(frozen=True)
-class Tolerances:
-    """Largest relative errors that pass.
-
-    Attributes:
-        model: For ``M`` and ``J`` from MuJoCo, which has the same rigid bodies and solves no system.
-        values: For ``H``, ``G``, ``Λ_c``, and gradients by adjoints.
-        differences: For gradients by finite differences.
-    """
-
-    model: float = 1e-9
-    values: float = 1e-9
-    differences: float = 1e-8
-
-    @staticmethod
-    def of(objective: ImpactObjective) -> Tolerances:
-        """Return the tolerances.  Feet at compliance ε make a system of condition 1/ε, which costs digits."""
-        return Tolerances(values=1e-7, differences=1e-6) if objective.supports else Tolerances()
+# Largest relative errors that pass.  _MODEL is for M and J from MuJoCo, which has the same rigid bodies and solves no
+# system, _VALUES for H, G, Λ_c and gradients by adjoints, and _DIFFERENCES for gradients by finite differences.
+_MODEL, _VALUES, _DIFFERENCES = 1e-9, 1e-9, 1e-8
+# The last two on feet.  Feet at compliance ε make a system of condition 1/ε, which costs digits.
+_ON_FEET = 1e-7, 1e-6
 
 
 def verify(
@@ -83,15 +70,15 @@ def verify(
         raise InputError(f"the seed is {seed}", where="--seed", hint="give zero or more")
     drawn = random_samples(objective.robot, samples, seed, np.array(objective.contact.normal))
     expected = [pinocchio_numbers(objective, sample) for sample in drawn]
-    allowed = Tolerances.of(objective)
-    values = dict.fromkeys(("H", "G", "Λ_c", "∇H"), allowed.values)
-    of_mujoco = {"M": allowed.model, "J": allowed.model} | values | {"∇H": allowed.differences}
+    allowed, by_differences = _ON_FEET if objective.supports else (_VALUES, _DIFFERENCES)
+    values = dict.fromkeys(("H", "G", "Λ_c", "∇H"), allowed)
+    of_mujoco = {"M": _MODEL, "J": _MODEL} | values | {"∇H": by_differences}
     with ExitStack() as stack:
         compiled = None if find_compiler() is None else stack.enter_context(compiled_source(objective))
         candidates = (
             _Candidate(CASADI, values, casadi_source(objective)),
             _Candidate(COMPILED, values, compiled, NO_COMPILER),
-            _Candidate(DIFFERENCES, {"∇H": allowed.differences}, partial(pinocchio_differences, objective)),
+            _Candidate(DIFFERENCES, {"∇H": by_differences}, partial(pinocchio_differences, objective)),
             _mujoco(objective, of_mujoco),
         )
         compared, total = 0, sum(own.source is not None for own in candidates) * len(drawn)

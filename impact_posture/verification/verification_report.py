@@ -36,10 +36,6 @@ class Row:
     entry: str = ""
     note: str = ""
 
-    def to_dict(self) -> dict[str, object]:
-        """Return the JSON content."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, eq=False)
 class VerificationReport:
@@ -68,7 +64,7 @@ class VerificationReport:
             "reference": REFERENCE,
             "seed": self.seed,
             "count": len(self.samples),
-            "rows": [row.to_dict() for row in self.rows],
+            "rows": [asdict(row) for row in self.rows],
             "samples": [
                 {"sample": k, "q": self.samples[k].q.tolist(), "normal": self.samples[k].normal.tolist()}
                 for k in named

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.codegen.export import export
-from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot_loader import load_robot
 from tests.benchmarks.cases import CASES, Case
@@ -41,7 +41,7 @@ def lines(request: Request) -> Iterator[str]:
 
 def _row(case: Case, share: float, postures: int) -> list[str]:
     robot, normal = load_robot(case.robot), case.normal or (0.0, 0.0, 1.0)
-    supports = tuple(Support.from_spec(s) for s in robot.spec.supports)
+    supports = robot.spec.supports
     contact = ImpactContact(robot.spec.contact.frame or "", normal)
     objective = ImpactObjective(robot, contact, supports=supports, compliance=share / robot.mass)
     kernel, oracle = objective.metric_fun(), objective.oracle
