@@ -397,6 +397,7 @@ def test_command_refuses(tmp_path: Path, arguments: tuple[str, ...], code: int, 
 def test_one_library_checks_a_source_with_any_posture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     need_compiler()
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("CFLAGS", "-O0")
     objective = ImpactObjective(load_robot("panda"), ImpactContact("panda_link8", (0, 0, 1)))
     made = []
     for number, posture in enumerate(sample_postures(objective.robot, 2, 0)):
