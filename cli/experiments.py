@@ -23,16 +23,16 @@ ScenarioName = Annotated[
         "g1-strike, solo12-landing, panda-tap, hextilt-poke, or a path to a scenario.toml.",
     ),
 ]
-Seeds = Annotated[int, typer.Option("--seeds", min=1, rich_help_panel=RUN, help="Seeds a controller, from 0.")]
+Seeds = Annotated[int, typer.Option("--seeds", min=1, rich_help_panel=RUN, help="Seeds of each controller, from 0.")]
 Compile = Annotated[
     CompileMode,
     typer.Option(
         "--compile", rich_help_panel=RUN,
-        help="Whether controllers run as machine code. auto: from 3 seeds on, which pay for building it.",
+        help="Whether controllers are compiled to machine code. auto: from 3 seeds on, which pay for it.",
     ),
 ]  # fmt: skip
 Processes = Annotated[
-    int, typer.Option("--jobs", min=1, rich_help_panel=RUN, help="Processes that run at the same time.")
+    int, typer.Option("--jobs", min=1, rich_help_panel=RUN, help="Number of processes that run at the same time.")
 ]
 
 

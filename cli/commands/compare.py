@@ -16,7 +16,7 @@ Controllers = Annotated[
     str,
     typer.Option(
         "--controllers", metavar="A,B,…", rich_help_panel=RUN,
-        help="Names as in simulate; robust:held holds the reached posture, robust:free leaves the feet away.",
+        help="Names as in simulate. robust:held is robust with --mode held, and robust:free is robust with --free.",
     ),
 ]  # fmt: skip
 Out = Annotated[str | None, options.out_option("Folder for comparison.json and figures.", "none")]

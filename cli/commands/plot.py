@@ -16,7 +16,7 @@ Figures = Annotated[
     list[str] | None,
     typer.Option(
         "--figure",
-        help="ellipsoid, postures, jump, nullspace, classical, tradeoff or self_motion; repeatable.",
+        help="Figure to draw: ellipsoid, postures, jump, nullspace, classical, tradeoff or self_motion; repeatable.",
         show_default="all",
     ),
 ]

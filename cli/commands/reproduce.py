@@ -17,12 +17,12 @@ All = Annotated[
     typer.Option(
         "--all",
         rich_help_panel=RUN,
-        help="Every controller, not only nominal, robust, robust-flow and the recommended.",
+        help="Run every controller, not only nominal, robust, robust-flow and the recommended ones.",
     ),
 ]
 Scenarios = Annotated[
     list[str] | None,
-    typer.Option("--scenario", rich_help_panel=RUN, show_default="all four", help="That one only; repeatable."),
+    typer.Option("--scenario", rich_help_panel=RUN, show_default="all four", help="Run this one only; repeatable."),
 ]
 Out = Annotated[str, options.out_option("Folder of the results.")]
 

@@ -31,17 +31,17 @@ RunMode = Annotated[
     Mode,
     typer.Option(
         "--mode", rich_help_panel=RUN,
-        help="live: the term stays on through the impact; held: the reached posture is held before it.",
+        help="live keeps the impact-robust term on in the impact; held keeps the posture that was reached before.",
     ),
 ]  # fmt: skip
 Free = Annotated[
-    bool, typer.Option("--free", rich_help_panel=RUN, help="Gradient and optimum of the robot without its feet.")
+    bool, typer.Option("--free", rich_help_panel=RUN, help="Gradient and optimum as if the feet were in the air.")
 ]
 Gain = Annotated[
     float | None,
     typer.Option(
         "--gain", rich_help_panel=RUN, callback=positive, show_default="the scenario's",
-        help="K of the impact-robust term, 1/s².",
+        help="Gain K of the impact-robust term, 1/s².",
     ),
 ]  # fmt: skip
 Sign = Annotated[

@@ -28,7 +28,7 @@ NormalOfFirst = Annotated[
 ]  # fmt: skip
 Samples = Annotated[
     int,
-    typer.Option("--samples", min=1, rich_help_panel=OUTPUT, help="Random postures and normals."),
+    typer.Option("--samples", min=1, rich_help_panel=OUTPUT, help="Number of random postures and normals."),
 ]
 SampleSeed = Annotated[int, typer.Option("--seed", min=0, rich_help_panel=OUTPUT, help="Seed of the random samples.")]
 
