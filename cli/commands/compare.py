@@ -10,7 +10,7 @@ import typer
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Processes, ScenarioName, Seeds, rows_table
 from impact_posture_cli.output import Page, complain, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 
 Controllers = Annotated[
     str,

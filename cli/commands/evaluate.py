@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from impact_posture.settings import ImpactSettings
 from impact_posture_cli import options
+from impact_posture_cli.impact_tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 from impact_posture_cli.output import Page, number, print_json, vector
 from impact_posture_cli.settings_options import Given, with_settings
-from impact_posture_cli.tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 
 if TYPE_CHECKING:
     from impact_posture.impact.classical_ellipsoids import Ellipsoid

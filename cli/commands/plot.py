@@ -9,7 +9,7 @@ import typer
 
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 
 ResultFolder = Annotated[str, typer.Argument(metavar="RESULT_DIR", help="A folder that optimize wrote.")]
 Figures = Annotated[

@@ -11,7 +11,7 @@ import typer
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Mode, ScenarioName
 from impact_posture_cli.output import Page, complain, number, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import positive
 
 # Exit code of a run that did not complete.

@@ -12,7 +12,7 @@ import typer
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, number, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

@@ -12,7 +12,7 @@ from impact_posture.setting import CONTACT, OUTPUT
 from impact_posture.settings import ImpactSettings, Vector3
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, complain, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import Given, check_direction, with_settings
 
 if TYPE_CHECKING:
