@@ -33,6 +33,8 @@ from impact_posture.toolchain import find_compiler, words_of
 
 # The oracle factorizes another matrix.  Feet at compliance ε cost digits there (condition about 1/ε).
 _ORACLE_TOLERANCE = 1e-5
+# Random postures and normals of a comparison.
+_SAMPLES = 20
 # Number of libraries in the cache. The oldest go first.
 _CACHED = 16
 # C function → the reference's names of its results.
@@ -63,7 +65,6 @@ def compile_and_check(
     export_dir: Path,
     prefix: str,
     objective: ImpactObjective | Sequence[ImpactObjective],
-    samples: int = 20,
     *,
     keep: bool = False,
 ) -> float:
@@ -73,7 +74,6 @@ def compile_and_check(
         export_dir: The folder of the export.
         prefix: The prefix of the export.
         objective: The exported objective, or one for each frame.
-        samples: The number of postures.
         keep: Leave the library in the folder of the export, even if it fails.
 
     Raises:
@@ -96,7 +96,7 @@ def compile_and_check(
                 (casadi_reference, tolerance, "CasADi"),
                 (oracle_reference, max(_ORACLE_TOLERANCE, tolerance), "Pinocchio"),
             ):
-                found = largest_difference(gradient, own, reference, samples)
+                found = largest_difference(gradient, own, reference, _SAMPLES)
                 if found > allowed:
                     raise CompilerError(
                         f"the numbers of the compiled code differ from those of {name} by {found:.3g}, relative",

@@ -43,12 +43,6 @@ class ImpactGradient:
         dtype: The number type of the library.
     """
 
-    manifest: Mapping[str, Any]
-    frame: str
-    free: bool
-    nq: int
-    nv: int
-
     def __init__(
         self, library: ctypes.CDLL, manifest: Mapping[str, Any], frame: str | None = None, *, free: bool = False
     ) -> None:

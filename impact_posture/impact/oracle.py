@@ -237,10 +237,15 @@ class ImpactOracle:
         """Return the tangent gradient of E, ``−∇G/(2G²)``, shape (nv,)."""
         return -self.gradient_G(q) / (2 * self.quantities(q).G ** 2)
 
+    @property
+    def axes(self) -> Array:
+        """World axes in which the contact's normal is given, at the last posture, as columns, shape (3, 3)."""
+        return np.asarray(self.numeric.placement(self.point).rotation) if self.case.in_contact_frame else np.eye(3)
+
     def _normals(self, given: Array | None) -> tuple[Array, Array]:
         """A normal (by default that of the contact) in the axes of the contact's normal, and in world axes."""
         own = np.array(self.contact.normal) if given is None else given
-        return own, self.numeric.placement(self.point).rotation @ own if self.case.in_contact_frame else own
+        return own, self.axes @ own if self.case.in_contact_frame else own
 
     def support_gradient(self, q: Array) -> Array:
         """Return the tangent Jacobian of the support impulses ``f``, shape (rows, nv).

@@ -25,6 +25,8 @@ FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
 
 # Rounding error of a zero in a rotation matrix or an inertia (SI units).
 _ROUNDING = 1e-14
+# Largest distance (rad, m) beyond a position limit that counts as on it.
+_ON_LIMIT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +236,7 @@ class Robot:
         what = f"the base quaternion {fault} and looks like w x y z"
         raise PostureError(what, where=where, hint="give it as x y z w (scalar last)")
 
-    def check_limits(self, q: Array, *, where: str = "posture", tolerance: float = 1e-6) -> None:
+    def check_limits(self, q: Array, *, where: str = "posture") -> None:
         """Raise :class:`NotWithinLimits` for the first joint of ``q`` outside its position limits."""
         for joint in self.joint_names:
             index = self.model.getJointId(joint)
@@ -243,7 +245,7 @@ class Robot:
             entries = q_slice(self.model, index)
             for k in range(entries.start, entries.stop):
                 low, high = float(self.model.lowerPositionLimit[k]), float(self.model.upperPositionLimit[k])
-                if not low - tolerance <= q[k] <= high + tolerance:
+                if not low - _ON_LIMIT <= q[k] <= high + _ON_LIMIT:
                     raise NotWithinLimits(joint, float(q[k]), low, high, where=where)
 
 
