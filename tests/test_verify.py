@@ -26,8 +26,15 @@ from impact_posture.verification import verification as module
 from impact_posture.verification.differences import difference_gradient
 from impact_posture.verification.samples import Sample, random_samples
 from impact_posture.verification.sources import Numbers, casadi_source, pinocchio_numbers
-from impact_posture.verification.verification import CASADI, COMPILED, DIFFERENCES, MUJOCO, verify
-from impact_posture.verification.verification_report import Row, VerificationReport
+from impact_posture.verification.verification import (
+    CASADI,
+    COMPILED,
+    DIFFERENCES,
+    MUJOCO,
+    Row,
+    VerificationReport,
+    verify,
+)
 from tests.command import run
 from tests.helpers import NAMES, Vector, robot
 from tests.test_dynamics import write_urdf

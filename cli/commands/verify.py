@@ -17,7 +17,7 @@ from impact_posture_cli.settings_options import Given, check_direction, with_set
 
 if TYPE_CHECKING:
     from impact_posture.impact.resolved_impact import ResolvedImpact
-    from impact_posture.verification.verification_report import Row, VerificationReport
+    from impact_posture.verification.verification import Row, VerificationReport
 
 NormalOfFirst = Annotated[
     Vector3 | None,
