@@ -124,22 +124,12 @@ class Robot:
         return self._hash(np.asarray(self.model.armature))
 
     def _hash(self, armature: Array) -> str:
-        model = self.model
-        content = [
-            [
-                [
-                    str(model.names[i]),
-                    str(model.joints[i].shortname()),
-                    int(model.parents[i]),
-                    *_rounded(model.jointPlacements[i].homogeneous),
-                    *_rounded(model.inertias[i].matrix()),
-                    *_rounded(_axis(model.joints[i])),
-                ]
-                for i in range(1, model.njoints)
-            ],
-            _rounded(armature),
-        ]
-        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+        model, joints = self.model, []
+        for i in range(1, model.njoints):
+            arrays = model.jointPlacements[i].homogeneous, model.inertias[i].matrix(), _axis(model.joints[i])
+            numbers = [number for array in arrays for number in _rounded(array)]
+            joints.append([str(model.names[i]), str(model.joints[i].shortname()), int(model.parents[i]), *numbers])
+        return hashlib.sha256(json.dumps([joints, _rounded(armature)]).encode()).hexdigest()
 
     def frame_id(self, name: str) -> int:
         """Return the index of the frame ``name``; if a link and a joint share the name, that of the link.
