@@ -28,10 +28,11 @@ if TYPE_CHECKING:
     from impact_posture.controller_export.export import export_controller
     from impact_posture.errors import ImpactPostureError
     from impact_posture.front_door import ImpactObjective, PostureProblem, PostureResult, optimize
-    from impact_posture.impact.contact import ImpactContact, Support
+    from impact_posture.impact.contact import ImpactContact
     from impact_posture.impact.metric import Metric
     from impact_posture.robot.robot import Robot
     from impact_posture.robot.robot_loader import known_robots, load_robot
+    from impact_posture.robot.spec import Support
 
 
 _HOMES = {
@@ -45,7 +46,7 @@ _HOMES = {
     "PostureProblem": "front_door",
     "PostureResult": "front_door",
     "Robot": "robot.robot",
-    "Support": "impact.contact",
+    "Support": "robot.spec",
     "export_controller": "controller_export.export",
     "known_robots": "robot.robot_loader",
     "load_robot": "robot.robot_loader",
