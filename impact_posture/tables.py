@@ -34,7 +34,7 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
     try:
         # As JSON, because strict dataclasses do not accept Python dictionaries.
         text = json.dumps(data, default=_plain)
-        made: _Table = _adapter(cls).validate_json(text)  # type: ignore[arg-type]
+        made: _Table = adapter(cls).validate_json(text)  # type: ignore[arg-type]
         return made
     except ValidationError as error:
         # A misspelt key is reported before the key that is then missing.
@@ -77,7 +77,8 @@ _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 
 @cache
-def _adapter(cls: type) -> Any:
+def adapter(cls: type) -> Any:
+    """Return the ``TypeAdapter`` of a dataclass, made once."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(cls)

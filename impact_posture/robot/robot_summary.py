@@ -157,7 +157,7 @@ def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
             "violations": list(held.violations),
             "lateral_force": None,
         }
-        if _level(robot, q):
+        if pin.Quaternion(np.array(q[3:7])).toRotationMatrix()[2, 2] > 1 - 1e-6:
             lateral = lateral_force_range(model, propulsion, q)
             sides = ("forward", "backward", "left", "right")
             entry["lateral_force"] = {side: _finite(getattr(lateral, side)) for side in sides}
@@ -174,12 +174,8 @@ def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
     }
 
 
-def _level(robot: Robot, q: np.ndarray[Any, np.dtype[np.float64]]) -> bool:
-    return bool(pin.Quaternion(np.array(q[3:7])).toRotationMatrix()[2, 2] > 1 - 1e-6)
-
-
 def _limit(value: float) -> float | None:
-    return float(value) if np.isfinite(value) and abs(value) < _NO_LIMIT else None
+    return _finite(value) if abs(value) < _NO_LIMIT else None
 
 
 def _finite(value: float) -> float | None:
