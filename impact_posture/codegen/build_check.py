@@ -38,7 +38,7 @@ _SAMPLES = 20
 # Number of libraries in the cache. The oldest go first.
 _CACHED = 16
 # C function → the reference's names of its results.
-_RESULTS = {
+RESULTS = {
     "eval": ("H", "grad"),
     "objective": ("objective", "objective_grad"),
     "value": ("H",),
@@ -150,7 +150,7 @@ def largest_difference(
         # Rounded to the C type, so that the call changes nothing.
         q, n = (np.array(v, dtype=gradient.dtype).astype(float) for v in (q, normals[k]))
         expected = reference(q, n)
-        for name, quantities in _RESULTS.items():
+        for name, quantities in RESULTS.items():
             if not set(quantities) <= set(expected):
                 continue
             code, results = gradient.call(name, q, n)

@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.joints import JointKind, joint_kind
+from impact_posture.robot.model_joints import ENDLESS
 
 # Joints whose last coordinate is an angle; their q has its cosine and sine.
 _ANGLES = ("continuous", "planar")
@@ -101,7 +102,6 @@ class Chart:
             if slot.kind.family in ("revolute", "prismatic", "translation"):
                 low = np.array(self._model.lowerPositionLimit[slot.q])
                 high = np.array(self._model.upperPositionLimit[slot.q])
-                # Pinocchio writes "no limit" as the largest double.
-                lower[slot.x] = np.where(low < -1e10, -np.inf, low)
-                upper[slot.x] = np.where(high > 1e10, np.inf, high)
+                lower[slot.x] = np.where(low < -ENDLESS, -np.inf, low)
+                upper[slot.x] = np.where(high > ENDLESS, np.inf, high)
         return lower, upper

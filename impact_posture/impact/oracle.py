@@ -17,8 +17,8 @@ from impact_posture.errors import MetricError
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.impact_case import ImpactCase
 
-# Relative size of a singular value of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
-_RANK = 1e-9
+# Relative size of an eigenvalue of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
+SINGULAR = 1e-9
 # A contact whose 1/m_eff along the normal is below this share of the largest mobility cannot move along it.
 _BLOCKED = 1e-12
 # Postures whose factorization is kept, because a search comes back to its starts.
@@ -314,7 +314,7 @@ class _HeldPoint:
     @staticmethod
     def of(kkt: Array, J: Array, mobility: Array, mobile: NDArray[np.bool_]) -> _HeldPoint:
         values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
-        kept = values > _RANK * max(float(values[-1]), 1e-300)
+        kept = values > SINGULAR * max(float(values[-1]), 1e-300)
         axes = np.eye(3) if kept.all() else vectors[:, kept]
         size, nv = len(kkt), J.shape[1]
         system = np.zeros((size + axes.shape[1],) * 2)
@@ -325,7 +325,7 @@ class _HeldPoint:
 
     def can_move(self, n: Array) -> bool:
         """Return whether the point can move along ``n``."""
-        return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(_RANK))
+        return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(SINGULAR))
 
     def answer(self, *, tau: Array | None = None, velocity: Array | None = None) -> tuple[Answer, Array]:
         """Return the jump under ``τ`` with the point moving at ``v``, and the impulse ``s`` of the point."""
