@@ -154,15 +154,21 @@ def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finish
         if report:
             # This process would only wait.  What goes wrong here goes wrong again for the report, which says so.
             with suppress(Exception):
-                from impact_posture.report.result_report import result_scene
-
-                scene = result_scene(prepared, view, meshes)
-                _ = scene.packed
+                scene = _scene(prepared, view, meshes)
         for done, (index, result) in enumerate(results, start=1):
             yield done, count, result if codegen and index == 0 else None
     if report:
         # It shows the figures, so it comes last.
         yield count, count, _report(folder, prepared, view, document, meshes, scene)
+
+
+def _scene(prepared: Prepared, view: ResultView, meshes: bool) -> Scene:
+    """Return the packed scene of the report."""
+    from impact_posture.report.result_report import result_scene
+
+    scene = result_scene(prepared, view, meshes)
+    _ = scene.packed
+    return scene
 
 
 def _report(
