@@ -50,7 +50,7 @@ def _load(settings: ProblemSettings, folder: Path, report: bool, meshes: bool) -
     tempfile.tempdir = str(folder)
     import impact_posture.codegen.export
     import impact_posture.plot  # noqa: F401 (the import is what takes long)
-    from impact_posture.codegen.export_files import load_templates
+    from impact_posture.codegen.render import load_templates
     from impact_posture.posture.problem_settings import prepare
     from impact_posture.result_folder import finish_result
 

@@ -77,8 +77,8 @@ def test_code_from_the_cache_is_the_code(
     def texts(**changed: object) -> list[str]:
         exported = named_objectives([changed.pop("objective", objective)], "a")
         code = build_code(exported, "a", changed.pop("real", DOUBLE), **changed)
-        from impact_posture.codegen.export_files import render
-        from impact_posture.codegen.export_manifest import build_manifest
+        from impact_posture.codegen.manifest_builder import build_manifest
+        from impact_posture.codegen.render import render
 
         manifest = build_manifest([v.objective for v in exported][:1], "a", None, None, DOUBLE, code.stack_bytes)
         return list(render(exported, "a", manifest, code, DOUBLE).values())

@@ -18,9 +18,9 @@ from jinja2 import UndefinedError
 
 from impact_posture.codegen.build_check import largest_difference
 from impact_posture.codegen.export import Export, export
-from impact_posture.codegen.export_files import Verbatim, _environment
-from impact_posture.codegen.export_manifest import sample_postures
 from impact_posture.codegen.functions import casadi_reference, oracle_reference
+from impact_posture.codegen.manifest_builder import sample_postures
+from impact_posture.codegen.render import Verbatim, _environment
 from impact_posture.escape import c_comment
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric

@@ -15,9 +15,9 @@ import pytest
 from impact_posture.codegen.build_check import largest_difference, self_test_tolerance
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export, write_export
-from impact_posture.codegen.export_manifest import sample_postures
 from impact_posture.codegen.functions import casadi_reference, oracle_reference
 from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.manifest_builder import sample_postures
 from impact_posture.codegen.naming import products
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.contact import ImpactContact

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from impact_posture.codegen.export import export
-from impact_posture.codegen.export_manifest import sample_postures
+from impact_posture.codegen.manifest_builder import sample_postures
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.coulomb import coulomb_impact
 from impact_posture.impact.objective import ImpactObjective

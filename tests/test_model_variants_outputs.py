@@ -10,8 +10,8 @@ import pytest
 
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
-from impact_posture.codegen.export_manifest import sample_postures
 from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.manifest_builder import sample_postures
 from impact_posture.libraries import build_library, library_path
 from tests.command import run
 from tests.helpers import assert_close

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impact_posture.codegen.export_manifest import sample_postures
+from impact_posture.codegen.manifest_builder import sample_postures
 from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError, SpecError
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.evaluation import evaluate

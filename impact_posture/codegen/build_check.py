@@ -12,9 +12,9 @@ import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.codegen.emitter import REALS, Real
-from impact_posture.codegen.export_manifest import sample_postures
 from impact_posture.codegen.functions import Reference, casadi_reference, named_objectives, oracle_reference
 from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.manifest_builder import sample_postures
 from impact_posture.codegen.reader import read_manifest
 from impact_posture.errors import CompilerError, OutputError
 from impact_posture.impact.contact import heavy_feet_rounding

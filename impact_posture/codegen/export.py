@@ -14,11 +14,11 @@ from impact_posture.arrays import Array
 from impact_posture.codegen.build_check import compile_and_check
 from impact_posture.codegen.code import build_code
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
-from impact_posture.codegen.export_files import render
-from impact_posture.codegen.export_manifest import build_manifest
 from impact_posture.codegen.functions import named_objectives
 from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.manifest_builder import build_manifest
 from impact_posture.codegen.naming import c_identifier, check_prefix, products
+from impact_posture.codegen.render import render
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.contact_compression import Compression
 from impact_posture.impact.objective import ImpactObjective

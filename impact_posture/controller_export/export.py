@@ -13,7 +13,7 @@ import casadi as ca
 
 from impact_posture.codegen.export import WrittenCode
 from impact_posture.codegen.export import export as export_gradient
-from impact_posture.codegen.export_manifest import configuration_names
+from impact_posture.codegen.manifest_builder import configuration_names
 from impact_posture.codegen.naming import c_identifier, check_prefix
 from impact_posture.codegen.reader import identity
 from impact_posture.controller_export.compiled_controller import CompiledController

@@ -14,10 +14,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from impact_posture.arrays import Array
 from impact_posture.codegen.emitter import DOUBLE, BlockText, Constants, Emitter, c_double
-from impact_posture.codegen.export_files import wrapped
-from impact_posture.codegen.export_manifest import configuration_names
 from impact_posture.codegen.graph import graph_of
 from impact_posture.codegen.layout import lay_out
+from impact_posture.codegen.manifest_builder import configuration_names
+from impact_posture.codegen.render import wrapped
 from impact_posture.codegen.sums import rebuilt
 from impact_posture.controller_export.parameters import RULES, Field
 from impact_posture.controller_export.rigid_body import MovingTree
