@@ -13,9 +13,9 @@ from impact_posture.tsid.qp import QP, Solved
 _SOLVED, _NONE = (1, 2), -1
 # Flag of a program that could not be solved for another reason.
 FAILED = 0
-# Largest violation of a bound, largest number of iterations for one program, and squared sine of the angle of a row to
-# the active rows below which it depends on them.  The cost of a quadruped, with the condition 4e10, turns rows so far
-# towards each other that DAQP's default, 3.7e-11, takes active sets for singular that are not, and finds no answer.
+# Largest violation of a bound, largest number of iterations for one program, and squared sine of the angle between a
+# row and the active rows below which it depends on them.  The cost of a quadruped, with the condition 4e10, turns
+# rows so close to each other that DAQP's default, 3.7e-11, takes them for dependent, and finds no answer.
 _SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000, "sing_tol": 1e-13}
 
 

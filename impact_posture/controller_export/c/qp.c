@@ -96,9 +96,7 @@ static void ip_cost(const ip_context *c, double *H, int stride, double *g)
     for (i = 0; i < IP_NV && weight > 0.0; ++i) {
       const double s = weight * J[i];
       g[i] += s * a;
-      for (j = i; j < IP_NV; ++j) {
-        H[i * stride + j] += s * J[j];
-      }
+      ip_add(H + i * stride + i, s, J + i, IP_NV - i);
     }
   }
   for (i = 0; i < IP_NV; ++i) {
@@ -128,9 +126,7 @@ static void ip_factorize(ip_context *c)
     }
     for (k = i + 1; k < IP_NV; ++k) {
       const double s = -R[i * IP_NV + k] * pivot;
-      for (j = k; j < IP_NV; ++j) {
-        out[j] += s * inverse[k * IP_NV + j];
-      }
+      ip_add(out + k, s, inverse + k * IP_NV + k, IP_NV - k);
     }
   }
 #else
@@ -160,10 +156,9 @@ static double ip_force_row(const ip_context *c, const double *s, int first, int 
   int i, j, k;
   ip_scaled(c->m.M + first * IP_NV, s[0], row, IP_NV);
   for (i = 1; i < count; ++i) {
-    const double t = s[i], *M = c->m.M + (first + i) * IP_NV;
-    bias += t * c->free_force[first + i];
-    for (j = 0; j < IP_NV && t != 0.0; ++j) {
-      row[j] += t * M[j];
+    bias += s[i] * c->free_force[first + i];
+    if (s[i] != 0.0) {
+      ip_add(row, s[i], c->m.M + (first + i) * IP_NV, IP_NV);
     }
   }
   memset(row + IP_NV, 0, sizeof(double) * IP_SPARE);
