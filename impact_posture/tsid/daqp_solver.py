@@ -25,11 +25,18 @@ class DaqpSolver:
     After a reset, equal programs give bitwise equal answers.
     """
 
-    def __init__(self, n: int, m: int) -> None:
-        """Allocate a workspace for ``n`` variables and ``m`` rows."""
+    def __init__(self, n: int, m: int, *, proximal: float | None = None) -> None:
+        """Allocate a workspace for ``n`` variables and ``m`` rows.
+
+        Args:
+            n: Number of variables.
+            m: Number of rows.
+            proximal: Weight of proximal-point iterations, which solve programs whose cost is too flat for one
+                factorization, in more time.  DAQP decides by itself without it.
+        """
         self._flag = 1
         self._model = daqp.Model()
-        self._model.settings = _SETTINGS
+        self._model.settings = _SETTINGS if proximal is None else _SETTINGS | {"eps_prox": proximal}
         # The first program only sets the dimensions.  None of its bounds can be active.
         blank, upper = QP.empty(n, m), np.full(n + m, 1e30)
         self._model.setup(blank.H, blank.g, blank.A, upper, -upper, blank.sense)

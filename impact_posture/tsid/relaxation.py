@@ -64,7 +64,7 @@ def solve(assembly: Assembly, solver: Solver, aside: Solver) -> Outcome:
     Args:
         assembly: With :attr:`Assembly.qp` built.
         solver: Solver of the ticks, which keeps its active set.
-        aside: Solver of the relaxed QPs, of the same size.
+        aside: Slower and safer solver of what the other does not solve, and of the relaxed QPs, of the same size.
     """
     qp = assembly.rank.qp
     if assembly.rank.changed:
@@ -74,6 +74,10 @@ def solve(assembly: Assembly, solver: Solver, aside: Solver) -> Outcome:
         # The solver gave up from its warm start.  Try once without.
         solver.reset()
         solved = solver.solve(qp)
+    if solved is None and qp.finite:
+        # Rows that are nearly dependent look infeasible.  A flatter cost with proximal steps decides.
+        aside.reset()
+        solved = aside.solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
     return _relax(assembly, aside)

@@ -23,7 +23,9 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import library_path, load_library
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.tsid.controller import Command, Controller, Status
+from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
+from impact_posture.tsid.qp import QP
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from tests.benchmarks.core import Vector
 from tests.benchmarks.flow import CASES
@@ -32,13 +34,13 @@ from tests.relaxation_in_c import missed, stationarity
 from tests.relaxed_ticks import problem_of
 
 HEAD = (
-    "robot|states|solved|largest difference of u|over 1e-9|relaxed|status differs (Python/C)|"
-    "C: violation, optimality|Python's|held (C)"
+    "robot|states|solved|largest difference of u|over 1e-9|its own|relaxed|status differs (Python/C)|"
+    "C: violation, optimality|Python's|held (C)|difference of q_r"
 ).split("|")
 # Largest violation of what always holds, and largest residual of optimality, of a right answer.
 HOLDS, OPTIMAL = 1e-9, 1e-7
 # Of so many relaxed ticks, one is certified.
-_SOME = 20
+SOME = 20
 # Robots that tick a million times.
 GROWTH = ("tilthex_arm", "panda", "solo8", "talos")
 
@@ -79,23 +81,25 @@ class Agreement:
         solved: Ticks that both solved.
         worst: Largest relative difference of their controls.
         differ: Solved ticks whose controls differ by more than 1e-9.
+        own: Largest relative difference, in those, of Python's controls from its own with the last digits moved.
         relaxed: Ticks that both relaxed.
         other: Ticks with different statuses, as ``Python/C``.
         held: Ticks in which C found no answer.
         off: Largest violation and residual of optimality, of C and of Python, where answers differ or were relaxed.
         wrong: Differences, and certified relaxed ticks, in which the answer of C, or of Python, is not right.
-        states: The states, row by row.
+        reference: Largest difference of the postures that flows have reached, rad or m.
     """
 
     solved: int = 0
     worst: float = 0.0
     differ: int = 0
+    own: float = 0.0
     relaxed: int = 0
     other: Counter[str] = field(default_factory=Counter)
     held: int = 0
     off: Vector = field(default_factory=lambda: np.zeros((2, 2)))
     wrong: Vector = field(default_factory=lambda: np.zeros(2, dtype=int))
-    states: list[Vector] = field(default_factory=list)
+    reference: float = 0.0
 
     def row(self, name: str, kind: str) -> list[str]:
         """Return a row of the table."""
@@ -104,8 +108,8 @@ class Agreement:
             f"{violation:.0e}, {optimality:.0e}" + (f" ({wrong} not right)" if wrong else "")
             for (violation, optimality), wrong in zip(self.off, self.wrong, strict=True)
         )
-        return [name, kind, str(self.solved), f"{self.worst:.0e}", str(self.differ), str(self.relaxed), other, ours,
-                theirs, str(self.held)]  # fmt: skip
+        return [name, kind, str(self.solved), f"{self.worst:.0e}", str(self.differ), f"{self.own:.0e}",
+                str(self.relaxed), other, ours, theirs, str(self.held), f"{self.reference:.0e}"]  # fmt: skip
 
 
 def objective_of(name: str) -> ImpactObjective:
@@ -143,9 +147,11 @@ def agreement(name: str, kind: str, ticks: int) -> Agreement:
         if states.follows and (phase := phases.get(k % states.again)):
             getattr(posture, phase)()
             getattr(theirs, phase)()
-        found.states.append(np.concatenate([q, v]))
         a, b = ours.tick(1e-3 * k, q, v), theirs.tick(1e-3 * k, q, v)
         _compare(found, ours, a, b)
+        if isinstance(posture, ReferenceFlowPosture):
+            away = pin.difference(robot.model, posture.target, theirs.target)
+            found.reference = max(found.reference, float(np.max(np.abs(away))))
         if k % 50 == 0:
             push = states.push * rng.normal(size=robot.nv) * (k % 100 == 0)
         v = v + 1e-3 * (a.acceleration + push)
@@ -161,12 +167,14 @@ def _compare(found: Agreement, ours: Controller, a: Command, b: Command) -> None
         found.other[f"{a.status.value}/{b.status.value}"] += 1
     elif a.status is Status.SOLVED:
         found.solved += 1
-        difference = float(np.max(np.abs(a.u - b.u)) / max(1.0, float(np.max(np.abs(a.u)))))
+        difference = _difference(a.u, b.u)
         found.worst, certify = max(found.worst, difference), difference > 1e-9
         found.differ += certify
+        if certify:
+            found.own = max(found.own, _difference(a.u, _moved(ours)))
     elif a.status is Status.RELAXED:
         found.relaxed += 1
-        certify = found.relaxed % _SOME == 1
+        certify = found.relaxed % SOME == 1
     for i, command in enumerate((b, a) if certify else ()):
         if command.status in answered:
             z = np.concatenate([command.acceleration, command.forces])
@@ -174,6 +182,25 @@ def _compare(found: Agreement, ours: Controller, a: Command, b: Command) -> None
             off = missed(program, z)[0], max(stationarity(program, z))
             found.off[i] = np.maximum(found.off[i], off)
             found.wrong[i] += not (off[0] <= HOLDS and off[1] <= OPTIMAL)
+
+
+def _difference(u: Vector, other: Vector) -> float:
+    return float(np.max(np.abs(u - other)) / max(1.0, float(np.max(np.abs(u)))))
+
+
+def _moved(controller: Controller) -> Vector:
+    """Return the controls of the last program, each number of which is moved by a last digit."""
+    qp, rng = controller.assembly.rank.qp, np.random.default_rng(0)
+    digits = np.finfo(float).eps * rng.choice([-1.0, 1.0], size=(qp.n, qp.n))
+    bounds = 1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], size=qp.n + qp.m)
+    H, A = qp.H * (1.0 + np.tril(digits) + np.tril(digits, -1).T), qp.A * (1.0 + digits[0])
+    moved = QP(H, qp.g * (1.0 + digits[0]), A, bounds * qp.lower, bounds * qp.upper, qp.sense)
+    solved = DaqpSolver(qp.n, qp.m).solve(moved)
+    return (
+        np.full(controller.actuators.controls, np.nan)
+        if solved is None
+        else (controller.assembly.controls(controller.state, solved.z))
+    )
 
 
 def equality(ticks: int) -> Iterator[list[str]]:

@@ -103,7 +103,7 @@ static void ip_prepare(ip_memory *s, int n, int simple, int m, double *u, DAQPWo
   s->settings.iter_limit = IP_ITERATIONS;
   s->settings.fval_bound = DAQP_INF;
   s->settings.rho_soft = DAQP_DEFAULT_RHO_SOFT;
-  s->settings.sing_tol = DAQP_DEFAULT_SING_TOL;
+  s->settings.sing_tol = 1e-13; /* as in Python */
   s->settings.refactor_tol = DAQP_DEFAULT_REFACTOR_TOL;
   s->settings.eq_reduction = DAQP_EQ_REDUCTION_OFF;
   w->settings = &s->settings;
