@@ -6,7 +6,7 @@ import ctypes
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -149,15 +149,14 @@ class CompiledController:
         if not self._ready:
             raise InputError("has not been reset", where="controller", hint="call reset(q, v) first")
         self._q[:], self._v[:] = q, v
-        pushed = None
+        q_at, v_at, force_at = self._pointers
         if force is not None:
             given = np.asarray(force, dtype=float)
             if given.shape not in ((3,), (6,)):
                 raise ValueError(f"a measured force has 3 or 6 numbers, not shape {given.shape}")
             self._force[:] = 0.0
             self._force[: given.size] = given
-            pushed = self._pointers[2]
-        q_at, v_at, _ = self._pointers
+        pushed = None if force is None else force_at
         self._call("tick", ctypes.c_double(t), q_at, v_at, pushed, ctypes.byref(self._command))
         return self._commanded()
 
@@ -182,13 +181,12 @@ class CompiledController:
             for k, (name, multiplier) in enumerate(zip(checked.bounds, found["multipliers"], strict=True)):
                 if multiplier and k not in equations:
                     active.append((name, "upper" if multiplier > 0 else "lower"))
-        dynamics, level, value = (float(found[name][0]) for name in ("dynamics", "level", "value"))
-        iterations = int(self._report.iterations)
+        numbers = [float(found[name][0]) for name in ("dynamics", "level", "value")]
         names = ("joint limits", *(name for name, _ in checked.levels))
         relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, found["relaxed"], strict=True) if x > 0)
         missed = zip(names[1:], found["deficient"], strict=False)
         deficient = tuple(Relaxed(n, float(x)) for n, x in missed if x > 0)
-        return Report(status, relaxed, deficient, residuals, tuple(active), dynamics, level, value, iterations)
+        return Report(status, relaxed, deficient, residuals, tuple(active), *numbers, int(self._report.iterations))
 
     # ---- targets and phases ------------------------------------------------------------------------------------
 
@@ -270,8 +268,8 @@ class CompiledController:
             self._enter("brace", t)
         elif not math.isfinite(t_impact) or "brace_before" not in self._functions:
             raise InputError("no flow can rest before that time", where="brace", hint="give finite seconds")
-        elif self._call("brace_before", ctypes.c_double(t), ctypes.c_double(t_impact)):
-            self._refuse("brace", t)
+        else:
+            self._enter("brace_before", t, t_impact)
 
     def contact(self, t: float = -math.inf) -> None:
         """Hold the reached posture during the impact, or keep the term on if it is live; as :meth:`brace`."""
@@ -288,13 +286,10 @@ class CompiledController:
 
     # ---- parts --------------------------------------------------------------------------------------------------
 
-    def _enter(self, phase: str, t: float) -> None:
-        if self._call(phase, ctypes.c_double(t)):
-            self._refuse(phase, t)
-
-    def _refuse(self, phase: str, t: float) -> NoReturn:
-        words = f"'{phase}' at {t:g} s does not follow the phase before it"
-        raise InputError(words, where="controller", hint="give phases in the order of their times, or reset it")
+    def _enter(self, function: str, *times: float) -> None:
+        if self._call(function, *map(ctypes.c_double, times)):
+            words = f"'{function.partition('_')[0]}' at {times[0]:g} s does not follow the phase before it"
+            raise InputError(words, where="controller", hint="give phases in the order of their times, or reset it")
 
     def _target(self, task: str) -> Array:
         if task not in self._targets:

@@ -28,8 +28,8 @@ from impact_posture.version import __version__
 
 # Files in c/, in the order in which one source has them, and those that follow objectives and flow add.
 _CORE = (
-    "vector.c", "algebra.c", "tasks.c", "posture.c", "qp.c", "rank.c", "solve.c", "give_way.c", "init.c", "tick.c",
-    "report.c",
+    "vector.c", "algebra.c", "tasks.c", "contacts.c", "posture.c", "qp.c", "rank.c", "solve.c", "give_way.c",
+    "init.c", "tick.c", "report.c",
 )  # fmt: skip
 _FOLLOW = ("eigen.c",)
 _RELAXATION = (

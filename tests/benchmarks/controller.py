@@ -1,7 +1,7 @@
 """The exported controller beside the one in Python, in three parts: equal answers, growth, and what a tick takes.
 
 ``python -m tests.benchmarks.controller FOLDER [TICKS] [equality|growth|times]`` writes a part, or all of them, into
-``FOLDER`` and, where all are there, the page of the documentation.  Times need a quiet machine, the others do not.
+``FOLDER``, and what is there into the page of the documentation.  Times need a quiet machine, the others do not.
 """
 
 from __future__ import annotations
@@ -104,9 +104,9 @@ def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: lis
 def equality(ticks: int) -> Iterator[str]:
     """Yield what differs between both controllers over the same states."""
     yield (
-        f"{ticks} ticks of each kind of states. Controls are compared relative to the largest one. *Its own*: largest "
-        "change of Python's controls, in ticks over 1e-9, where each number of the program changes by its last digit. "
-        f"Where answers differ, and of every {controller_equality.SOME}th relaxed tick: largest violation of what "
+        f"{ticks} ticks of each kind of states. Controls are compared relative to the largest one. *Its own*: "
+        "largest change of Python's controls, in ticks over 1e-9, where each number of the program changes by its last digit. "
+        f"Where answers differ (the first {controller_equality.MOST}), and of every {controller_equality.SOME}th relaxed tick: largest violation of what "
         "always holds, and largest residual of optimality, by a certificate that neither controller shares; Python "
         "solves relaxed levels to six digits."
     )
@@ -164,7 +164,7 @@ PARTS = {"equality": equality, "growth": growth, "times": times_of_ticks}
 
 
 def main(out: Path, ticks: int, parts: list[str]) -> None:
-    """Write parts, and the page where all of them are there."""
+    """Write parts, and the page of all that are there."""
     out.mkdir(parents=True, exist_ok=True)
     for part in parts:
         lines = [machine("daqp"), ""]
@@ -172,10 +172,8 @@ def main(out: Path, ticks: int, parts: list[str]) -> None:
             print(line, flush=True)
             lines.append(line)
         (out / f"{part}.md").write_text("\n".join([*lines, ""]), encoding="utf-8")
-    files = [out / f"{part}.md" for part in PARTS]
-    if all(file.is_file() for file in files):
-        texts = [file.read_text(encoding="utf-8") for file in files]
-        page_of("controller").write_text("\n".join([_HEAD, "", *texts]), encoding="utf-8")
+    texts = [file.read_text(encoding="utf-8") for part in PARTS if (file := out / f"{part}.md").is_file()]
+    page_of("controller").write_text("\n".join([_HEAD, "", *texts]), encoding="utf-8")
 
 
 if __name__ == "__main__":

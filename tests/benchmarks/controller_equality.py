@@ -39,8 +39,8 @@ HEAD = (
 ).split("|")
 # Largest violation of what always holds, and largest residual of optimality, of a right answer.
 HOLDS, OPTIMAL = 1e-9, 1e-7
-# Of so many relaxed ticks, one is certified.
-SOME = 20
+# Of so many relaxed ticks, one is certified, and of solved ticks that differ, at most so many.
+SOME, MOST = 20, 500
 # Robots that tick a million times.
 GROWTH = ("tilthex_arm", "panda", "solo8", "talos")
 
@@ -170,6 +170,7 @@ def _compare(found: Agreement, ours: Controller, a: Command, b: Command) -> None
         difference = _difference(a.u, b.u)
         found.worst, certify = max(found.worst, difference), difference > 1e-9
         found.differ += certify
+        certify &= found.differ <= MOST
         if certify:
             found.own = max(found.own, _difference(a.u, _moved(ours)))
     elif a.status is Status.RELAXED:

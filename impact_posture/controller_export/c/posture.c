@@ -68,14 +68,9 @@ static void ip_activate(ip_context *c, double dt)
 /* C = A B, all n x n. */
 static void ip_multiply(const double *A, const double *B, double *C, int n)
 {
-  int i, j, k;
-  memset(C, 0, sizeof(double) * (size_t)(n * n));
+  int i;
   for (i = 0; i < n; ++i) {
-    for (k = 0; k < n; ++k) {
-      for (j = 0; j < n; ++j) {
-        C[i * n + j] += A[i * n + k] * B[k * n + j];
-      }
-    }
+    ip_combine(C + i * n, n, A + i * n, 1, B, n, n);
   }
 }
 
@@ -95,14 +90,9 @@ static int ip_normalize(ip_context *c)
     memset(A, 0, sizeof(double) * N * N);
     memset(P, 0, sizeof(double) * N * N);
     for (k = 0; k < IP_FORCES + (all ? IP_ROWS : IP_STRICT); ++k) {
-      const double *row = k < IP_FORCES ? NULL : c->J[k - IP_FORCES];
-      for (i = 0; i < IP_CONTACTS && !row; ++i) {
-        row = k < ip_contact_row[i + 1] ? c->m.jacobian[ip_contact_point[i]] + (k - ip_contact_row[i]) * N : NULL;
-      }
+      const double *row = k < IP_FORCES ? ip_contact_motion(c, k) : c->J[k - IP_FORCES];
       for (i = 0; i < N; ++i) {
-        for (j = 0; j < N; ++j) {
-          A[i * N + j] += row[i] * row[j];
-        }
+        ip_add(A + i * N, row[i], row, N);
       }
     }
     ip_eigen(A, V, N);
@@ -139,11 +129,8 @@ static int ip_normalize(ip_context *c)
   memcpy(A, V, sizeof(double) * N * N);
   ip_multiply(P, A, V, N);
   for (i = 0; i < N; ++i) {
-    for (j = 0; j < N; ++j) {
-      A[i * N + j] = V[j * N + i];
-    }
+    ip_combine(P + i * N, N, V + i, N, V, N, N);
   }
-  ip_multiply(A, V, P, N);
   ip_eigen(P, V, N);
   for (i = 0; i < N; ++i) {
     largest = fmax(largest, P[i * (N + 1)]);

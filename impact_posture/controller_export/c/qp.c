@@ -22,14 +22,10 @@ static void ip_whiten(const ip_context *c, const double *row, double *restrict o
 {
   int i, j;
 #if IP_DENSE
-  for (j = 0; j < IP_NV; ++j) {
-    out[j] = 0.0;
-  }
+  (void)j;
+  memset(out, 0, sizeof(double) * IP_NV);
   for (i = 0; i < IP_NV; ++i) {
-    const double s = row[i], *factor = c->factor + i * IP_NV;
-    for (j = i; j < IP_NV; ++j) {
-      out[j] += s * factor[j];
-    }
+    ip_add(out + i, row[i], c->factor + i * (IP_NV + 1), IP_NV - i);
   }
 #elif IP_MOMENTUM
   const double *M = c->m.M, *R = c->m.base, scale = 1.0 / M[0];
@@ -82,14 +78,13 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
  * pulls towards g: weighted tasks, contacts that are not hard, and the posture. */
 static void ip_cost(const ip_context *c, double *H, int stride, double *g)
 {
-  int i, j, k, r;
+  int i, k, r;
   for (r = IP_STRICT; r < IP_ROWS + IP_FORCES; ++r) {
-    const double *J = r < IP_ROWS ? c->J[r] : NULL;
-    double a = r < IP_ROWS ? c->a[r] : c->contact_a[r - IP_ROWS], weight = r < IP_ROWS ? c->p.task_weight[r] : 0.0;
+    const int f = r - IP_ROWS;
+    const double *J = f < 0 ? c->J[r] : ip_contact_motion(c, f), a = f < 0 ? c->a[r] : c->contact_a[f];
+    double weight = f < 0 ? c->p.task_weight[r] : 0.0;
     for (k = 0; k < IP_CONTACTS; ++k) {
-      const int own = r - IP_ROWS - ip_contact_row[k];
-      if (own >= 0 && r - IP_ROWS < ip_contact_row[k + 1] && !ip_contact_hard[k]) {
-        J = c->m.jacobian[ip_contact_point[k]] + own * IP_NV;
+      if (f >= ip_contact_row[k] && f < ip_contact_row[k + 1] && !ip_contact_hard[k]) {
         weight = c->p.contact_weight[k];
       }
     }

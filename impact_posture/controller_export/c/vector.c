@@ -56,7 +56,7 @@ static inline void ip_add(double *restrict out, double s, const double *restrict
 }
 
 /* out = sum of a[k step] x[k stride ...] over k, of n numbers each. */
-static void ip_combine(double *restrict out, int n, const double *a, int step, const double *x, int stride, int count)
+static inline void ip_combine(double *restrict out, int n, const double *a, int step, const double *x, int stride, int count)
 {
   int i = 0, k;
 #if defined(__GNUC__)
