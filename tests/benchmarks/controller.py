@@ -104,11 +104,11 @@ def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: lis
 def equality(ticks: int) -> Iterator[str]:
     """Yield what differs between both controllers over the same states."""
     yield (
-        f"{ticks} ticks of each kind of states. Controls are compared relative to the largest one. *Its own*: "
-        "largest change of Python's controls, in ticks over 1e-9, where each number of the program changes by its last digit. "
-        f"Where answers differ (the first {controller_equality.MOST}), and of every {controller_equality.SOME}th relaxed tick: largest violation of what "
-        "always holds, and largest residual of optimality, by a certificate that neither controller shares; Python "
-        "solves relaxed levels to six digits."
+        f"{ticks} ticks of each kind of states. Controls are compared relative to the largest one. *Its own*: largest "
+        "change of Python's controls, in ticks over 1e-9, where each number of the program moves by its last digit. "
+        f"Where answers differ (the first {controller_equality.MOST}), and of every {controller_equality.SOME}th relaxed "
+        "tick: largest violation of what always holds, and largest residual of optimality, by a certificate that "
+        "neither controller shares; Python solves relaxed levels to six digits."
     )
     yield ""
     yield from table(controller_equality.HEAD, controller_equality.equality(ticks))
