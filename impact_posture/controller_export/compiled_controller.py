@@ -23,9 +23,7 @@ from impact_posture.tsid.relaxation import Relaxed
 
 # Statuses in the order of their numbers in C.
 _STATUSES = tuple(Status)
-_FUNCTIONS = (
-    "init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release",
-)  # fmt: skip
+_FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
 # Numbers of a target: set, position, rotation, velocity, acceleration.
 _TARGET = 25
 
@@ -53,11 +51,8 @@ class CompiledController:
             ("multipliers", max(1, bounds)),
             ("relaxed", 1 + len(manifest.levels)),
             ("deficient", room("LEVELS")),
-            ("dynamics", 1),
-            ("level", 1),
-            ("value", 1),
-            ("target", manifest.nq),
         ]
+        rows += [("dynamics", 1), ("level", 1), ("value", 1), ("target", manifest.nq)]
         self._report, self._diagnosis = _structure(rows, ["status", "iterations", "resting", "flow_failures"])
         self._given, self.parameters = _structure([*manifest.parameters.items()], [])
         bytes_ = ctypes.c_ulong.in_dll(library, f"{prefix}_context_bytes").value
@@ -69,8 +64,7 @@ class CompiledController:
         self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * _TARGET * max(1, tasks))
         self._targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
-        doubles = ctypes.POINTER(ctypes.c_double)
-        self._pointers = [x.ctypes.data_as(doubles) for x in (self._q, self._v, self._force)]
+        self._pointers = [x.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for x in (self._q, self._v, self._force)]
         names = (*_FUNCTIONS, *(["brace_before"] if sizes.get("FLOW") else []))
         self._functions = {name: getattr(library, f"{prefix}_{name}") for name in names}
         getattr(library, f"{prefix}_default_params")(ctypes.byref(self._given))
@@ -104,8 +98,6 @@ class CompiledController:
         except (AttributeError, ValueError) as error:
             raise SpecError(f"lacks a function ({error})", where=str(target), hint="run codegen again") from None
 
-    # ---- the interface of tsid.Controller ----------------------------------------------------------------------
-
     def reset(self, q: ArrayLike, v: ArrayLike) -> Command:
         """Start again at ``(q, ν)`` with the present parameters.  Targets that are set stay.
 
@@ -129,9 +121,7 @@ class CompiledController:
         self._q[:], self._v[:] = q, v
         code = self._call("reset", *self._pointers[:2], ctypes.byref(self._command))
         if code == 1:
-            raise PostureError(
-                "no state of the robot", where="reset", hint="give finite numbers and unit quaternions"
-            )
+            raise PostureError("no state of the robot", where="reset", hint="give finite numbers, unit quaternions")
         if code == 3:
             raise ContactError("the sole stands on its edge", where="contact", hint="put the sole on the ground")
         if code:
@@ -188,14 +178,8 @@ class CompiledController:
         deficient = tuple(Relaxed(n, float(x)) for n, x in missed if x > 0)
         return Report(status, relaxed, deficient, residuals, tuple(active), *numbers, int(self._report.iterations))
 
-    # ---- targets and phases ------------------------------------------------------------------------------------
-
     def set_target(
-        self,
-        task: str,
-        target: pin.SE3 | ArrayLike,
-        velocity: ArrayLike = 0.0,
-        acceleration: ArrayLike = 0.0,
+        self, task: str, target: pin.SE3 | ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0
     ) -> None:
         """Set the target of a task by name, as its class in ``tsid`` takes it, between ticks.
 
@@ -284,8 +268,6 @@ class CompiledController:
         """Level of the impact-robust term, 0 to 1, or whether the flow may move."""
         return float(self._level[0])
 
-    # ---- parts --------------------------------------------------------------------------------------------------
-
     def _enter(self, function: str, *times: float) -> None:
         if self._call(function, *map(ctypes.c_double, times)):
             words = f"'{function.partition('_')[0]}' at {times[0]:g} s does not follow the phase before it"
@@ -295,8 +277,7 @@ class CompiledController:
         if task not in self._targets:
             known = ", ".join(self._targets) or "none"
             raise InputError(f"there is no task '{task}'", where="controller", hint=f"one of: {known}")
-        row: Array = self._targets[task]
-        return row
+        return self._targets[task]
 
     def _call(self, name: str, *arguments: Any) -> int:
         return int(self._functions[name](self._context, *arguments))

@@ -103,12 +103,13 @@ def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: lis
 
 def equality(ticks: int) -> Iterator[str]:
     """Yield what differs between both controllers over the same states."""
+    some, most = controller_equality.SOME, controller_equality.MOST
     yield (
-        f"{ticks} ticks of each kind of states. Controls are compared relative to the largest one. *Its own*: largest "
+        f"{ticks} ticks of each kind of states. Controls are compared relative to the largest. *Its own*: largest "
         "change of Python's controls, in ticks over 1e-9, where each number of the program moves by its last digit. "
-        f"Where answers differ (the first {controller_equality.MOST}), and of every {controller_equality.SOME}th relaxed "
-        "tick: largest violation of what always holds, and largest residual of optimality, by a certificate that "
-        "neither controller shares; Python solves relaxed levels to six digits."
+        f"Where answers differ (the first {most}), and of every {some}th relaxed tick: largest violation of what "
+        "always holds, and largest residual of optimality, by a certificate that neither controller shares; Python "
+        "solves relaxed levels to six digits."
     )
     yield ""
     yield from table(controller_equality.HEAD, controller_equality.equality(ticks))
@@ -123,7 +124,7 @@ def growth(_: int) -> Iterator[str]:
 def times_of_ticks(_: int) -> Iterator[str]:
     """Yield what a tick takes in Python, in C, and by hand in C++, each row as soon as it is known."""
     ratios = list[list[str]]()
-    yield f"Median / p99 of {TIMED} quiet states, µs; each tick of C and C++ is the least of {REPETITIONS} repetitions."
+    yield f"Median / p99 of {TIMED} quiet states, µs; each tick of C and C++ is the least of {REPETITIONS}."
     yield ""
     with ExitStack() as stack:
         try:
