@@ -171,12 +171,13 @@ class CompiledController:
             for k, (name, multiplier) in enumerate(zip(checked.bounds, found["multipliers"], strict=True)):
                 if multiplier and k not in equations:
                     active.append((name, "upper" if multiplier > 0 else "lower"))
-        numbers = [float(found[name][0]) for name in ("dynamics", "level", "value")]
+        dynamics, level, value = (float(found[name][0]) for name in ("dynamics", "level", "value"))
         names = ("joint limits", *(name for name, _ in checked.levels))
         relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, found["relaxed"], strict=True) if x > 0)
         missed = zip(names[1:], found["deficient"], strict=False)
         deficient = tuple(Relaxed(n, float(x)) for n, x in missed if x > 0)
-        return Report(status, relaxed, deficient, residuals, tuple(active), *numbers, int(self._report.iterations))
+        iterations = int(self._report.iterations)
+        return Report(status, relaxed, deficient, residuals, tuple(active), dynamics, level, value, iterations)
 
     def set_target(
         self, task: str, target: pin.SE3 | ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0

@@ -22,11 +22,8 @@ static void ip_whiten(const ip_context *c, const double *row, double *restrict o
 {
   int i, j;
 #if IP_DENSE
-  (void)j;
-  memset(out, 0, sizeof(double) * IP_NV);
-  for (i = 0; i < IP_NV; ++i) {
-    ip_add(out + i, row[i], c->factor + i * (IP_NV + 1), IP_NV - i);
-  }
+  (void)i, (void)j;
+  ip_combine(out, IP_NV, row, 1, c->factor, IP_NV, IP_NV);
 #elif IP_MOMENTUM
   const double *M = c->m.M, *R = c->m.base, scale = 1.0 / M[0];
   const double x = row[0] * scale, y = row[1] * scale, z = row[2] * scale;
@@ -121,7 +118,9 @@ static void ip_factorize(ip_context *c)
     }
     for (k = i + 1; k < IP_NV; ++k) {
       const double s = -R[i * IP_NV + k] * pivot;
-      ip_add(out + k, s, inverse + k * IP_NV + k, IP_NV - k);
+      for (j = k; j < IP_NV; ++j) {
+        out[j] += s * inverse[k * IP_NV + j];
+      }
     }
   }
 #else
