@@ -25,8 +25,6 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 
 # Longest time step of ramps, in periods.  Longer pauses between ticks count as this.
 _LONGEST = 10
-# Weight of proximal-point iterations, which solve what the solver of ticks gives up.
-_PROXIMAL = 1e-6
 # Least nv for which LAPACK whitens a dense cost; by measurement, a quadruped gains nothing.
 _LARGE = 20
 # Largest sum of squares of a measurement (1e8 m, rad/s or N); a larger one is refused.
@@ -133,7 +131,7 @@ class Controller:
         self.assembly = Assembly(robot, formulation, self.actuators)
         n, m = self.assembly.qp.n, self.assembly.qp.m
         self._solver: Solver = DaqpSolver(n, m)
-        self._aside = DaqpSolver(n, m, proximal=_PROXIMAL)
+        self._aside = DaqpSolver(n, m)
         if formulation.weighted and robot.nv >= _LARGE:
             # Imported here, because SciPy takes long to import and only humanoids need it.
             from impact_posture.tsid.whitened import WhitenedSolver
