@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -45,23 +45,36 @@ def early_writer(
         yield finish
 
 
-def _load(settings: ProblemSettings, folder: Path, report: bool, meshes: bool) -> Finish:
+def _load(
+    settings: ProblemSettings, folder: Path, report: bool, meshes: bool, requested: Callable[[], bool]
+) -> Finish:
     # The process may be killed.  Then nobody else removes its temporary files, of which matplotlib makes some.
     tempfile.tempdir = str(folder)
-    import impact_posture.codegen.export
-    import impact_posture.plot  # noqa: F401 (the import is what takes long)
+    from impact_posture.codegen.emitter import DOUBLE
+    from impact_posture.codegen.export import cached_code, default_prefix
     from impact_posture.codegen.render import load_templates
+    from impact_posture.plot import draw_all
     from impact_posture.posture.problem_settings import prepare
     from impact_posture.result_folder import finish_result
+    from impact_posture.result_view import result_view
 
     load_templates()
     prepared = prepare(settings)
-    if report:
-        # What goes wrong here goes wrong again for the report, which says so.
-        with suppress(Exception):
+    # What goes wrong here goes wrong again for the result, which says so.
+    with suppress(Exception):
+        if report:
             from impact_posture.report.page import load_template
             from impact_posture.report.shapes import draw_robot
 
             load_template()
             draw_robot(prepared.impact.robot, meshes)
+        # A large robot takes so long to solve that there is time to do more.
+        if not requested():
+            objectives = (prepared.impact.objective,)
+            cached_code(objectives, default_prefix(objectives), DOUBLE, False)
+        if not requested():
+            # The first figure of a process loads fonts, shapes and more for all.
+            q = prepared.problem.given
+            view = result_view(prepared, q, q, None, {}, None, None)
+            draw_all(view, folder / "first", only=["postures"])
     return partial(finish_result, prepared)
