@@ -50,6 +50,8 @@ def _load(
 ) -> Finish:
     # The process may be killed.  Then nobody else removes its temporary files, of which matplotlib makes some.
     tempfile.tempdir = str(folder)
+    import threadpoolctl
+
     from impact_posture.codegen.emitter import DOUBLE
     from impact_posture.codegen.export import cached_code, default_prefix
     from impact_posture.codegen.render import load_templates
@@ -58,6 +60,8 @@ def _load(
     from impact_posture.result_folder import finish_result
     from impact_posture.result_view import result_view
 
+    # Threads of a BLAS would wait for each other, and take the cores from the solver.
+    threadpoolctl.threadpool_limits(1, "blas")
     load_templates()
     prepared = prepare(settings)
     # What goes wrong here goes wrong again for the result, which says so.
