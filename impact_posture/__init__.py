@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from impact_posture.controller_export.compiled_controller import CompiledController
     from impact_posture.controller_export.export import export_controller
     from impact_posture.errors import ImpactPostureError
-    from impact_posture.front_door import ImpactObjective, PostureProblem, PostureResult, optimize
+    from impact_posture.front_door import PostureResult, optimize
+    from impact_posture.front_door_problem import ImpactObjective, PostureProblem
     from impact_posture.impact.contact import ImpactContact, Support
     from impact_posture.impact.metric import Metric
     from impact_posture.robot.robot import Robot
@@ -39,10 +40,10 @@ _HOMES = {
     "Export": "codegen.export",
     "ImpactContact": "impact.contact",
     "ImpactGradient": "codegen.impact_gradient",
-    "ImpactObjective": "front_door",
+    "ImpactObjective": "front_door_problem",
     "ImpactPostureError": "errors",
     "Metric": "impact.metric",
-    "PostureProblem": "front_door",
+    "PostureProblem": "front_door_problem",
     "PostureResult": "front_door",
     "Robot": "robot.robot",
     "Support": "impact.contact",

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from impact_posture.errors import OutputError
-from impact_posture.output_folder import scratch_folder
 from impact_posture.processes import fork_server
+from impact_posture.scratch_folder import scratch_folder
 
 # This module is imported before all that takes long to import.
 if TYPE_CHECKING:

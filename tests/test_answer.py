@@ -151,7 +151,8 @@ def test_an_answer_of_a_small_robot_imports_no_part_of_scipy() -> None:
     """A part of SciPy takes longer to import than such a problem takes to solve."""
     program = """if True:
         import sys
-        from impact_posture.front_door import PostureProblem, optimize
+        from impact_posture.front_door import optimize
+        from impact_posture.front_door_problem import PostureProblem
         from impact_posture.posture.problem_settings import prepare
         from impact_posture.settings import ProblemSettings
 

@@ -23,8 +23,8 @@ from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.output_folder import RECORD
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.scratch_folder import RECORD
 from impact_posture.settings import LoadOptions
 from impact_posture.toolchain import run_compiler
 from tests import command, exported

@@ -51,8 +51,8 @@ def optimize(
     from impact_posture.early_writer import early_writer
 
     with early_writer(settings, jobs, report=not no_report, meshes=meshes) as finish:
-        from impact_posture.front_door import PostureProblem
         from impact_posture.front_door import optimize as solve
+        from impact_posture.front_door_problem import PostureProblem
         from impact_posture.output_folder import check_output
         from impact_posture.posture.problem_settings import prepare
         from impact_posture.result_folder import FORMATS, default_out

@@ -28,7 +28,7 @@ from impact_posture.libraries import (
     seal_path,
     source_key,
 )
-from impact_posture.output_folder import scratch_folder
+from impact_posture.scratch_folder import scratch_folder
 from impact_posture.toolchain import find_compiler, words_of
 
 # The oracle factorizes another matrix.  Feet at compliance ε cost digits there (condition about 1/ε).

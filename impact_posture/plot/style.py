@@ -21,9 +21,9 @@ from matplotlib.transforms import Bbox
 
 from impact_posture.errors import InputError, OutputError
 from impact_posture.escape import printable
-from impact_posture.output_folder import scratch_folder
 from impact_posture.plot.labels import draw_with_labels
 from impact_posture.plot.view import SEPARATOR
+from impact_posture.scratch_folder import scratch_folder
 
 # Okabe and Ito's palette, "Color Universal Design", 2008.
 VERMILLION, BLUE, GREEN, SKY, PURPLE, ORANGE = "#D55E00", "#0072B2", "#009E73", "#56B4E9", "#CC79A7", "#E69F00"

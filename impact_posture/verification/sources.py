@@ -16,8 +16,8 @@ from impact_posture.dynamics.mjcf_numeric import MujocoNumeric
 from impact_posture.dynamics.numeric import hold_locked
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import build_library, load_library
-from impact_posture.output_folder import scratch_folder
 from impact_posture.robot.model_joints import finite_armature
+from impact_posture.scratch_folder import scratch_folder
 from impact_posture.verification.differences import difference_gradient
 from impact_posture.verification.samples import Sample
 
