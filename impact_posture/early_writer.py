@@ -39,15 +39,24 @@ def early_writer(
         if jobs > 1 and "fork" in multiprocessing.get_all_start_methods():
             try:
                 folder = stack.enter_context(scratch_folder())
-                finish = stack.enter_context(fork_server(partial(_load, settings, folder, report, meshes)))
+                finish = stack.enter_context(fork_server(partial(load, settings, folder, report, meshes)))
             except (OSError, OutputError):
                 finish = None
         yield finish
 
 
-def _load(
+def load(
     settings: ProblemSettings, folder: Path, report: bool, meshes: bool, requested: Callable[[], bool]
 ) -> Finish:
+    """Load what writing the result of a problem needs, prepare more until it is requested, and return what writes it.
+
+    Args:
+        settings: The problem.
+        folder: Place of temporary files.
+        report: As :func:`early_writer`.
+        meshes: As :func:`early_writer`.
+        requested: Tells whether the result has been requested.
+    """
     # The process may be killed.  Then nobody else removes its temporary files, of which matplotlib makes some.
     tempfile.tempdir = str(folder)
     import threadpoolctl

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture.early_writer import early_writer
+from impact_posture.early_writer import early_writer, load
 from impact_posture.errors import (
     ControllerNotFound,
     ImpactPostureError,
@@ -349,6 +349,22 @@ def test_an_iteration_that_is_left_leaves_no_server() -> None:
         pid = next(answers)
         del answers
         assert gone([pid], within=1.0)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_writer_prepares_more_only_while_nothing_is_requested(late: bool, tmp_path: Path) -> None:
+    done: list[str] = []
+
+    def prepare() -> list[str]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("impact_posture.codegen.export.cached_code", lambda *_: done.append("code"))
+            patch.setattr("impact_posture.plot.draw_all", lambda *_, **__: done.append("figure"))
+            load(ProblemSettings(robot="tilthex_arm", normal=(0, 0, 1)), tmp_path, False, False, lambda: late)
+        return done
+
+    # In a copy, because it moves the temporary folder of its process.
+    with fork_call(prepare) as collect:
+        assert collect() == ([] if late else ["code", "figure"])
 
 
 def test_where_nothing_can_be_forked_the_solving_process_writes(monkeypatch: pytest.MonkeyPatch) -> None:
