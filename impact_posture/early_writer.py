@@ -61,13 +61,12 @@ def load(
     tempfile.tempdir = str(folder)
     import threadpoolctl
 
+    import impact_posture.plot  # noqa: F401 (the import is what takes long)
     from impact_posture.codegen.emitter import DOUBLE
     from impact_posture.codegen.export import cached_code, default_prefix
     from impact_posture.codegen.render import load_templates
-    from impact_posture.plot import draw_all
     from impact_posture.posture.problem_settings import prepare
     from impact_posture.result_folder import finish_result
-    from impact_posture.result_view import result_view
 
     # Threads of a BLAS would wait for each other, and take the cores from the solver.
     threadpoolctl.threadpool_limits(1, "blas")
@@ -85,9 +84,4 @@ def load(
         if not requested():
             objectives = (prepared.impact.objective,)
             cached_code(objectives, default_prefix(objectives), DOUBLE, False)
-        if not requested():
-            # The first figure of a process loads fonts, shapes and more for all.
-            q = prepared.problem.given
-            view = result_view(prepared, q, q, None, {}, None, None)
-            draw_all(view, folder / "first", only=["postures"])
     return partial(finish_result, prepared)

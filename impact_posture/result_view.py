@@ -105,7 +105,7 @@ def result_view(
     prepared: Prepared,
     initial: np.ndarray,
     optimal: np.ndarray,
-    path: NullSpacePath | None,
+    path: NullSpacePath,
     document: dict[str, Any],
     motion: PosturePath | None,
     mapped: SelfMotionMap | None,
@@ -116,7 +116,7 @@ def result_view(
         prepared: The problem.
         initial: Posture before, shape (nq,).
         optimal: Posture after, shape (nq,).
-        path: The path between them, if it is known.
+        path: The path between them.
         document: The content of ``result.json``.
         motion: The path to the optimum, if it was searched.
         mapped: The self-motion map, if it was computed.

@@ -358,13 +358,12 @@ def test_a_writer_prepares_more_only_while_nothing_is_requested(late: bool, tmp_
     def prepare() -> list[str]:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("impact_posture.codegen.export.cached_code", lambda *_: done.append("code"))
-            patch.setattr("impact_posture.plot.draw_all", lambda *_, **__: done.append("figure"))
             load(ProblemSettings(robot="tilthex_arm", normal=(0, 0, 1)), tmp_path, False, False, lambda: late)
         return done
 
     # In a copy, because it moves the temporary folder of its process.
     with fork_call(prepare) as collect:
-        assert collect() == ([] if late else ["code", "figure"])
+        assert collect() == ([] if late else ["code"])
 
 
 def test_where_nothing_can_be_forked_the_solving_process_writes(monkeypatch: pytest.MonkeyPatch) -> None:
