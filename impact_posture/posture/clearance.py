@@ -97,7 +97,7 @@ class Clearance(Constraint):
         """Return lower bounds on all distances from a sphere around each body."""
         centers = np.array([body.place(model, own) for body, own in zip(self._bodies, self._centers, strict=True)])
         apart = centers[self._first] - centers[self._second]
-        bound = np.linalg.norm(apart, axis=1)
+        bound = np.sqrt((apart * apart).sum(axis=1))
         for k, mine, normal, offset in self._planes:
             bound[mine] = apart[mine] @ (self._bodies[k].placement(model).rotation @ normal) - offset
         return np.asarray(bound - self._reach[self._first] - self._reach[self._second] - self._margins)
@@ -180,14 +180,14 @@ class Clearance(Constraint):
 
     def guess(self, model: Numeric) -> Guess:
         """See :class:`Constraint`."""
-        parts = [one.guess(model) for _, one, _ in self._program]
-        values, lower = ([np.zeros(0), *[getattr(part, key) for part in parts]] for key in ("values", "lower"))
-        return Guess(np.concatenate(values), np.concatenate(lower))
+        return Guess.joined([one.guess(model) for _, one, _ in self._program])
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
         """See :class:`Constraint`; the rows of pairs that are near, in the program or not."""
-        counts = [one.count for _, one, _ in self._program]
-        own = dict(zip(self.active, np.split(auxiliaries, np.cumsum(counts)[:-1]), strict=False)) if counts else {}
-        values = self._distances(model, _ROWS)[0]
-        parts = [self._separators[int(k)].linearize(model, own.get(int(k))) for k in np.flatnonzero(values < _ROWS)]
+        near = np.flatnonzero(self._distances(model, _ROWS)[0] < _ROWS)
+        own: dict[int, Array] = {}
+        if near.size and self.active:
+            counts = [one.count for _, one, _ in self._program]
+            own = dict(zip(self.active, np.split(auxiliaries, np.cumsum(counts)[:-1]), strict=True))
+        parts = [self._separators[int(k)].linearize(model, own.get(int(k))) for k in near]
         return Linearization.joined(parts, model.model.nv)

@@ -22,7 +22,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -121,6 +121,12 @@ class PostureNLP:
         """Coordinates of the robot."""
         return self.program.chart
 
+    def at(self, problem: PostureProblem) -> PostureNLP:
+        """Return the program with another target, whose expressions and bounds of rows are the same."""
+        found = replace(self, problem=problem)
+        vars(found)["_row_bounds"] = self._row_bounds
+        return found
+
     def grown(self, problem: PostureProblem, *, compile: CompileMode = "auto") -> PostureNLP:
         """Build the program of a problem that this one grew into."""
         return build_nlp(problem, compile=compile, program=self.program)
@@ -137,13 +143,15 @@ class PostureNLP:
             price: Price of a meter of slack.
         """
         problem, nx = self.problem, self.chart.nx
-        x = np.clip(self.chart.to_x(start), problem.lower, problem.upper)
-        q = self.chart.to_q(x)
+        given = self.chart.to_x(start)
+        x = np.clip(given, problem.lower, problem.upper)
+        # The quantities at a posture within its limits are known as a rule.
+        q = start if np.array_equal(x, given) else self.chart.to_q(x)
         scale = scale or problem.objective.value(q)
         guess = problem.objective.guess(q, scale, attempt)
         own = problem.guess(self.program.numeric.at(q))
         lower = np.concatenate([problem.lower, guess.lower, own.lower])
-        upper = np.concatenate([problem.upper, np.full(guess.values.size, np.inf), own.upper])
+        upper = np.concatenate([problem.upper, guess.above, own.above])
         p = parameters(problem, self.chart, scale, price)
         x0 = np.concatenate([x, guess.values, own.values])
         began, busy = time.perf_counter(), time.process_time()

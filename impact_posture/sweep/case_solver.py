@@ -23,8 +23,8 @@ from impact_posture.sweep.grid import Grid
 from impact_posture.sweep.point_search import Place, Timer, Walk
 from impact_posture.sweep.sweep_file import OFFSETS, Case
 
-# Problems and programs that a process keeps.  Both are small beside the solver itself.
-_TEMPLATES, _PROGRAMS = 16, 16
+# Problems and programs that a process keeps.  A program takes some MB, and few are in use at a time.
+_TEMPLATES, _PROGRAMS = 16, 4
 
 _Value = TypeVar("_Value")
 
