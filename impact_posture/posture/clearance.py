@@ -141,10 +141,13 @@ class Clearance(Constraint):
         for k in np.argsort(values, kind="stable"):
             if values[k] >= -_MISSING or added == _MOST:
                 break
-            new, old = self._separators[int(k)].corners(model), active.get(int(k), Corners(frozenset(), frozenset()))
-            if not (new.a <= old.a and new.b <= old.b):
-                active[int(k)] = Corners(old.a | new.a, old.b | new.b)
-                added += 1
+            one, old = self._separators[int(k)], active.get(int(k), Corners(frozenset(), frozenset()))
+            # A plane of the program that is not the one between the closest points may cut any corner without a row.
+            for new in (one.corners(model), one.every_corner):
+                if not (new.a <= old.a and new.b <= old.b):
+                    active[int(k)] = Corners(old.a | new.a, old.b | new.b)
+                    added += 1
+                    break
         return type(self)(self.name, self._separators, self._words, active, self._lifted) if added else self
 
     # ---- lifted form ------------------------------------------------------------------------------------------

@@ -178,6 +178,13 @@ class Separator:
             frozenset(int(k) for k in (second @ self._y.T).argmax(axis=1)) if len(self._y) else frozenset(),
         )
 
+    @property
+    def every_corner(self) -> Corners:
+        """All corners of both bodies; none of a body in front of a known plane, which is the one that it has."""
+        if self.known:
+            return Corners(frozenset(), frozenset())
+        return Corners(frozenset(range(len(self._x))), frozenset(range(len(self._y))))
+
     def _relative(self, tree: Tree) -> tuple[ca.SX, ca.SX]:
         """Placement of ``a`` in the axes of ``b``."""
         if self.b.turns:
