@@ -100,7 +100,7 @@ class HeldOrientation(ExpressionConstraint):
 
     def pose_error(self, value: Array) -> tuple[float, float]:
         """See :class:`Constraint`; the rows are ``2 sin(θ/2)`` along the axis of a rotation by θ, or of a tilt."""
-        return 0.0, float(2 * np.arcsin(min(1.0, np.linalg.norm(value) / 2)))
+        return 0.0, 2 * float(np.arcsin(min(1.0, float(np.linalg.norm(value)) / 2)))
 
 
 class HeldPose(ExpressionConstraint):
