@@ -150,6 +150,25 @@ def test_distances_and_their_gradient(name: str) -> None:
     assert seen > 10
 
 
+def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> None:
+    """Else a plane of the program that cuts corners without rows would look like a trap."""
+    robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
+    constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
+    numeric, seen = Numeric(robot.model), set[bool]()
+    for _ in range(40):
+        values = constraint.value(numeric.at(_random(robot, rng)))
+        last, now = constraint, constraint.grown(numeric)
+        while now is not last:
+            last, now = now, now.grown(numeric)
+        assert set(now.active) == set(np.flatnonzero(values < 0))
+        for k, corners in now.active.items():
+            one = now._separators[k]
+            seen.add(one.known)
+            whole = set(range(len(one._x))), set(range(len(one._y)))
+            assert one.known or (corners.a, corners.b) == whole
+    assert seen == {False, True}
+
+
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_bound_on_distances_is_one(seed: int) -> None:
