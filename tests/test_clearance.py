@@ -176,11 +176,15 @@ def test_bound_on_distances_is_one(seed: int) -> None:
     robot = load_robot("tilthex_arm")
     separators = [_separator(robot, kind) for kind in KINDS]
     constraint = Clearance("c", separators, "words")
-    numeric = Numeric(robot.model).at(_random(robot, np.random.default_rng(seed)))
-    values = constraint.evaluate(numeric)[0]
-    exact = np.array([one.distance(numeric)[0] for one in separators])
-    assert (values <= exact + 1e-9).all()
-    assert ((values < 0) == (exact < 0)).all()
+    rng = np.random.default_rng(seed)
+    numeric, q = Numeric(robot.model), _random(robot, rng)
+    for size in (0.0, 1e-3, 0.03, 0.3, 1.0):
+        # What was exact before bounds what comes after.
+        q = pin.integrate(robot.model, q, size * rng.normal(size=robot.nv))
+        values = constraint.evaluate(numeric.at(q))[0]
+        exact = np.array([one.distance(numeric)[0] for one in separators])
+        assert (values <= exact + 1e-9).all()
+        assert ((values < 0) == (exact < 0)).all() and np.allclose(values[exact < 0], exact[exact < 0])
 
 
 def _problem(**changes: object) -> ProblemSettings:

@@ -79,12 +79,6 @@ class Body:
         center = np.zeros(3) if self.hull is None else self.hull.center
         return np.asarray(self.point.placement.act(center)) if self.turns else center
 
-    def place(self, model: Numeric, center: Array) -> Array:
-        """Return the place of the :attr:`center` in the world, shape (3,), m."""
-        if self.turns:
-            return np.asarray(model.data.oMi[self.point.joint].act(center))
-        return np.asarray(model.data.oMi[self.point.joint].act(self.point.position) + center)
-
     def rates(self, model: Numeric, direction: Array, positions: Array) -> Array:
         """Return the tangent gradients of the heights of points of the body, shape (k, nv).
 
