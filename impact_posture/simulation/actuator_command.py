@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from impact_posture.arrays import Array
 from impact_posture.settings import Vector3
-from impact_posture.simulation.contact_forces import ShapeTruth
+from impact_posture.simulation.contact_forces import ContactTrace, ShapeTruth
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,3 +62,27 @@ class Truth(NamedTuple):
     torques: Array
     shapes: tuple[ShapeTruth, ...]
     at_stops: tuple[str, ...]
+
+
+class Trace(NamedTuple):
+    """True states of a world at n marks, in the words of :class:`Truth`.
+
+    Attributes:
+        t: Shape (n,).
+        q: Shape (n, nq).
+        v: Shape (n, nv).
+        rotor_speeds: Shape (n, rotors).
+        torques: Shape (n, joints).
+        contacts: Contacts of all shapes.
+        stopped: Whether each joint with limits is at one of them or beyond, shape (n, limited).
+        limited: Names of the joints with limits.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    rotor_speeds: Array
+    torques: Array
+    contacts: ContactTrace
+    stopped: Array
+    limited: tuple[str, ...]

@@ -1,8 +1,7 @@
-"""Forces of the surfaces on each shape, step by step."""
+"""Forces of the surfaces on each shape, written down in every step and evaluated for many steps at once."""
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +12,8 @@ from impact_posture.arrays import Array
 _ROWS, _FIRST = np.arange(3), np.arange(3) == 0
 # Places of the factors of a vector product.
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+# Steps with contact until they are evaluated, even if nobody looks.
+_MOST = 4096
 
 
 class ShapeTruth(NamedTuple):
@@ -37,122 +38,182 @@ class ShapeTruth(NamedTuple):
     slip: float
 
 
-class _Pairs(NamedTuple):
-    """Contacts of geoms: which shape each belongs to, the way it pushes, and whether it is one on the ground.
+class ContactTrace(NamedTuple):
+    """Contacts of all shapes at n marks, in the words of :class:`ShapeTruth`.
 
-    All three have shape (shapes, contacts).  ``bodies`` and ``roots`` are those of the second geoms.
+    Attributes:
+        touching: Shape (n, shapes).
+        force: Shape (n, shapes, 3).
+        impulse: Shape (n, shapes, 3).
+        peak: Since the mark before, shape (n, shapes).
+        began: Since the mark before, NaN for none, shape (n, shapes).
+        slip: Shape (n, shapes).
     """
 
-    of_shape: Array
-    signed: Array
-    on_ground: Array
-    bodies: Array
-    roots: Array
+    touching: Array
+    force: Array
+    impulse: Array
+    peak: Array
+    began: Array
+    slip: Array
+
+
+class _Step(NamedTuple):
+    """Contacts of a step, as MuJoCo has them, with the number of the step and the time of its end."""
+
+    number: int
+    time: float
+    geoms: Array
+    sizes: Array
+    rows: Array
+    frames: Array
+    forces: Array
+
+
+class _Mark(NamedTuple):
+    """Contacts after a step, with velocities and centers of mass of all bodies."""
+
+    number: int
+    geoms: Array
+    points: Array
+    normals: Array
+    twists: Array
+    centers: Array
 
 
 class ContactLog:
-    """Contact forces of the last step, and what accumulates from them.
+    """Contacts of all steps since the last :meth:`look`, and what accumulates from them.
 
     Args:
         model: The MuJoCo model.
         geoms: Names of the geoms of the shapes.
-        frames: The frames that carry the shapes.
     """
 
-    def __init__(self, model: Any, geoms: tuple[str, ...], frames: tuple[str, ...]) -> None:
-        self._frames, count = frames, len(frames)
+    def __init__(self, model: Any, geoms: tuple[str, ...]) -> None:
+        self._count, self._step = len(geoms), float(model.opt.timestep)
         # MuJoCo names the plane of a contact first, so the contact pushes the second geom.  A ball may be either.
         self._shape_of = np.full(model.ngeom, -1)
         for k, name in enumerate(geoms):
             self._shape_of[model.geom(name).id] = k
         self._body_of, self._root_of = np.array(model.geom_bodyid), np.array(model.body_rootid)
-        self._step = float(model.opt.timestep)
-        self.forces: Array = np.zeros((count, 3))
-        self._normal, self._impulses, self._peaks = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
-        self._began = np.full(count, np.nan)
-        # The same geoms touch for many steps: what only depends on which ones do, by their pairs.
-        self._pairs: dict[bytes, _Pairs] = {}
-        self.pushing = False
-        """Whether a surface pushed a shape in the last step."""
+        self.reset()
 
     def reset(self) -> None:
-        """Set everything to zero."""
-        for values in (self.forces, self._normal, self._impulses, self._peaks):
-            values[:] = 0.0
-        self._began[:] = np.nan
-        self.pushing = False
+        """Forget everything."""
+        count = self._count
+        self._steps: list[_Step] = []
+        self._marks: list[_Mark] = []
+        self._number = 0
+        self._force, self._normal, self._impulse = np.zeros((count, 3)), np.zeros(count), np.zeros((count, 3))
+        self._peak, self._began = np.zeros(count), np.full(count, np.inf)
 
-    def step(self, data: Any) -> None:
-        """Add the forces of a step from ``data.time − timestep`` to ``data.time``."""
+    def step(self, data: Any, number: int) -> None:
+        """Write down the contacts of a step, which ends at ``data.time`` and has some."""
+        contact = data.contact
+        self._steps.append(
+            _Step(
+                number, data.time, contact.geom.copy(), contact.dim.copy(), contact.efc_address.copy(),
+                contact.frame.copy(), data.efc_force.copy(),
+            )
+        )  # fmt: skip
+
+    def fold(self, number: int) -> None:
+        """Evaluate the steps until now if they are many and no state waits for a look."""
+        if len(self._steps) >= _MOST and not self._marks:
+            self._marks.append(_bare(number))
+            found = self.look()
+            self._peak, self._began = found.peak[0], np.where(np.isnan(found.began[0]), np.inf, found.began[0])
+
+    def mark(self, data: Any, number: int) -> None:
+        """Let the state after a step be one to look at."""
         if not data.ncon:
-            if self.pushing:
-                self.forces[:], self._normal[:], self.pushing = 0.0, 0.0, False
+            self._marks.append(_bare(number))
             return
         contact = data.contact
-        first, geoms, sizes = contact.efc_address, contact.geom, contact.dim
-        frames = contact.frame.reshape(-1, 3, 3)
-        if first.min() < 0:
-            # A contact just outside the surface does not push and has no address.
-            there = first >= 0
-            first, geoms, sizes, frames = first[there], geoms[there], sizes[there], frames[there]
-        # A contact has one number without friction, else three.
-        rough = (sizes == 3)[:, None]
-        local = data.efc_force[first[:, None] + _ROWS * rough] * (rough | _FIRST)
-        pairs = self._known(geoms)
-        # The rows of a contact frame are its axes, the normal first.
-        self.forces[:] = pairs.signed @ (local[:, None, :] @ frames)[:, 0]
-        self._normal[:] = pairs.of_shape @ local[:, 0]
-        self._impulses += self._step * self.forces
-        np.maximum(self._peaks, self._normal, out=self._peaks)
-        pushed = self._normal > 0
-        self.pushing = bool(pushed.any())
-        fresh = pushed & np.isnan(self._began)
-        if fresh.any():
-            self._began[fresh] = data.time - self._step
-
-    def look(self, data: Any) -> tuple[ShapeTruth, ...]:
-        """Return the contact of every shape, and begin new peaks and new first touches."""
-        slips, pushed = self._slips(data).tolist(), (self._normal > 0).tolist()
-        peaks, began = self._peaks.tolist(), self._began.tolist()
-        # One copy for all shapes, whose rows nobody writes.
-        forces, impulses = self.forces.copy(), self._impulses.copy()
-        found = tuple(
-            ShapeTruth(
-                frame=frame,
-                touching=pushed[k],
-                force=forces[k],
-                impulse=impulses[k],
-                peak=peaks[k],
-                began=None if math.isnan(began[k]) else began[k],
-                slip=slips[k],
+        self._marks.append(
+            _Mark(
+                number, contact.geom.copy(), contact.pos.copy(), contact.frame[:, :3].copy(), data.cvel.copy(),
+                data.subtree_com.copy(),
             )
-            for k, frame in enumerate(self._frames)
-        )
-        self._peaks[:], self._began[:] = 0.0, np.nan
+        )  # fmt: skip
+
+    def forces(self, count: int, shape: int) -> list[list[float]]:
+        """Return the forces on a shape in the last ``count`` steps with contact, N, shape (count, 3)."""
+        found: list[list[float]] = self._evaluated(self._steps[-count:])[0][:, shape].tolist()
         return found
 
-    def _slips(self, data: Any) -> Array:
-        """Return tangential speeds, shape (shapes,), of the shapes that were pushed in the last step."""
-        if not (data.ncon and self.pushing):
-            return np.zeros(len(self._frames))
-        contact = data.contact
-        pairs, normals = self._known(contact.geom), contact.frame[:, :3]
-        twists, arms = data.cvel[pairs.bodies], contact.pos - data.subtree_com[pairs.roots]
-        spins = twists[:, :3]
+    def look(self) -> ContactTrace:
+        """Return the contacts at all marks, and begin again."""
+        steps, ends, count = self._steps, np.array([mark.number for mark in self._marks]), self._count
+        n = ends.size
+        # What was there at the last look is still there where no step has been taken since.
+        unmoved = ends == self._number
+        force, normal = self._force * unmoved[:, None, None], self._normal * unmoved[:, None]
+        impulse, peak, began = np.zeros((n, count, 3)), np.zeros((n, count)), np.full((n, count), np.inf)
+        peak[0], began[0] = self._peak, self._began
+        if steps:
+            forces, normals = self._evaluated(steps)
+            numbers, times = np.array([s.number for s in steps]), np.array([s.time for s in steps])
+            into = np.searchsorted(ends, numbers)
+            np.add.at(impulse, into, self._step * forces)
+            np.maximum.at(peak, into, normals)
+            at, shape = np.nonzero(normals > 0)
+            np.minimum.at(began, (into[at], shape), times[at] - self._step)
+            last = np.minimum(np.searchsorted(numbers, ends), len(steps) - 1)
+            now = numbers[last] == ends
+            force[now], normal[now] = forces[last[now]], normals[last[now]]
+        impulse = self._impulse + impulse.cumsum(axis=0)
+        slip = self._slips() * (normal > 0)
+        self._number, self._force, self._normal, self._impulse = int(ends[-1]), force[-1], normal[-1], impulse[-1]
+        self._peak, self._began = np.zeros(count), np.full(count, np.inf)
+        self._steps, self._marks = [], []
+        return ContactTrace(normal > 0, force, impulse, peak, np.where(np.isinf(began), np.nan, began), slip)
+
+    def _evaluated(self, steps: list[_Step]) -> tuple[Array, Array]:
+        """Return forces, shape (steps, shapes, 3), and sums of normal forces, shape (steps, shapes)."""
+        counts, sizes = [s.sizes.size for s in steps], np.concatenate([s.sizes for s in steps])
+        starts = np.cumsum([0, *(s.forces.size for s in steps[:-1])])
+        first, at = np.concatenate([s.rows for s in steps]), np.repeat(np.arange(len(steps)), counts)
+        geoms, frames = np.concatenate([s.geoms for s in steps]), np.concatenate([s.frames for s in steps])
+        # A contact just outside the surface does not push and has no address.
+        there = first >= 0
+        first = (first + np.repeat(starts, counts))[there]
+        at, geoms, sizes, frames = at[there], geoms[there], sizes[there], frames[there].reshape(-1, 3, 3)
+        # A contact has one number without friction, else three.
+        rough = (sizes == 3)[:, None]
+        local = np.concatenate([s.forces for s in steps])[first[:, None] + _ROWS * rough] * (rough | _FIRST)
+        one, other = self._shape_of[geoms].T
+        shape, sign = np.maximum(one, other), np.where(other >= 0, 1.0, -1.0)
+        forces, normals = np.zeros((len(steps), self._count, 3)), np.zeros((len(steps), self._count))
+        # The rows of a contact frame are its axes, the normal first.
+        np.add.at(forces, (at, shape), sign[:, None] * (local[:, None, :] @ frames)[:, 0])
+        np.add.at(normals, (at, shape), local[:, 0])
+        return forces, normals
+
+    def _slips(self) -> Array:
+        """Return the largest tangential speed of the contact points of each shape at all marks, shape (n, shapes)."""
+        slips = np.zeros((len(self._marks), self._count))
+        there = [(k, mark) for k, mark in enumerate(self._marks) if mark.geoms.size]
+        if not there:
+            return slips
+        geoms, normals = (np.concatenate([getattr(m, name) for _, m in there]) for name in ("geoms", "normals"))
+        at = np.repeat(np.arange(len(there)), [len(m.geoms) for _, m in there])
+        bodies, other = self._body_of[geoms[:, 1]], self._shape_of[geoms[:, 1]]
+        twists = np.array([m.twists for _, m in there])[at, bodies]
+        centers = np.array([m.centers for _, m in there])[at, self._root_of[bodies]]
+        arms, spins = np.concatenate([m.points for _, m in there]) - centers, twists[:, :3]
         velocities = twists[:, 3:] + spins[:, _NEXT] * arms[:, _LAST] - spins[:, _LAST] * arms[:, _NEXT]
         velocities -= (normals * velocities).sum(axis=1, keepdims=True) * normals
-        slips = (pairs.on_ground * np.sqrt((velocities * velocities).sum(axis=1))).max(axis=1)
-        return np.asarray(slips * (self._normal > 0))
+        # A ball is no place to slide on.
+        ground = (self._body_of[geoms[:, 0]] == 0) & (other >= 0)
+        speeds = np.sqrt((velocities * velocities).sum(axis=1))[ground]
+        np.maximum.at(slips, (np.array([k for k, _ in there])[at[ground]], other[ground]), speeds)
+        return slips
 
-    def _known(self, geoms: Array) -> _Pairs:
-        """Return what depends on the geoms of the contacts alone, shape (contacts, 2)."""
-        key = geoms.tobytes()
-        if key not in self._pairs:
-            one, other = self._shape_of[geoms].T
-            shapes, bodies = np.maximum(one, other), self._body_of[geoms[:, 1]]
-            of_shape = (shapes == np.arange(len(self._frames))[:, None]).astype(float)
-            # A ball is no place to slide on.
-            ground = (self._body_of[geoms[:, 0]] == 0) & (other >= 0)
-            signed, on_ground = of_shape * np.where(other >= 0, 1.0, -1.0), of_shape * ground
-            self._pairs[key] = _Pairs(of_shape, signed, on_ground, bodies, self._root_of[bodies])
-        return self._pairs[key]
+
+_NOTHING = np.zeros((0, 2), dtype=int)
+
+
+def _bare(number: int) -> _Mark:
+    """Return a mark without contacts."""
+    return _Mark(number, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING)

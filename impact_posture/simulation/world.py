@@ -15,8 +15,8 @@ from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import hover
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.actuator_command import ActuatorCommand, Push, Truth
-from impact_posture.simulation.contact_forces import ContactLog
+from impact_posture.simulation.actuator_command import ActuatorCommand, Push, Trace, Truth
+from impact_posture.simulation.contact_forces import ContactLog, ShapeTruth
 from impact_posture.simulation.rotors import Rotors, Vibration
 from impact_posture.simulation.scene import Scene
 from impact_posture.simulation.sensor_noise import Reading, Sample, SensorNoise
@@ -27,6 +27,11 @@ from impact_posture.tsid.state import checked_velocity
 
 # No robot is so far away or so fast, m, m/s, rad/s, and no torque so large, N·m.
 _RUNAWAY = 1e6
+_NOTHING = np.zeros(0)
+
+
+def _ignore(message: str) -> None:
+    """Take a warning and do nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +70,7 @@ class World:
         self._data = self._mujoco.MjData(self._model)
         frames, sensors, propulsion = tuple(s.frame for s in scene.shapes), scene.sensors, robot.spec.propulsion
         self.ball = None if built.throw is None else Ball(self._model, built.throw)
-        self._log = ContactLog(self._model, built.shape_geoms, frames)
+        self._frames, self._log = frames, ContactLog(self._model, built.shape_geoms)
         self._noise = SensorNoise(robot, sensors)
         self._rotors = None if propulsion is None else Rotors(propulsion, self.timestep)
         self._vibration = None
@@ -77,16 +82,16 @@ class World:
         self._effort = np.where(effort > 0, effort, np.inf)
         self._torques: Array = np.zeros(self._effort.size)
         self._felt = None if sensors.force_frame is None else frames.index(sensors.force_frame)
-        self._smoothing = -np.expm1(-2 * np.pi * sensors.force_cutoff * self.timestep)
-        self._force: Array = np.zeros(3)
-        self._feels = False
+        self._smoothing = -math.expm1(-2 * np.pi * sensors.force_cutoff * self.timestep)
+        self._force = [0.0, 0.0, 0.0]
+        self._marks: list[tuple[float, Sample, Array, Array]] = []
         self._past: deque[Sample] = deque(maxlen=1 + round(sensors.delay / self.timestep))
         self._pushes: list[_ActivePush] = []
         self._steps = 0
         limited = np.array(self._model.jnt_limited, dtype=bool)
         self._limited = np.array(self._model.jnt_qposadr)[limited]
         self._low, self._high = np.array(self._model.jnt_range)[limited].T
-        self._limited_names = [self._model.joint(int(k)).name for k in np.flatnonzero(limited)]
+        self._limited_names = tuple(self._model.joint(int(k)).name for k in np.flatnonzero(limited))
 
     def reset(
         self, q: ArrayLike, v: ArrayLike | None = None, seed: int = 0, *, rotor_speed: ArrayLike | None = None
@@ -108,14 +113,16 @@ class World:
         self._mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[: self._layout.nqpos] = self._layout.qpos(q)
         self._data.qvel[: self._layout.nv] = self._layout.qvel(q, v)
-        self._generator = np.random.default_rng(seed)
+        generator = np.random.default_rng(seed)
         propulsion = self.robot.spec.propulsion
         if self._rotors is not None and propulsion is not None:
             self._rotors.reset(hover(self.robot.model, propulsion, q).speeds if rotor_speed is None else rotor_speed)
         if self._vibration is not None:
-            self._vibration.reset(q, self._generator.uniform(0, 2 * np.pi, self._count))
+            self._vibration.reset(q, generator.uniform(0, 2 * np.pi, self._count))
+        self._noise.reset(generator)
         self._log.reset()
-        self._force[:], self._feels = 0.0, False
+        self._marks.clear()
+        self._force = [0.0, 0.0, 0.0]
         self._torques = np.zeros(self._effort.size)
         self._pushes.clear()
         self._steps = 0
@@ -123,7 +130,14 @@ class World:
         self._past.clear()
         speeds = np.zeros(0) if self._rotors is None else self._rotors.speeds
         phases = np.zeros(0) if self._vibration is None else self._vibration.phases
-        self._past.append(self._sample(speeds, phases))
+        qpos, qvel = self._data.qpos[: self._layout.nqpos].copy(), self._data.qvel[: self._layout.nv].copy()
+        self._past.append(Sample(self._layout, qpos, qvel, speeds, phases, self._force))
+
+    @property
+    def speed(self) -> float:
+        """``‖ν‖``."""
+        rates = self._past[-1].qvel
+        return math.sqrt(rates.dot(rates))
 
     @property
     def time(self) -> float:
@@ -175,7 +189,7 @@ class World:
             return
         # MuJoCo itself would write a warning to a log file in the working directory.  The state shows the problem.
         before = self._mujoco.get_mju_user_warning()
-        self._mujoco.set_mju_user_warning(lambda message: None)
+        self._mujoco.set_mju_user_warning(_ignore)
         try:
             self._advance(speed, count)
         finally:
@@ -196,7 +210,10 @@ class World:
             speeds = rotors.steps(command, count)
             thrusts = rotors.thrusts(speeds)
             phases = phases if vibration is None else vibration.steps(speeds, self.timestep)
-        control = data.ctrl[: self._count]
+        control, log, delayed = data.ctrl[: self._count], self._log, self._past.maxlen != 1
+        log.fold(self._steps)
+        states: list[tuple[Array, Array]] = []
+        touched: set[int] = set()
         for k in range(count):
             if rotors is not None:
                 control[:] = thrusts[k]
@@ -204,47 +221,83 @@ class World:
                 self._apply_pushes()
             second(model, data)
             self._steps += 1
-            self._log.step(data)
-            self._feels = self._feels or self._log.pushing
-            if self._felt is not None and self._feels:
-                self._force += self._smoothing * (self._log.forces[self._felt] - self._force)
+            if data.ncon:
+                log.step(data, self._steps)
+                touched.add(k)
             # Now positions, contacts and velocities are those of the new state, and forces those of the step.
             first(model, data)
-            if self._past.maxlen != 1 or k == count - 1:
-                self._past.append(self._sample(speeds[k], phases[k]))
+            if delayed or k == count - 1:
+                states.append((data.qpos[: self._layout.nqpos].copy(), data.qvel[: self._layout.nv].copy()))
+        forces = self._filtered(count, touched)
+        for k, (qpos, qvel) in enumerate(states, count - len(states)):
+            self._past.append(Sample(self._layout, qpos, qvel, speeds[k], phases[k], forces[k]))
+
+    def _filtered(self, count: int, touched: set[int]) -> list[list[float]]:
+        """Return the felt force after each of the last steps, some of which had contacts."""
+        if self._felt is None or not (touched or any(self._force)):
+            return [self._force] * count
+        pushed, found = iter(self._log.forces(len(touched), self._felt) if touched else ()), []
+        for k in range(count):
+            force = next(pushed) if k in touched else (0.0, 0.0, 0.0)
+            self._force = [old + self._smoothing * (new - old) for old, new in zip(self._force, force, strict=True)]
+            found.append(self._force)
+        return found
 
     def read(self) -> Reading:
         """Return what the sensors measure now.  Every call draws new noise."""
         self._check_ready()
         sample = self._past[0]
-        q, v = (part.copy() for part in sample.state)
+        q, v = sample.state
         if self._vibration is not None:
+            v = v.copy()
             v[:6] += self._vibration.twist(sample.speeds, sample.phases)
-        force = None if self._felt is None else sample.force
-        return self._noise.read(self.time, q, v, force, self._generator)
+        return self._noise.read(self.time, q, v, None if self._felt is None else np.array(sample.force))
+
+    def mark(self) -> None:
+        """Let the present state be one of those that the next :meth:`trace` returns."""
+        self._check_ready()
+        speeds = _NOTHING if self._rotors is None else self._rotors.speeds
+        self._marks.append((self.time, self._past[-1], self._torques, speeds))
+        self._log.mark(self._data, self._steps)
+
+    def trace(self) -> Trace:
+        """Return the true states at all marks, of which there is at least one, and begin again."""
+        times, samples, torques, speeds = zip(*self._marks, strict=True)
+        self._marks = []
+        q, v = (np.array(part) for part in zip(*(sample.state for sample in samples), strict=True))
+        values = np.array([sample.qpos for sample in samples])[:, self._limited]
+        stopped = (values <= self._low) | (values >= self._high)
+        found = (np.array(times), q, v, np.array(speeds), np.array(torques), self._log.look(), stopped)
+        return Trace(*found, self._limited_names)
 
     def truth(self) -> Truth:
-        """Return the true state.  The peak force and the first touch of each shape begin again."""
-        self._check_ready()
-        q, v = (part.copy() for part in self._past[-1].state)
-        values = self._data.qpos[self._limited]
-        stopped = ((values <= self._low) | (values >= self._high)).nonzero()[0]
-        rotors = self._rotors
-        return Truth(
-            t=self.time,
-            q=q,
-            v=v,
-            rotor_speeds=np.zeros(0) if rotors is None else rotors.speeds,
-            thrusts=np.zeros(0) if rotors is None else rotors.thrusts(rotors.speeds),
-            torques=self._torques,
-            shapes=self._log.look(self._data),
-            at_stops=tuple(self._limited_names[k] for k in stopped),
+        """Return the true state.  The peak force and the first touch of each shape begin again, as do all marks."""
+        self.mark()
+        found, rotors = self.trace(), self._rotors
+        touching, force, impulse, peak, began, slip = (column[-1] for column in found.contacts)
+        shapes = tuple(
+            ShapeTruth(
+                frame=frame,
+                touching=bool(touching[k]),
+                force=force[k],
+                impulse=impulse[k],
+                peak=float(peak[k]),
+                began=None if math.isnan(began[k]) else float(began[k]),
+                slip=float(slip[k]),
+            )
+            for k, frame in enumerate(self._frames)
         )
-
-    def _sample(self, speeds: Array, phases: Array) -> Sample:
-        data = self._data
-        qpos, qvel = data.qpos[: self._layout.nqpos].copy(), data.qvel[: self._layout.nv].copy()
-        return Sample(self._layout, qpos, qvel, speeds, phases, self._force.copy())
+        speeds = found.rotor_speeds[-1]
+        return Truth(
+            t=float(found.t[-1]),
+            q=found.q[-1],
+            v=found.v[-1],
+            rotor_speeds=speeds,
+            thrusts=speeds if rotors is None else rotors.thrusts(speeds),
+            torques=found.torques[-1],
+            shapes=shapes,
+            at_stops=tuple(name for name, there in zip(found.limited, found.stopped[-1], strict=True) if there),
+        )
 
     def _apply_pushes(self) -> None:
         data = self._data
@@ -262,13 +315,12 @@ class World:
                 where="command",
                 hint=f"give {self._count} and {self._effort.size}",
             )
-        # A sum of finite numbers is finite as long as they are not absurd.
-        if not math.isfinite(speed.sum() + torque.sum()) and not (
-            np.isfinite(speed).all() and np.isfinite(torque).all()
-        ):
+        # A sum of squares that is not absurd settles it.
+        usual = speed.dot(speed) + torque.dot(torque) < _RUNAWAY**2
+        if not usual and not (np.isfinite(speed).all() and np.isfinite(torque).all()):
             raise InputError("is not finite", where="command", hint="hold the last one instead")
         torque = np.minimum(np.maximum(torque, -self._effort), self._effort)
-        if not torque.dot(torque) < _RUNAWAY**2 and not np.abs(torque).max(initial=0.0) < _RUNAWAY:
+        if not usual and not np.abs(torque).max(initial=0.0) < _RUNAWAY:
             raise InputError("has an endless torque", where="command", hint="give the joints effort limits")
         return speed if self._rotors is None else self._rotors.within(speed), torque
 
