@@ -38,26 +38,6 @@ class ShapeTruth(NamedTuple):
     slip: float
 
 
-class ContactTrace(NamedTuple):
-    """Contacts of all shapes at n marks, in the words of :class:`ShapeTruth`.
-
-    Attributes:
-        touching: Shape (n, shapes).
-        force: Shape (n, shapes, 3).
-        impulse: Shape (n, shapes, 3).
-        peak: Since the mark before, shape (n, shapes).
-        began: Since the mark before, NaN for none, shape (n, shapes).
-        slip: Shape (n, shapes).
-    """
-
-    touching: Array
-    force: Array
-    impulse: Array
-    peak: Array
-    began: Array
-    slip: Array
-
-
 class _Step(NamedTuple):
     """Contacts of a step, as MuJoCo has them, with the number of the step and the time of its end."""
 
@@ -71,12 +51,11 @@ class _Step(NamedTuple):
 
 
 class _Mark(NamedTuple):
-    """Contacts after a step, with velocities and centers of mass of all bodies."""
+    """Contacts after a step, with velocities and centers of mass of all bodies, as MuJoCo has them."""
 
-    number: int
     geoms: Array
     points: Array
-    normals: Array
+    frames: Array
     twists: Array
     centers: Array
 
@@ -102,7 +81,7 @@ class ContactLog:
         """Forget everything."""
         count = self._count
         self._steps: list[_Step] = []
-        self._marks: list[_Mark] = []
+        self._marks: list[tuple[int, _Mark | None]] = []
         self._number = 0
         self._force, self._normal, self._impulse = np.zeros((count, 3)), np.zeros(count), np.zeros((count, 3))
         self._peak, self._began = np.zeros(count), np.full(count, np.inf)
@@ -110,42 +89,47 @@ class ContactLog:
     def step(self, data: Any, number: int) -> None:
         """Write down the contacts of a step, which ends at ``data.time`` and has some."""
         contact = data.contact
-        self._steps.append(
-            _Step(
-                number, data.time, contact.geom.copy(), contact.dim.copy(), contact.efc_address.copy(),
-                contact.frame.copy(), data.efc_force.copy(),
-            )
-        )  # fmt: skip
+        parts = contact.geom, contact.dim, contact.efc_address, contact.frame, data.efc_force
+        self._steps.append(_Step(number, data.time, *(part.copy() for part in parts)))
 
     def fold(self, number: int) -> None:
         """Evaluate the steps until now if they are many and no state waits for a look."""
         if len(self._steps) >= _MOST and not self._marks:
-            self._marks.append(_bare(number))
-            found = self.look()
-            self._peak, self._began = found.peak[0], np.where(np.isnan(found.began[0]), np.inf, found.began[0])
+            self._marks.append((number, None))
+            *_, peak, began, _ = self.look()
+            self._peak, self._began = peak[0], np.where(np.isnan(began[0]), np.inf, began[0])
 
     def mark(self, data: Any, number: int) -> None:
         """Let the state after a step be one to look at."""
-        if not data.ncon:
-            self._marks.append(_bare(number))
-            return
-        contact = data.contact
-        self._marks.append(
-            _Mark(
-                number, contact.geom.copy(), contact.pos.copy(), contact.frame[:, :3].copy(), data.cvel.copy(),
-                data.subtree_com.copy(),
-            )
-        )  # fmt: skip
+        found = None
+        if data.ncon:
+            parts = data.contact.geom, data.contact.pos, data.contact.frame, data.cvel, data.subtree_com
+            found = _Mark(*(part.copy() for part in parts))
+        self._marks.append((number, found))
 
-    def forces(self, count: int, shape: int) -> list[list[float]]:
-        """Return the forces on a shape in the last ``count`` steps with contact, N, shape (count, 3)."""
-        found: list[list[float]] = self._evaluated(self._steps[-count:])[0][:, shape].tolist()
-        return found
+    def force(self, shape: int) -> list[float]:
+        """Return the force on a shape in the last step with contact, world, N, shape (3,)."""
+        # For few contacts, as in the middle of a run, this is faster than what evaluates many steps.
+        step, force = self._steps[-1], np.zeros(3)
+        contacts = zip(step.rows, step.sizes, self._shape_of[step.geoms], step.frames, strict=True)
+        for row, size, pair, frame in contacts:
+            if row >= 0 and pair.max() == shape:
+                pushed = step.forces[row : row + size] @ frame.reshape(3, 3)[:size]
+                force = force + pushed if pair[1] >= 0 else force - pushed
+        return list(force.tolist())
 
-    def look(self) -> ContactTrace:
-        """Return the contacts at all marks, and begin again."""
-        steps, ends, count = self._steps, np.array([mark.number for mark in self._marks]), self._count
-        n = ends.size
+    def look(self) -> tuple[Array, ...]:
+        """Return the contacts at all n marks, and begin again.
+
+        Returns:
+            The numbers of :class:`ShapeTruth` in their order, but for the frame.  The first axis is that of the
+            marks, the second that of the shapes.  Where a shape was not touched anew, ``began`` is NaN.
+        """
+        ends, count = np.array([number for number, _ in self._marks]), self._count
+        numbers, n = np.array([step.number for step in self._steps]), ends.size
+        # A run that ends within a tick has steps behind its last mark.
+        looked = int(np.searchsorted(numbers, ends[-1], side="right"))
+        steps, numbers, self._steps = self._steps[:looked], numbers[:looked], self._steps[looked:]
         # What was there at the last look is still there where no step has been taken since.
         unmoved = ends == self._number
         force, normal = self._force * unmoved[:, None, None], self._normal * unmoved[:, None]
@@ -153,8 +137,7 @@ class ContactLog:
         peak[0], began[0] = self._peak, self._began
         if steps:
             forces, normals = self._evaluated(steps)
-            numbers, times = np.array([s.number for s in steps]), np.array([s.time for s in steps])
-            into = np.searchsorted(ends, numbers)
+            into, times = np.searchsorted(ends, numbers), np.array([s.time for s in steps])
             np.add.at(impulse, into, self._step * forces)
             np.maximum.at(peak, into, normals)
             at, shape = np.nonzero(normals > 0)
@@ -166,8 +149,8 @@ class ContactLog:
         slip = self._slips() * (normal > 0)
         self._number, self._force, self._normal, self._impulse = int(ends[-1]), force[-1], normal[-1], impulse[-1]
         self._peak, self._began = np.zeros(count), np.full(count, np.inf)
-        self._steps, self._marks = [], []
-        return ContactTrace(normal > 0, force, impulse, peak, np.where(np.isinf(began), np.nan, began), slip)
+        self._marks = []
+        return normal > 0, force, impulse, peak, np.where(np.isinf(began), np.nan, began), slip
 
     def _evaluated(self, steps: list[_Step]) -> tuple[Array, Array]:
         """Return forces, shape (steps, shapes, 3), and sums of normal forces, shape (steps, shapes)."""
@@ -193,27 +176,19 @@ class ContactLog:
     def _slips(self) -> Array:
         """Return the largest tangential speed of the contact points of each shape at all marks, shape (n, shapes)."""
         slips = np.zeros((len(self._marks), self._count))
-        there = [(k, mark) for k, mark in enumerate(self._marks) if mark.geoms.size]
+        there = [k for k, (_, found) in enumerate(self._marks) if found]
         if not there:
             return slips
-        geoms, normals = (np.concatenate([getattr(m, name) for _, m in there]) for name in ("geoms", "normals"))
-        at = np.repeat(np.arange(len(there)), [len(m.geoms) for _, m in there])
-        bodies, other = self._body_of[geoms[:, 1]], self._shape_of[geoms[:, 1]]
-        twists = np.array([m.twists for _, m in there])[at, bodies]
-        centers = np.array([m.centers for _, m in there])[at, self._root_of[bodies]]
-        arms, spins = np.concatenate([m.points for _, m in there]) - centers, twists[:, :3]
-        velocities = twists[:, 3:] + spins[:, _NEXT] * arms[:, _LAST] - spins[:, _LAST] * arms[:, _NEXT]
+        geoms, points, frames, twists, centers = zip(*(self._marks[k][1] for k in there), strict=True)
+        at = np.repeat(np.arange(len(there)), [len(own) for own in geoms])
+        geom, normals = np.concatenate(geoms), np.concatenate(frames)[:, :3]
+        bodies, other = self._body_of[geom[:, 1]], self._shape_of[geom[:, 1]]
+        twist, center = np.array(twists)[at, bodies], np.array(centers)[at, self._root_of[bodies]]
+        arms, spins = np.concatenate(points) - center, twist[:, :3]
+        velocities = twist[:, 3:] + spins[:, _NEXT] * arms[:, _LAST] - spins[:, _LAST] * arms[:, _NEXT]
         velocities -= (normals * velocities).sum(axis=1, keepdims=True) * normals
         # A ball is no place to slide on.
-        ground = (self._body_of[geoms[:, 0]] == 0) & (other >= 0)
+        ground = (self._body_of[geom[:, 0]] == 0) & (other >= 0)
         speeds = np.sqrt((velocities * velocities).sum(axis=1))[ground]
-        np.maximum.at(slips, (np.array([k for k, _ in there])[at[ground]], other[ground]), speeds)
+        np.maximum.at(slips, (np.array(there)[at[ground]], other[ground]), speeds)
         return slips
-
-
-_NOTHING = np.zeros((0, 2), dtype=int)
-
-
-def _bare(number: int) -> _Mark:
-    """Return a mark without contacts."""
-    return _Mark(number, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING)

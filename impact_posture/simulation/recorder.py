@@ -10,7 +10,6 @@ from impact_posture.arrays import Array
 from impact_posture.errors import ImpactPostureError
 from impact_posture.impact.contact import point_on
 from impact_posture.simulation.actuator_command import Trace
-from impact_posture.simulation.contact_forces import ContactTrace
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.series import STATUSES, Series
 from impact_posture.tsid.controller import Command
@@ -71,11 +70,11 @@ class Recorder:
 
     def first_touch(self, begin: float, end: float) -> float | None:
         """Return when the shape that hits first began to touch within ``[begin, end)``, s."""
-        contacts, k = self._trace().contacts, self._shape
+        trace, k = self._trace(), self._shape
         assert k is not None  # noqa: S101 (a push has no shape that hits)
         # A contact that lasts is pushed anew in every tick.
-        before = np.concatenate([[False], contacts.touching[:-1, k]])
-        touches = contacts.began[~before, k]
+        before = np.concatenate([[False], trace.touching[:-1, k]])
+        touches = trace.began[~before, k]
         touches = touches[(begin <= touches) & (touches < end)]
         return float(touches[0]) if touches.size else None
 
@@ -83,32 +82,28 @@ class Recorder:
         """Return the time series, with what follows from the recorded states and commands."""
         trace = self._trace()
         command, level, status, distance = (np.array(column) for column in zip(*self._rows, strict=True))
-        t, q, contacts, (pushed, begin, end) = trace.t, trace.q, trace.contacts, self._push
+        t, q, (pushed, begin, end) = trace.t, trace.q, self._push
         if self._shape is not None:
-            force, peak, slip = (x[:, self._shape] for x in (contacts.force, contacts.peak, contacts.slip))
+            force, peak, slip = (x[:, self._shape] for x in (trace.force, trace.peak, trace.slip))
         else:
             force = pushed * ((begin < t) & (t <= end + 1e-9))[:, None]
-            peak, slip = np.linalg.norm(force, axis=1), contacts.slip.max(axis=1, initial=0.0)
+            peak, slip = np.linalg.norm(force, axis=1), trace.slip.max(axis=1, initial=0.0)
         stopped, names = np.zeros(trace.v.shape, dtype=bool), self._setup.robot.tangent_names
-        known = [name in names for name in trace.limited]
-        stopped[:, [names.index(name) for name in trace.limited if name in names]] = trace.stopped[:, known]
+        for name, there in zip(self._world.limited, trace.stopped.T, strict=True):
+            if name in names:
+                stopped[:, names.index(name)] = there
         objective = np.full(t.size, np.nan)
         objective[::_EVERY] = [self._value(posture) for posture in q[::_EVERY]]
         return Series(
             t, q, trace.v, trace.torques, np.clip(command, *self._rotors), trace.rotor_speeds, force, peak, slip,
-            contacts.touching.sum(axis=1), contacts.touching[:, self._feet], objective, level, status, stopped,
-            distance,
+            trace.touching.sum(axis=1), trace.touching[:, self._feet], objective, level, status, stopped, distance,
         )  # fmt: skip
 
     def _trace(self) -> Trace:
         """Return the true states of all ticks."""
         if len(self._rows) > sum(trace.t.size for trace in self._traces):
             self._traces.append(self._world.trace())
-        *columns, _, _, limited = zip(*self._traces, strict=True)
-        t, q, v, speeds, torques = map(np.concatenate, columns[:5])
-        contacts = ContactTrace(*map(np.concatenate, zip(*(trace.contacts for trace in self._traces), strict=True)))
-        stopped = np.concatenate([trace.stopped for trace in self._traces])
-        self._traces = [Trace(t, q, v, speeds, torques, contacts, stopped, limited[0])]
+        self._traces = [Trace(*map(np.concatenate, zip(*self._traces, strict=True)))]
         return self._traces[0]
 
     def _value(self, q: Array) -> float:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -13,13 +15,11 @@ from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.scene import Sensors
 
-
 # Readings whose noise is drawn at once.
 _DRAWS = 64
 
 
-@dataclass(frozen=True, eq=False)
-class Reading:
+class Reading(NamedTuple):
     """Measured state.
 
     Attributes:
@@ -34,6 +34,28 @@ class Reading:
     q: Array
     v: Array
     force: Array | None
+
+
+NO_FORCE = [0.0, 0.0, 0.0]
+
+
+class ForceFilter:
+    """Low-pass filter of a force sensor.
+
+    Attributes:
+        force: The filtered force, N, three numbers.
+
+    Args:
+        turns: Cutoff frequency times the time step.
+    """
+
+    def __init__(self, turns: float) -> None:
+        self._share, self.force = -math.expm1(-2 * math.pi * turns), NO_FORCE
+
+    def feel(self, force: list[float]) -> None:
+        """Take the force of a step."""
+        if force is not NO_FORCE or any(self.force):
+            self.force = [old + self._share * (new - old) for old, new in zip(self.force, force, strict=True)]
 
 
 @dataclass(eq=False, slots=True)
