@@ -81,8 +81,8 @@ def simulate(
 ) -> None:
     """Run ``impact-posture simulate``."""
     from impact_posture.escape import file_name
-    from impact_posture.experiment.folders import FORMATS, write_simulation
-    from impact_posture.experiment.jobs import Job, execute
+    from impact_posture.experiment.folders import FORMATS, Output, write_simulation
+    from impact_posture.experiment.jobs import Job, execute, worth_compiling
     from impact_posture.experiment.statistics import fate
     from impact_posture.output_folder import check_output
     from impact_posture.posture.nlp import one_blas_thread
@@ -92,16 +92,15 @@ def simulate(
         _export_world(Page(quiet=quiet or json), scenario, Path(export_world), force)
         return
     name = read_scenario(scenario).name
-    job = Job(scenario, controller, seed, mode, free, gain, None if sign is None else int(sign))
+    only, code = None if sign is None else int(sign), worth_compiling(compile, 1)
+    job = Job(scenario, controller, seed, mode, free, gain, only, code)
     folder = Path(out) if out else Path(file_name(f"{name}-{job.label.replace(':', '-')}"))
     check_output(folder, force=force, kind="run")
     with progress("running", shown=not (quiet or json)):
         with one_blas_thread():
-            runs, document = execute(job, compile=compile)
-        formats = format or FORMATS
-        failure = write_simulation(
-            folder, job, runs, document, force=force, formats=formats, report=not no_report, meshes=meshes
-        )
+            runs, document = execute(job)
+        output = Output(folder, force, format or FORMATS, not no_report, meshes)
+        failure = write_simulation(output, job, runs, document)
     if failure and not quiet:
         complain(f"warning: there is no report.html: {failure}")
     if json:

@@ -249,8 +249,8 @@ class World:
         q, v = zip(*(sample.state for sample in samples), strict=True)
         values = np.array([sample.qpos for sample in samples])[:, self._limited]
         stopped = (values <= self._low) | (values >= self._high)
-        states = (np.array(column) for column in (times, q, v, speeds, torques))
-        return Trace(*states, stopped, *self._log.look())
+        parts = [np.array(column) for column in (times, q, v, speeds, torques)]
+        return Trace._make([*parts, stopped, *self._log.look()])
 
     def truth(self) -> Truth:
         """Return the true state.  The peak force and the first touch of each shape begin again, as do all marks."""
