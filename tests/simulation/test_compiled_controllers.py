@@ -71,7 +71,7 @@ def test_auto_builds_where_it_can_and_a_job_says_so_where_its_runs_pay_for_it() 
 def test_a_document_says_who_computed_the_ticks() -> None:
     made = in_c("solo8-push")
     for compile, language in (("always", "C"), ("never", "Python")):
-        _, document = execute(Job("solo8-push", "nominal", sign=1, compile=compile), made)
+        _, document = execute(Job("solo8-push", "robust", sign=1, compile=compile), made)
         assert document["language"] == language
 
 
