@@ -93,7 +93,7 @@ def write_reproduction(output: Output, found: Reproduction, store: Store) -> dic
         (folder / "runs").mkdir()
         for job in found.jobs:
             _write_json(folder / "runs" / f"{job.name}.json", store.find(job))
-        draw_reproduction(found, found.shown, store, folder, output.formats)
+        draw_reproduction(found, store, folder, output.formats)
     store.remove()
     return document
 

@@ -93,8 +93,8 @@ class Truth(NamedTuple):
 class Trace(NamedTuple):
     """True states of a world at n marks, in the words of :class:`Truth` and :class:`ShapeTruth`.
 
-    The first axis is that of the marks.  The second one is that of the numbers, of the joints with limits for
-    ``stopped``, and of the shapes for what follows.
+    The first axis is that of the marks.  The second one is that of the joints with limits for ``stopped``, and of the
+    shapes for what follows.
     """
 
     t: Array

@@ -36,7 +36,7 @@ def lines(request: Request) -> Iterator[str]:
     yield "\n\n".join(_parts(found, every))
     if request.write:
         with tempfile.TemporaryDirectory() as folder:
-            draw_reproduction(found, found.shown, store, Path(folder), ["png"])
+            draw_reproduction(found, store, Path(folder), ["png"])
             _take_shown(Path(folder))
 
 
