@@ -19,6 +19,7 @@ from impact_posture.experiment.reproduction import jobs_of
 def test_a_run_answers_with_its_document(aerial: Path) -> None:
     runs, found = execute(Job(str(aerial), "nominal"))
     assert found["schema"] == SCHEMA and found["controller"] == "nominal" and found["seed"] == 0
+    assert found["language"] == "Python"
     assert found["metrics"]["contacts"] == 1 and found["metrics"]["q_total_impact"] > 0
     assert {"inside", "outside"} <= set(found["metrics"]["saturation_s"])
     assert [w["kind"] for w in found["windows"]] == ["impact", "dwell", "recovery"]
