@@ -62,6 +62,20 @@ def test_the_polygon_of_the_feet_is_the_convex_hull(corners: list[tuple[float, f
         assert np.abs(np.column_stack([normals, -offsets]) - [*n, b]).max(axis=1).min() < 1e-6
 
 
+coarse = st.lists(st.tuples(*[st.sampled_from([-0.1, 0.0, 0.1])] * 2), min_size=3, max_size=9)
+
+
+@given(coarse, st.integers(0, 10**6))
+@settings(max_examples=60, deadline=None)
+def test_feet_in_a_row_whose_places_are_inexact_keep_their_corners(
+    corners: list[tuple[float, float]], seed: int
+) -> None:
+    points = np.array(corners) + 1e-10 * np.random.default_rng(seed).normal(size=(len(corners), 2))
+    found = polygon_edges(points)
+    if found is not None:
+        assert (points @ found[0].T <= found[1] + 1e-8).all()
+
+
 def _objective(robot: str, frame: str) -> ImpactObjective:
     problem = prepare(ProblemSettings(robot=robot, frame=frame, normal=(0.0, 0.0, 1.0), collision=False)).problem
     return problem.impact
