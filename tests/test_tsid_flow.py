@@ -197,7 +197,7 @@ def test_a_tick_evaluates_at_most_one_gradient() -> None:
         calls[0] = 0
         flow.advance(DT, flow.q)
         counts.append(calls[0])
-    assert max(counts) == 1 and sum(counts) == 4 * 3
+    assert max(counts) == 1 and sum(counts) == 4 * 2
 
 
 def flying(function: Well) -> tuple[Controller, ReferenceFlowPosture, Vector, Vector]:
