@@ -22,11 +22,11 @@ help:
 	@echo "make study-global   how complete the search global is, and basin hopping beside multi-start"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
 	@echo "make study-feasible  what it costs to be clear of collisions and held by the motors, over the catalogue"
-	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts (an hour)"
+	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts (ten minutes)"
 	@echo "make study-real-impacts  balls, strikes, taps: what the rigid model predicts, and what MuJoCo finds (some minutes)"
 	@echo "make study-robustness  where each controller helps, and which targets it keeps: variations of each experiment (some hours; goes on where it was)"
 	@echo "make study-scan     what decides along the redundancy of an arm and of a humanoid, as a picture"
-	@echo "make study-controller  the controller in C against the one in Python: equal commands, times of a tick (some minutes)"
+	@echo "make study-controller  the controller in C against the one in Python: equal answers, growth, times of a tick (an hour; PART=equality, growth or times: times alone need a quiet machine, 4 minutes)"
 	@echo "make study-sweep    what sweeps survive (killed workers and parents, MPI, Slurm jobs), and what they cost"
 	@echo "make calibration    the simulated world's restitution, law by law"
 	@echo "make regression  recompute the committed reference results"
@@ -110,7 +110,7 @@ study-flow: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks flow --jobs $(JOBS) --write
 
 study-controller: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks.controller build/controller 10000
+	$(BIN)/python -m tests.benchmarks.controller build/controller 10000 $(PART)
 
 study-sweep: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks.sweep

@@ -6,12 +6,6 @@ import re
 from collections.abc import Sequence
 from itertools import zip_longest
 
-
-def put_right(arguments: Sequence[str]) -> list[str]:
-    """Join pairs and fill in optional values."""
-    return fill_optional(in_pairs(arguments))
-
-
 # Options whose value may be left out, and the pattern of a value.
 _OPTIONAL = {
     # Any number; the option itself refuses what is no whole number.
@@ -20,7 +14,12 @@ _OPTIONAL = {
 }
 
 
-def in_pairs(arguments: Sequence[str]) -> list[str]:
+def put_right(arguments: Sequence[str]) -> list[str]:
+    """Join pairs and fill in optional values."""
+    return fill_optional(_in_pairs(arguments))
+
+
+def _in_pairs(arguments: Sequence[str]) -> list[str]:
     """Write ``--payload FRAME MASS`` as ``--payload FRAME:MASS``: Typer has no repeatable options of two values."""
     found, rest = [], list(arguments)
     while rest:

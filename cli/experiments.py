@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from impact_posture_cli.options import CompileMode
 from impact_posture_cli.output import Page
 
 if TYPE_CHECKING:
@@ -13,7 +14,6 @@ if TYPE_CHECKING:
 
 RUN = "Run"
 Mode = Literal["live", "held"]
-CompileMode = Literal["auto", "always", "never"]
 
 ScenarioName = Annotated[
     str,
@@ -23,16 +23,16 @@ ScenarioName = Annotated[
         "g1-strike, solo12-landing, panda-tap, hextilt-poke, or a path to a scenario.toml.",
     ),
 ]
-Seeds = Annotated[int, typer.Option("--seeds", min=1, rich_help_panel=RUN, help="Seeds a controller, from 0.")]
+Seeds = Annotated[int, typer.Option("--seeds", min=1, rich_help_panel=RUN, help="Seeds of each controller, from 0.")]
 Compile = Annotated[
     CompileMode,
     typer.Option(
         "--compile", rich_help_panel=RUN,
-        help="Whether controllers run as machine code. auto: from 3 seeds on, which pay for building it.",
+        help="Whether controllers are compiled to machine code. auto: from 3 seeds on, which pay for it.",
     ),
 ]  # fmt: skip
 Processes = Annotated[
-    int, typer.Option("--jobs", min=1, rich_help_panel=RUN, help="Processes that run at the same time.")
+    int, typer.Option("--jobs", min=1, rich_help_panel=RUN, help="Number of processes that run at the same time.")
 ]
 
 

@@ -53,42 +53,38 @@ Out = Annotated[str | None, out_option("Result folder.", "./ROBOT-FRAME")]
 Force = Annotated[bool, option("--force", panel=OUTPUT, help="Replace an existing result folder.")]
 Prefix = Annotated[
     str | None,
-    option("--prefix", metavar="NAME", panel=OUTPUT, show_default="ROBOT_FRAME", help="What the C names begin with."),
+    option("--prefix", metavar="NAME", panel=OUTPUT, show_default="ROBOT_FRAME", help="Beginning of all names in C."),
 ]
 ExportOut = Annotated[str | None, out_option("Folder of the C code.", "./PREFIX-c")]
 Float = Annotated[bool, option("--float", panel=OUTPUT, help="Compute in float instead of double.")]
 Portable = Annotated[
     bool,
-    option("--portable", panel=OUTPUT, help="Plain C99 without vectors, for compilers other than GCC and Clang."),
+    option("--portable", panel=OUTPUT, help="Write C99 without vectors, for compilers other than GCC and Clang."),
 ]
 CompileLibrary = Annotated[
-    bool, option("--compile", panel=OUTPUT, help="Build the shared library and compare it with other libraries.")
+    bool, option("--compile", panel=OUTPUT, help="Build the shared library and check its numbers.")
 ]
 ControllerKind = Annotated[
     Literal["aerial", "legged", "arm"] | None,
     option(
         "--controller", panel=OUTPUT, show_default="the gradient alone",
-        help="Write the whole online controller of such a robot; with --normal, the impact-robust one.",
+        help="Write a whole online controller for this kind of robot; with --normal, an impact-robust one.",
     ),
 ]  # fmt: skip
 ControllerFlow = Annotated[
     bool,
     option(
         "--flow", panel=OUTPUT,
-        help="With --controller and an impact, let the posture follow the reference flow (robust-flow).",
+        help="With --controller and an impact: let the posture follow the reference flow (robust-flow).",
     ),
 ]  # fmt: skip
 ControllerScenario = Annotated[
     str | None,
-    option(
-        "--scenario", metavar="SCENARIO", panel=OUTPUT, help="Tasks and gains of the controller, from a scenario."
-    ),
+    option("--scenario", metavar="SCENARIO", panel=OUTPUT, help="With --controller: tasks and gains of a scenario."),
 ]
 Daqp = Annotated[
     str | None,
-    option(
-        "--daqp", metavar="DIR", panel=OUTPUT, help="Sources of DAQP for --controller, where there is no network."
-    ),
+    option("--daqp", metavar="DIR", panel=OUTPUT, help="With --controller: sources of DAQP, without a network."),
 ]
 NoCodegen = Annotated[bool, option("--no-codegen", panel=OUTPUT, help="Leave the C export out.")]
 NoReport = Annotated[bool, option("--no-report", panel=OUTPUT, help="Leave report.html out.")]
@@ -96,11 +92,11 @@ Meshes = Annotated[
     bool,
     option("--meshes", panel=OUTPUT, help="Put meshes of your own URDF into report.html, which passes them on."),
 ]
-Json = Annotated[bool, option("--json", panel=OUTPUT, help="One JSON document on standard output.")]
-Quiet = Annotated[bool, option("--quiet", "-q", panel=OUTPUT, help="The result alone: no warnings, no progress.")]
-Jobs = Annotated[int, option("--jobs", panel=OUTPUT, min=1, help="Processes that search.")]
-Compile = Annotated[CompileMode, option("--compile", panel=OUTPUT, help="Whether the program becomes machine code.")]
+Json = Annotated[bool, option("--json", panel=OUTPUT, help="Print one JSON document instead of tables.")]
+Quiet = Annotated[bool, option("--quiet", "-q", panel=OUTPUT, help="Print no warnings and no progress.")]
+Jobs = Annotated[int, option("--jobs", panel=OUTPUT, min=1, help="Number of processes that search.")]
+Compile = Annotated[CompileMode, option("--compile", panel=OUTPUT, help="Whether the solver runs compiled code.")]
 Formats = Annotated[
     list[PictureFormat] | None,
-    option("--format", panel=OUTPUT, show_default="png", help="Of the pictures: png, svg or pdf; repeatable."),
+    option("--format", panel=OUTPUT, show_default="png", help="Format of the pictures: png, svg or pdf; repeatable."),
 ]

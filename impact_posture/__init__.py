@@ -27,11 +27,13 @@ if TYPE_CHECKING:
     from impact_posture.controller_export.compiled_controller import CompiledController
     from impact_posture.controller_export.export import export_controller
     from impact_posture.errors import ImpactPostureError
-    from impact_posture.front_door import ImpactObjective, PostureProblem, PostureResult, optimize
-    from impact_posture.impact.contact import ImpactContact, Support
+    from impact_posture.front_door import PostureResult, optimize
+    from impact_posture.front_door_problem import ImpactObjective, PostureProblem
+    from impact_posture.impact.contact import ImpactContact
     from impact_posture.impact.metric import Metric
     from impact_posture.robot.robot import Robot
     from impact_posture.robot.robot_loader import known_robots, load_robot
+    from impact_posture.robot.spec import Support
 
 
 _HOMES = {
@@ -39,13 +41,13 @@ _HOMES = {
     "Export": "codegen.export",
     "ImpactContact": "impact.contact",
     "ImpactGradient": "codegen.impact_gradient",
-    "ImpactObjective": "front_door",
+    "ImpactObjective": "front_door_problem",
     "ImpactPostureError": "errors",
     "Metric": "impact.metric",
-    "PostureProblem": "front_door",
+    "PostureProblem": "front_door_problem",
     "PostureResult": "front_door",
     "Robot": "robot.robot",
-    "Support": "impact.contact",
+    "Support": "robot.spec",
     "export_controller": "controller_export.export",
     "known_robots": "robot.robot_loader",
     "load_robot": "robot.robot_loader",

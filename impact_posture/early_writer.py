@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import multiprocessing
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from impact_posture.errors import OutputError
-from impact_posture.output_folder import scratch_folder
 from impact_posture.processes import fork_server
+from impact_posture.scratch_folder import scratch_folder
 
 # This module is imported before all that takes long to import.
 if TYPE_CHECKING:
@@ -39,29 +39,49 @@ def early_writer(
         if jobs > 1 and "fork" in multiprocessing.get_all_start_methods():
             try:
                 folder = stack.enter_context(scratch_folder())
-                finish = stack.enter_context(fork_server(partial(_load, settings, folder, report, meshes)))
+                finish = stack.enter_context(fork_server(partial(load, settings, folder, report, meshes)))
             except (OSError, OutputError):
                 finish = None
         yield finish
 
 
-def _load(settings: ProblemSettings, folder: Path, report: bool, meshes: bool) -> Finish:
+def load(
+    settings: ProblemSettings, folder: Path, report: bool, meshes: bool, requested: Callable[[], bool]
+) -> Finish:
+    """Load what writing the result of a problem needs, prepare more until it is requested, and return what writes it.
+
+    Args:
+        settings: The problem.
+        folder: Place of temporary files.
+        report: As :func:`early_writer`.
+        meshes: As :func:`early_writer`.
+        requested: Tells whether the result has been requested.
+    """
     # The process may be killed.  Then nobody else removes its temporary files, of which matplotlib makes some.
     tempfile.tempdir = str(folder)
-    import impact_posture.codegen.export
+    import threadpoolctl
+
     import impact_posture.plot  # noqa: F401 (the import is what takes long)
+    from impact_posture.codegen.emitter import DOUBLE
+    from impact_posture.codegen.export import cached_code, default_prefix
     from impact_posture.codegen.render import load_templates
     from impact_posture.posture.problem_settings import prepare
     from impact_posture.result_folder import finish_result
 
+    # Threads of a BLAS would wait for each other, and take the cores from the solver.
+    threadpoolctl.threadpool_limits(1, "blas")
     load_templates()
     prepared = prepare(settings)
-    if report:
-        # What goes wrong here goes wrong again for the report, which says so.
-        with suppress(Exception):
+    # What goes wrong here goes wrong again for the result, which says so.
+    with suppress(Exception):
+        if report:
             from impact_posture.report.page import load_template
             from impact_posture.report.shapes import draw_robot
 
             load_template()
             draw_robot(prepared.impact.robot, meshes)
+        # A large robot takes so long to solve that there is time to do more.
+        if not requested():
+            objectives = (prepared.impact.objective,)
+            cached_code(objectives, default_prefix(objectives), DOUBLE, False)
     return partial(finish_result, prepared)

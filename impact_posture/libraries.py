@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from impact_posture.errors import OutputError, SpecError
-from impact_posture.output_folder import scratch_folder
+from impact_posture.scratch_folder import scratch_folder
 from impact_posture.toolchain import find_compiler, no_compiler, run_compiler, words_of
 from impact_posture.version import __version__
 

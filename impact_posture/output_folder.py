@@ -1,23 +1,15 @@
-"""Output folders and temporary folders: written whole or not at all, and never over the files of others.
+"""Output folders: written whole or not at all, and never over the files of others.
 
 Each output folder holds a record, ``.impact-posture.json``, of the files that were written into it.  ``--force``
 replaces a folder only if the record names every file in it.
-
-A temporary folder has the same file from its first moment on, locked by the process that works in it.  A folder that
-nobody locks is what a killed process left.  The next process that works in the same place removes it.
 """
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import secrets
-import shlex
-import shutil
-import sys
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -25,12 +17,9 @@ from typing import Any, Literal
 
 from impact_posture.errors import OutputError
 from impact_posture.processes import signals_held, undone
+from impact_posture.scratch_folder import RECORD, SCHEMA, SCRATCH, made_by, remove_scratch, scratch_folder
 
-RECORD = ".impact-posture.json"
-SCHEMA = "impact-posture/folder/1"
-_SCRATCH = ".impact-posture-"
 _SHOWN = 3
-_PROGRAM = "impact-posture"
 
 Kind = Literal["result", "export", "run", "comparison", "reproduction", "runs", "sweep", "world"]
 
@@ -107,7 +96,7 @@ def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None
         OSError: The record cannot be written.
     """
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
-    content = {"schema": SCHEMA, "kind": kind, "files": files, "products": sorted(products), **_made_by()}
+    content = {"schema": SCHEMA, "kind": kind, "files": files, "products": sorted(products), **made_by()}
     (folder / RECORD).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
@@ -117,11 +106,6 @@ def typed_command(folder: Path) -> str:
         return str(json.loads((folder / RECORD).read_text(encoding="utf-8")).get("command", ""))
     except (OSError, ValueError, AttributeError, RecursionError):
         return ""
-
-
-def _made_by() -> dict[str, str]:
-    program, *words = sys.argv or [""]
-    return {"command": shlex.join([_PROGRAM, *words])} if Path(program).stem == _PROGRAM else {}
 
 
 def is_ours(folder: Path, kind: Kind) -> bool:
@@ -239,9 +223,9 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
     except BaseException:
         os.rename(old, out)
         raise
-    swept = out.with_name(f"{_SCRATCH}{secrets.token_hex(4)}")
+    swept = out.with_name(f"{SCRATCH}{secrets.token_hex(4)}")
     os.rename(old, swept)
-    _remove(swept)
+    remove_scratch(swept)
 
 
 @contextmanager
@@ -263,74 +247,3 @@ def _parents_of(out: Path) -> Iterator[None]:
                 f"cannot be made ({error.strerror})", where=str(missing[-1]), hint="choose another --out"
             ) from None
         yield
-
-
-# ---- temporary folders ---------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Path]:
-    """Yield a temporary folder.  It is removed after the block, also after a signal.
-
-    Args:
-        parent: The folder above it; the system's temporary folder by default.
-        mode: Permissions; only the user can read it by default.
-
-    Raises:
-        OutputError: The system has no temporary folder.
-        OSError: The folder cannot be made.
-    """
-    try:
-        parent = Path(tempfile.gettempdir()) if parent is None else parent
-    except FileNotFoundError:
-        raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to one") from None
-    _sweep(parent)
-    folder = parent / f"{_SCRATCH}{secrets.token_hex(4)}"
-    # The folder does not exist yet, so no signal can come between.
-    with undone(lambda: _remove(folder)):
-        folder.mkdir(mode)
-        record = os.open(folder / RECORD, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        try:
-            # Where nothing can be locked, nothing is swept.
-            with suppress(OSError):
-                fcntl.flock(record, fcntl.LOCK_EX)
-            # This follows the lock.  A process that finds the record unlocked finds it empty, and leaves it alone.
-            content = {"schema": SCHEMA, "host": os.uname().nodename, **_made_by()}
-            os.write(record, json.dumps(content).encode())
-            yield folder
-        finally:
-            os.close(record)
-
-
-def _sweep(parent: Path) -> None:
-    """Remove the temporary folders that processes of this package left when they were killed."""
-    with suppress(OSError):
-        for folder in parent.glob(f"{_SCRATCH}*"):
-            with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
-                _sweep_one(folder)
-
-
-def _sweep_one(folder: Path) -> None:
-    if folder.is_symlink() or folder.stat().st_uid != os.geteuid():
-        return
-    record = os.open(folder / RECORD, os.O_RDWR | os.O_NOFOLLOW)
-    try:
-        # This fails while the process of the folder lives.
-        fcntl.flock(record, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        content = json.loads(os.read(record, 1 << 24))
-        # Locks may not reach across machines.  The record of a finished folder names no machine.
-        if content["schema"] == SCHEMA and content.get("host", os.uname().nodename) == os.uname().nodename:
-            _remove(folder)
-    finally:
-        os.close(record)
-
-
-def _remove(folder: Path) -> None:
-    """Remove a temporary folder and its record last, so that after an interruption it still counts as ours."""
-    with suppress(OSError):
-        for entry in os.scandir(folder):
-            if entry.is_dir(follow_symlinks=False):
-                shutil.rmtree(entry.path, ignore_errors=True)
-            elif entry.name != RECORD:
-                os.unlink(entry.path)
-    shutil.rmtree(folder, ignore_errors=True)

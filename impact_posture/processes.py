@@ -142,7 +142,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
         OSError: The system cannot fork.
     """
 
-    def begin() -> Callable[[None], Iterable[_Result]]:
+    def begin(_: Callable[[], bool]) -> Callable[[None], Iterable[_Result]]:
         result = function()
         return lambda _: [result]
 
@@ -152,13 +152,13 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
 
 @contextmanager
 def fork_server(
-    begin: Callable[[], Callable[[_Request], Iterable[_Result]]],
+    begin: Callable[[Callable[[], bool]], Callable[[_Request], Iterable[_Result]]],
 ) -> Iterator[Callable[[_Request], Iterator[_Result]]]:
-    """Start ``begin()`` in a copy of this process, and yield a function that sends one request to what it returns.
+    """Start ``begin`` in a copy of this process, and yield a function that sends one request to what it returns.
 
-    So the copy can do what needs no request, such as imports, while this process finds out what to request.  The
-    function yields the results as they come.  Exceptions of the copy are raised there.  The copy does not outlive
-    the block, and not the iteration.
+    So the copy can do what needs no request, such as imports, while this process finds out what to request.
+    ``begin`` takes a function that tells whether the request has come.  The yielded function yields the results as
+    they come.  Exceptions of the copy are raised there.  The copy does not outlive the block, and not the iteration.
 
     Raises:
         OSError: The system cannot fork.
@@ -200,11 +200,11 @@ def fork_server(
             ours.close()
 
 
-def _serve(begin: Callable[[], Callable[[Any], Iterable[Any]]], channel: Any) -> NoReturn:
+def _serve(begin: Callable[[Callable[[], bool]], Callable[[Any], Iterable[Any]]], channel: Any) -> NoReturn:
     """Run in the copy: send the results, and end without the clean-up of the original."""
     try:
         try:
-            for result in begin()(channel.recv()):
+            for result in begin(channel.poll)(channel.recv()):
                 channel.send((True, result))
             channel.send(None)
         except BaseException as error:

@@ -147,27 +147,32 @@ def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finish
     tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
     motion = motion_of(folder, document, prepared.impact.robot)
     view = result_view(prepared, initial, optimal, path, document, motion, mapped)
-    tasks += _drawings(view, folder, formats)
+    tasks += _drawings(view, folder, formats, report)
     count = len(tasks) + report
     scene: Scene | None = None
+    pictures: list[tuple[str, str]] = []
     with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
         if report:
             # This process would only wait.  What goes wrong here goes wrong again for the report, which says so.
             with suppress(Exception):
                 scene = _scene(prepared, view, meshes)
         for done, (index, result) in enumerate(results, start=1):
-            yield done, count, result if codegen and index == 0 else None
+            exported = codegen and index == 0
+            pictures += [] if exported else result
+            yield done, count, result if exported else None
     if report:
         # It shows the figures, so it comes last.
-        yield count, count, _report(folder, prepared, view, document, meshes, scene)
+        yield count, count, _report(folder, prepared, view, document, meshes, scene, sorted(pictures))
 
 
 def _scene(prepared: Prepared, view: ResultView, meshes: bool) -> Scene:
-    """Return the packed scene of the report."""
+    """Return the packed scene of the report, and load the viewer."""
+    from impact_posture.report.page import read_viewer
     from impact_posture.report.result_report import result_scene
 
     scene = result_scene(prepared, view, meshes)
     _ = scene.packed
+    read_viewer()
     return scene
 
 
@@ -178,12 +183,13 @@ def _report(
     document: dict[str, Any],
     meshes: bool,
     scene: Scene | None,
+    pictures: Sequence[tuple[str, str]],
 ) -> str:
     """Write the report; return why that failed, because a result is kept without it."""
     try:
         from impact_posture.report.result_report import write_result_report
 
-        write_result_report(folder, prepared, view, document, meshes=meshes, scene=scene)
+        write_result_report(folder, prepared, view, document, meshes=meshes, scene=scene, pictures=pictures)
     except Exception as error:
         return one_line(f"{type(error).__name__}: {error}")
     return ""
@@ -209,11 +215,18 @@ def _export(prepared: Prepared, optimal: np.ndarray, folder: Path) -> tuple[Expo
     return made, failure
 
 
-def _drawings(view: ResultView, folder: Path, formats: Sequence[str]) -> list[Callable[[], Any]]:
-    """Return a function for each figure that draws it."""
+def _drawings(
+    view: ResultView, folder: Path, formats: Sequence[str], report: bool
+) -> list[Callable[[], list[tuple[str, str]]]]:
+    """Return a function for each figure that draws it, and returns it as the report shows it."""
     from impact_posture.plot import draw_all, drawable
+    from impact_posture.report.page import figures
 
-    return [partial(draw_all, view, folder, formats, [name]) for name in drawable(view)]
+    def draw(name: str) -> list[tuple[str, str]]:
+        draw_all(view, folder, formats, [name])
+        return figures(folder, f"{name}.*") if report else []
+
+    return [partial(draw, name) for name in drawable(view)]
 
 
 def _write_json(path: Path, document: dict[str, object]) -> None:

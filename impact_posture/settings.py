@@ -69,7 +69,7 @@ class LoadOptions:
     lock: Annotated[
         tuple[str, ...],
         Setting(
-            "Joint made rigid, or a pattern in quotes such as 'gripper_*'; repeatable.",
+            "Make a joint rigid, or all that fit a pattern such as 'gripper_*' (in quotes); repeatable.",
             ROBOT, "JOINT", repeatable=True,
         ),
     ] = ()  # fmt: skip
@@ -85,12 +85,12 @@ class LoadOptions:
         ),
     ] = None  # fmt: skip
     config: Annotated[
-        str | None, Setting("Data of the robot that URDF cannot hold.", ROBOT, "ROBOT.TOML", "beside the URDF")
+        str | None, Setting("File of data that the URDF cannot hold.", ROBOT, "ROBOT.TOML", "beside the URDF")
     ] = None
     srdf: Annotated[
         str | None,
         Setting(
-            "Named postures, rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "robot.toml's"
+            "Named postures and rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "robot.toml's"
         ),
     ] = None  # fmt: skip
     package_dir: Annotated[
@@ -118,7 +118,7 @@ class ImpactSettings(RobotSettings):
     normal: Annotated[
         Vector3 | None,
         Setting(
-            "Direction out of the surface, towards the robot; any length. Required, or --contact.",
+            "Direction out of the surface, towards the robot, of any length. Required unless --contact is given.",
             CONTACT, "X Y Z", **demand.DIRECTION,
         ),
     ] = None  # fmt: skip
@@ -128,7 +128,7 @@ class ImpactSettings(RobotSettings):
             "Contact point from the frame's origin, in the frame, m.", CONTACT, "X Y Z", "0 0 0", **demand.NUMBERS
         ),
     ] = None
-    normal_frame: Annotated[NormalFrame, Setting("Axes of the normal.", CONTACT)] = "world"
+    normal_frame: Annotated[NormalFrame, Setting("Axes in which the normal is given.", CONTACT)] = "world"
     contact: Annotated[
         str | tuple[str, ...] | None,
         Setting(
@@ -142,14 +142,14 @@ class ImpactSettings(RobotSettings):
     restitution: Annotated[
         float,
         Setting(
-            "0 (plastic) to 1 (elastic).",
+            "Coefficient of restitution, 0 (plastic) to 1 (elastic).",
             CONTACT, **demand.SHARE,
         ),
     ] = 0.0  # fmt: skip
     contact_stiffness: Annotated[
         str | float | None,
         Setting(
-            f"Stiffness of the contact, or what a steel tip touches: {', '.join(MATERIALS)}.",
+            f"Stiffness of the contact, or the material that a steel tip touches: {', '.join(MATERIALS)}.",
             CONTACT, "N/M|MATERIAL", "not known", parse=parse_number_or_name,
             **demand.between(1.0, 1e12, "N/m", tuple(MATERIALS)),
         ),
@@ -162,7 +162,7 @@ class ImpactSettings(RobotSettings):
         ),
     ] = None  # fmt: skip
     friction: Annotated[
-        float, Setting("Friction of the impact, and of the feet.", CONTACT, **demand.ZERO_OR_MORE)
+        float, Setting("Friction coefficient at the impact and at the feet.", CONTACT, **demand.ZERO_OR_MORE)
     ] = FRICTION
     metric: Annotated[
         MetricKind,
@@ -171,7 +171,7 @@ class ImpactSettings(RobotSettings):
     weights: Annotated[
         str | tuple[float, ...] | None,
         Setting(
-            "Diagonal of the weighted metric: TOML of joint = weight, or 1/limit².", METRIC, "FILE|velocity-limits"
+            "Weights of the weighted metric: TOML of joint = weight, or 1/limit².", METRIC, "FILE|velocity-limits"
         ),
     ] = None  # fmt: skip
     objective: Annotated[
@@ -193,14 +193,14 @@ class ImpactSettings(RobotSettings):
     normal_cone: Annotated[
         float,
         Setting(
-            "Uncertainty of the normal.",
+            "Half angle of the cone of normals that are possible; the worst normal counts.",
             METRIC, "DEG", **demand.HALF_ANGLE,
         ),
     ] = 0.0  # fmt: skip
     armature_range: Annotated[
         tuple[float, float] | None,
         Setting(
-            "Lowest and highest factor on the armature; the worst case counts.",
+            "Lowest and highest factor on the armature that are possible; the worst case counts.",
             METRIC, "LOW HIGH", "as stated", **demand.FACTORS,
         ),
     ] = None  # fmt: skip
@@ -295,11 +295,11 @@ class ProblemSettings(ImpactSettings):
         0.05,
     )
     keep: Annotated[
-        tuple[str, ...], Setting("Frame whose pose is held; repeatable.", TASK, "FRAME", repeatable=True)
+        tuple[str, ...], Setting("Hold the pose of another frame; repeatable.", TASK, "FRAME", repeatable=True)
     ] = ()
     hold: Annotated[
         tuple[str, ...] | None,
-        Setting("Joint kept at its value; repeatable.", TASK, "JOINT", "robot.toml's", repeatable=True),
+        Setting("Keep a joint at its value; repeatable.", TASK, "JOINT", "robot.toml's", repeatable=True),
     ] = None
     base: Annotated[
         BaseMode | None,
@@ -344,21 +344,21 @@ class ProblemSettings(ImpactSettings):
     max_force: Annotated[
         float | None,
         Setting(
-            "Largest peak force, N, without friction; needs --contact-stiffness or --contact-duration.", TASK,
+            "Largest allowed peak force, N, without friction; needs --contact-stiffness or --contact-duration.", TASK,
             default="no bound", **demand.between(1e-6, 1e9, "N"),
         ),
     ] = None  # fmt: skip
     max_joint_jump: Annotated[
         float | None,
         Setting(
-            "Largest velocity jump of a joint without friction, rad/s or m/s.", TASK, default="no bound",
+            "Largest allowed velocity jump of a joint without friction, rad/s or m/s.", TASK, default="no bound",
             **demand.between(1e-6, 1e9, "rad/s or m/s"),
         ),
     ] = None  # fmt: skip
     max_torque: Annotated[
         float | None,
         Setting(
-            "Largest torque, N·m, with which the controller answers the jump; needs --velocity-gain.", TASK,
+            "Largest torque with which the controller may answer the jump, N·m; needs --velocity-gain.", TASK,
             default="no bound", **demand.between(1e-6, 1e9, "N·m"),
         ),
     ] = None  # fmt: skip
@@ -382,7 +382,7 @@ class ProblemSettings(ImpactSettings):
     surface: Annotated[
         str | float | None,
         Setting(
-            "Surface at the contact: its plane, none, or the edge length of a square of it in m.", TASK,
+            "Surface at the contact: an endless plane, none, or a square of this edge length, m.", TASK,
             "plane|none|M", f"the plane, or {PATCH:g} where the robot stands behind it", parse=parse_number_or_name,
             **demand.between(1e-3, 1e3, "m", ("plane", "none")),
         ),
@@ -398,8 +398,8 @@ class ProblemSettings(ImpactSettings):
     tradeoff: Annotated[
         int,
         Setting(
-            "Best objective within each of K distances from the start, which shows the gain of smaller changes; "
-            f"{TRADEOFF_POINTS} distances without K, none for 0.",
+            "Also find the best posture within each of K distances from the start, which shows what a smaller change "
+            f"gains; {TRADEOFF_POINTS} distances without K, none for 0.",
             TASK, "[K]", **demand.ZERO_OR_MORE,
         ),
     ] = 0  # fmt: skip
@@ -410,12 +410,12 @@ class ProblemSettings(ImpactSettings):
         ),
     ] = "distance"  # fmt: skip
     path: Annotated[
-        bool, Setting("Find a path from the start to the optimum on which all constraints hold, and time it.", TASK)
+        bool, Setting("Also find and time a path from the start to the optimum on which all constraints hold.", TASK)
     ] = False
     search: Annotated[
         Search,
         Setting(
-            "multistart, or global: all self-motions with 1 or 2 degrees of freedom left, else hops from the best.",
+            "multistart, or global: maps self-motions of 1 or 2 degrees of freedom, else hops from the best optimum.",
             OUTPUT, "HOW",
         ),
     ] = "multistart"  # fmt: skip

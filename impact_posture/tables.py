@@ -34,7 +34,7 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
     try:
         # As JSON, because strict dataclasses do not accept Python dictionaries.
         text = json.dumps(data, default=_plain)
-        made: _Table = _adapter(cls).validate_json(text)  # type: ignore[arg-type]
+        made: _Table = adapter(cls).validate_json(text)  # type: ignore[arg-type]
         return made
     except ValidationError as error:
         # A misspelt key is reported before the key that is then missing.
@@ -56,10 +56,17 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
         raise SpecError(f"key '{path}': {what}", where=where, hint=hint) from None
 
 
-def json_block(value: Any) -> dict[str, object]:
-    """Return the fields of a dataclass as JSON content, with arrays as lists."""
-    found = {field.name: getattr(value, field.name) for field in fields(value)}
-    return {name: entry.tolist() if hasattr(entry, "tolist") else entry for name, entry in found.items()}
+def json_block(value: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as JSON content: arrays as lists, and parts by their own ``to_dict``."""
+    return {field.name: _json(getattr(value, field.name)) for field in fields(value)}
+
+
+def _json(entry: Any) -> Any:
+    if isinstance(entry, tuple):
+        return [_json(part) for part in entry]
+    if hasattr(entry, "to_dict"):
+        return entry.to_dict()
+    return entry.tolist() if hasattr(entry, "tolist") else entry
 
 
 def _plain(value: Any) -> Any:
@@ -70,7 +77,8 @@ _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 
 @cache
-def _adapter(cls: type) -> Any:
+def adapter(cls: type) -> Any:
+    """Return the ``TypeAdapter`` of a dataclass, made once."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(cls)

@@ -40,9 +40,9 @@ import impact_posture.robot.robot_summary
 import impact_posture.verification.verification
 import impact_posture_cli.argv
 import impact_posture_cli.error_boundary
+import impact_posture_cli.impact_tables
 import impact_posture_cli.output
-import impact_posture_cli.progress
-import impact_posture_cli.tables  # noqa: F401
+import impact_posture_cli.progress_line  # noqa: F401
 from impact_posture_cli.app import COMMANDS, app, load
 
 with contextlib.suppress(ImportError):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.reader import read_manifest
 from impact_posture.libraries import build_library, library_path, load_library
-from impact_posture.output_folder import scratch_folder
+from impact_posture.scratch_folder import scratch_folder
 
 Vector = NDArray[Any]
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from impact_posture.controller_export import daqp_sources
+from impact_posture.controller_export import daqp_sources, render
 from tests.daqp import sources_or_skip
 from tests.relaxed_ticks import RelaxedTick
 
@@ -54,9 +54,11 @@ class Relaxation:
         """Compile in a folder; our own code without a warning."""
         for name, content in sources_or_skip().items():
             (folder / name).write_bytes(content)
+        for name, text in render.relaxation().items():
+            (folder / name).write_text(text, encoding="utf-8")
         compiler = ["cc", "-O1", "-fPIC", *flags]
         subprocess.run(
-            [*compiler, *_STRICT, "-isystem", str(folder), "-c", str(SOURCES / "relaxation.c"), "-o", "relaxation.o"],
+            [*compiler, *_STRICT, "-isystem", str(folder), "-c", "relaxation.c"],
             cwd=folder, check=True,
         )  # fmt: skip
         subprocess.run(

@@ -21,7 +21,7 @@ from impact_posture.tsid.qp import Solver
 # Scenario, force (N) on the frame of the push from 0.2 s to 0.6 s, seconds.
 RUNS = {
     "tilthex_arm": ("aerial-vertical", "ee", (0.0, 60.0, 40.0), 2.0),
-    "solo8": ("solo8-push", "base_link", (25.0, 15.0, 0.0), 2.0),
+    "solo8": ("solo8-push", "base_link", (150.0, 80.0, 0.0), 2.0),
     "talos": ("talos-push", "torso_2_link", (150.0, 60.0, 0.0), 2.0),
     "g1": ("g1-strike", "torso_link", (60.0, 40.0, 0.0), 2.0),
 }

@@ -62,6 +62,20 @@ def test_the_polygon_of_the_feet_is_the_convex_hull(corners: list[tuple[float, f
         assert np.abs(np.column_stack([normals, -offsets]) - [*n, b]).max(axis=1).min() < 1e-6
 
 
+coarse = st.lists(st.tuples(*[st.sampled_from([-0.1, 0.0, 0.1])] * 2), min_size=3, max_size=9)
+
+
+@given(coarse, st.integers(0, 10**6))
+@settings(max_examples=60, deadline=None)
+def test_feet_in_a_row_whose_places_are_inexact_keep_their_corners(
+    corners: list[tuple[float, float]], seed: int
+) -> None:
+    points = np.array(corners) + 1e-10 * np.random.default_rng(seed).normal(size=(len(corners), 2))
+    found = polygon_edges(points)
+    if found is not None:
+        assert (points @ found[0].T <= found[1] + 1e-8).all()
+
+
 def _objective(robot: str, frame: str) -> ImpactObjective:
     problem = prepare(ProblemSettings(robot=robot, frame=frame, normal=(0.0, 0.0, 1.0), collision=False)).problem
     return problem.impact
@@ -77,7 +91,7 @@ def test_code_from_the_cache_is_the_code(
     def texts(**changed: object) -> list[str]:
         exported = named_objectives([changed.pop("objective", objective)], "a")
         code = build_code(exported, "a", changed.pop("real", DOUBLE), **changed)
-        from impact_posture.codegen.manifest import build_manifest
+        from impact_posture.codegen.manifest_builder import build_manifest
         from impact_posture.codegen.render import render
 
         manifest = build_manifest([v.objective for v in exported][:1], "a", None, None, DOUBLE, code.stack_bytes)
@@ -151,7 +165,8 @@ def test_an_answer_of_a_small_robot_imports_no_part_of_scipy() -> None:
     """A part of SciPy takes longer to import than such a problem takes to solve."""
     program = """if True:
         import sys
-        from impact_posture.front_door import PostureProblem, optimize
+        from impact_posture.front_door import optimize
+        from impact_posture.front_door_problem import PostureProblem
         from impact_posture.posture.problem_settings import prepare
         from impact_posture.settings import ProblemSettings
 

@@ -150,6 +150,25 @@ def test_distances_and_their_gradient(name: str) -> None:
     assert seen > 10
 
 
+def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> None:
+    """Else a plane of the program that cuts corners without rows would look like a trap."""
+    robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
+    constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
+    numeric, seen = Numeric(robot.model), set[bool]()
+    for _ in range(40):
+        values = constraint.value(numeric.at(_random(robot, rng)))
+        last, now = constraint, constraint.grown(numeric)
+        while now is not last:
+            last, now = now, now.grown(numeric)
+        assert set(now.active) == set(np.flatnonzero(values < 0))
+        for k, corners in now.active.items():
+            one = now._separators[k]
+            seen.add(one.known)
+            whole = set(range(len(one._x))), set(range(len(one._y)))
+            assert one.known or (corners.a, corners.b) == whole
+    assert seen == {False, True}
+
+
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_bound_on_distances_is_one(seed: int) -> None:
@@ -157,11 +176,15 @@ def test_bound_on_distances_is_one(seed: int) -> None:
     robot = load_robot("tilthex_arm")
     separators = [_separator(robot, kind) for kind in KINDS]
     constraint = Clearance("c", separators, "words")
-    numeric = Numeric(robot.model).at(_random(robot, np.random.default_rng(seed)))
-    values = constraint.evaluate(numeric)[0]
-    exact = np.array([one.distance(numeric)[0] for one in separators])
-    assert (values <= exact + 1e-9).all()
-    assert ((values < 0) == (exact < 0)).all()
+    rng = np.random.default_rng(seed)
+    numeric, q = Numeric(robot.model), _random(robot, rng)
+    for size in (0.0, 1e-3, 0.03, 0.3, 1.0):
+        # What was exact before bounds what comes after.
+        q = pin.integrate(robot.model, q, size * rng.normal(size=robot.nv))
+        values = constraint.evaluate(numeric.at(q))[0]
+        exact = np.array([one.distance(numeric)[0] for one in separators])
+        assert (values <= exact + 1e-9).all()
+        assert ((values < 0) == (exact < 0)).all() and np.allclose(values[exact < 0], exact[exact < 0])
 
 
 def _problem(**changes: object) -> ProblemSettings:

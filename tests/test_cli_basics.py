@@ -318,7 +318,7 @@ def test_a_traceback_comes_only_when_asked_for(
 
 
 def test_a_long_wait_is_estimated_from_the_pace_so_far() -> None:
-    from impact_posture_cli.progress import _time_left
+    from impact_posture_cli.progress_line import _time_left
 
     assert _time_left(30.0, 10, 20) == ", 0:01:00 left"
     # No pace yet, and nothing left.

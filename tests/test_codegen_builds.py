@@ -17,14 +17,14 @@ from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export, write_export
 from impact_posture.codegen.functions import casadi_reference, oracle_reference
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.manifest import sample_postures
+from impact_posture.codegen.manifest_builder import sample_postures
 from impact_posture.codegen.naming import products
 from impact_posture.errors import CompilerError, InputError, OutputError
-from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.output_folder import RECORD
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.scratch_folder import RECORD
 from impact_posture.settings import LoadOptions
 from impact_posture.toolchain import run_compiler
 from tests import command, exported
@@ -164,7 +164,7 @@ def test_stack_stays_below_its_bound(arm: ImpactObjective, tmp_path: Path, real:
 def test_stack_of_a_robot_that_stands(tmp_path: Path, tool: str) -> None:
     need(tool)
     solo8 = load_robot("solo8")
-    feet = tuple(Support.from_spec(s) for s in solo8.spec.supports)
+    feet = solo8.spec.supports
     objective = ImpactObjective(solo8, ImpactContact("base_link", (1, 0, 0)), supports=feet)
     bound = export(objective, tmp_path, prefix="solo8", check=False).manifest["stack_bytes"]
     deepest = deepest_stack(tmp_path, "solo8", tool, "-O3 -mavx512f -mfma")
@@ -397,6 +397,7 @@ def test_command_refuses(tmp_path: Path, arguments: tuple[str, ...], code: int, 
 def test_one_library_checks_a_source_with_any_posture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     need_compiler()
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("CFLAGS", "-O0")
     objective = ImpactObjective(load_robot("panda"), ImpactContact("panda_link8", (0, 0, 1)))
     made = []
     for number, posture in enumerate(sample_postures(objective.robot, 2, 0)):

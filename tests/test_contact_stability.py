@@ -30,7 +30,7 @@ FEET = {"solo8": 4, "solo12": 4, "talos": 2}
 
 def standing(name: str) -> tuple[Robot, tuple[Support, ...]]:
     found = robot(name)
-    return found, tuple(Support.from_spec(s) for s in found.spec.supports)
+    return found, found.spec.supports
 
 
 def oracle_of(name: str, normal: tuple[float, float, float], frame: str = "base_link") -> ImpactOracle:

@@ -107,7 +107,9 @@ def test_value_and_gradient_agree_three_ways(name: str) -> None:
         assert_coulomb(o.mobility, o.normal, friction, impact.impulse, 1e-8)
         assert_close(oracle.at(q).solve(oracle.J.T @ impact.impulse), impact.jump, 1e-8, where)
         limit = o.S if impact.sticks else o.V if friction == 0 else None
-        assert limit is None or abs(value / limit - 1) < 1e-14, where
+        # Both solve with M, each in its own order.
+        rounding = 4 * np.finfo(float).eps * np.linalg.cond(oracle.M)
+        assert limit is None or abs(value / limit - 1) < rounding, where
         differences = central_gradient(objective.value, found.model, q, STEP)
         assert_close(gradient, differences, 1e-6, f"differences ({where})", value)
         if name in WHOLE or index == 0:

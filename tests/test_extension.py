@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import shutil
-import subprocess
 import sys
 import tomllib
 from dataclasses import dataclass, replace
@@ -43,7 +41,6 @@ from .experiments.conftest import shortened as cut
 from .helpers import Vector, robot
 from .simulation.factories import controller_factory, factory, needs_mujoco, shortened
 
-COMMAND = Path(sys.executable).parent / "impact-posture"
 EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "setback"
 
 
@@ -171,15 +168,7 @@ def test_the_installed_command_runs_a_registered_controller(setback: ModuleType,
     scenario.write_text(cut("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05), encoding="utf-8")
 
     words = ("simulate", scenario, "--json", "--controller")
-    path = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run(
-        [COMMAND, *words, "setback", "--no-report"],
-        cwd=tmp_path,
-        env=path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = start(*words, "setback", "--no-report", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     found = json.loads(done.stdout)
     assert (found["controller"], found["status"], found["warnings"]) == ("setback", "completed", [])

@@ -53,7 +53,7 @@ def quantities(
 
 
 def feet(found: Robot) -> tuple[Support, ...]:
-    return tuple(Support.from_spec(s) for s in found.spec.supports)
+    return found.spec.supports
 
 
 def jacobians(found: Robot, q: Vector, supports: tuple[Support, ...]) -> tuple[Vector, Vector, Vector]:

@@ -17,7 +17,7 @@ import pytest
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.manifest import sample_postures
+from impact_posture.codegen.manifest_builder import sample_postures
 from impact_posture.errors import (
     CompilerError,
     FrameNotFound,

@@ -43,7 +43,7 @@ FRAMES = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "bolt": "base_link", "
 
 
 def feet_of(found: Robot) -> tuple[Support, ...]:
-    return tuple(Support.from_spec(s) for s in found.spec.supports)
+    return found.spec.supports
 
 
 # ---- what a model variant is ------------------------------------------------------------------------------------

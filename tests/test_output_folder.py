@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from impact_posture.errors import OutputError
-from impact_posture.output_folder import RECORD, Kind, add_to_record, check_output, scratch_folder, whole_folder
+from impact_posture.output_folder import Kind, add_to_record, check_output, whole_folder
+from impact_posture.scratch_folder import RECORD, scratch_folder
 
 
 def write(out: Path, text: str, *, force: bool = False, kind: Kind = "result") -> None:
@@ -223,7 +224,8 @@ def test_failure_inside_leaves_nothing_and_made_parents_go(tmp_path: Path) -> No
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from impact_posture.output_folder import scratch_folder, whole_folder
+from impact_posture.output_folder import whole_folder
+from impact_posture.scratch_folder import scratch_folder
 
 with whole_folder(Path(sys.argv[1], "out"), force=False, kind="result") as folder, scratch_folder(folder):
     (folder / "half").write_text("x")

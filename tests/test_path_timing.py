@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from impact_posture.arrays import Array
-from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.path import timing
 from impact_posture.path.actuator_limits import ActuatorLimits
@@ -179,7 +179,7 @@ def vars_of(made: Robot) -> dict[str, object]:
 def test_a_light_standing_robot_rests_and_a_slippery_one_does_not(name: str) -> None:
     """Level ground needs no friction at rest in a symmetric stance, but some for a push sideways."""
     loaded = robot(name)
-    supports = tuple(Support.from_spec(s) for s in loaded.spec.supports)
+    supports = loaded.spec.supports
     objective = ImpactObjective(loaded, ImpactContact(loaded.spec.contact.frame, (1, 0, 0)), supports=supports)
     q, zero = loaded.posture(), np.zeros(loaded.nv)
     limits = ActuatorLimits(objective, q, Requirements(friction=0.7))

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture.early_writer import early_writer
+from impact_posture.early_writer import early_writer, load
 from impact_posture.errors import (
     ControllerNotFound,
     ImpactPostureError,
@@ -305,9 +305,14 @@ def test_no_copy_outlives_its_block(tmp_path: Path) -> None:
 def test_a_server_begins_before_it_is_asked_and_answers_as_it_goes(tmp_path: Path) -> None:
     begun = tmp_path / "begun"
 
-    def begin() -> Callable[[list[int]], Iterator[tuple[int, int]]]:
+    def begin(requested: Callable[[], bool]) -> Callable[[list[int]], Iterator[tuple[int, int]]]:
+        assert not requested()
         begun.touch()
-        return lambda numbers: ((number**2, os.getpid()) for number in numbers)
+        end = time.monotonic() + 30
+        while not requested() and time.monotonic() < end:
+            time.sleep(0.001)
+        known = requested()
+        return lambda numbers: ((number**2 if known else 0, os.getpid()) for number in numbers)
 
     with fork_server(begin) as ask:
         end = time.monotonic() + 30
@@ -324,7 +329,7 @@ def test_a_server_begins_before_it_is_asked_and_answers_as_it_goes(tmp_path: Pat
 
 @pytest.mark.parametrize("early", [True, False])
 def test_a_servers_fault_is_raised_where_it_is_asked(early: bool) -> None:
-    def begin() -> Callable[[int], Iterator[float]]:
+    def begin(_: Callable[[], bool]) -> Callable[[int], Iterator[float]]:
         if early:
             raise InputError("is wrong", where="the copy", hint="correct it")
         return lambda number: iter([1.0, 1.0 / number])
@@ -339,11 +344,26 @@ def test_an_iteration_that_is_left_leaves_no_server() -> None:
         yield from range(start, 1000)
         time.sleep(60)
 
-    with fork_server(lambda: count) as ask:
+    with fork_server(lambda _: count) as ask:
         answers = ask(0)
         pid = next(answers)
         del answers
         assert gone([pid], within=1.0)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_writer_prepares_more_only_while_nothing_is_requested(late: bool, tmp_path: Path) -> None:
+    done: list[str] = []
+
+    def prepare() -> list[str]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("impact_posture.codegen.export.cached_code", lambda *_: done.append("code"))
+            load(ProblemSettings(robot="tilthex_arm", normal=(0, 0, 1)), tmp_path, False, False, lambda: late)
+        return done
+
+    # In a copy, because it moves the temporary folder of its process.
+    with fork_call(prepare) as collect:
+        assert collect() == ([] if late else ["code"])
 
 
 def test_where_nothing_can_be_forked_the_solving_process_writes(monkeypatch: pytest.MonkeyPatch) -> None:

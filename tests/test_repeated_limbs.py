@@ -219,10 +219,11 @@ def test_limbs_are_outermost_and_disjoint() -> None:
                 assert model.joints[i].shortname() == model.joints[j].shortname()
 
 
-@pytest.mark.parametrize("count", [2, 4, 5])
+# Five limbs are a vector of four and one alone.
+@pytest.mark.parametrize("count", [2, 5])
 def test_compiled_limbs(tmp_path: Path, count: int) -> None:
     need_compiler()
-    (tmp_path / "t.urdf").write_text(limbs_urdf([0, 4, 2], count, 7, odd=True))
+    (tmp_path / "t.urdf").write_text(limbs_urdf([0, 4, 2], count, 7, odd=count == 2))
     loaded = load_robot(str(tmp_path / "t.urdf"), LoadOptions(root="free-flyer"))
     objective = ImpactObjective(loaded, ImpactContact("b1_2", (0.3, -0.4, 0.9)), kind="sticking")
     export(objective, tmp_path, prefix="t", check=False)

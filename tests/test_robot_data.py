@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 import impact_posture_robots
-from impact_posture.robot.spec import RobotSpec, SupportSpec, read_spec
+from impact_posture.robot.spec import RobotSpec, Support, read_spec
 
 ROBOTS = Path(impact_posture_robots.__path__[0])
 NAMES = sorted(p.parent.name for p in ROBOTS.glob("*/robot.toml"))
@@ -101,7 +101,7 @@ def limits(name: str) -> dict[str, tuple[float, float]]:
     return result | dict(spec.limits.position)
 
 
-def support_points(support: SupportSpec, data: pin.Data, model: pin.Model) -> np.ndarray:
+def support_points(support: Support, data: pin.Data, model: pin.Model) -> np.ndarray:
     """Corners of the sole (one point for a point foot), in the world."""
     placement = data.oMf[body_frame(model, support.frame)]
     x, y = support.size

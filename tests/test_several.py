@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impact_posture.codegen.manifest import sample_postures
+from impact_posture.codegen.manifest_builder import sample_postures
 from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError, SpecError
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.evaluation import evaluate
@@ -177,7 +177,7 @@ def test_subgradients_at_a_mirror_symmetric_posture(name: str, frames: tuple[str
 
 def test_both_hands_of_talos_by_hand() -> None:
     found = robot("talos")
-    feet = tuple(Support.from_spec(s) for s in found.spec.supports)
+    feet = found.spec.supports
     right, left = (
         ImpactContact(frame, (-1.0, 0.0, 0.2), impulse=i) for frame, i in zip(HANDS, (1.0, 2.0), strict=True)
     )

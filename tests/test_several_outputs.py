@@ -11,8 +11,8 @@ import pytest
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.manifest import sample_postures
-from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.codegen.manifest_builder import sample_postures
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import build_library, library_path
@@ -60,7 +60,7 @@ def test_exported_frame_struck_along_two_normals(tmp_path: Path) -> None:
     make = need("make")
     need_compiler()
     found = robot("bolt")
-    feet = tuple(Support.from_spec(s) for s in found.spec.supports)
+    feet = found.spec.supports
     contacts = [ImpactContact("base_link", n, impulse=i) for n, i in (((0, 0, 1), 1.0), ((1, 0, 0.2), 2.0))]
     objective = ImpactObjective(
         found, contacts[0], Metric("kinetic"), supports=feet, others=(contacts[1],), bilateral=True

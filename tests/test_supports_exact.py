@@ -51,7 +51,7 @@ def sixty_digits() -> Iterator[None]:
 
 def feet(found: Robot) -> tuple[Support, ...]:
     """The robot's feet; solo8's by their centers, where straight legs are singular."""
-    own = tuple(Support.from_spec(s) for s in found.spec.supports)
+    own = found.spec.supports
     return tuple(replace(s, offset=(0.0, 0.0, 0.0)) for s in own) if found.name == "solo8" else own
 
 
@@ -235,7 +235,7 @@ def test_the_limit_of_no_compliance_is_not_smooth() -> None:
 def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
     """Rigid contacts by Pinocchio: within ``ε/(σ+ε)`` of ours, and what ours extrapolate to at no compliance."""
     found = robot(name)
-    supports = tuple(Support.from_spec(s) for s in found.spec.supports)[:count]
+    supports = found.spec.supports[:count]
     base = replace(objective(name, 1e-4), supports=supports)
     (q,) = random_configurations(found.model, 1, name, count, "full rank", spread=0.5)
     rigid = Rigid(base, q)

@@ -249,6 +249,7 @@ def test_a_solver_that_gives_up_holds_the_last_command(monkeypatch: pytest.Monke
     working, aside = controller._solver, controller._aside
     # The one that is called aside helps out...
     controller._solver = Refusing()
+    monkeypatch.setattr(relaxation, "DaqpSolver", lambda n, m, **options: Refusing())
     command = controller.tick(0.001, r.posture(), np.zeros(r.nv))
     assert command.status is Status.SOLVED and np.allclose(command.u, before.u, rtol=0, atol=1e-6)
     # ... where it does not, the levels without the cost do ...

@@ -22,7 +22,7 @@ from impact_posture.posture.solve import solve
 from impact_posture.tsid.activation import Activation, Phase
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.frame_tasks import FramePose
-from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
+from impact_posture.tsid.impact_robust import ImpactRobustPosture, curvature_scale, gradient_of
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
@@ -379,3 +379,15 @@ def test_the_documentations_example_runs(exported: dict[str, ImpactGradient], tm
     before, after = (float(line.split(":")[1].split(";")[0]) for line in done.stdout.splitlines()[:2])
     assert after < 0.5 * before
     assert "free, solved" in done.stdout
+
+
+def test_the_scale_of_the_term_does_not_depend_on_the_basis_of_the_redundancy() -> None:
+    """The exported controller computes another basis, and differences along it would differ by their own error."""
+    r, generator = robot("panda"), rng("basis")
+    Z, turn = (np.linalg.qr(generator.normal(size=shape))[0] for shape in ((r.nv, 3), (3, 3)))
+
+    def gradient(q: np.ndarray) -> tuple[float, np.ndarray]:
+        return 1.0, np.sin(30.0 * q)
+
+    first, other = (curvature_scale(gradient, r.model, r.posture(), basis, "term") for basis in (Z, Z @ turn))
+    assert first > 1.0 and other == pytest.approx(first, rel=1e-13)

@@ -7,7 +7,7 @@ import importlib.util
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,15 @@ from impact_posture.verification import verification as module
 from impact_posture.verification.differences import difference_gradient
 from impact_posture.verification.samples import Sample, random_samples
 from impact_posture.verification.sources import Numbers, casadi_source, pinocchio_numbers
-from impact_posture.verification.verification import CASADI, COMPILED, DIFFERENCES, MUJOCO, verify
-from impact_posture.verification.verification_report import Row, VerificationReport
+from impact_posture.verification.verification import (
+    CASADI,
+    COMPILED,
+    DIFFERENCES,
+    MUJOCO,
+    Row,
+    VerificationReport,
+    verify,
+)
 from tests.command import run
 from tests.helpers import NAMES, Vector, robot
 from tests.test_dynamics import write_urdf
@@ -343,7 +350,7 @@ def test_the_document() -> None:
 
 
 def report_like(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [Row(**row).to_dict() for row in rows]
+    return [asdict(Row(**row)) for row in rows]
 
 
 def test_a_failure_is_exit_code_1_and_one_line(

@@ -10,7 +10,7 @@ from impact_posture_cli import options
 from impact_posture_cli.controller_code import write_controller
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:

@@ -10,13 +10,13 @@ import typer
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Processes, ScenarioName, Seeds, rows_table
 from impact_posture_cli.output import Page, complain, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 
 Controllers = Annotated[
     str,
     typer.Option(
         "--controllers", metavar="A,B,…", rich_help_panel=RUN,
-        help="Names as in simulate; robust:held holds the reached posture, robust:free leaves the feet away.",
+        help="Names as in simulate. robust:held is robust with --mode held, and robust:free is robust with --free.",
     ),
 ]  # fmt: skip
 Out = Annotated[str | None, options.out_option("Folder for comparison.json and figures.", "none")]
@@ -40,7 +40,7 @@ def compare(
     labels = [text.strip() for text in controllers.split(",") if text.strip()]
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
-    from impact_posture.experiment.folders import FORMATS, store_beside, write_comparison
+    from impact_posture.experiment.folders import FORMATS, Output, store_beside, write_comparison
     from impact_posture.experiment.reproduction import reproduce
     from impact_posture.output_folder import check_output
 
@@ -53,10 +53,8 @@ def compare(
     with progress("running", "runs", shown=not (quiet or json)) as advance:
         found = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
         if folder is not None and store is not None:
-            failure = write_comparison(
-                folder, found, plan, store,
-                force=force, formats=format or FORMATS, report=not no_report, meshes=meshes,
-            )  # fmt: skip
+            output = Output(folder, force, format or FORMATS, not no_report, meshes)
+            failure = write_comparison(output, found, store)
     if failure and not quiet:
         complain(f"warning: there is no report.html: {failure}")
     if json:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from impact_posture.settings import ImpactSettings
 from impact_posture_cli import options
+from impact_posture_cli.impact_tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 from impact_posture_cli.output import Page, number, print_json, vector
 from impact_posture_cli.settings_options import Given, with_settings
-from impact_posture_cli.tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 
 if TYPE_CHECKING:
     from impact_posture.impact.classical_ellipsoids import Ellipsoid
@@ -68,22 +68,16 @@ def evaluate(
 def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
     from impact_posture.impact.quantity_table import quantities
 
-    mine, free = (
-        found.scalars.to_dict(),
-        found.without_supports.to_dict() if found.without_supports is not None else None,
-    )
-    mass = (
-        found.scalars.effective_mass,
-        None if found.without_supports is None else found.without_supports.effective_mass,
-    )
+    shown = [scalars for scalars in (found.scalars, found.without_supports) if scalars is not None]
+    blocks = [scalars.to_dict() for scalars in shown]
     rows = [
-        (f"  {key}", number(mine[key]), *(() if free is None else (number(free[key]),)), unit, words)
+        (f"  {key}", *(number(block[key]) for block in blocks), unit, words)
         for key, unit, words in quantities(impact.metric)
     ]
-    masses = [number(value, missing="unbounded") for value in (mass if free is not None else mass[:1])]
+    masses = [number(scalars.effective_mass, missing="unbounded") for scalars in shown]
     rows.append(("  1/G", *masses, "kg", "effective mass along n"))
     page.gap()
-    values = ("value",) if free is None else ("standing", "free")
+    values = ("standing", "free") if len(shown) > 1 else ("value",)
     page.table(("", *values, "unit", "meaning"), rows, right=tuple(range(1, 1 + len(values))))
     letters = {"impulse": f"λ̄²H, λ̄ = {impact.contact.impulse:g} N·s", "speed": "V", "sticking": "S", "energy": "E"}
     letters["coulomb"] = f"C, μ = {impact.contact.friction:g}"
@@ -100,7 +94,6 @@ def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
 
 
 def _ellipsoids(page: Page, impact: ResolvedImpact, ellipsoids: dict[str, Ellipsoid]) -> None:
-
     units = {"velocity": "m/s of |ν| = 1", "force": "N of |τ| = 1"}
     kinetic = impact.metric.kind == "kinetic"
     rows = []

@@ -22,8 +22,8 @@ WriteRobotToml = Annotated[
     str | None,
     typer.Option(
         "--write-robot-toml", metavar="[FILE.toml]", rich_help_panel=OUTPUT,
-        help="Draft the robot.toml of a URDF, every guess marked; without FILE beside the URDF, or here as NAME.toml "
-        "where the URDF is in a package.",
+        help="Draft a robot.toml for a URDF, with every guess marked. Without FILE it is written beside the URDF, or "
+        "here as NAME.toml if the URDF belongs to a package.",
     ),
 ]  # fmt: skip
 ForceFile = Annotated[bool, typer.Option("--force", rich_help_panel=OUTPUT, help="Replace an existing robot.toml.")]
@@ -122,7 +122,6 @@ def _constraints(constraints: dict[str, Any]) -> str:
 
 
 def _joints(page: Page, summary: dict[str, Any]) -> None:
-
     def limits(joint: dict[str, Any]) -> str:
         if joint["lower"] is None and joint["upper"] is None:
             return "none"
@@ -171,7 +170,6 @@ def _postures(page: Page, summary: dict[str, Any]) -> None:
 
 
 def _actuation(page: Page, actuation: dict[str, Any]) -> None:
-
     page.gap()
     condition = number(actuation["condition"], missing="infinite")
     page.title(

@@ -9,10 +9,10 @@ import typer
 
 from impact_posture.settings import ProblemSettings
 from impact_posture_cli import options
+from impact_posture_cli.impact_tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 from impact_posture_cli.output import Page, number, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import Given, with_settings
-from impact_posture_cli.tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 
 if TYPE_CHECKING:
     from impact_posture.posture.problem_settings import Prepared
@@ -51,8 +51,8 @@ def optimize(
     from impact_posture.early_writer import early_writer
 
     with early_writer(settings, jobs, report=not no_report, meshes=meshes) as finish:
-        from impact_posture.front_door import PostureProblem
         from impact_posture.front_door import optimize as solve
+        from impact_posture.front_door_problem import PostureProblem
         from impact_posture.output_folder import check_output
         from impact_posture.posture.problem_settings import prepare
         from impact_posture.result_folder import FORMATS, default_out
@@ -140,7 +140,6 @@ def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
 
 
 def _announce(page: Page, prepared: Prepared) -> None:
-
     if page.quiet:
         return
     impact, problem = prepared.impact, prepared.problem

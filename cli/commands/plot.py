@@ -9,14 +9,14 @@ import typer
 
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 
 ResultFolder = Annotated[str, typer.Argument(metavar="RESULT_DIR", help="A folder that optimize wrote.")]
 Figures = Annotated[
     list[str] | None,
     typer.Option(
         "--figure",
-        help="ellipsoid, postures, jump, nullspace, classical, tradeoff or self_motion; repeatable.",
+        help="Figure to draw: ellipsoid, postures, jump, nullspace, classical, tradeoff or self_motion; repeatable.",
         show_default="all",
     ),
 ]

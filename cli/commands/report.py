@@ -11,7 +11,7 @@ import typer
 from impact_posture.escape import printable
 from impact_posture_cli import options
 from impact_posture_cli.output import print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 
 OutputFolder = Annotated[
     str, typer.Argument(metavar="DIR", help="A folder that optimize, simulate or compare --out wrote.")

@@ -10,19 +10,19 @@ import typer
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Processes, Seeds, rows_table
 from impact_posture_cli.output import Page, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 
 All = Annotated[
     bool,
     typer.Option(
         "--all",
         rich_help_panel=RUN,
-        help="Every controller, not only nominal, robust, robust-flow and the recommended.",
+        help="Run every controller, not only nominal, robust, robust-flow and the recommended ones.",
     ),
 ]
 Scenarios = Annotated[
     list[str] | None,
-    typer.Option("--scenario", rich_help_panel=RUN, show_default="all four", help="That one only; repeatable."),
+    typer.Option("--scenario", rich_help_panel=RUN, show_default="all four", help="Run this one only; repeatable."),
 ]
 Out = Annotated[str, options.out_option("Folder of the results.")]
 
@@ -41,7 +41,7 @@ def reproduce(
 ) -> None:
     """Run ``impact-posture reproduce``."""
     from impact_posture.errors import ScenarioNotFound
-    from impact_posture.experiment.folders import FORMATS, store_beside, write_reproduction
+    from impact_posture.experiment.folders import FORMATS, Output, store_beside, write_reproduction
     from impact_posture.experiment.paper import PAPER
     from impact_posture.experiment.reproduction import controllers_of
     from impact_posture.experiment.reproduction import reproduce as reproduce_all
@@ -58,8 +58,7 @@ def reproduce(
     with progress("running", "runs", shown=not (quiet or json)) as advance:
         plan = {name: controllers_of(name, all_) for name in scenarios}
         found = reproduce_all(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
-        formats = format or FORMATS
-        document = write_reproduction(folder, found, plan, store, force=force, formats=formats)
+        document = write_reproduction(Output(folder, force, format or FORMATS), found, store)
     if json:
         print_json(document)
         return

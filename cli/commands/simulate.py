@@ -11,7 +11,7 @@ import typer
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Mode, ScenarioName
 from impact_posture_cli.output import Page, complain, number, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import positive
 
 # Exit code of a run that did not complete.
@@ -31,17 +31,17 @@ RunMode = Annotated[
     Mode,
     typer.Option(
         "--mode", rich_help_panel=RUN,
-        help="live: the term stays on through the impact; held: the reached posture is held before it.",
+        help="live keeps the impact-robust term on in the impact; held keeps the posture that was reached before.",
     ),
 ]  # fmt: skip
 Free = Annotated[
-    bool, typer.Option("--free", rich_help_panel=RUN, help="Gradient and optimum of the robot without its feet.")
+    bool, typer.Option("--free", rich_help_panel=RUN, help="Gradient and optimum as if the feet were in the air.")
 ]
 Gain = Annotated[
     float | None,
     typer.Option(
         "--gain", rich_help_panel=RUN, callback=positive, show_default="the scenario's",
-        help="K of the impact-robust term, 1/s².",
+        help="Gain K of the impact-robust term, 1/s².",
     ),
 ]  # fmt: skip
 Sign = Annotated[
@@ -81,8 +81,8 @@ def simulate(
 ) -> None:
     """Run ``impact-posture simulate``."""
     from impact_posture.escape import file_name
-    from impact_posture.experiment.folders import FORMATS, write_simulation
-    from impact_posture.experiment.jobs import Job, execute
+    from impact_posture.experiment.folders import FORMATS, Output, write_simulation
+    from impact_posture.experiment.jobs import Job, execute, worth_compiling
     from impact_posture.experiment.statistics import fate
     from impact_posture.output_folder import check_output
     from impact_posture.posture.nlp import one_blas_thread
@@ -92,16 +92,15 @@ def simulate(
         _export_world(Page(quiet=quiet or json), scenario, Path(export_world), force)
         return
     name = read_scenario(scenario).name
-    job = Job(scenario, controller, seed, mode, free, gain, None if sign is None else int(sign))
+    only, code = None if sign is None else int(sign), worth_compiling(compile, 1)
+    job = Job(scenario, controller, seed, mode, free, gain, only, code)
     folder = Path(out) if out else Path(file_name(f"{name}-{job.label.replace(':', '-')}"))
     check_output(folder, force=force, kind="run")
     with progress("running", shown=not (quiet or json)):
         with one_blas_thread():
-            runs, document = execute(job, compile=compile)
-        formats = format or FORMATS
-        failure = write_simulation(
-            folder, job, runs, document, force=force, formats=formats, report=not no_report, meshes=meshes
-        )
+            runs, document = execute(job)
+        output = Output(folder, force, format or FORMATS, not no_report, meshes)
+        failure = write_simulation(output, job, runs, document)
     if failure and not quiet:
         complain(f"warning: there is no report.html: {failure}")
     if json:
@@ -127,7 +126,6 @@ def _export_world(page: Page, scenario: str, out: Path, force: bool) -> None:
 
 
 def _rigid(prediction: dict[str, Any]) -> str:
-
     if prediction["sticking"] is None:
         return f"{number(prediction['frictionless'], missing='–')} if nobody controlled"
     named = {"frictionless": "without friction", "coulomb": "with the surface's", "sticking": "sticking"}
@@ -135,7 +133,6 @@ def _rigid(prediction: dict[str, Any]) -> str:
 
 
 def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> None:
-
     page.title(f"{document['scenario']}, {label}", f"seed {document['seed']}")
     runs = document["runs"]
     rows = [("status", document["status"])]

@@ -12,7 +12,7 @@ import typer
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, number, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -21,18 +21,18 @@ RUN = "Where it runs"
 
 Target = Annotated[
     str,
-    typer.Argument(metavar="SWEEP.toml|show", help="What to solve, or the word show for a folder that sweep wrote."),
+    typer.Argument(metavar="SWEEP.toml|show", help="File of the problems to solve, or the word show."),
 ]
-Shown = Annotated[str | None, typer.Argument(metavar="DIR", help="With show: the folder.")]
-Workers = Annotated[int, options.option("--workers", panel=RUN, min=1, help="Processes on this machine.")]
+Shown = Annotated[str | None, typer.Argument(metavar="DIR", help="With show: the folder that sweep wrote.")]
+Workers = Annotated[int, options.option("--workers", panel=RUN, min=1, help="Number of processes on this machine.")]
 Scheduler = Annotated[
     str | None,
-    options.option("--scheduler", metavar="ADDRESS", panel=RUN, help="A Dask cluster, such as tcp://host:8786."),
+    options.option("--scheduler", metavar="ADDRESS", panel=RUN, help="On a Dask cluster, such as tcp://host:8786."),
 ]
-Mpi = Annotated[bool, options.option("--mpi", panel=RUN, help="The ranks of mpiexec … -m mpi4py.futures.")]
+Mpi = Annotated[bool, options.option("--mpi", panel=RUN, help="On the ranks of mpiexec … -m mpi4py.futures.")]
 Slurm = Annotated[
     list[str] | None,
-    options.option("--slurm", metavar="KEY=VALUE", panel=RUN, help="Slurm job arrays by submitit; repeatable."),
+    options.option("--slurm", metavar="KEY=VALUE", panel=RUN, help="As Slurm job arrays by submitit; repeatable."),
 ]
 Out = Annotated[
     str | None, options.out_option("Folder of the sweep; with show, of the maps.", "./SWEEP, or DIR/maps")

@@ -12,12 +12,12 @@ from impact_posture.setting import CONTACT, OUTPUT
 from impact_posture.settings import ImpactSettings, Vector3
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, complain, print_json
-from impact_posture_cli.progress import progress
+from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import Given, check_direction, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.impact.resolved_impact import ResolvedImpact
-    from impact_posture.verification.verification_report import Row, VerificationReport
+    from impact_posture.verification.verification import Row, VerificationReport
 
 NormalOfFirst = Annotated[
     Vector3 | None,
@@ -28,7 +28,7 @@ NormalOfFirst = Annotated[
 ]  # fmt: skip
 Samples = Annotated[
     int,
-    typer.Option("--samples", min=1, rich_help_panel=OUTPUT, help="Random postures and normals."),
+    typer.Option("--samples", min=1, rich_help_panel=OUTPUT, help="Number of random postures and normals."),
 ]
 SampleSeed = Annotated[int, typer.Option("--seed", min=0, rich_help_panel=OUTPUT, help="Seed of the random samples.")]
 

@@ -14,7 +14,7 @@ from impact_posture.arrays import Array
 from impact_posture.codegen.emitter import REALS, Real
 from impact_posture.codegen.functions import Reference, casadi_reference, named_objectives, oracle_reference
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.manifest import sample_postures
+from impact_posture.codegen.manifest_builder import sample_postures
 from impact_posture.codegen.reader import read_manifest
 from impact_posture.errors import CompilerError, OutputError
 from impact_posture.impact.contact import heavy_feet_rounding
@@ -28,15 +28,17 @@ from impact_posture.libraries import (
     seal_path,
     source_key,
 )
-from impact_posture.output_folder import scratch_folder
+from impact_posture.scratch_folder import scratch_folder
 from impact_posture.toolchain import find_compiler, words_of
 
 # The oracle factorizes another matrix.  Feet at compliance ε cost digits there (condition about 1/ε).
 _ORACLE_TOLERANCE = 1e-5
+# Random postures and normals of a comparison.
+_SAMPLES = 20
 # Number of libraries in the cache. The oldest go first.
 _CACHED = 16
 # C function → the reference's names of its results.
-_RESULTS = {
+RESULTS = {
     "eval": ("H", "grad"),
     "objective": ("objective", "objective_grad"),
     "value": ("H",),
@@ -63,7 +65,6 @@ def compile_and_check(
     export_dir: Path,
     prefix: str,
     objective: ImpactObjective | Sequence[ImpactObjective],
-    samples: int = 20,
     *,
     keep: bool = False,
 ) -> float:
@@ -73,7 +74,6 @@ def compile_and_check(
         export_dir: The folder of the export.
         prefix: The prefix of the export.
         objective: The exported objective, or one for each frame.
-        samples: The number of postures.
         keep: Leave the library in the folder of the export, even if it fails.
 
     Raises:
@@ -96,7 +96,7 @@ def compile_and_check(
                 (casadi_reference, tolerance, "CasADi"),
                 (oracle_reference, max(_ORACLE_TOLERANCE, tolerance), "Pinocchio"),
             ):
-                found = largest_difference(gradient, own, reference, samples)
+                found = largest_difference(gradient, own, reference, _SAMPLES)
                 if found > allowed:
                     raise CompilerError(
                         f"the numbers of the compiled code differ from those of {name} by {found:.3g}, relative",
@@ -150,7 +150,7 @@ def largest_difference(
         # Rounded to the C type, so that the call changes nothing.
         q, n = (np.array(v, dtype=gradient.dtype).astype(float) for v in (q, normals[k]))
         expected = reference(q, n)
-        for name, quantities in _RESULTS.items():
+        for name, quantities in RESULTS.items():
             if not set(quantities) <= set(expected):
                 continue
             code, results = gradient.call(name, q, n)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -18,6 +17,7 @@ from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.sums import rebuilt
 from impact_posture.libraries import source_key
 from impact_posture.stored_text import read_stored, write_stored
+from impact_posture.tables import adapter
 
 LARGEST_VECTOR = 64
 """Bytes of the widest vectors that the source uses, and of the widest group of narrower vectors in a batch."""
@@ -84,18 +84,11 @@ def build_code(exported: Sequence[NamedObjective], prefix: str, real: Real, *, p
     # A pydantic fault is a ValueError.
     with suppress(ValueError):
         if text is not None:
-            code: Code = _adapter().validate_json(text)
+            code: Code = adapter(Code).validate_json(text)
             return code
     code = _generate(exported, found, prefix, real, portable=portable)
-    write_stored("code", key, _adapter().dump_json(code).decode())
+    write_stored("code", key, adapter(Code).dump_json(code).decode())
     return code
-
-
-@cache
-def _adapter() -> Any:
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(Code)
 
 
 def _generate(exported: Sequence[NamedObjective], found: Library, prefix: str, real: Real, *, portable: bool) -> Code:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,11 @@ import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.codegen.build_check import compile_and_check
-from impact_posture.codegen.code import build_code
+from impact_posture.codegen.code import Code, build_code
 from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
-from impact_posture.codegen.functions import named_objectives
+from impact_posture.codegen.functions import NamedObjective, named_objectives
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.manifest import build_manifest
+from impact_posture.codegen.manifest_builder import build_manifest
 from impact_posture.codegen.naming import c_identifier, check_prefix, products
 from impact_posture.codegen.render import render
 from impact_posture.errors import CompilerError, InputError, OutputError
@@ -158,8 +159,7 @@ def export(
         posture = robot.check_posture(given, limits=False)
         # Normalizing a configuration of unit norm changes its last digits.  Keep those that result.json has.
         posture = given if np.allclose(given, posture, rtol=0, atol=1e-9) else posture
-    exported = named_objectives(objectives, prefix)
-    code = build_code(exported, prefix, real, portable=portable)
+    exported, code = cached_code(tuple(objectives), prefix, real, portable)
     manifest = build_manifest(objectives, prefix, posture, compression, real, code.stack_bytes)
     texts = render(exported, prefix, manifest, code, real)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
@@ -172,6 +172,15 @@ def export(
     if not check or find_compiler() is None:
         return made
     return replace(made, agreement=compile_and_check(out, prefix, objectives))
+
+
+@lru_cache(maxsize=1)
+def cached_code(
+    objectives: tuple[ImpactObjective, ...], prefix: str, real: Real, portable: bool
+) -> tuple[tuple[NamedObjective, ...], Code]:
+    """Return the functions of an export, which take most of the time of :func:`export` and need no posture."""
+    exported = named_objectives(objectives, prefix)
+    return exported, build_code(exported, prefix, real, portable=portable)
 
 
 def write_export(

@@ -43,12 +43,6 @@ class ImpactGradient:
         dtype: The number type of the library.
     """
 
-    manifest: Mapping[str, Any]
-    frame: str
-    free: bool
-    nq: int
-    nv: int
-
     def __init__(
         self, library: ctypes.CDLL, manifest: Mapping[str, Any], frame: str | None = None, *, free: bool = False
     ) -> None:
@@ -139,6 +133,13 @@ class ImpactGradient:
             self._n[:] = n
         return function(), results
 
+    def _results(self, name: str, q: ArrayLike, n: ArrayLike | None = None) -> tuple[Array, ...]:
+        """Return the results of a C function whose code is zero."""
+        code, results = self.call(name, q, n)
+        if code:
+            raise _failure(code)
+        return results
+
     def value_and_gradient(self, q: ArrayLike, n: ArrayLike) -> tuple[float, Array]:
         """Return ``H`` and its tangent gradient, a view of shape (nv,).
 
@@ -152,6 +153,7 @@ class ImpactGradient:
             MetricError: The result is not finite, because the quantity does not exist there.
             ValueError: An input has another shape.
         """
+        # Written out, because control loops call this method in every tick.
         code, (H, gradient) = self.call("eval", q, n)
         if code:
             raise _failure(code)
@@ -163,9 +165,7 @@ class ImpactGradient:
         Raises:
             InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
         """
-        code, (value, gradient) = self.call("objective", q)
-        if code:
-            raise _failure(code)
+        value, gradient = self._results("objective", q)
         return value.item(), gradient
 
     def value(self, q: ArrayLike, n: ArrayLike) -> float:
@@ -174,10 +174,7 @@ class ImpactGradient:
         Raises:
             InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
         """
-        code, (H,) = self.call("value", q, n)
-        if code:
-            raise _failure(code)
-        return float(H.item())
+        return float(self._results("value", q, n)[0].item())
 
     def jump(self, q: ArrayLike, n: ArrayLike) -> tuple[Array, float, float]:
         """Return ``a = M⁻¹Jᵀn``, a view of shape (nv,), ``G = nᵀJa`` (1/kg) and ``V = H/G²``.
@@ -185,9 +182,7 @@ class ImpactGradient:
         Raises:
             InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
         """
-        code, (a, G, V) = self.call("jump", q, n)
-        if code:
-            raise _failure(code)
+        a, G, V = self._results("jump", q, n)
         return a, G.item(), V.item()
 
     def ellipsoid(self, q: ArrayLike) -> Array:
@@ -196,10 +191,7 @@ class ImpactGradient:
         Raises:
             InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
         """
-        code, (ellipsoid,) = self.call("ellipsoid", q)
-        if code:
-            raise _failure(code)
-        return ellipsoid.reshape(3, 3)
+        return self._results("ellipsoid", q)[0].reshape(3, 3)
 
     # ---- many configurations ----------------------------------------------------------------------------------
 

@@ -72,7 +72,7 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
     Raises:
         SpecError: There is no manifest, there are several, or it is broken.
     """
-    files = [path] if not path.is_dir() else sorted(p for p in path.glob("*.json") if is_manifest(p))
+    files = [path] if not path.is_dir() else sorted(p for p in path.glob("*.json") if _is_manifest(p))
     if len(files) != 1:
         what = "holds no export" if not files else f"holds {len(files)} exports"
         hint = "name the folder that codegen wrote" if not files else f"name one, such as {files[0].name}"
@@ -145,7 +145,7 @@ def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: s
             )
 
 
-def is_manifest(path: Path) -> bool:
+def _is_manifest(path: Path) -> bool:
     """Return whether a file is the manifest of an export."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))

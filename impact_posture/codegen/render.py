@@ -17,11 +17,11 @@ from impact_posture.codegen.build_check import self_test_tolerance
 from impact_posture.codegen.code import Code
 from impact_posture.codegen.emitter import DOUBLE, SHORT_NAMES, Real
 from impact_posture.codegen.functions import NamedObjective
-from impact_posture.codegen.manifest import unit_slices
 from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.reader import identity
 from impact_posture.escape import c_comment, markdown
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.robot.robot import unit_parts
 from impact_posture.version import __version__
 
 _WIDTH = 112
@@ -134,7 +134,7 @@ def _context(
     names = [o.contact.frame for o in objectives]
     supports = ", ".join(f"{s.frame} ({s.kind})" for s in objective.supports)
     weights = {"euclidean": "W = I", "kinetic": "W = M", "weighted": f"W diagonal, {metric.source or 'given'}"}
-    units = unit_slices(objective.robot)
+    units = [part for _, part in unit_parts(objective.robot.model)]
     tests = [block["self_test"] for f in manifest["frames"] for block in (f, f["free"]) if block is not None]
     alone = len(objectives) == 1 and joint is None
     return {

@@ -6,7 +6,7 @@ import ctypes
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -23,9 +23,7 @@ from impact_posture.tsid.relaxation import Relaxed
 
 # Statuses in the order of their numbers in C.
 _STATUSES = tuple(Status)
-_FUNCTIONS = (
-    "init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release",
-)  # fmt: skip
+_FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
 # Numbers of a target: set, position, rotation, velocity, acceleration.
 _TARGET = 25
 
@@ -53,11 +51,8 @@ class CompiledController:
             ("multipliers", max(1, bounds)),
             ("relaxed", 1 + len(manifest.levels)),
             ("deficient", room("LEVELS")),
-            ("dynamics", 1),
-            ("level", 1),
-            ("value", 1),
-            ("target", manifest.nq),
         ]
+        rows += [("dynamics", 1), ("level", 1), ("value", 1), ("target", manifest.nq)]
         self._report, self._diagnosis = _structure(rows, ["status", "iterations", "resting", "flow_failures"])
         self._given, self.parameters = _structure([*manifest.parameters.items()], [])
         bytes_ = ctypes.c_ulong.in_dll(library, f"{prefix}_context_bytes").value
@@ -69,8 +64,7 @@ class CompiledController:
         self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * _TARGET * max(1, tasks))
         self._targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
-        doubles = ctypes.POINTER(ctypes.c_double)
-        self._pointers = [x.ctypes.data_as(doubles) for x in (self._q, self._v, self._force)]
+        self._pointers = [x.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for x in (self._q, self._v, self._force)]
         names = (*_FUNCTIONS, *(["brace_before"] if sizes.get("FLOW") else []))
         self._functions = {name: getattr(library, f"{prefix}_{name}") for name in names}
         getattr(library, f"{prefix}_default_params")(ctypes.byref(self._given))
@@ -104,8 +98,6 @@ class CompiledController:
         except (AttributeError, ValueError) as error:
             raise SpecError(f"lacks a function ({error})", where=str(target), hint="run codegen again") from None
 
-    # ---- the interface of tsid.Controller ----------------------------------------------------------------------
-
     def reset(self, q: ArrayLike, v: ArrayLike) -> Command:
         """Start again at ``(q, ν)`` with the present parameters.  Targets that are set stay.
 
@@ -129,9 +121,7 @@ class CompiledController:
         self._q[:], self._v[:] = q, v
         code = self._call("reset", *self._pointers[:2], ctypes.byref(self._command))
         if code == 1:
-            raise PostureError(
-                "no state of the robot", where="reset", hint="give finite numbers and unit quaternions"
-            )
+            raise PostureError("no state of the robot", where="reset", hint="give finite numbers, unit quaternions")
         if code == 3:
             raise ContactError("the sole stands on its edge", where="contact", hint="put the sole on the ground")
         if code:
@@ -149,15 +139,14 @@ class CompiledController:
         if not self._ready:
             raise InputError("has not been reset", where="controller", hint="call reset(q, v) first")
         self._q[:], self._v[:] = q, v
-        pushed = None
+        q_at, v_at, force_at = self._pointers
         if force is not None:
             given = np.asarray(force, dtype=float)
             if given.shape not in ((3,), (6,)):
                 raise ValueError(f"a measured force has 3 or 6 numbers, not shape {given.shape}")
             self._force[:] = 0.0
             self._force[: given.size] = given
-            pushed = self._pointers[2]
-        q_at, v_at, _ = self._pointers
+        pushed = None if force is None else force_at
         self._call("tick", ctypes.c_double(t), q_at, v_at, pushed, ctypes.byref(self._command))
         return self._commanded()
 
@@ -183,21 +172,15 @@ class CompiledController:
                 if multiplier and k not in equations:
                     active.append((name, "upper" if multiplier > 0 else "lower"))
         dynamics, level, value = (float(found[name][0]) for name in ("dynamics", "level", "value"))
-        iterations = int(self._report.iterations)
         names = ("joint limits", *(name for name, _ in checked.levels))
         relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, found["relaxed"], strict=True) if x > 0)
         missed = zip(names[1:], found["deficient"], strict=False)
         deficient = tuple(Relaxed(n, float(x)) for n, x in missed if x > 0)
+        iterations = int(self._report.iterations)
         return Report(status, relaxed, deficient, residuals, tuple(active), dynamics, level, value, iterations)
 
-    # ---- targets and phases ------------------------------------------------------------------------------------
-
     def set_target(
-        self,
-        task: str,
-        target: pin.SE3 | ArrayLike,
-        velocity: ArrayLike = 0.0,
-        acceleration: ArrayLike = 0.0,
+        self, task: str, target: pin.SE3 | ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0
     ) -> None:
         """Set the target of a task by name, as its class in ``tsid`` takes it, between ticks.
 
@@ -270,8 +253,8 @@ class CompiledController:
             self._enter("brace", t)
         elif not math.isfinite(t_impact) or "brace_before" not in self._functions:
             raise InputError("no flow can rest before that time", where="brace", hint="give finite seconds")
-        elif self._call("brace_before", ctypes.c_double(t), ctypes.c_double(t_impact)):
-            self._refuse("brace", t)
+        else:
+            self._enter("brace_before", t, t_impact)
 
     def contact(self, t: float = -math.inf) -> None:
         """Hold the reached posture during the impact, or keep the term on if it is live; as :meth:`brace`."""
@@ -286,22 +269,16 @@ class CompiledController:
         """Level of the impact-robust term, 0 to 1, or whether the flow may move."""
         return float(self._level[0])
 
-    # ---- parts --------------------------------------------------------------------------------------------------
-
-    def _enter(self, phase: str, t: float) -> None:
-        if self._call(phase, ctypes.c_double(t)):
-            self._refuse(phase, t)
-
-    def _refuse(self, phase: str, t: float) -> NoReturn:
-        words = f"'{phase}' at {t:g} s does not follow the phase before it"
-        raise InputError(words, where="controller", hint="give phases in the order of their times, or reset it")
+    def _enter(self, function: str, *times: float) -> None:
+        if self._call(function, *map(ctypes.c_double, times)):
+            words = f"'{function.partition('_')[0]}' at {times[0]:g} s does not follow the phase before it"
+            raise InputError(words, where="controller", hint="give phases in the order of their times, or reset it")
 
     def _target(self, task: str) -> Array:
         if task not in self._targets:
             known = ", ".join(self._targets) or "none"
             raise InputError(f"there is no task '{task}'", where="controller", hint=f"one of: {known}")
-        row: Array = self._targets[task]
-        return row
+        return self._targets[task]
 
     def _call(self, name: str, *arguments: Any) -> int:
         return int(self._functions[name](self._context, *arguments))

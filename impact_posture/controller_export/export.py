@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import casadi as ca
 
 from impact_posture.codegen.export import WrittenCode
 from impact_posture.codegen.export import export as export_gradient
-from impact_posture.codegen.manifest import configuration_names
+from impact_posture.codegen.manifest_builder import configuration_names
 from impact_posture.codegen.naming import c_identifier, check_prefix
 from impact_posture.codegen.reader import identity
 from impact_posture.controller_export.compiled_controller import CompiledController
@@ -159,35 +159,11 @@ def _manifest(s: Structure, fields: Sequence[Field], prefix: str) -> dict[str, A
         "sizes": s.sizes,
         "parameters": {f.name: int(f.value.size) for f in fields},
         "tasks": [{"name": t.name, "rows": t.size} for t in s.tasks],
-        "levels": [list(names) for names in _level_names(s)],
+        "levels": [[name, int(rows)] for name, rows in zip(s.levels, s.tables["level_rows"], strict=True)],
         "posture": None if s.formulation.posture is None else s.formulation.posture.name,
-        "bounds": list(_bound_names(s)),
+        "bounds": list(s.bounds),
         "versions": {"impact_posture": __version__, "casadi": str(ca.CasadiMeta.version()), "daqp": VERSION},
     }
-
-
-def _level_names(s: Structure) -> Iterator[tuple[str, int]]:
-    if s.sizes["HARD"]:
-        yield "contacts", s.sizes["HARD"]
-    for level in s.formulation.levels:
-        yield ", ".join(task.name for task in level), sum(task.size for task in level)
-
-
-def _bound_names(s: Structure) -> Iterator[str]:
-    """Return the name of each bound, in the order of the multipliers in a report."""
-    sizes, joints = s.sizes, s.robot.tangent_names[s.sizes["BASE"] :]
-    if sizes["SIMPLE"]:
-        yield from joints
-    yield from (f"dynamics {k}" for k in range(sizes["BLIND"]))
-    yield from (f"contact motion {k}" for k in range(sizes["HARD"]))
-    yield from (f"{t.name}[{k}]" for level in s.formulation.levels for t in level for k in range(t.size))
-    yield from s.actuators.names
-    for contact, start, stop in zip(
-        s.formulation.contacts, s.tables["contact_cone"][:-1], s.tables["contact_cone"][1:], strict=True
-    ):
-        yield from (f"cone of {contact.point.frame}[{k}]" for k in range(stop - start))
-    if s.sizes["LAW"] and not sizes["SIMPLE"]:
-        yield from joints
 
 
 def _makefile(manifest: dict[str, Any]) -> str:

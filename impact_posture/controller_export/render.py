@@ -16,7 +16,7 @@ from impact_posture.arrays import Array
 from impact_posture.codegen.emitter import DOUBLE, BlockText, Constants, Emitter, c_double
 from impact_posture.codegen.graph import graph_of
 from impact_posture.codegen.layout import lay_out
-from impact_posture.codegen.manifest import configuration_names
+from impact_posture.codegen.manifest_builder import configuration_names
 from impact_posture.codegen.render import wrapped
 from impact_posture.codegen.sums import rebuilt
 from impact_posture.controller_export.parameters import RULES, Field
@@ -28,10 +28,14 @@ from impact_posture.version import __version__
 
 # Files in c/, in the order in which one source has them, and those that follow objectives and flow add.
 _CORE = (
-    "vector.c", "algebra.c", "tasks.c", "posture.c", "qp.c", "rank.c", "solve.c", "give_way.c", "init.c", "tick.c",
-    "report.c",
+    "vector.c", "algebra.c", "tasks.c", "contacts.c", "posture.c", "qp.c", "rank.c", "solve.c", "give_way.c",
+    "init.c", "tick.c", "report.c",
 )  # fmt: skip
 _FOLLOW = ("eigen.c",)
+_RELAXATION = (
+    "relaxation_memory.c", "vector.c", "relaxation_rows.c", "relaxation_elimination.c", "relaxation_level.c",
+    "relaxation_cost.c", "relaxation.c",
+)  # fmt: skip
 _FLOW = ("reference_flow_space.c", "reference_flow_direction.c", "reference_flow.c", "reference_flow_motion.c")
 # Parameters that init compares with others.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
@@ -171,10 +175,15 @@ def _relaxation_room(n: int, m: int, levels: int) -> int:
     return matrices + 16 * n + 7 * active + (20 + levels) * entries + 64
 
 
+def relaxation() -> dict[str, str]:
+    """Return file name → text of the relaxation, before its names have a prefix."""
+    return {"relaxation.h": _own("relaxation.h"), "relaxation.c": "\n".join(_own(name) for name in _RELAXATION)}
+
+
 def _relaxation(prefix: str) -> dict[str, str]:
     """Return the files of the relaxation, with names that another controller in the program does not have."""
-    texts = {f"{prefix}_relaxation.{end}": _own(f"relaxation.{end}") for end in ("h", "c")}
-    return {name: re.sub(r"\b(daqp\.h|relaxation[_.][a-z])", rf"{prefix}_\1", text) for name, text in texts.items()}
+    texts = {name: re.sub(r"\b(daqp\.h|relaxation\.h)", rf"{prefix}_\1", text) for name, text in relaxation().items()}
+    return {f"{prefix}_{name}": named(text, prefix) for name, text in texts.items()}
 
 
 def named(text: str, prefix: str) -> str:

@@ -44,6 +44,8 @@ class Structure:
         points: Points whose kinematics a tick needs.
         sizes: Name → number, of every size that the code fixes.
         tables: Name → constant integers or doubles.
+        levels: Names of the strict levels.
+        bounds: Name of each bound, in the order of the multipliers in a report.
     """
 
     robot: Robot
@@ -53,6 +55,8 @@ class Structure:
     points: tuple[Point, ...]
     sizes: dict[str, int]
     tables: dict[str, NDArray[Any]]
+    levels: tuple[str, ...]
+    bounds: tuple[str, ...]
 
     @property
     def robust(self) -> ImpactRobustPosture | None:
@@ -86,8 +90,8 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     strict = tuple(task for level in formulation.levels for task in level)
     tasks, contacts, points = (*strict, *formulation.weighted), formulation.contacts, formulation.points
     # An assembly moves the targets of its tasks into its own buffers, and a controller may run with these tasks.
-    levels = tuple(tuple(map(copy, level)) for level in formulation.levels)
-    copies = replace(formulation, levels=levels, weighted=tuple(map(copy, formulation.weighted)))
+    copied = tuple(tuple(map(copy, level)) for level in formulation.levels)
+    copies = replace(formulation, levels=copied, weighted=tuple(map(copy, formulation.weighted)))
     assembly = Assembly(robot, copies, actuators)
     nv, rotors, spare = robot.nv, actuators.rotors, actuators.spare.shape[1]
     law, posture = formulation.law, formulation.posture
@@ -159,7 +163,11 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     }
     found: dict[str, NDArray[Any]] = {name: np.array(v, dtype=np.int64) for name, v in tables.items()}
     found |= {name: np.array(values, dtype=float).ravel() for name, values in doubles.items()}
-    return Structure(robot, formulation, actuators, tasks, points, sizes, found)
+    # Bounds on joints are simple ones, which come first, or the last rows.
+    bounded, rows = assembly.names[actuators.base : nv], assembly.names[assembly.qp.n :]
+    names = (*(bounded if sizes["SIMPLE"] else ()), *rows, *(bounded if bounds else ()))
+    levels = tuple(name for name, _ in assembly.levels)
+    return Structure(robot, formulation, actuators, tasks, points, sizes, found, levels, names)
 
 
 def _add_flow(

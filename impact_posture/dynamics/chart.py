@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -13,9 +13,12 @@ import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.joints import JointKind, joint_kind
+from impact_posture.robot.model_joints import ENDLESS
 
 # Joints whose last coordinate is an angle; their q has its cosine and sine.
 _ANGLES = ("continuous", "planar")
+# Joints whose coordinates may have limits.
+_BOUNDED = ("revolute", "prismatic", "translation")
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,13 @@ class Chart:
         """Return the chart of a model, made once for the models used last."""
         return Chart(model)
 
+    @cached_property
+    def bounded(self) -> tuple[list[int], list[int]]:
+        """Tangent indices and chart indices of coordinates that may have limits, and equal their tangent entry."""
+        slots = [slot for slot in self.slots if slot.kind.family in _BOUNDED]
+        in_v = [k for slot in slots for k in range(slot.v.start, slot.v.stop)]
+        return in_v, [k for slot in slots for k in range(slot.x.start, slot.x.stop)]
+
     def configuration(self, x: ca.SX) -> ca.SX:
         """Return ``q(x)``, shape (nq, 1)."""
         parts: list[ca.SX] = self._parts(x, ca.cos, ca.sin)
@@ -83,6 +93,8 @@ class Chart:
 
     def to_x(self, q: Array) -> Array:
         """Return the chart coordinates of a configuration, shape (nx,)."""
+        if self.nx == self.nq:
+            return np.array(q, dtype=float)
         parts: list[Any] = []
         for slot in self.slots:
             piece = q[slot.q]
@@ -92,16 +104,16 @@ class Chart:
 
     def to_q(self, x: Array) -> Array:
         """Return the configuration of chart coordinates, shape (nq,), with normalized quaternions."""
-        return np.asarray(pin.normalize(self._model, np.hstack([np.zeros(0), *self._parts(x, np.cos, np.sin)])))
+        q = x if self.nx == self.nq else np.hstack(self._parts(x, np.cos, np.sin))
+        return np.asarray(pin.normalize(self._model, q))
 
     def bounds(self) -> tuple[Array, Array]:
         """Return the position limits in chart coordinates, infinite where there are none."""
         lower, upper = np.full(self.nx, -np.inf), np.full(self.nx, np.inf)
         for slot in self.slots:
-            if slot.kind.family in ("revolute", "prismatic", "translation"):
+            if slot.kind.family in _BOUNDED:
                 low = np.array(self._model.lowerPositionLimit[slot.q])
                 high = np.array(self._model.upperPositionLimit[slot.q])
-                # Pinocchio writes "no limit" as the largest double.
-                lower[slot.x] = np.where(low < -1e10, -np.inf, low)
-                upper[slot.x] = np.where(high > 1e10, np.inf, high)
+                lower[slot.x] = np.where(low < -ENDLESS, -np.inf, low)
+                upper[slot.x] = np.where(high > ENDLESS, np.inf, high)
         return lower, upper

@@ -183,10 +183,7 @@ class Kinematics:
 
     def to_link(self, joint: int, direction: ca.SX) -> ca.SX:
         """Rotate a world direction into link coordinates, down the chain from the root."""
-        chain = [joint]
-        while self._parents[chain[-1]] > 0:
-            chain.append(self._parents[chain[-1]])
-        for i in reversed(chain):
+        for i in self._chain(joint)[-2::-1]:
             direction = transposed_times(self._R[i], direction)
         return direction
 

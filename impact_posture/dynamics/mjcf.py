@@ -18,6 +18,7 @@ from impact_posture.dynamics.chart import Chart, JointSlot
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.errors import InputError, UnsupportedJoint
 from impact_posture.escape import xml_name
+from impact_posture.robot.model_joints import ENDLESS
 
 Geom = Literal["sphere", "box", "plane"]
 
@@ -25,8 +26,6 @@ Geom = Literal["sphere", "box", "plane"]
 WORLD = 0
 # MuJoCo refuses a moving body with less mass (kg) or moment (kg m²) than this.
 _LEAST = 1e-15
-# Pinocchio writes "no limit" as the largest double.
-_ENDLESS = 1e10
 # MuJoCo takes every inertia as it is.  It derives none, raises none, and merges or turns no body.
 _COMPILER = {
     "degree": False,
@@ -213,7 +212,7 @@ def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken:
             joint.axis = axis
         if limit is not None:
             low, high = float(model.lowerPositionLimit[limit]), float(model.upperPositionLimit[limit])
-            if low < high and max(-low, high) < _ENDLESS:
+            if low < high and max(-low, high) < ENDLESS:
                 joint.range = (low, high)
 
     def add_slides(count: int, values: Array, limited: bool = False) -> None:

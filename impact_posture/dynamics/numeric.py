@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -27,7 +29,7 @@ class Numeric:
         self.model.armature, self.locked = finite_armature(model)
         self.data = self.model.createData()
         self.q = pin.neutral(model)
-        self._zero, self._below = np.zeros(model.nv), np.tril_indices(model.nv, -1)
+        self._zero, self._below = np.zeros(model.nv), _below_diagonal(model.nv)
 
     def at(self, q: Array) -> Numeric:
         """Move to ``q``, shape (nq,)."""
@@ -47,11 +49,8 @@ class Numeric:
 
     def jacobian(self, point: PointOnLink) -> Array:
         """Return ``J``, shape (6, nv), of the world linear and angular velocity (LOCAL_WORLD_ALIGNED)."""
-        local = pin.getJointJacobian(self.model, self.data, point.joint, pin.LOCAL)
-        local = np.asarray(local).reshape(6, -1)
-        R = self.data.oMi[point.joint].rotation
-        linear = local[:3] - pin.skew(point.position) @ local[3:]
-        return np.vstack([R @ linear, R @ local[3:]])
+        found = pin.getFrameJacobian(self.model, self.data, point.joint, point.placement, pin.LOCAL_WORLD_ALIGNED)
+        return np.asarray(found).reshape(6, -1)
 
     def center_of_mass(self) -> tuple[Array, Array]:
         """Return the world center of mass, shape (3,), and its Jacobian, shape (3, nv)."""
@@ -103,6 +102,12 @@ def hold_locked(locked: NDArray[np.bool_], M: Array, *jacobians: Array) -> tuple
         return M, *jacobians
     mobile = ~locked
     return np.where(np.outer(mobile, mobile), M, np.diag(locked.astype(float))), *(J * mobile for J in jacobians)
+
+
+@cache
+def _below_diagonal(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the places below the diagonal of a square matrix, which take NumPy longer than a copy of the model."""
+    return np.tril_indices(size, -1)
 
 
 def _cross(a: Array, b: Array) -> Array:

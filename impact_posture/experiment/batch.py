@@ -16,7 +16,6 @@ from impact_posture.errors import ImpactPostureError, InputError, MetricError, O
 from impact_posture.experiment.jobs import Job, controller_factory, execute, lost
 from impact_posture.libraries import source_key
 from impact_posture.output_folder import is_ours, write_record, write_whole
-from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.processes import fork_map
 from impact_posture.simulation.controller_factory import CONTROLLERS
@@ -42,7 +41,8 @@ _PARTS = (
 class Store:
     """A folder of finished jobs.
 
-    A stored job only counts for the same scenario, robot and source code.
+    A stored job only counts for the same scenario, robot and source code, and for the same :attr:`Job.compile`.  Runs
+    in Python and in C lie side by side.
 
     Args:
         folder: The folder, which is made when it is first written to.
@@ -83,7 +83,7 @@ class Store:
 
     def series(self, job: Job, sign: int) -> Path:
         """Return the path of the time series of a run."""
-        return self.folder / f"{job.name}{'' if sign > 0 else '-minus'}.npz"
+        return self._path(job).with_suffix(f"{'' if sign > 0 else '.minus'}.npz")
 
     def has_series(self, job: Job, document: Document) -> bool:
         """Whether all time series of a job are there and undamaged."""
@@ -105,7 +105,7 @@ class Store:
         write_whole(self._path(job), f"{_seal(job, text)}\n{text}")
 
     def _path(self, job: Job) -> Path:
-        return self.folder / f"{job.name}.json"
+        return self.folder / f"{job.name}-{job.compile}.json"
 
 
 def _seal(job: Job, text: str) -> str:
@@ -138,8 +138,6 @@ def run_batch(
     store: Store | None = None,
     keep_series: Callable[[Job], bool] = lambda job: False,
     progress: Progress | None = None,
-    compile: CompileMode = "auto",
-    seeds: int = 1,
 ) -> list[Document]:
     """Run the jobs that are not stored yet, and return all documents in the order of the jobs.
 
@@ -152,8 +150,6 @@ def run_batch(
         store: Folder where finished jobs are kept and found.
         keep_series: Whether the store keeps the time series of a job, too.
         progress: Callback with (done, all).
-        compile: Whether controllers run as machine code.
-        seeds: Number of runs of each controller that compiling has to pay for.
 
     Raises:
         ImpactPostureError: A scenario cannot be set up, or there is no such controller.
@@ -176,7 +172,7 @@ def run_batch(
 
     def work(index: int) -> Document:
         job = jobs[waiting[index]]
-        return _run(job, store if keep_series(job) else None, compile, seeds)
+        return _run(job, store if keep_series(job) else None)
 
     with one_blas_thread(), fork_map(work, len(waiting), processes) as results:
         for index, document in results:
@@ -189,9 +185,9 @@ def run_batch(
     return [done[k] for k in range(len(jobs))]
 
 
-def _run(job: Job, store: Store | None, compile: CompileMode, seeds: int) -> Document:
+def _run(job: Job, store: Store | None) -> Document:
     try:
-        runs, document = execute(job, compile=compile, runs=seeds)
+        runs, document = execute(job)
     except ImpactPostureError as error:
         if isinstance(error, InputError) and not isinstance(error, MetricError):
             # A mistake of the user is the same for all seeds, and no result.

@@ -40,9 +40,7 @@ def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: 
         draw_snapshots(views, folder, formats)
 
 
-def draw_reproduction(
-    found: Reproduction, jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]
-) -> None:
+def draw_reproduction(found: Reproduction, store: Store, folder: Path, formats: Sequence[str]) -> None:
     """Draw ``bars``, and for each scenario a folder with nominal, robust and the best controller side by side."""
     bars = []
     for row in found.rows:
@@ -55,7 +53,7 @@ def draw_reproduction(
     for scenario in found.scenarios:
         best = found.best(scenario)
         shown = dict.fromkeys(("nominal", "robust", *(() if best is None else (best.controller,))))
-        labels = {job.label: job for job in jobs if job.scenario == scenario}
+        labels = {job.label: job for job in found.shown if job.scenario == scenario}
         draw_side_by_side([labels[label] for label in shown if label in labels], store, folder / scenario, formats)
 
 

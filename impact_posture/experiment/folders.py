@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from impact_posture.experiment.batch import Store
 from impact_posture.experiment.figures import draw_reproduction, draw_runs, draw_side_by_side
 from impact_posture.experiment.jobs import Job
-from impact_posture.experiment.reproduction import Plan, Reproduction, jobs_of
+from impact_posture.experiment.reproduction import Reproduction
 from impact_posture.experiment.reproduction_summary import summary
 from impact_posture.experiment.run_reports import COMPARISON, SIMULATION, keep_runs, try_report
 from impact_posture.output_folder import whole_folder
@@ -20,17 +21,26 @@ REPRODUCTION = "reproduction.json"
 FORMATS = ("png",)
 
 
-def write_simulation(
-    out: Path,
-    job: Job,
-    runs: Sequence[Run],
-    document: dict[str, Any],
-    *,
-    force: bool = False,
-    formats: Sequence[str] = FORMATS,
-    report: bool = True,
-    meshes: bool = False,
-) -> str:
+@dataclass(frozen=True)
+class Output:
+    """Where results are written, and what beside the numbers.
+
+    Attributes:
+        folder: The folder.
+        force: Whether an earlier result there may be replaced.
+        formats: Formats of the figures.
+        report: Whether ``report.html`` is written.
+        meshes: Whether it shows the meshes of the robot.
+    """
+
+    folder: Path
+    force: bool = False
+    formats: Sequence[str] = FORMATS
+    report: bool = True
+    meshes: bool = False
+
+
+def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: dict[str, Any]) -> str:
     """Write ``run.json``, ``series.npz`` (``series-minus.npz`` for a push with sign -1), figures and ``report.html``.
 
     Returns:
@@ -39,25 +49,15 @@ def write_simulation(
     Raises:
         OutputError: The folder exists without ``force``, is not ours, or cannot be written.
     """
-    with whole_folder(out, force=force, kind="run") as folder:
+    with whole_folder(output.folder, force=output.force, kind="run") as folder:
         _write_json(folder / SIMULATION, document)
         for one in runs:
             one.series.save(folder / f"series{'' if one.sign > 0 else '-minus'}.npz")
-        draw_runs(job, runs, document, folder, formats)
-        return try_report(folder, job.scenario, meshes=meshes) if report else ""
+        draw_runs(job, runs, document, folder, output.formats)
+        return try_report(folder, job.scenario, meshes=output.meshes) if output.report else ""
 
 
-def write_comparison(
-    out: Path,
-    found: Reproduction,
-    plan: Plan,
-    store: Store,
-    *,
-    force: bool = False,
-    formats: Sequence[str] = FORMATS,
-    report: bool = True,
-    meshes: bool = False,
-) -> str:
+def write_comparison(output: Output, found: Reproduction, store: Store) -> str:
     """Write ``comparison.json``, figures, ``runs/`` and ``report.html`` of the first seed, and remove the store.
 
     Returns:
@@ -66,20 +66,18 @@ def write_comparison(
     Raises:
         OutputError: As :func:`write_simulation`.
     """
-    with whole_folder(out, force=force, kind="comparison") as folder:
+    with whole_folder(output.folder, force=output.force, kind="comparison") as folder:
         _write_json(folder / COMPARISON, found.comparison())
-        jobs, failure = jobs_of(plan, seeds=1), ""
-        draw_side_by_side(jobs, store, folder, formats)
-        if report:
-            keep_runs(folder, jobs, store)
-            failure = try_report(folder, jobs[0].scenario, meshes=meshes)
+        draw_side_by_side(found.shown, store, folder, output.formats)
+        failure = ""
+        if output.report:
+            keep_runs(folder, found.shown, store)
+            failure = try_report(folder, found.shown[0].scenario, meshes=output.meshes)
     store.remove()
     return failure
 
 
-def write_reproduction(
-    out: Path, found: Reproduction, plan: Plan, store: Store, *, force: bool = False, formats: Sequence[str] = FORMATS
-) -> dict[str, Any]:
+def write_reproduction(output: Output, found: Reproduction, store: Store) -> dict[str, Any]:
     """Write ``reproduction.json``, ``SUMMARY.md``, all documents in ``runs/``, and figures, and remove the store.
 
     Returns:
@@ -89,13 +87,13 @@ def write_reproduction(
         OutputError: As :func:`write_simulation`.
     """
     document = {**found.to_dict(), "summary": summary(found)}
-    with whole_folder(out, force=force, kind="reproduction") as folder:
+    with whole_folder(output.folder, force=output.force, kind="reproduction") as folder:
         _write_json(folder / REPRODUCTION, document)
         (folder / "SUMMARY.md").write_text(document["summary"], encoding="utf-8")
         (folder / "runs").mkdir()
-        for job in jobs_of(plan, found.seeds):
+        for job in found.jobs:
             _write_json(folder / "runs" / f"{job.name}.json", store.find(job))
-        draw_reproduction(found, jobs_of(plan, seeds=1), store, folder, formats)
+        draw_reproduction(found, store, folder, output.formats)
     store.remove()
     return document
 

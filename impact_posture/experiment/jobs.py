@@ -23,6 +23,9 @@ from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 
 SCHEMA = "impact-posture/simulation/4"
+# Runs from which building pays: a humanoid's library takes about 10 s, and saves 4 s of each run.  The cache does not
+# count, because a run would then depend on what ran before, and differ from another one by amplified rounding.
+_PAYS = 3
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,7 @@ class Job:
         free: Whether gradients and the offline optimum ignore the feet.
         gain: K instead of that of the scenario, 1/s².
         sign: The only sign of the push to run.
+        compile: Whether its controller runs as machine code: ``auto`` where it can, always, or never.
     """
 
     scenario: str
@@ -46,6 +50,7 @@ class Job:
     free: bool = False
     gain: float | None = None
     sign: int | None = None
+    compile: CompileMode = "never"
 
     @property
     def label(self) -> str:
@@ -56,6 +61,14 @@ class Job:
     def name(self) -> str:
         """Name of its files."""
         return f"{file_name(self.scenario)}-{file_name(self.label.replace(':', '-'))}-{self.seed}"
+
+
+def worth_compiling(compile: CompileMode, runs: int) -> CompileMode:
+    """Return what :attr:`Job.compile` says where each controller has a number of runs.
+
+    ``auto`` means machine code from three runs on.
+    """
+    return "never" if compile == "auto" and runs < _PAYS else compile
 
 
 def parse_controller(text: str) -> tuple[str, Mode, bool]:
@@ -81,23 +94,19 @@ def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
     return ControllerFactory(set_up(read_scenario(scenario)), free)
 
 
-def execute(
-    job: Job, factory: ControllerFactory | None = None, *, compile: CompileMode = "auto", runs: int = 1
-) -> tuple[tuple[Run, ...], dict[str, Any]]:
+def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[Run, ...], dict[str, Any]]:
     """Run a job and return its runs and its document.
 
     Args:
         job: The job.
-        factory: A variation of its scenario to run instead, which then says by itself what to compile.
-        compile: Whether controllers run as machine code, as of :class:`ControllerFactory`.
-        runs: Number of runs of each controller that compiling has to pay for.
+        factory: A variation of its scenario to run instead.
 
     Raises:
         ImpactPostureError: As :func:`impact_posture.simulation.run.run`, or the scenario cannot be set up.
     """
     if factory is None:
         factory = controller_factory(job.scenario, job.free)
-        factory.compile, factory.runs = compile, runs
+    factory.compile = job.compile
     scenario = factory.setup.scenario
     if job.sign is not None and job.sign not in scenario.signs:
         raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, hint="leave --sign out")
@@ -116,6 +125,7 @@ def execute(
         "free": job.free,
         "gain": scenario.control.robust.gain if job.gain is None else job.gain,
         "seed": job.seed,
+        "language": "C" if factory.in_c else "Python",
         "status": status,
         "events": [{**event, "sign": part["sign"]} for part in parts for event in part["events"]],
         "metrics": together(metrics).to_dict() if completed else None,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from impact_posture.experiment.batch import Document, Progress, Store, run_batch
-from impact_posture.experiment.jobs import Job, jsonable, parse_controller
+from impact_posture.experiment.jobs import Job, jsonable, parse_controller, worth_compiling
 from impact_posture.experiment.paper import PAPER, RECOMMENDED
 from impact_posture.experiment.statistics import Interval, Row, row_of
 from impact_posture.posture.compiled import CompileMode
@@ -75,13 +75,13 @@ def controllers_of(scenario: str, everything: bool) -> tuple[str, ...]:
     return tuple(dict.fromkeys(("nominal", "robust", "robust-flow", RECOMMENDED[scenario])))
 
 
-def jobs_of(plan: Plan, seeds: int) -> list[Job]:
+def jobs_of(plan: Plan, seeds: int, compile: CompileMode = "auto") -> list[Job]:
     """Return all jobs of a plan, scenario by scenario, controller by controller, seed by seed."""
-    found = []
+    found, compile = [], worth_compiling(compile, seeds)
     for scenario, labels in plan.items():
         for label in labels:
             name, mode, free = parse_controller(label)
-            found += [Job(scenario, name, seed, mode, free) for seed in range(seeds)]
+            found += [Job(scenario, name, seed, mode, free, compile=compile) for seed in range(seeds)]
     return found
 
 
@@ -100,10 +100,17 @@ class Reproduction:
     Attributes:
         seeds: Number of seeds.
         rows: Rows, scenario by scenario, nominal first.
+        jobs: The jobs that they are of.
     """
 
     seeds: int
     rows: tuple[Row, ...]
+    jobs: tuple[Job, ...] = ()
+
+    @property
+    def shown(self) -> list[Job]:
+        """The jobs with the first seed, whose time series are kept."""
+        return [job for job in self.jobs if job.seed == 0]
 
     @property
     def scenarios(self) -> tuple[str, ...]:
@@ -166,19 +173,17 @@ def reproduce(
         ImpactPostureError: A scenario cannot be set up, there is no such controller, MuJoCo is not installed, or the
             store cannot be written.
     """
-    jobs = jobs_of(plan, seeds)
+    jobs = jobs_of(plan, seeds, compile)
     documents = run_batch(
         jobs,
         processes=processes,
         store=store,
         keep_series=lambda job: store is not None and job.seed == 0,
         progress=progress,
-        compile=compile,
-        seeds=seeds,
     )
     rows: list[Row] = []
     for scenario, labels in plan.items():
         count = len(labels) * seeds
         rows += gather(scenario, labels, documents[:count])
         documents = documents[count:]
-    return Reproduction(seeds, tuple(rows))
+    return Reproduction(seeds, tuple(rows), tuple(jobs))

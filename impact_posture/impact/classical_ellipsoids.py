@@ -44,15 +44,6 @@ def ellipsoid_of(matrix: Array) -> Ellipsoid:
     return Ellipsoid(_oriented(vectors[:, ::-1]), np.sqrt(np.clip(values[::-1], 0.0, None)))
 
 
-def velocity_ellipsoid(J: Array) -> Ellipsoid:
-    """Return the ellipsoid of ``JJᵀ``: contact velocities for joint velocities ``|ν| ≤ 1`` (Yoshikawa 1985).
-
-    Args:
-        J: Linear contact Jacobian in world axes, shape (3, nv).
-    """
-    return ellipsoid_of(J @ J.T)
-
-
 def force_ellipsoid(J: Array) -> Ellipsoid:
     """Return the ellipsoid of ``(JJᵀ)⁻¹``: contact forces for joint torques ``|Jᵀf| ≤ 1``.
 
@@ -70,10 +61,11 @@ def force_ellipsoid(J: Array) -> Ellipsoid:
 def classical_ellipsoids(objective: ImpactObjective, q: Array) -> dict[str, Ellipsoid]:
     """Return ``{"velocity", "force"}`` of the contact at ``q``.
 
-    Both ignore inertia and supports, and mix m/s with rad/s as ``|ν|`` does.
+    The first, that of ``JJᵀ``, holds the contact velocities for ``|ν| ≤ 1`` (Yoshikawa 1985).  Both ignore inertia
+    and supports, and mix m/s with rad/s as ``|ν|`` does.
     """
     J = objective.oracle.at(q).J
-    return {"velocity": velocity_ellipsoid(J), "force": force_ellipsoid(J)}
+    return {"velocity": ellipsoid_of(J @ J.T), "force": force_ellipsoid(J)}
 
 
 def _oriented(vectors: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Contacts of an impact, and supports that stay on the ground."""
+"""Contacts of an impact, and the inertia of supports that stay on the ground."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import SupportSpec
-from impact_posture.settings import FRICTION, NormalFrame, SupportKind, Vector3
+from impact_posture.robot.spec import Support as Support
+from impact_posture.settings import FRICTION, NormalFrame, Vector3
 
 # A normal shorter than this is zero up to rounding.
 _DUST = 1e-9
@@ -81,38 +81,6 @@ class ImpactContact:
         object.__setattr__(self, "normal", tuple(float(v) for v in n))
         object.__setattr__(self, "offset", tuple(float(v) for v in offset))
         object.__setattr__(self, "impulse", float(self.impulse))
-
-
-@dataclass(frozen=True)
-class Support:
-    """A foot that stays on the ground; its velocities are zero up to the compliance.
-
-    Attributes:
-        frame: The foot's frame.
-        kind: ``point`` holds three velocities, ``surface`` holds six.
-        offset: Contact point from the frame's origin, in the frame, meters.
-        size: Half extents (x, y) of the sole in its frame, meters.
-    """
-
-    frame: str
-    kind: SupportKind = "point"
-    offset: Vector3 = (0.0, 0.0, 0.0)
-    size: tuple[float, float] = (0.0, 0.0)
-
-    @staticmethod
-    def from_spec(spec: SupportSpec) -> Support:
-        """Return a support of ``robot.toml``."""
-        return Support(spec.frame, spec.kind, spec.offset, spec.size)
-
-    @property
-    def rows(self) -> int:
-        """Number of velocities that it holds."""
-        return 3 if self.kind == "point" else 6
-
-    @property
-    def has_sole(self) -> bool:
-        """Whether it is a surface of known size."""
-        return self.kind == "surface" and min(self.size) > 0
 
 
 def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> PointOnLink:

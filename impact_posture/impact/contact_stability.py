@@ -78,13 +78,8 @@ class ContactStability:
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
         finite = self.friction is not None and np.isfinite(self.friction)
-        return {
-            "friction": self.friction if finite else None,
-            "stays": bool(finite),
-            "freedom": self.freedom,
-            "feet": [foot.to_dict() for foot in self.feet],
-            "verdict": self.line,
-        }
+        friction = self.friction if finite else None
+        return json_block(self) | {"friction": friction, "stays": bool(finite), "verdict": self.line}
 
 
 def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Array) -> ContactStability:

@@ -94,7 +94,7 @@ def coulomb_gradient(oracle: ImpactOracle, q: Array, impact: CoulombImpact) -> A
     e = np.cross(n, p)
     K = np.outer(e, e) / (e @ B @ e + impact.sigma * e @ e)
     r = -value * n - K @ (oracle.J @ oracle.solve(weighed) - value * B @ n)
-    turned = oracle.numeric.placement(oracle.point).rotation.T if oracle.case.in_contact_frame else np.eye(3)
+    turned = oracle.axes.T
     step = float(np.linalg.norm(p) / np.linalg.norm(r))
     above, below = (oracle.gradient_G(q, turned @ (p + sign * step * r)) for sign in (1, -1))
     return np.asarray(oracle.gradient_H(q, turned @ p) + (above - below) / (2 * step))

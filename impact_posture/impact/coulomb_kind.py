@@ -59,7 +59,7 @@ class CoulombKind(ImpactKind):
         case, n = k.case, k.n
         if case.contact.friction <= NO_FRICTION:
             return k.V, k.grad_V
-        R = k.tree.rotation(k.point) if case.in_contact_frame else ca.SX.eye(3)
+        R = in_world(case, k.tree, ca.SX.eye(3))
         B = R.T @ k.mobility @ R
         direction, K = coulomb_direction(B, n, case.contact.friction)
         x = k.answer([impact_at(case, direction / ca.dot(B @ n, direction))])
@@ -98,9 +98,8 @@ class CoulombKind(ImpactKind):
         n, p = oracle.n, found.impulse
         size, slip = float(n @ p), float(np.linalg.norm(found.slip))
         d = (n - p / size) / friction if found.sticks and friction > NO_FRICTION else found.slip / max(slip, 1e-300)
-        axes = oracle.numeric.placement(oracle.point).rotation if oracle.case.in_contact_frame else np.eye(3)
         ends = np.array([slip, max(1 - float(d @ d), 0.0)])
-        values = (oracle.with_support_impulses(found.jump), np.array([size]), axes.T @ d, ends)
+        values = (oracle.with_support_impulses(found.jump), np.array([size]), oracle.axes.T @ d, ends)
         guess = Guess.unbounded(np.concatenate(values))
         guess.lower[-2:] = 0.0
         return guess

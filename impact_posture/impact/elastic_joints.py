@@ -87,11 +87,6 @@ class ElasticResponse:
         return json_block(self) | {"compliance_ratio": ratio}
 
 
-def elastic_response(case: ImpactCase, q: Array, stiffness: float, speed: float = 1.0) -> ElasticResponse:
-    """Return the response of a robot with elastic joints to one contact; see :class:`ElasticImpact`."""
-    return ElasticImpact(case).response(q, stiffness, speed)
-
-
 class ElasticImpact:
     """Response to a contact of given stiffness, and its tangent gradient, by the matrix exponential.
 

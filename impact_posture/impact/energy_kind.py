@@ -8,9 +8,8 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.impact.frictionless_kind import FrictionlessKind
 from impact_posture.impact.impact_case import ImpactCase
-from impact_posture.impact.impact_kind import QuadraticKind
+from impact_posture.impact.impact_kind import FrictionlessKind, QuadraticKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import UnknownJump
 from impact_posture.impact.oracle import ImpactOracle

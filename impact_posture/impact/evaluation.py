@@ -16,7 +16,7 @@ from impact_posture.impact.contact import LARGEST, point_on
 from impact_posture.impact.contact_compression import Compression, ContactStiffness, both_models, compression
 from impact_posture.impact.contact_stability import ContactStability, contact_stability
 from impact_posture.impact.coulomb_contacts import CoulombJump, coulomb_jump, coulomb_jumps
-from impact_posture.impact.elastic_joints import ElasticResponse, elastic_response
+from impact_posture.impact.elastic_joints import ElasticImpact, ElasticResponse
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
@@ -29,6 +29,7 @@ from impact_posture.impact.scalars import (
     worst_variant,
 )
 from impact_posture.impact.velocity_jump import Dominance, Jump, find_dominance, weighed_jump
+from impact_posture.tables import json_block
 
 # A relative change of H above this share, with supports ten times as stiff, gets a warning.
 _SOFT = 0.01
@@ -107,46 +108,32 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, object]:
         """Return the ``initial`` or ``optimal`` block of ``result.json``; a value that does not exist is ``None``."""
-        quaternion = pin.Quaternion(self.pose.rotation)
+        found, quaternion = json_block(self), pin.Quaternion(self.pose.rotation)
         block: dict[str, object] = {
-            "q": self.q.tolist(),
-            "objective": self.objective,
-            **self.scalars.to_dict(),
+            **{key: found[key] for key in ("q", "objective")},
+            **found["scalars"],
             "effective_mass": self.scalars.effective_mass,
-            "gradient": self.gradient.tolist(),
-            "objective_gradient": None if self.objective_gradient is None else self.objective_gradient.tolist(),
-            "worst_normal": self.worst_normal.tolist(),
-            "ellipsoid": self.ellipsoid.to_dict(),
+            **{key: found[key] for key in ("gradient", "objective_gradient", "worst_normal", "ellipsoid")},
             "pose": {"position": self.pose.translation.tolist(), "quaternion_xyzw": quaternion.coeffs().tolist()},
-            "jump": {
-                "speed": self.speed,
-                "restitution": self.restitution,
-                "frictionless": None if self.frictionless is None else self.frictionless.to_dict(),
-                "sticking": None if self.sticking is None else self.sticking.to_dict(),
-                "coulomb": None if self.coulomb is None else self.coulomb.to_dict(),
-                "energy_loss": self.energy_loss,
-            },
-            "compression": None if self.compression is None else self.compression.to_dict(),
-            "elastic": None if self.elastic is None else self.elastic.to_dict(),
-            "dominance": self.dominance.to_dict(),
+            "jump": {key: found[key] for key in _JUMP},
+            **{key: found[key] for key in ("compression", "elastic", "dominance")},
         }
         if self.cone is not None:
-            block["cone"] = self.cone.to_dict()
+            block["cone"] = found["cone"]
         if self.without_supports is not None:
-            block |= {"free": self.without_supports.to_dict(), "compliance_effect": self.compliance_effect}
+            block |= {"free": found["without_supports"], "compliance_effect": self.compliance_effect}
         if self.contact_stability is not None:
-            block["footing"] = self.contact_stability.to_dict()
+            block["footing"] = found["contact_stability"]
         if self.impulses is not None:
-            block["worst_impulses"] = self.impulses.to_dict()
-            blocks = [contact.to_dict() for contact in self.contacts]
-            block["coulomb_together"] = None if self.together is None else [one.to_dict() for one in self.together]
-            block["by_contact"] = [{key: one[key] for key in _OWN if key in one} for one in blocks]
+            block |= {"worst_impulses": found["impulses"], "coulomb_together": found["together"]}
+            block["by_contact"] = [{key: one[key] for key in _OWN if key in one} for one in found["contacts"]]
         if self.model_variants:
-            block["by_scenario"] = [variant.to_dict() for variant in self.model_variants]
+            block["by_scenario"] = found["model_variants"]
             block["worst_scenario"] = self.model_variants[worst_variant(self.model_variants)].name
         return block
 
 
+_JUMP = ("speed", "restitution", "frictionless", "sticking", "coulomb", "energy_loss")
 # Keys of one contact among several, without those of the posture and of the objective.
 _OWN = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pose", "free", "footing")
 
@@ -257,7 +244,7 @@ def _elastic(
             hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
         )
     G = objective.oracle.quantities(q).G
-    return elastic_response(objective.case, q, contact.linear_stiffness(G, speed), speed)
+    return ElasticImpact(objective.case).response(q, contact.linear_stiffness(G, speed), speed)
 
 
 def _joint_model_warning(objective: ImpactObjective, q: Array, found: Compression | None) -> tuple[str, ...]:

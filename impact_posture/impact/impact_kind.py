@@ -1,4 +1,4 @@
-"""The abstract base of the kinds of objective: which scalar of an impact is minimized."""
+"""The abstract bases of the kinds of objective: which scalar of an impact is minimized."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.kernel import ImpactKernel
-from impact_posture.impact.lifted import Guess, Lifted, UnknownJump, impact_at, unknown_jump, weighed
+from impact_posture.impact.lifted import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump, weighed
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities, no_sticking
 
 
@@ -87,6 +87,20 @@ class ImpactKind(ABC):
         """Return the unknowns of :meth:`lift` that solve its equations at ``q``."""
         a, impulse = self.jump(oracle.quantities(q))
         return Guess.unbounded(np.concatenate([oracle.with_support_impulses(a), impulse]))
+
+
+class FrictionlessKind(ImpactKind):
+    """A kind of an impact at unit approach speed without friction, whose impulse ``λ`` is unknown."""
+
+    def unknowns(self, case: ImpactCase, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
+        """Return ``M a − J_sᵀf − λJᵀn = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``; ``λ`` is the last unknown."""
+        impulse = ca.SX.sym(f"lam{label}")
+        jump = unknown_jump(case, tree, impact_at(case, n * impulse), label)
+        return jump.with_impulse(impulse, ca.dot(in_world(case, tree, n), jump.contact_velocity) - 1)
+
+    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
+        """Return ``a/G`` and ``λ = 1/G``."""
+        return found.jump / found.G, np.array([1 / found.G])
 
 
 class QuadraticKind(ImpactKind):

@@ -19,6 +19,7 @@ from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Wrench
 from impact_posture.impact.contact import support_inertia
 from impact_posture.impact.impact_case import ImpactCase
+from impact_posture.impact.lifted import impact_at, in_world
 from impact_posture.robot.robot import Robot
 
 # Singular values of stacked Jacobians below this part of the largest are rounding.
@@ -46,12 +47,12 @@ class ImpactKernel:
     @cached_property
     def impact(self) -> Wrench:
         """The unit impulse along the normal."""
-        return Wrench(self.point, self.n, ca.SX.zeros(3), in_frame=self.case.in_contact_frame)
+        return impact_at(self.case, self.n)
 
     @cached_property
     def world_normal(self) -> ca.SX:
         """The normal in world axes, shape (3,)."""
-        return self.tree.rotation(self.point) @ self.n if self.case.in_contact_frame else self.n
+        return in_world(self.case, self.tree, self.n)
 
     @cached_property
     def jump(self) -> Response:
@@ -79,12 +80,12 @@ class ImpactKernel:
     @cached_property
     def H(self) -> ca.SX:
         """``aᵀWa``: squared jump per squared impulse."""
-        return ca.dot(self.jump.a, self._weigh(self.jump.a, self.jump.velocities))
+        return self.product(self.jump, self.jump)
 
     @cached_property
     def G(self) -> ca.SX:
         """``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg."""
-        return self._along(self.impact, self.jump.velocities)
+        return ca.dot(self.tree.link_force(self.impact), self.jump.velocities[self.point.joint])
 
     @cached_property
     def grad_H(self) -> ca.SX:
@@ -177,8 +178,7 @@ class ImpactKernel:
     @cached_property
     def S(self) -> ca.SX:
         """``‖M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹n‖²_W``: as V if the contact point sticks."""
-        x = self._sticking
-        return ca.dot(x.a, self._weigh(x.a, x.velocities))
+        return self.product(self._sticking, self._sticking)
 
     @cached_property
     def grad_S(self) -> ca.SX:
@@ -207,9 +207,6 @@ class ImpactKernel:
 
     def _force(self, impulse: ca.SX) -> Wrench:
         return Wrench(self.point, impulse, ca.SX.zeros(3))
-
-    def _along(self, wrench: Wrench, velocities: ByJoint) -> ca.SX:
-        return ca.dot(self.tree.link_force(wrench), velocities[wrench.point.joint])
 
 
 def frozen_directions(robot: Robot, point: PointOnLink) -> NDArray[np.float64]:

@@ -54,6 +54,17 @@ class Guess:
         """Return a guess without lower bounds."""
         return Guess(values, np.full(values.size, -np.inf))
 
+    @property
+    def above(self) -> Array:
+        """Upper bounds, infinite where there are none, shape (k,)."""
+        return np.full(self.values.size, np.inf) if self.upper is None else self.upper
+
+    @staticmethod
+    def joined(parts: Sequence[Guess]) -> Guess:
+        """Return the auxiliaries of several parts as one."""
+        keys = ("values", "lower", "above")
+        return Guess(*(np.concatenate([np.zeros(0), *[getattr(part, key) for part in parts]]) for key in keys))
+
 
 @dataclass(frozen=True, eq=False)
 class UnknownJump:

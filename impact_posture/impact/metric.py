@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.errors import MetricError
+from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import MetricKind
 from impact_posture.tables import read_toml
@@ -98,9 +99,7 @@ def _from_file(robot: Robot, path: Path) -> np.ndarray[tuple[int], np.dtype[np.f
             if key == "base" and base:
                 values[:6] = np.array(value, dtype=float)
             else:
-                joint = robot.joint_id(key)
-                first = robot.model.idx_vs[joint]
-                values[first : first + robot.model.nvs[joint]] = float(value)  # type: ignore[arg-type]
+                values[v_slice(robot.model, robot.joint_id(key))] = float(value)  # type: ignore[arg-type]
         except (TypeError, ValueError):
             raise MetricError(
                 f"key '{key}' holds no number", where=str(path), hint="joint = weight; base = [6 numbers]"

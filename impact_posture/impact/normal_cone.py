@@ -90,8 +90,7 @@ class NormalCone:
 
     def worst_in_world(self, q: Array) -> WorstNormal:
         """Return :meth:`worst` with its normals in world axes."""
-        found = self.worst(q)
-        return found.turned(self._axes_in_world(q))
+        return self.worst(q).turned(self.oracle.at(q).axes)
 
     def value(self, q: Array) -> float:
         """See :class:`~impact_posture.impact.worst_case.Minimized`."""
@@ -130,10 +129,8 @@ class NormalCone:
 
     def worst_normal_expression(self, k: ImpactKernel) -> ca.SX:
         """Return the worst normal for the symbols of a kernel in closed form, in the axes of ``n``, shape (3,)."""
-        K = self.kind.form_expression(k)
-        if k.case.in_contact_frame:
-            R = k.tree.rotation(k.point)
-            K = R.T @ K @ R
+        R = in_world(k.case, k.tree, ca.SX.eye(3))
+        K = R.T @ self.kind.form_expression(k) @ R
         return worst_normal_symbolic((K + K.T) / 2, k.n, self.degrees)
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
@@ -187,13 +184,6 @@ class NormalCone:
         alpha = np.deg2rad(self.degrees)
         return float(np.cos(alpha)), float(np.sin(alpha))
 
-    def _axes_in_world(self, q: Array) -> Array:
-        """World axes of the contact's normal at ``q``, as columns."""
-        oracle = self.oracle.at(q)
-        return (
-            np.array(oracle.numeric.placement(oracle.point).rotation) if oracle.case.in_contact_frame else np.eye(3)
-        )
-
     def _form(self, q: Array, directions: Array | None = None) -> tuple[Array, Array, Array]:
         """``K`` along three directions (columns in the axes of the normal, those axes by default), shape (3, 3).
 
@@ -204,7 +194,7 @@ class NormalCone:
         Raises:
             MetricError: The form does not exist at ``q``.
         """
-        world = self._axes_in_world(q)
+        world = self.oracle.at(q).axes
         if directions is not None:
             world = world @ directions
         responses = self.oracle.solve(self.oracle.J.T)

@@ -238,11 +238,6 @@ class ImpactObjective:
         names = ["q", "n"], ["value", "gradient"]
         return ca.Function("gradient", [k.q, k.n], [value, gradient], *names, {"cse": True})
 
-    def metric_fun(self) -> ca.Function:
-        """Return ``(q, n) → H, grad``, the impact-robustness metric and its tangent gradient, for any objective."""
-        k = self.kernel
-        return ca.Function("eval", [k.q, k.n], [k.H, k.grad_H], ["q", "n"], ["H", "grad"], {"cse": True})
-
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
         """Return the objective with its linear solves as equations of the program."""
         return self.worst_case.lift(tree, parameters, scale)

@@ -17,8 +17,8 @@ from impact_posture.errors import MetricError
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.impact_case import ImpactCase
 
-# Relative size of a singular value of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
-_RANK = 1e-9
+# Relative size of an eigenvalue of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
+SINGULAR = 1e-9
 # A contact whose 1/m_eff along the normal is below this share of the largest mobility cannot move along it.
 _BLOCKED = 1e-12
 # Postures whose factorization is kept, because a search comes back to its starts.
@@ -237,26 +237,23 @@ class ImpactOracle:
         """Return the tangent gradient of E, ``−∇G/(2G²)``, shape (nv,)."""
         return -self.gradient_G(q) / (2 * self.quantities(q).G ** 2)
 
+    @property
+    def axes(self) -> Array:
+        """World axes in which the contact's normal is given, at the last posture, as columns, shape (3, 3)."""
+        return np.asarray(self.numeric.placement(self.point).rotation) if self.case.in_contact_frame else np.eye(3)
+
     def _normals(self, given: Array | None) -> tuple[Array, Array]:
         """A normal (by default that of the contact) in the axes of the contact's normal, and in world axes."""
         own = np.array(self.contact.normal) if given is None else given
-        return own, self.numeric.placement(self.point).rotation @ own if self.case.in_contact_frame else own
+        return own, self.axes @ own if self.case.in_contact_frame else own
 
     def support_gradient(self, q: Array) -> Array:
         """Return the tangent Jacobian of the support impulses ``f``, shape (rows, nv).
 
         Row k uses the adjoint ``M p − J_sᵀr = 0, J_s p + εr = −e_k``: ``∂f_k = pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)``.
         """
-        self.at(q)
-        x = self.answer(self.J.T @ self.n)
-        rows = len(self.Js)
-        adjoints = self.answer(np.zeros((self._nv, rows)), -np.eye(rows))
-        found = [
-            self.coupling(np.array(self.contact.normal), p, self.case.in_contact_frame)
-            - self.inertial(Answer(p, r), x)
-            for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
-        ]
-        return np.array(found).reshape(rows, self._nv)
+        rows = len(self.at(q).Js)
+        return self._adjoint_rows(self.answer(np.zeros((self._nv, rows)), -np.eye(rows)))
 
     def jump_gradient(self, q: Array) -> Array:
         """Return the tangent Jacobian of ``a = M⁻¹Jᵀn``, shape (nv, nv).
@@ -264,14 +261,16 @@ class ImpactOracle:
         Row k is ``∂a_k = p_kᵀ∂(Jᵀn − M a)`` with ``M p_k = e_k``.
         """
         self.at(q)
-        x = self.answer(self.J.T @ self.n)
-        adjoints = self.answer(np.eye(self._nv))
-        own = np.array(self.contact.normal)
+        return self._adjoint_rows(self.answer(np.eye(self._nv)))
+
+    def _adjoint_rows(self, adjoints: Answer) -> Array:
+        """Return ``pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)`` for each adjoint ``p, r``, shape (k, nv)."""
+        own, x = np.array(self.contact.normal), self.answer(self.J.T @ self.n)
         rows = [
             self.coupling(own, p, self.case.in_contact_frame) - self.inertial(Answer(p, r), x)
             for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
         ]
-        return np.array(rows)
+        return np.array(rows).reshape(-1, self._nv)
 
     def coupling(self, direction: Array, v: Array, in_frame: bool) -> Array:
         """Return ``∂_q directionᵀJ v``, shape (nv,), for a direction in world axes or fixed in the frame."""
@@ -315,7 +314,7 @@ class _HeldPoint:
     @staticmethod
     def of(kkt: Array, J: Array, mobility: Array, mobile: NDArray[np.bool_]) -> _HeldPoint:
         values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
-        kept = values > _RANK * max(float(values[-1]), 1e-300)
+        kept = values > SINGULAR * max(float(values[-1]), 1e-300)
         axes = np.eye(3) if kept.all() else vectors[:, kept]
         size, nv = len(kkt), J.shape[1]
         system = np.zeros((size + axes.shape[1],) * 2)
@@ -326,7 +325,7 @@ class _HeldPoint:
 
     def can_move(self, n: Array) -> bool:
         """Return whether the point can move along ``n``."""
-        return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(_RANK))
+        return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(SINGULAR))
 
     def answer(self, *, tau: Array | None = None, velocity: Array | None = None) -> tuple[Answer, Array]:
         """Return the jump under ``τ`` with the point moving at ``v``, and the impulse ``s`` of the point."""

@@ -9,11 +9,8 @@ import numpy as np
 from impact_posture.arrays import Array
 from impact_posture.errors import MetricError
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.impact.oracle import SINGULAR, ImpactQuantities
 from impact_posture.impact.worst_case import SingleImpact
-
-# JM⁻¹Jᵀ is singular if an eigenvalue is below this share of the largest one.
-_SINGULAR = 1e-9
 
 
 @dataclass(frozen=True)
@@ -106,5 +103,5 @@ def objective_gradient(objective: ImpactObjective, q: Array, value: float | None
     It is ``None`` where it does not exist.
     """
     values = np.linalg.eigvalsh(objective.oracle.quantities(q).mobility)
-    singular = objective.kind == "sticking" and values[0] <= _SINGULAR * values[-1]
+    singular = objective.kind == "sticking" and values[0] <= SINGULAR * values[-1]
     return None if singular or value is None else objective.gradient(q)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from impact_posture.impact.frictionless_kind import FrictionlessKind
+from impact_posture.impact.impact_kind import FrictionlessKind
 
 
 class SpeedKind(FrictionlessKind):

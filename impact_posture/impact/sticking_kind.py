@@ -11,10 +11,7 @@ from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_kind import QuadraticKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import UnknownJump, in_world, unknown_jump
-from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities, no_sticking
-
-# An eigenvalue of JM⁻¹Jᵀ below this share of the largest one is zero.
-_SINGULAR = 1e-9
+from impact_posture.impact.oracle import SINGULAR, ImpactOracle, ImpactQuantities, no_sticking
 
 
 class StickingKind(QuadraticKind):
@@ -41,7 +38,7 @@ class StickingKind(QuadraticKind):
     def directions(self, mobility: Array, world: Array) -> Array:
         """Return ``B⁻¹`` times the directions."""
         sizes = np.linalg.eigvalsh((mobility + mobility.T) / 2)
-        if sizes[0] <= _SINGULAR * sizes[-1]:
+        if sizes[0] <= SINGULAR * sizes[-1]:
             raise no_sticking()
         return np.asarray(np.linalg.solve(mobility, world))
 

@@ -23,16 +23,13 @@ def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support
         FrameNotFound: There is no such frame; the error lists the nearest names.
         InputError: A frame is given twice.
     """
-    known = {spec.frame: Support.from_spec(spec) for spec in robot.spec.supports}
-    if texts is None:
-        found = list(known.values())
-    else:
-        found = [_support(robot, text, known) for text in texts]
+    known = {support.frame: support for support in robot.spec.supports}
+    found = robot.spec.supports if texts is None else tuple(_support(robot, text, known) for text in texts)
     for support in found:
         if sum(s.frame == support.frame for s in found) > 1:
             raise InputError(f"frame '{support.frame}' is given twice", where="support", hint="remove one")
         point_on(robot, support.frame, support.offset)
-    return tuple(found)
+    return found
 
 
 def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:

@@ -10,6 +10,7 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.joints import joint_kind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactQuantities
+from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.tables import json_block
 
@@ -78,10 +79,14 @@ def tangent_units(robot: Robot) -> tuple[str, ...]:
 
 def largest_entries(robot: Robot, values: Array, count: int = 5) -> tuple[tuple[str, float, str], ...]:
     """Return ``(name, value, unit)`` of the largest entries of a tangent vector, above 0.1 % of the first."""
-    units, sizes = tangent_units(robot), np.abs(values)
+    units = tangent_units(robot)
+    return tuple((robot.tangent_names[k], float(values[k]), units[k]) for k in _largest(np.abs(values), count))
+
+
+def _largest(sizes: Array, count: int) -> list[int]:
+    """Return the indices of the largest sizes, largest first, above 0.1 % of the first."""
     order = np.argsort(-sizes, kind="stable")[:count]
-    kept = [int(k) for k in order if sizes[k] > 1e-3 * sizes[order[0]]]
-    return tuple((robot.tangent_names[k], float(values[k]), units[k]) for k in kept)
+    return [int(k) for k in order if sizes[k] > 1e-3 * sizes[order[0]]]
 
 
 def merged_entries(
@@ -90,11 +95,9 @@ def merged_entries(
     """Return ``(name, unit, values)`` of the entries that are largest in any jump; ``None`` for a missing jump."""
     units, names = tangent_units(robot), robot.tangent_names
     sizes = np.max([np.zeros(robot.nv), *(np.abs(j.velocity) for j in jumps if j is not None)], axis=0)
-    order = np.argsort(-sizes, kind="stable")[:count]
     return [
         (names[k], units[k], tuple(None if j is None else float(j.velocity[k]) for j in jumps))
-        for k in order
-        if sizes[k] > 1e-3 * sizes[order[0]]
+        for k in _largest(sizes, count)
     ]
 
 
@@ -112,11 +115,10 @@ def find_dominance(objective: ImpactObjective, found: ImpactQuantities) -> Domin
     if found.H <= 0 or not robot.joint_names:
         return Dominance("", 0.0, float(found.H > 0), "no joint takes part in H")
     base = float(parts[:width].sum() / found.H)
-    slots = [(name, robot.joint_id(name)) for name in robot.joint_names]
-    first = {name: int(robot.model.idx_vs[k]) for name, k in slots}
-    shares = {name: float(parts[first[name] :][: robot.model.nvs[k]].sum() / found.H) for name, k in slots}
+    slots = {name: v_slice(robot.model, robot.joint_id(name)) for name in robot.joint_names}
+    shares = {name: float(parts[slot].sum() / found.H) for name, slot in slots.items()}
     joint = max(shares, key=lambda name: shares[name])
-    share, k = shares[joint], first[joint]
+    share, k = shares[joint], slots[joint].start
     percent = f"{100 * share:.0f} %"
     if share > 0.5:
         unit = "kg" if tangent_units(robot)[k] == "m/s" else "kg·m²"

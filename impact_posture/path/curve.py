@@ -69,6 +69,7 @@ class PathCurve:
     def deviation(self) -> float:
         """Return the largest tangent distance of the curve to the constraints; infinite where it is not valid there.
 
+        The first distance above the one that is allowed is returned, because such a curve needs more knots anyway.
         It is taken at so many places that no frame moves more than the check distance between two of them.
         """
         worst, before, parts = (
@@ -82,6 +83,8 @@ class PathCurve:
             if q is None or self._space.size(self._space.difference(before, q)) > 1:
                 return float("inf")
             worst, before = max(worst, self._space.distance(off, q)), q
+            if worst > DEVIATION:
+                break
         return worst
 
 

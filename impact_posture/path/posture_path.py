@@ -12,6 +12,7 @@ from impact_posture.errors import InputError
 from impact_posture.impact.objective import Objective
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import fitted_curve
+from impact_posture.path.own_component import OwnComponent
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.search import EFFORT, Connection, connect, shortened
 from impact_posture.path.timing import LimitUse, limit_use, timed
@@ -152,25 +153,29 @@ def _still(space: PathSpace, objective: Objective, q: Array, reason: str) -> Pos
 def _reached(solution: PostureSolution, space: PathSpace, seed: int, effort: int) -> tuple[Connection, str]:
     """Return the path to the optimum, or to the best posture that is reached and why it ends there."""
     start, objective = solution.initial, solution.problem.objective
+    own = OwnComponent.of(space, start)
     others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
     stay = found = Connection([start], [start], "")
-    end, visited = "", [start]
+    end, proof, visited = "", "", [start]
     for k, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):
         target = space.pulled(space.unwound(start, q))
         if target is None or (k and objective.value(target) >= objective.value(start)):
             continue
-        found = connect(space, start, target, seed, effort)
+        found = own.connect(target) if own else connect(space, start, target, seed, effort)
         visited += found.reached
+        proof = proof if k else found.proof
         if found.path is not None:
             if k == 0:
                 return (found if space.length(found.path) > _NO_MOTION else stay), ""
             end = f"optimum that was reached, number {k + 1} of {len(solution.optima)}"
             break
     best = objective.value(found.path[-1] if found.path else start) * (1 - _NO_GAIN)
-    lowest = min(visited[:: max(1, len(visited) // _MOST_VISITED)], key=objective.value)
+    lowest = own.lowest() if own else min(visited[:: max(1, len(visited) // _MOST_VISITED)], key=objective.value)
     if objective.value(lowest) < best:
-        found, end = connect(space, start, lowest, seed, effort), "posture that was reached"
+        found = own.connect(lowest) if own else connect(space, start, lowest, seed, effort)
+        end = "posture that was reached"
+    words = "was found at this contact pose, which does not prove that there is none"
     return (found if found.path else stay), (
-        "no path to the optimum was found at this contact pose, which does not prove that there is none"
+        f"no path to the optimum {f'exists at this contact pose ({proof})' if proof else words}"
         + (f"; the path ends at the best {end}" if found.path else "; nothing better than the start was reached")
     )

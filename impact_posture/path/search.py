@@ -30,11 +30,13 @@ class Connection:
         path: Postures from one to the other with valid motions between them; ``None`` if no path was found.
         reached: All postures that were reached from the first.
         method: ``continuation`` if walks alone arrived, else ``sampling``.
+        proof: Why no path exists; empty where this is not known.
     """
 
     path: list[Array] | None
     reached: list[Array]
     method: str
+    proof: str = ""
 
 
 class _Tree:

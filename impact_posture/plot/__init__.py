@@ -63,15 +63,16 @@ __all__ = [
     "snapshots_figure",
 ]
 
+# What takes longest comes first, so that processes that draw side by side end together.
 FIGURES: dict[str, Callable[[ResultView], Figure]] = {
-    "ellipsoid": ellipsoid_figure.ellipsoid_figure,
-    "postures": postures_figure,
     "jump": jump_figure.jump_figure,
-    "nullspace": path_figures.path_figure,
+    "ellipsoid": ellipsoid_figure.ellipsoid_figure,
     "classical": classical_figure.classical_figure,
+    "postures": postures_figure,
     "tradeoff": path_figures.tradeoff_figure,
     "path": motion_figure.motion_figure,
     "self_motion": self_motion_figure.self_motion_figure,
+    "nullspace": path_figures.path_figure,
 }
 
 # Figures that are drawn only if the view has this field.

@@ -64,7 +64,9 @@ def draw_with_labels(figure: Figure) -> FigureCanvasAgg:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     # Rows of the image count from the top. Grids and faint fills are lighter than ink.
-    ink = np.asarray(canvas.buffer_rgba())[::-1, :, :3].min(axis=2) < _INK if labels else np.zeros((0, 0), bool)
+    image = np.asarray(canvas.buffer_rgba())[::-1] if labels else np.zeros((0, 0, 4), np.uint8)
+    # `min` over the last axis takes five times as long.
+    ink = np.minimum(np.minimum(image[..., 0], image[..., 1]), image[..., 2]) < _INK
     for axes, label in labels:
         label.set_visible(True)
         _place(axes, label, ink)
@@ -83,6 +85,8 @@ def _place(axes: Any, label: Label, ink: NDArray[np.bool_]) -> None:
     half = np.array([box.width, box.height]) / 2 + _CLEAR * scale
     best, taken, place = np.inf, ink[:0], anchor
     for gap in _GAPS:
+        if gap - 6.0 > best:
+            break
         for angle in _ANGLES:
             direction = np.array([np.cos(angle), np.sin(angle)])
             center = anchor + direction * (gap * scale + float(np.abs(direction) @ half))

@@ -21,9 +21,9 @@ from matplotlib.transforms import Bbox
 
 from impact_posture.errors import InputError, OutputError
 from impact_posture.escape import printable
-from impact_posture.output_folder import scratch_folder
 from impact_posture.plot.labels import draw_with_labels
 from impact_posture.plot.view import SEPARATOR
+from impact_posture.scratch_folder import scratch_folder
 
 # Okabe and Ito's palette, "Color Universal Design", 2008.
 VERMILLION, BLUE, GREEN, SKY, PURPLE, ORANGE = "#D55E00", "#0072B2", "#009E73", "#56B4E9", "#CC79A7", "#E69F00"
@@ -61,11 +61,15 @@ _RC: dict[str, Any] = {
     "axes.linewidth": 0.7,
     "axes.grid": False,
     "axes.axisbelow": True,
+    # No ticks are above a panel.  By default matplotlib looks for them each time that it measures or draws a panel.
+    "axes.titley": 1.0,
     "grid.color": PALE,
     "grid.linewidth": 0.5,
     "hatch.linewidth": 0.5,
     "legend.frameon": False,
     "figure.dpi": 200,
+    # At this resolution letters need no fitting to the pixels, which takes a third of the time to draw them.
+    "text.hinting": "none",
     # TrueType in the PDF (publishers refuse Type 3), and files that do not change when nothing changed.
     "pdf.fonttype": 42,
     "svg.hashsalt": "impact-posture",

@@ -15,8 +15,7 @@ from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.constraint import Constraint
-from impact_posture.posture.impact_limits import ImpactLimits
-from impact_posture.posture.kept_feet import KeptFeet
+from impact_posture.posture.impact_constraints import in_every_variant, kept_feet, limits
 from impact_posture.posture.load_cases import LoadCases, load_cases
 from impact_posture.posture.pose_constraints import (
     AxisInCone,
@@ -73,9 +72,9 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
     if isinstance(objective, ImpactObjective):
         bounds = requirements.least_mobility, requirements.largest_jump
         if requirements.keep_contacts:
-            constraints += _kept_feet(objective, numeric, requirements.friction)
-        constraints += _limits(objective, bounds)
-        constraints += _in_every_variant(objective, numeric, requirements.friction, bounds, constraints)
+            constraints += kept_feet(objective, numeric, requirements.friction)
+        constraints += limits(objective, bounds)
+        constraints += in_every_variant(objective, numeric, requirements.friction, bounds, constraints)
     lower, upper = _bounds(robot, chart, given, requirements)
     held_up = load_cases(objective, given, requirements) if requirements.holdable else LoadCases()
     decided += held_up.notes
@@ -224,49 +223,6 @@ def _contact_constraints(
     if mode == "box":
         return [PositionBox(f"position of {contact.frame}", point, target.translation, requirements.box)]
     return [HeldPosition(f"position of {contact.frame}", point, target.translation)]
-
-
-def _limits(objective: ImpactObjective, bounds: tuple[float, float], variant: str = "") -> list[Constraint]:
-    """One constraint for each contact, none where nothing is bounded or all joints are locked."""
-    made = [ImpactLimits(single, *bounds, variant) for single in objective.singles]
-    return [limits for limits in made if limits.rows]
-
-
-def _kept_feet(objective: ImpactObjective, numeric: Numeric, friction: float) -> list[Constraint]:
-    """One constraint for each contact; cones are convex, so feet that stay under each impact stay under all."""
-    if objective.bilateral:
-        raise InputError(
-            "contacts that pull as well as push would have to leave the feet without any impulse",
-            where="keep_contacts",
-            hint="leave out `bilateral=True` or `keep_contacts=True`",
-        )
-    return [KeptFeet(single, numeric, friction) for single in objective.singles]
-
-
-def _in_every_variant(
-    objective: ImpactObjective,
-    numeric: Numeric,
-    friction: float,
-    bounds: tuple[float, float],
-    constraints: Sequence[Constraint],
-) -> list[Constraint]:
-    """Constraints of the other model variants that the constraints of the robot as modeled do not imply.
-
-    A pose does not depend on the weight of the robot, but its center of mass and the support impulses do.  Without
-    these constraints a posture could tip over with the very payload that it was found for.
-    """
-    found: list[Constraint] = []
-    kept = any(isinstance(constraint, KeptFeet) for constraint in constraints)
-    centers = [constraint for constraint in constraints if isinstance(constraint, CenterOfMassOverFeet)]
-    for variant, member in zip(objective.model_variants[1:], objective.by_variant[1:], strict=True):
-        # The armature does not move the center of mass.
-        if variant.payload is not None and variant.armature_factor == 1:
-            loaded = variant.robot.model, variant.name
-            found += [CenterOfMassOverFeet(c.normals, c.offsets, c.margin, loaded) for c in centers]
-        if kept:
-            found += [KeptFeet(single, numeric, friction, variant.name) for single in member.singles]
-        found += _limits(member, bounds, variant.name)
-    return found
 
 
 def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements) -> list[Constraint]:

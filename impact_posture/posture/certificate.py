@@ -109,9 +109,9 @@ def certify(
     """
     numeric = (numeric or Numeric(problem.robot.model)).at(q)
     gradients, gaps = objective_gradients(problem, q, scale)
-    errors = [c.pose_error(numeric) for c in problem.constraints]
     own = problem.guess(numeric).values if auxiliaries is None else auxiliaries
     parts = [c.linearize(numeric, z) for c, z in zip(problem.constraints, problem.split(own), strict=True)]
+    errors = [c.pose_error(part.value) for c, part in zip(problem.constraints, parts, strict=True)]
     rows = Linearization.joined(parts, problem.robot.nv)
     jacobian = np.hstack([rows.posture, rows.auxiliary])
     violation = float(np.maximum(rows.lower - rows.value, rows.value - rows.upper).max(initial=0.0))
@@ -186,19 +186,16 @@ def _near_bounds(name: str, value: float, low: float, high: float, gradient: Arr
 def _limits(problem: PostureProblem, q: Array) -> tuple[list[_Near], float]:
     """Joint limits that are near, and the largest violation of all limits."""
     chart = Chart.of(problem.robot.model)
-    x, unit = chart.to_x(q), np.eye(problem.robot.nv)
+    in_v, in_x = chart.bounded
+    x, low, high = chart.to_x(q)[in_x], problem.lower[in_x], problem.upper[in_x]
     near: list[_Near] = []
-    worst = 0.0
-    for slot in chart.slots:
-        if slot.kind.family not in ("revolute", "prismatic", "translation"):
-            continue
-        for k, v in zip(range(slot.x.start, slot.x.stop), range(slot.v.start, slot.v.stop), strict=True):
-            low, high = problem.lower[k], problem.upper[k]
-            worst = max(worst, low - x[k], x[k] - high)
-            # A held joint is an equality.
-            if low != high:
-                near += _near_bounds(f"joint '{slot.name}'", x[k], low, high, unit[v])
-    return near, float(worst)
+    # A held joint is an equality.
+    for k in np.flatnonzero((np.minimum(x - low, high - x) < _ACTIVE) & (low != high)):
+        unit = np.zeros(problem.robot.nv)
+        unit[in_v[k]] = 1.0
+        name = next(slot.name for slot in chart.slots if slot.v.start <= in_v[k] < slot.v.stop)
+        near += _near_bounds(f"joint '{name}'", x[k], low[k], high[k], unit)
+    return near, float(np.maximum(low - x, x - high).max(initial=0.0))
 
 
 def _multipliers(gradients: Array, equalities: Array, near: Sequence[_Near]) -> tuple[Array, Array, Array]:

@@ -32,6 +32,7 @@ class Clearance(Constraint):
     """``distance(a, b) − clearance ≥ 0`` for pairs of bodies; the program has the pairs that were found to matter.
 
     A pair that no solve brings close costs nothing.  :meth:`grown` adds pairs that the end of a solve violates.
+    The last exact distance of a pair, less what its bodies have moved since, is a bound as well.
 
     Args:
         name: Name of the constraint.
@@ -65,8 +66,19 @@ class Clearance(Constraint):
         self._first = np.array([where[id(one.a)] for one in self._separators], dtype=int)
         self._margins = np.array([one.margin for one in self._separators])
         self._second = np.array([where[id(one.b)] for one in self._separators], dtype=int)
-        self._centers = [body.center for body in self._bodies]
+        # A body that does not turn keeps world axes around its point.
+        self._turns = np.array([body.turns for body in self._bodies], dtype=bool)
+        self._joints = np.array([body.point.joint for body in self._bodies], dtype=int)
+        still = np.where(self._turns, 0.0, 1.0)[:, None]
+        centers = np.array([body.center for body in self._bodies]).reshape(-1, 3)
+        points = np.array([body.point.position for body in self._bodies]).reshape(-1, 3)
+        self._carried, self._beside = (1 - still) * centers + still * points, still * centers
         self._reach = np.array([0.0 if body.hull is None else body.hull.reach for body in self._bodies])
+        # The last exact distance of each pair and the places of its bodies then; a plane that turns has no reach.
+        turning = [body.normal is not None and body.turns and body.point.joint > 0 for body in self._bodies]
+        self._lasting = ~np.array(turning, dtype=bool)[self._second]
+        self._latest = np.full(len(self._separators), -np.inf)
+        self._then = np.zeros((2, len(self._separators), 12))
         self._planes = [
             (k, self._second == k, body.normal, body.offset)
             for k, body in enumerate(self._bodies)
@@ -93,21 +105,34 @@ class Clearance(Constraint):
 
     # ---- numbers ----------------------------------------------------------------------------------------------
 
-    def _bounds(self, model: Numeric) -> Array:
+    def _placed(self, model: Numeric) -> tuple[Array, Array]:
+        """Return the axes, shape (k, 3, 3), and the centers, shape (k, 3), m, of all bodies in the world."""
+        links = np.array([at.homogeneous for at in model.data.oMi])[self._joints]
+        centers = (links[:, :3, :3] @ self._carried[:, :, None])[:, :, 0] + links[:, :3, 3] + self._beside
+        return np.where(self._turns[:, None, None], links[:, :3, :3], np.eye(3)), centers
+
+    def _bounds(self, model: Numeric, centers: Array) -> Array:
         """Return lower bounds on all distances from a sphere around each body."""
-        centers = np.array([body.place(model, own) for body, own in zip(self._bodies, self._centers, strict=True)])
         apart = centers[self._first] - centers[self._second]
-        bound = np.linalg.norm(apart, axis=1)
+        bound = np.sqrt((apart * apart).sum(axis=1))
         for k, mine, normal, offset in self._planes:
             bound[mine] = apart[mine] @ (self._bodies[k].placement(model).rotation @ normal) - offset
         return np.asarray(bound - self._reach[self._first] - self._reach[self._second] - self._margins)
 
     def _distances(self, model: Numeric, within: float) -> tuple[Array, dict[int, tuple[Array, Array]]]:
         """Return all distances, exact below ``within`` and else lower bounds, and normal and points of the former."""
-        values, found = self._bounds(model), {}
+        axes, centers = self._placed(model)
+        values, found = self._bounds(model, centers), {}
+        near = np.flatnonzero(values < within)
+        if near.size:
+            places = np.hstack([axes.reshape(-1, 9) * self._reach[:, None], centers])
+            now = places[self._first[near]], places[self._second[near]]
+            values[near] = np.maximum(values[near], self._latest[near] - sum(map(_moved, now, self._then[:, near])))
         for k in map(int, np.flatnonzero(values < within)):
             values[k], normal, points = self._separators[k].distance(model)
             found[k] = normal, points
+            if self._lasting[k]:
+                self._latest[k], self._then[:, k] = values[k], places[[self._first[k], self._second[k]]]
         return values, found
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
@@ -126,7 +151,7 @@ class Clearance(Constraint):
 
     def closest(self, model: Numeric) -> tuple[str, float]:
         """Return the pair that is closest, and its distance less the clearance, m."""
-        bounds, found = self._bounds(model), ("", np.inf)
+        bounds, found = self._bounds(model, self._placed(model)[1]), ("", np.inf)
         for k in np.argsort(bounds, kind="stable"):
             if bounds[k] >= found[1]:
                 break
@@ -141,10 +166,13 @@ class Clearance(Constraint):
         for k in np.argsort(values, kind="stable"):
             if values[k] >= -_MISSING or added == _MOST:
                 break
-            new, old = self._separators[int(k)].corners(model), active.get(int(k), Corners(frozenset(), frozenset()))
-            if not (new.a <= old.a and new.b <= old.b):
-                active[int(k)] = Corners(old.a | new.a, old.b | new.b)
-                added += 1
+            one, old = self._separators[int(k)], active.get(int(k), Corners(frozenset(), frozenset()))
+            # A plane of the program that is not the one between the closest points may cut any corner without a row.
+            for new in (one.corners(model), one.every_corner):
+                if not (new.a <= old.a and new.b <= old.b):
+                    active[int(k)] = Corners(old.a | new.a, old.b | new.b)
+                    added += 1
+                    break
         return type(self)(self.name, self._separators, self._words, active, self._lifted) if added else self
 
     # ---- lifted form ------------------------------------------------------------------------------------------
@@ -180,14 +208,25 @@ class Clearance(Constraint):
 
     def guess(self, model: Numeric) -> Guess:
         """See :class:`Constraint`."""
-        parts = [one.guess(model) for _, one, _ in self._program]
-        values, lower = ([np.zeros(0), *[getattr(part, key) for part in parts]] for key in ("values", "lower"))
-        return Guess(np.concatenate(values), np.concatenate(lower))
+        return Guess.joined([one.guess(model) for _, one, _ in self._program])
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
         """See :class:`Constraint`; the rows of pairs that are near, in the program or not."""
-        counts = [one.count for _, one, _ in self._program]
-        own = dict(zip(self.active, np.split(auxiliaries, np.cumsum(counts)[:-1]), strict=False)) if counts else {}
-        values = self._distances(model, _ROWS)[0]
-        parts = [self._separators[int(k)].linearize(model, own.get(int(k))) for k in np.flatnonzero(values < _ROWS)]
+        near = np.flatnonzero(self._distances(model, _ROWS)[0] < _ROWS)
+        own: dict[int, Array] = {}
+        if near.size and self.active:
+            counts = [one.count for _, one, _ in self._program]
+            own = dict(zip(self.active, np.split(auxiliaries, np.cumsum(counts)[:-1]), strict=True))
+        parts = [self._separators[int(k)].linearize(model, own.get(int(k))) for k in near]
         return Linearization.joined(parts, model.model.nv)
+
+
+def _moved(now: Array, then: Array) -> Array:
+    """Return how far a point of each body has moved at most, ``|Δc| + |ΔR| r``, m, shape (k,).
+
+    Args:
+        now: Axes ``R`` times reach ``r``, and center ``c`` of each body, shape (k, 12).
+        then: The same before.
+    """
+    change = (now - then) ** 2
+    return np.asarray(np.sqrt(change[:, 9:].sum(axis=1)) + np.sqrt(change[:, :9].sum(axis=1)))

@@ -74,6 +74,10 @@ class Linearization:
     @staticmethod
     def joined(parts: Sequence[Linearization], nv: int) -> Linearization:
         """Return the rows of several parts, each with auxiliaries of its own."""
+        # Most postures are far from most bounds.
+        parts = [part for part in parts if part.names or part.auxiliary.shape[1]]
+        if len(parts) == 1:
+            return parts[0]
         ends = np.cumsum([0, *[part.auxiliary.shape[1] for part in parts]])
         auxiliary = np.zeros((sum(len(part.names) for part in parts), ends[-1]))
         row = 0
@@ -185,8 +189,8 @@ class Constraint(ABC):
         """Return the name of a row."""
         return self.name if self.rows == 1 else f"{self.name}[{row}]"
 
-    def pose_error(self, model: Numeric) -> tuple[float, float]:
-        """Return the error of a held pose in meters and radians; zeros for other constraints."""
+    def pose_error(self, value: Array) -> tuple[float, float]:
+        """Return the error of a held pose in meters and radians where ``c(q)`` is ``value``; zeros without a pose."""
         return 0.0, 0.0
 
 

@@ -88,7 +88,7 @@ def _relax(problem: PostureProblem, chart: Chart, program: ElasticProgram, start
         x0=np.concatenate([x, np.full(2 * rows, 0.1), guess.values]),
         p=np.concatenate([chart.to_x(problem.given), *[c.parameters for c in problem.constraints]]),
         lbx=np.concatenate([problem.lower, np.zeros(2 * rows), guess.lower]),
-        ubx=np.concatenate([problem.upper, np.full(2 * rows, np.inf), guess.upper]),
+        ubx=np.concatenate([problem.upper, np.full(2 * rows, np.inf), guess.above]),
         lbg=np.concatenate([norms, lower_rows]),
         ubg=np.concatenate([norms, upper_rows]),
     )

@@ -123,7 +123,7 @@ class Equilibrium:
 
         This proves without a linear program that the posture can be held.  It says nothing if they do not.
         """
-        still = self.load.torque(q, np.zeros(self.load.count))
+        still = self.load.torque(q, np.zeros(self.load.count), by_posture=False)
         A, b, S, c = self._affine(still.value, still.by_force)
         lower, upper = self.load.lower, self.load.upper
         pushing = np.isfinite(lower) & np.isinf(upper)

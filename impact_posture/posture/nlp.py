@@ -1,15 +1,5 @@
 """The nonlinear program, which is built once and solved for many starts, normals and targets.
 
-The lifted formulation leaves the linear solve of the impact to IPOPT::
-
-    min over x, a, f, s   aᵀWa        (or λ/2)
-    subject to            M(q)a − J_sᵀf − Jᵀs = 0,  J_s a + εf = 0,  equations of s and n,
-                          c(q) within bounds,  |quaternions| = 1,  limits,
-
-Every function is then linear or quadratic in the auxiliaries, and the exact Hessian stays small
-(``tests/benchmarks/formulations.py`` measures both forms).  An inner maximum adds a form of its own
-(:mod:`impact_posture.impact.worst_case`).
-
 NumPy, SciPy and CasADi (for MUMPS, within IPOPT) each bring a BLAS that uses all cores.  The systems here have about
 a hundred unknowns, so these threads only wait for each other and block the cores of parallel starts.
 :func:`one_blas_thread` stops that.
@@ -22,7 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -32,12 +22,9 @@ import threadpoolctl
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
-from impact_posture.dynamics.numeric import Numeric
-from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.compiled import CompileMode, compiled_solver
-from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.program_rows import Derivatives, ProgramRows, joined
+from impact_posture.posture.program import Program, parameters
 
 IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.print_level": 0,
@@ -121,6 +108,12 @@ class PostureNLP:
         """Coordinates of the robot."""
         return self.program.chart
 
+    def at(self, problem: PostureProblem) -> PostureNLP:
+        """Return the program with another target, whose expressions and bounds of rows are the same."""
+        found = replace(self, problem=problem)
+        vars(found)["_row_bounds"] = self._row_bounds
+        return found
+
     def grown(self, problem: PostureProblem, *, compile: CompileMode = "auto") -> PostureNLP:
         """Build the program of a problem that this one grew into."""
         return build_nlp(problem, compile=compile, program=self.program)
@@ -137,13 +130,15 @@ class PostureNLP:
             price: Price of a meter of slack.
         """
         problem, nx = self.problem, self.chart.nx
-        x = np.clip(self.chart.to_x(start), problem.lower, problem.upper)
-        q = self.chart.to_q(x)
+        given = self.chart.to_x(start)
+        x = np.clip(given, problem.lower, problem.upper)
+        # The quantities at a posture within its limits are known as a rule.
+        q = start if np.array_equal(x, given) else self.chart.to_q(x)
         scale = scale or problem.objective.value(q)
         guess = problem.objective.guess(q, scale, attempt)
         own = problem.guess(self.program.numeric.at(q))
         lower = np.concatenate([problem.lower, guess.lower, own.lower])
-        upper = np.concatenate([problem.upper, np.full(guess.values.size, np.inf), own.upper])
+        upper = np.concatenate([problem.upper, guess.above, own.above])
         p = parameters(problem, self.chart, scale, price)
         x0 = np.concatenate([x, guess.values, own.values])
         began, busy = time.perf_counter(), time.process_time()
@@ -227,59 +222,6 @@ def _noticing_interrupts() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-class Program:
-    """The expressions of a program, most of which stay while the problem grows.
-
-    Args:
-        problem: The problem before it grows.
-
-    Attributes:
-        chart: Coordinates of the robot.
-        numeric: The model in numbers, made once for all runs.
-        bounded: Number of last rows that are inequalities ``≤ 0`` of the objective.
-    """
-
-    def __init__(self, problem: PostureProblem) -> None:
-        self.chart = chart = Chart.of(problem.robot.model)
-        self.numeric = Numeric(problem.robot.model)
-        self._x = x = ca.SX.sym("x", chart.nx)
-        own = ca.SX.sym("own", len(problem.objective.parameters))
-        scale, weight, self._price = ca.SX.sym("scale"), ca.SX.sym("weight"), ca.SX.sym("price")
-        reference = ca.SX.sym("reference", chart.nx)
-        tree = Tree(problem.robot.model, chart.configuration(x), x)
-        self._lifted = lifted = problem.objective.lift(tree, own, scale)
-        self.bounded = int(lifted.inequalities.numel())
-        self._value = lifted.value / scale + weight * distance_squared(chart, tree.q, chart.configuration(reference))
-        self._norms = chart.norms(x)
-        self._rows = ProgramRows(x, tree, problem)
-        self._p = ca.vertcat(own, scale, weight, self._price, reference, *self._rows.parameters)
-
-    def symbols(self, problem: PostureProblem) -> tuple[dict[str, ca.SX], dict[str, ca.Function]]:
-        """Return the expressions of a problem, and the derivatives of one that grows as options of ``nlpsol``.
-
-        The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.
-        """
-        rows, objective = self._rows.lift(problem), self._lifted
-        x = ca.vertcat(self._x, objective.variables, rows.variables)
-        g = ca.vertcat(self._norms, rows.rows, objective.residual, objective.inequalities)
-        symbols = {"x": x, "p": self._p, "f": self._value + self._price * rows.slack, "g": g}
-        if not problem.grows:
-            return symbols, {}
-        found = joined(self._own, self._rows.derivatives(rows), self.chart.nx)
-        # Own rows are the value, the norms and the rows of the objective, with the constraints between the latter.
-        norms, count, own = self._norms.numel(), rows.rows.numel(), self._own.multipliers.numel()
-        order = [*range(1, 1 + norms), *range(own, own + count), *range(1 + norms, own)]
-        placed = Derivatives(found.multipliers[order], found.jacobian[order, :], found.hessian)
-        return symbols, placed.options(x, self._p, found.multipliers[0], g)
-
-    @cached_property
-    def _own(self) -> Derivatives:
-        """Derivatives of the value and of all rows but those of constraints."""
-        objective = self._lifted
-        rows = ca.vertcat(self._value, self._norms, objective.residual, objective.inequalities)
-        return Derivatives.of(rows, ca.vertcat(self._x, objective.variables))
-
-
 def build_nlp(
     problem: PostureProblem, *, compile: CompileMode = "auto", starts: int = 1, program: Program | None = None
 ) -> PostureNLP:
@@ -302,15 +244,3 @@ def build_nlp(
     built = compiled_solver(problem, symbols, options, compile, 1 if problem.grows else starts, derivatives)
     took = time.perf_counter() - began
     return PostureNLP(problem, program, built.solver, took, built.compiled, built.fault)
-
-
-def parameters(problem: PostureProblem, chart: Chart, scale: float, price: float) -> Array:
-    """Return the values of the parameters of the program."""
-    return np.concatenate(
-        [
-            problem.objective.parameters,
-            [scale, problem.requirements.regularization, price],
-            chart.to_x(problem.given),
-            *[c.parameters for c in problem.constraints],
-        ]
-    )

@@ -35,9 +35,9 @@ class HeldPosition(ExpressionConstraint):
         """See :class:`Constraint`."""
         return np.asarray(model.placement(self.point).translation - self.parameters)
 
-    def pose_error(self, model: Numeric) -> tuple[float, float]:
-        """See :class:`Constraint`."""
-        return float(np.linalg.norm(self.value(model))), 0.0
+    def pose_error(self, value: Array) -> tuple[float, float]:
+        """See :class:`Constraint`; outside a box it is the distance from the box."""
+        return float(np.linalg.norm(self.excess(value))), 0.0
 
 
 class PositionBox(HeldPosition):
@@ -56,11 +56,6 @@ class PositionBox(HeldPosition):
         """See :class:`Constraint`."""
         return f"{self.name} along {'xyz'[row]}"
 
-    def pose_error(self, model: Numeric) -> tuple[float, float]:
-        """Return the distance outside the box."""
-        outside = np.maximum(np.abs(self.value(model)) - self.upper, 0.0)
-        return float(np.linalg.norm(outside)), 0.0
-
 
 class HeldOrientation(ExpressionConstraint):
     """The frame keeps its orientation, or the direction of one of its axes.
@@ -77,11 +72,11 @@ class HeldOrientation(ExpressionConstraint):
     """
 
     def __init__(self, name: str, point: PointOnLink, target: Array, axis: Array | None = None) -> None:
-        self.name, self.point, self.target = name, point, np.array(target, dtype=float)
+        self.name, self.point, target = name, point, np.array(target, dtype=float)
         self.axis = axis
         width = 3 if axis is None else 2
         right = np.eye(3) if axis is None else _rotation_to(axis)
-        left = self.target @ right
+        left = target @ right
         self.parameters = np.concatenate([_coefficients(left.T), _coefficients(right)])
         self.lower = self.upper = np.zeros(width)
 
@@ -96,23 +91,16 @@ class HeldOrientation(ExpressionConstraint):
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
-        right = pin.Quaternion(self.parameters[4:8])
-        placement = model.placement(self.point)
-        error = pin.Quaternion(self.parameters[:4]) * pin.Quaternion(placement.rotation) * right
-        vector, w = np.array(error.coeffs()[:3]), float(error.w)
-        sign = 1.0 if w >= 0 else -1.0
+        right, rotation = pin.Quaternion(self.parameters[4:8]), model.placement(self.point).rotation
+        error = (pin.Quaternion(self.parameters[:4]) * pin.Quaternion(rotation) * right).coeffs()
+        x, y, z, w = error if error[3] >= 0 else -error
         # d(2 vec(Q)) = (w I + [v]×) ω in the axes that Q turns: those of the frame times `right`.
-        body = (placement.rotation @ right.matrix()).T @ model.jacobian(self.point)[3:]
-        J = (w * np.eye(3) + pin.skew(vector)) @ body
-        return sign * 2 * vector[: self.rows], sign * J[: self.rows]
+        turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w]])[: self.rows] @ (rotation @ right.matrix()).T
+        return 2 * np.array([x, y, z])[: self.rows], turn @ model.jacobian(self.point)[3:]
 
-    def pose_error(self, model: Numeric) -> tuple[float, float]:
-        """See :class:`Constraint`."""
-        rotation = model.placement(self.point).rotation
-        if self.axis is None:
-            return 0.0, float(np.linalg.norm(pin.log3(self.target.T @ rotation)))
-        now, wanted = rotation @ self.axis, self.target @ self.axis
-        return 0.0, float(np.arctan2(np.linalg.norm(np.cross(now, wanted)), now @ wanted))
+    def pose_error(self, value: Array) -> tuple[float, float]:
+        """See :class:`Constraint`; the rows are ``2 sin(θ/2)`` along the axis of a rotation by θ, or of a tilt."""
+        return 0.0, 2 * float(np.arcsin(min(1.0, float(np.linalg.norm(value)) / 2)))
 
 
 class HeldPose(ExpressionConstraint):
@@ -141,10 +129,10 @@ class HeldPose(ExpressionConstraint):
         values, jacobians = zip(*(p.evaluate(model) for p in self._parts), strict=True)
         return np.concatenate(values), np.vstack(jacobians)
 
-    def pose_error(self, model: Numeric) -> tuple[float, float]:
+    def pose_error(self, value: Array) -> tuple[float, float]:
         """See :class:`Constraint`."""
         position, orientation = self._parts
-        return position.pose_error(model)[0], orientation.pose_error(model)[1]
+        return position.pose_error(value[:3])[0], orientation.pose_error(value[3:])[1]
 
 
 class AxisInCone(ExpressionConstraint):

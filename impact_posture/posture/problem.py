@@ -145,13 +145,7 @@ class PostureProblem:
 
     def guess(self, numeric: Numeric) -> Guess:
         """Return the auxiliaries of all constraints to start from at ``numeric.q``, with their bounds."""
-        parts, empty = [c.guess(numeric) for c in self.constraints], np.zeros(0)
-        above = [np.full(part.values.size, np.inf) if part.upper is None else part.upper for part in parts]
-        return Guess(
-            np.concatenate([empty, *[part.values for part in parts]]),
-            np.concatenate([empty, *[part.lower for part in parts]]),
-            np.concatenate([empty, *above]),
-        )
+        return Guess.joined([c.guess(numeric) for c in self.constraints if c.unknowns])
 
     def split(self, auxiliaries: Array) -> list[Array]:
         """Return the auxiliaries of each constraint."""
@@ -163,9 +157,14 @@ class PostureProblem:
         """Whether the program may lack parts."""
         return any(c.grows for c in self.constraints)
 
-    def grown(self, postures: Sequence[Array]) -> PostureProblem:
-        """Return the problem with the parts that its program lacks at any of the postures; itself if none."""
-        constraints, numeric = list(self.constraints), Numeric(self.robot.model)
+    def grown(self, postures: Sequence[Array], numeric: Numeric | None = None) -> PostureProblem:
+        """Return the problem with the parts that its program lacks at any of the postures; itself if none.
+
+        Args:
+            postures: The postures, shape (nq,) each.
+            numeric: The model, if the caller has it; it is moved.
+        """
+        constraints, numeric = list(self.constraints), numeric or Numeric(self.robot.model)
         for q in postures:
             numeric.at(q)
             constraints = [c.grown(numeric) for c in constraints]

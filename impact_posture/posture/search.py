@@ -131,10 +131,11 @@ class Search:
                 if progress:
                     progress(min(len(runs), starts), starts)
             lacking = {k: r.q for k in waiting if (r := runs[k].record) is not None and runs[k].lacks}
-            # A higher price may lead out of a trap.
-            trapped = {k: r.q for k in waiting if (r := runs[k].record) is not None and runs[k].trapped}
-            self._trapped |= set(trapped)
-            self._ends |= lacking | trapped
+            # A run without all rows goes through bodies and may end between them.  With the rows and a higher price
+            # it keeps what its start satisfies.
+            trapped = {k for k in waiting if runs[k].trapped}
+            self._trapped |= trapped
+            self._ends = {k: q for k, q in (self._ends | lacking).items() if k not in trapped}
             waiting = sorted({*lacking, *trapped, *later})
             if lacking:
                 self.problem = self.problem.grown(list(lacking.values()))

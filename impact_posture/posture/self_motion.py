@@ -18,7 +18,7 @@ from impact_posture.posture.constraint_manifold import ConstraintManifold
 from impact_posture.posture.starts import random_posture
 
 # Steps along a curve, rad or m: the first, the longest, and one so short that the curve is singular.
-_FIRST, _LONGEST, _SINGULAR = 0.02, 0.08, 1e-7
+_FIRST, LONGEST_STEP, _SINGULAR = 0.02, 0.08, 1e-7
 # Cosine of the largest turn of the tangent in a step, and of a turn that lets the steps grow.
 _TURN, _STRAIGHT = 0.98, 0.995
 # A posture belongs to a node if it leaves the node's tangent space by at most this share of its distance.
@@ -111,6 +111,11 @@ def map_self_motion(
         idle = 0 if len(x) else idle + _BATCH
         unsuccessful = 0 if new else unsuccessful + len(x)
     return SelfMotion(manifold, dimension, tuple(found), starts, unsuccessful)
+
+
+def component_through(manifold: ConstraintManifold, x: Array) -> SelfMotion:
+    """Follow the curve through one posture, shape (nx,), of a manifold with one degree of freedom."""
+    return SelfMotion(manifold, 1, (_curve(manifold, x),), 0, 0)
 
 
 def _random(manifold: ConstraintManifold, rng: np.random.Generator) -> Array:
@@ -221,7 +226,7 @@ def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple
         nodes.append(moved.x[0])
         lengths.append(length)
         x, direction = moved.x[0], ahead
-        step = min(step * (1.5 if turn > _STRAIGHT else 1.0), _LONGEST)
+        step = min(step * (1.5 if turn > _STRAIGHT else 1.0), LONGEST_STEP)
     return nodes, lengths, "unfinished"
 
 

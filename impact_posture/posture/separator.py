@@ -79,12 +79,6 @@ class Body:
         center = np.zeros(3) if self.hull is None else self.hull.center
         return np.asarray(self.point.placement.act(center)) if self.turns else center
 
-    def place(self, model: Numeric, center: Array) -> Array:
-        """Return the place of the :attr:`center` in the world, shape (3,), m."""
-        if self.turns:
-            return np.asarray(model.data.oMi[self.point.joint].act(center))
-        return np.asarray(model.data.oMi[self.point.joint].act(self.point.position) + center)
-
     def rates(self, model: Numeric, direction: Array, positions: Array) -> Array:
         """Return the tangent gradients of the heights of points of the body, shape (k, nv).
 
@@ -177,6 +171,13 @@ class Separator:
             frozenset(int(k) for k in (first @ self._x.T).argmin(axis=1)),
             frozenset(int(k) for k in (second @ self._y.T).argmax(axis=1)) if len(self._y) else frozenset(),
         )
+
+    @property
+    def every_corner(self) -> Corners:
+        """All corners of both bodies; none of a body in front of a known plane, which is the one that it has."""
+        if self.known:
+            return Corners(frozenset(), frozenset())
+        return Corners(frozenset(range(len(self._x))), frozenset(range(len(self._y))))
 
     def _relative(self, tree: Tree) -> tuple[ca.SX, ca.SX]:
         """Placement of ``a`` in the axes of ``b``."""

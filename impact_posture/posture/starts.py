@@ -46,7 +46,7 @@ class Projector:
         self.numeric = Numeric(problem.robot.model)
         self.chart = Chart.of(problem.robot.model)
         self._held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
-        self._in_v, self._in_x = _bounded_entries(self.chart)
+        self._in_v, self._in_x = self.chart.bounded
 
     def clip(self, q: Array) -> Array:
         """Clamp ``q`` to the bounds."""
@@ -156,10 +156,3 @@ def random_posture(problem: PostureProblem, chart: Chart, rng: np.random.Generat
         step[:base] = rng.normal(size=base) * np.array([0.15] * 3 + [0.15, 0.15, 0.6])
         q = pin.integrate(model, q, step)
     return np.asarray(q)
-
-
-def _bounded_entries(chart: Chart) -> tuple[list[int], list[int]]:
-    """Tangent indices and chart indices of coordinates that equal their tangent entry."""
-    slots = [slot for slot in chart.slots if slot.kind.family in ("revolute", "prismatic", "translation")]
-    in_v = [k for slot in slots for k in range(slot.v.start, slot.v.stop)]
-    return in_v, [k for slot in slots for k in range(slot.x.start, slot.x.stop)]

@@ -47,7 +47,7 @@ class StaticTorque:
 
     Attributes:
         value: ``τ``, shape (nv,).
-        by_posture: Tangent Jacobian ``∂τ/∂q``, shape (nv, nv).
+        by_posture: Tangent Jacobian ``∂τ/∂q``, shape (nv, nv); zero if it was left out.
         by_force: ``∂τ/∂z``, shape (nv, k).
     """
 
@@ -97,8 +97,8 @@ class StaticLoad:
             wrenches.append(Wrench(source.point, w[:3], w[3:], source.in_frame))
         return -tree.generalized_force(wrenches)
 
-    def torque(self, q: Array, z: Array) -> StaticTorque:
-        """Return ``τ`` and its derivatives at a posture.
+    def torque(self, q: Array, z: Array, *, by_posture: bool = True) -> StaticTorque:
+        """Return ``τ`` and its derivatives at a posture, or ``τ`` and ``∂τ/∂z`` alone, which takes less time.
 
         Pinocchio holds forces constant in the link.  A force in world axes turns back as its link turns by δ, and
         becomes ``f + f × δ`` there.
@@ -112,16 +112,19 @@ class StaticLoad:
             point, joint = source.point, source.point.joint
             axes = point.rotation if source.in_frame else np.array(data.oMi[joint].rotation).T
             arm = pin.skew(point.position)
-            local = np.block([[axes, np.zeros((3, 3))], [arm @ axes, axes]])
+            local = np.zeros((6, 6))
+            local[:3, :3], local[3:, :3], local[3:, 3:] = axes, arm @ axes, axes
             jacobian = np.array(pin.getJointJacobian(model, data, joint, pin.LOCAL)).reshape(6, -1)
             by_force[:, start : start + own.size] = -jacobian.T @ local @ source.columns
             wrench = source.columns @ own + source.constant
             forces[joint] = forces[joint] + pin.Force(local @ wrench)
-            if not source.in_frame:
+            if by_posture and not source.in_frame:
                 force, moment = pin.skew(axes @ wrench[:3]), pin.skew(axes @ wrench[3:])
                 turning += jacobian.T @ np.vstack([force, moment + arm @ force]) @ jacobian[3:]
         external = pin.StdVec_Force()
         external.extend(forces)
-        derivative = np.array(pin.computeStaticTorqueDerivatives(model, data, q, external))
+        derivative = turning
+        if by_posture:
+            derivative = np.array(pin.computeStaticTorqueDerivatives(model, data, q, external))
         value = np.array(pin.rnea(model, data, q, np.zeros(model.nv), np.zeros(model.nv), external))
         return StaticTorque(value, derivative - turning, by_force)

@@ -173,7 +173,7 @@ class Surroundings:
 
     def closest(self, q: Array) -> dict[str, object]:
         """Return the bodies that are closest at ``q``, and their distance, m."""
-        numeric = Numeric(self.robot.model).at(q)
+        numeric = self._moving.at(q)
         name, value = min((c.closest(numeric) for c in self.constraints), key=lambda pair: pair[1])
         return {"closest": name, "distance": value + self._clearance}
 
@@ -195,6 +195,11 @@ class Surroundings:
         return self._meshes.collisions(q, solids, planes)
 
     @cached_property
+    def _moving(self) -> Numeric:
+        """The model at the posture that is looked at last, because the other one stays at the given posture."""
+        return Numeric(self.robot.model)
+
+    @cached_property
     def _meshes(self) -> MeshCheck:
         return MeshCheck(self.robot, self.shapes)
 
@@ -203,8 +208,7 @@ class Surroundings:
 
         Each comes with its exempt joints.
         """
-        numeric = Numeric(self.robot.model).at(q)
-        planes, solids = [], []
+        numeric, planes, solids = self._moving.at(q), [], []
         for wall in self._walls:
             at = wall.body.placement(numeric)
             if wall.body.normal is not None:

@@ -70,37 +70,46 @@ class Content:
     sources: tuple[tuple[str, str], ...] = ()
 
 
-def write_page(folder: Path, content: Content, scene: Scene) -> Path:
-    """Write ``report.html`` into a folder, with the figures that lie there; return its path.
+def write_page(
+    folder: Path, content: Content, scene: Scene, pictures: Sequence[tuple[str, str]] | None = None
+) -> Path:
+    """Write ``report.html`` into a folder; return its path.
+
+    Args:
+        folder: The folder.
+        content: What the page says.
+        scene: What its viewer shows.
+        pictures: What :func:`figures` returns, if it is known.
 
     Raises:
         OutputError: It cannot be written.
     """
-    write_whole(folder / REPORT, render(content, scene, figures(folder)))
+    write_whole(folder / REPORT, render(content, scene, figures(folder) if pictures is None else pictures))
     return folder / REPORT
 
 
 def render(content: Content, scene: Scene, pictures: Sequence[tuple[str, str]]) -> str:
     """Return the page.  Each text of it is escaped, and it may load nothing and run nothing but its own viewer."""
     packed, arrays = scene.packed
-    names = ("viewer.min.js", "loader.js", "page.css")
-    viewer, loader, style = ((_VIEWER / name).read_text(encoding="utf-8") for name in names)
+    viewer, compressed = read_viewer()
+    loader, style = ((_VIEWER / name).read_text(encoding="utf-8") for name in ("loader.js", "page.css"))
     # Scripts end at "</", wherever it stands.
     data = packed.replace("<", "\\u003c")
     text: str = load_template().render(
         content=content, scene=scene, pictures=pictures, data=data, arrays=arrays, style=style, loader=loader,
-        viewer=zipped(viewer.encode()), license=viewer.partition("*/")[0].partition("/*!")[2].strip(),
+        viewer=compressed, license=viewer.partition("*/")[0].partition("/*!")[2].strip(),
         version=__version__, charts=[_charts(track) for track in scene.tracks],
         hashes={"viewer": _hash(viewer), "loader": _hash(loader), "style": _hash(style)},
     )  # fmt: skip
     return text
 
 
-def figures(folder: Path) -> list[tuple[str, str]]:
+def figures(folder: Path, pattern: str = "*") -> list[tuple[str, str]]:
     """Return name and address of each figure in a folder and below: SVG if there is one, else PNG in fewer colors."""
-    found = sorted(p for p in folder.rglob("*") if p.suffix in _TYPES and p.is_file())
-    each = [list(same) for _, same in groupby(found, key=lambda path: path.with_suffix(""))]
-    return [(str(p[-1].relative_to(folder).with_suffix("")), _address(p[-1])) for p in each]
+    found = sorted(p for p in folder.rglob(pattern) if p.suffix in _TYPES and p.is_file())
+    # An SVG comes behind the PNG of the same name and takes its place.
+    each = {str(path.relative_to(folder).with_suffix("")): path for path in found}
+    return [(name, _address(path)) for name, path in each.items()]
 
 
 def _address(path: Path) -> str:
@@ -118,6 +127,13 @@ def _address(path: Path) -> str:
 
 def _hash(text: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+
+
+@cache
+def read_viewer() -> tuple[str, str]:
+    """Return the script of the viewer, and what :func:`zipped` makes of it, which takes long for the first time."""
+    viewer = (_VIEWER / "viewer.min.js").read_text(encoding="utf-8")
+    return viewer, zipped(viewer.encode())
 
 
 @cache

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ def write_result_report(
     *,
     meshes: bool = False,
     scene: Scene | None = None,
+    pictures: Sequence[tuple[str, str]] | None = None,
 ) -> Path:
     """Write ``report.html`` of a result into its folder; return its path.
 
@@ -42,12 +43,13 @@ def write_result_report(
         document: The content of ``result.json``.
         meshes: Pass on the meshes of the user's own URDF, too.
         scene: What :func:`result_scene` returns, if it is known.
+        pictures: What :func:`~impact_posture.report.page.figures` returns, if it is known.
 
     Raises:
         OutputError: It cannot be written.
     """
     scene = scene or result_scene(prepared, view, meshes)
-    return write_page(folder, _content(folder, prepared, view, document), scene)
+    return write_page(folder, _content(folder, prepared, view, document), scene, pictures)
 
 
 def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> Scene:

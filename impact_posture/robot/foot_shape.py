@@ -14,7 +14,7 @@ import pinocchio as pin
 from impact_posture.arrays import Array
 from impact_posture.robot.guess import joints_to, upright_frames
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import SupportSpec
+from impact_posture.robot.spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
 
 # Points of a foot within this distance (m) of its lowest one touch the ground with it.
@@ -25,7 +25,7 @@ _SOLE = 0.01
 _UPRIGHT = float(np.cos(np.radians(1.0)))
 
 
-def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> SupportSpec:
+def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> Support:
     """Return a foot with its contact point or sole, as far as primitive collision shapes define them.
 
     Args:
@@ -36,7 +36,7 @@ def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> SupportSpec:
     """
     data, index = upright_frames(robot), robot.frame_id(frame)
     points = _lowest_points(robot, data, index, urdf)
-    foot = SupportSpec(frame=frame, kind="surface" if flat else "point")
+    foot = Support(frame=frame, kind="surface" if flat else "point")
     if not len(points):
         return foot
     placement = data.oMf[index]
@@ -50,13 +50,13 @@ def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> SupportSpec:
     return replace(foot, kind="surface", size=(half_x, half_y)) if wide else foot
 
 
-def foot_specs(robot: Robot, feet: Sequence[str], urdf: Path) -> list[SupportSpec]:
+def foot_specs(robot: Robot, feet: Sequence[str], urdf: Path) -> list[Support]:
     """Return the feet as supports; those of two legs of six joints or more count as flat."""
     flat = len(feet) == 2
     return [support(robot, f, urdf, flat=flat and len(joints_to(robot, f)) > 5) for f in feet]
 
 
-def support_depth(robot: Robot, feet: Sequence[SupportSpec]) -> float:
+def support_depth(robot: Robot, feet: Sequence[Support]) -> float:
     """Return the depth of the center of mass in the support polygon, m; negative outside or without a polygon."""
     model, q = robot.model, robot.posture()
     data = model.createData()

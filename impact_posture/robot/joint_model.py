@@ -124,11 +124,10 @@ def describe_joints(robot: Robot) -> str:
     """Say in words what the impact meets at the joints."""
     armature = np.asarray(robot.model.armature)[6 if robot.floating else 0 :]
     held, kept = int(np.isinf(armature).sum()), int((np.isfinite(armature) & (armature > 0)).sum())
-    parts = [f"{held} of {len(armature)} joints rigid"] if held else []
-    if robot.joint_model == "reflected":
-        parts.insert(0, "links and rotors")
-    if robot.joint_model == "elastic":
-        parts.insert(0, "rotors on springs; H, G, V, S, E of the first moment")
-    if robot.joint_model == "link":
-        parts.insert(0, "links without rotors" + (f", but {kept} rigid transmissions" if kept else ""))
-    return f"{robot.joint_model} ({', '.join(parts)})"
+    words = {
+        "reflected": "links and rotors",
+        "elastic": "rotors on springs; H, G, V, S, E of the first moment",
+        "link": "links without rotors" + (f", but {kept} rigid transmissions" if kept else ""),
+    }
+    parts = [words.get(robot.joint_model), f"{held} of {len(armature)} joints rigid" if held else ""]
+    return f"{robot.joint_model} ({', '.join(filter(None, parts))})"

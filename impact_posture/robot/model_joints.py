@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import JointNotFound
 
+# Pinocchio writes "no limit" as the largest double.
+ENDLESS = 1e10
+
 
 def is_free_flyer(model: pin.Model) -> bool:
     """Tell whether the first joint of a model is a free-flyer."""

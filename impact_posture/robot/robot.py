@@ -25,6 +25,8 @@ FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
 
 # Rounding error of a zero in a rotation matrix or an inertia (SI units).
 _ROUNDING = 1e-14
+# Largest distance (rad, m) beyond a position limit that counts as on it.
+_ON_LIMIT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,22 +124,12 @@ class Robot:
         return self._hash(np.asarray(self.model.armature))
 
     def _hash(self, armature: Array) -> str:
-        model = self.model
-        content = [
-            [
-                [
-                    str(model.names[i]),
-                    str(model.joints[i].shortname()),
-                    int(model.parents[i]),
-                    *_rounded(model.jointPlacements[i].homogeneous),
-                    *_rounded(model.inertias[i].matrix()),
-                    *_rounded(_axis(model.joints[i])),
-                ]
-                for i in range(1, model.njoints)
-            ],
-            _rounded(armature),
-        ]
-        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+        model, joints = self.model, []
+        for i in range(1, model.njoints):
+            arrays = model.jointPlacements[i].homogeneous, model.inertias[i].matrix(), _axis(model.joints[i])
+            numbers = [number for array in arrays for number in _rounded(array)]
+            joints.append([str(model.names[i]), str(model.joints[i].shortname()), int(model.parents[i]), *numbers])
+        return hashlib.sha256(json.dumps([joints, _rounded(armature)]).encode()).hexdigest()
 
     def frame_id(self, name: str) -> int:
         """Return the index of the frame ``name``; if a link and a joint share the name, that of the link.
@@ -234,7 +226,7 @@ class Robot:
         what = f"the base quaternion {fault} and looks like w x y z"
         raise PostureError(what, where=where, hint="give it as x y z w (scalar last)")
 
-    def check_limits(self, q: Array, *, where: str = "posture", tolerance: float = 1e-6) -> None:
+    def check_limits(self, q: Array, *, where: str = "posture") -> None:
         """Raise :class:`NotWithinLimits` for the first joint of ``q`` outside its position limits."""
         for joint in self.joint_names:
             index = self.model.getJointId(joint)
@@ -243,7 +235,7 @@ class Robot:
             entries = q_slice(self.model, index)
             for k in range(entries.start, entries.stop):
                 low, high = float(self.model.lowerPositionLimit[k]), float(self.model.upperPositionLimit[k])
-                if not low - tolerance <= q[k] <= high + tolerance:
+                if not low - _ON_LIMIT <= q[k] <= high + _ON_LIMIT:
                     raise NotWithinLimits(joint, float(q[k]), low, high, where=where)
 
 

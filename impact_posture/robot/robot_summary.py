@@ -10,13 +10,11 @@ import pinocchio as pin
 
 from impact_posture.errors import ImpactPostureError
 from impact_posture.robot.actuation import allocation, hover, lateral_force_range, thrust_limits
+from impact_posture.robot.model_joints import ENDLESS
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import known_robots
 from impact_posture.robot.spec import PropulsionSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, robots_data
-
-# Pinocchio writes "no limit" as the largest double.
-_NO_LIMIT = 1e10
 
 WAYS_TO_NAME = (
     "a known name, as listed",
@@ -157,7 +155,7 @@ def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
             "violations": list(held.violations),
             "lateral_force": None,
         }
-        if _level(robot, q):
+        if pin.Quaternion(np.array(q[3:7])).toRotationMatrix()[2, 2] > 1 - 1e-6:
             lateral = lateral_force_range(model, propulsion, q)
             sides = ("forward", "backward", "left", "right")
             entry["lateral_force"] = {side: _finite(getattr(lateral, side)) for side in sides}
@@ -174,12 +172,8 @@ def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
     }
 
 
-def _level(robot: Robot, q: np.ndarray[Any, np.dtype[np.float64]]) -> bool:
-    return bool(pin.Quaternion(np.array(q[3:7])).toRotationMatrix()[2, 2] > 1 - 1e-6)
-
-
 def _limit(value: float) -> float | None:
-    return float(value) if np.isfinite(value) and abs(value) < _NO_LIMIT else None
+    return _finite(value) if abs(value) < ENDLESS else None
 
 
 def _finite(value: float) -> float | None:

@@ -55,18 +55,30 @@ class ContactSpec(_Table):
 
 
 @dataclass(frozen=True)
-class SupportSpec(_Table):
-    """A foot that stays on the ground.
+class Support(_Table):
+    """A foot that stays on the ground; its velocities are zero up to the compliance.
 
-    With kind ``point``, the contact point (frame origin plus ``offset``, in the frame) does not move.  With
-    ``surface``, the frame does not turn either.  ``size`` holds the half extents (x, y) of a sole around that point,
-    in the frame, meters, and widens the support polygon.
+    Attributes:
+        frame: Frame of the foot.
+        kind: ``point`` holds the three velocities of the contact point, ``surface`` also those of rotation.
+        offset: Contact point from the frame's origin, in the frame, meters.
+        size: Half extents (x, y) of the sole around the contact point, in the frame, meters.
     """
 
     frame: str
     kind: SupportKind = "point"
     offset: Vector3 = (0.0, 0.0, 0.0)
     size: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+
+    @property
+    def rows(self) -> int:
+        """Number of velocities that it holds."""
+        return 3 if self.kind == "point" else 6
+
+    @property
+    def has_sole(self) -> bool:
+        """Whether it is a surface of known size."""
+        return self.kind == "surface" and min(self.size) > 0
 
 
 @dataclass(frozen=True)
@@ -160,7 +172,7 @@ class RobotSpec(_Table):
     default_posture: str | None = None
     postures: dict[str, PostureSpec] = field(default_factory=dict)
     contact: ContactSpec = ContactSpec()
-    supports: tuple[SupportSpec, ...] = ()
+    supports: tuple[Support, ...] = ()
     constraints: ConstraintSpec = ConstraintSpec()
     limits: LimitSpec = LimitSpec()
     armature: ArmatureSpec = ArmatureSpec()

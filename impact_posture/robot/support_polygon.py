@@ -16,8 +16,9 @@ def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
     """Return the edges ``n·p ≤ b`` of the convex hull of points of the plane; ``None`` if they span no area.
 
     Each chain of the hull goes along the sorted points and leaves out those that do not turn left (A. M. Andrew,
-    "Another efficient algorithm for convex hulls in two dimensions", Inf. Process. Lett. 1979).  SciPy has convex
-    hulls as well, but takes longer to import than many problems take to solve.
+    "Another efficient algorithm for convex hulls in two dimensions", Inf. Process. Lett. 1979).  Corners that lie on
+    the line of their neighbors then go.  SciPy has convex hulls as well, but takes longer to import than many
+    problems take to solve.
 
     Args:
         points: Points, shape (2,) each, m.
@@ -30,10 +31,17 @@ def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
     for chain in (ordered, ordered[::-1]):
         hull: list[Array] = []
         for point in map(np.array, chain):
-            while len(hull) > 1 and _height(hull[-2], point, hull[-1]) < _ROUNDING:
+            while len(hull) > 1 and _height(hull[-2], point, hull[-1]) <= 0:
                 hull.pop()
             hull.append(point)
         corners += hull[:-1]
+    while len(corners) > 2:
+        # Only now is a point near the line of its neighbors also between them.
+        around = zip(np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0), corners, strict=True)
+        heights = [_height(*points) for points in around]
+        if min(heights) >= _ROUNDING:
+            break
+        corners.pop(int(np.argmin(heights)))
     if len(corners) < 3:
         return None
     steps = np.roll(corners, -1, axis=0) - corners

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from impact_posture.arrays import Array
+from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.settings import Vector3
 from impact_posture.simulation.contact_forces import ShapeTruth
 
@@ -40,6 +43,29 @@ class Push:
     offset: Vector3 = (0.0, 0.0, 0.0)
 
 
+class ActivePushes:
+    """Pushes that act on a world.
+
+    Attributes:
+        active: For each push, its body, its point in the axes of the body, its force, and its last step.
+
+    Args:
+        model: The MuJoCo model.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._model, self._apply = model, import_mujoco().mj_applyFT
+        self.active: list[tuple[int, Array, Array, int]] = []
+
+    def apply(self, data: Any, step: int) -> None:
+        """Add the forces to a step, and forget the pushes that have ended."""
+        data.qfrc_applied[:] = 0.0
+        self.active = [push for push in self.active if push[-1] > step]
+        for body, point, force, _ in self.active:
+            place = data.xpos[body] + data.xmat[body].reshape(3, 3) @ point
+            self._apply(self._model, data, force, np.zeros(3), place, body, data.qfrc_applied)
+
+
 class Truth(NamedTuple):
     """True state of a world.
 
@@ -62,3 +88,24 @@ class Truth(NamedTuple):
     torques: Array
     shapes: tuple[ShapeTruth, ...]
     at_stops: tuple[str, ...]
+
+
+class Trace(NamedTuple):
+    """True states of a world at n marks, in the words of :class:`Truth` and :class:`ShapeTruth`.
+
+    The first axis is that of the marks.  The second one is that of the joints with limits for ``stopped``, and of the
+    shapes for what follows.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    rotor_speeds: Array
+    torques: Array
+    stopped: Array
+    touching: Array
+    force: Array
+    impulse: Array
+    peak: Array
+    began: Array
+    slip: Array

@@ -1,8 +1,7 @@
-"""Forces of the surfaces on each shape, step by step."""
+"""Forces of the surfaces on each shape, written down in every step and evaluated for many steps at once."""
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +12,8 @@ from impact_posture.arrays import Array
 _ROWS, _FIRST = np.arange(3), np.arange(3) == 0
 # Places of the factors of a vector product.
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+# Steps with contact until they are evaluated, even if nobody looks.
+_MOST = 4096
 
 
 class ShapeTruth(NamedTuple):
@@ -37,122 +38,157 @@ class ShapeTruth(NamedTuple):
     slip: float
 
 
-class _Pairs(NamedTuple):
-    """Contacts of geoms: which shape each belongs to, the way it pushes, and whether it is one on the ground.
+class _Step(NamedTuple):
+    """Contacts of a step, as MuJoCo has them, with the number of the step and the time of its end."""
 
-    All three have shape (shapes, contacts).  ``bodies`` and ``roots`` are those of the second geoms.
-    """
+    number: int
+    time: float
+    geoms: Array
+    sizes: Array
+    rows: Array
+    frames: Array
+    forces: Array
 
-    of_shape: Array
-    signed: Array
-    on_ground: Array
-    bodies: Array
-    roots: Array
+
+class _Mark(NamedTuple):
+    """Contacts after a step, with velocities and centers of mass of all bodies, as MuJoCo has them."""
+
+    geoms: Array
+    points: Array
+    frames: Array
+    twists: Array
+    centers: Array
 
 
 class ContactLog:
-    """Contact forces of the last step, and what accumulates from them.
+    """Contacts of all steps since the last :meth:`look`, and what accumulates from them.
 
     Args:
         model: The MuJoCo model.
         geoms: Names of the geoms of the shapes.
-        frames: The frames that carry the shapes.
     """
 
-    def __init__(self, model: Any, geoms: tuple[str, ...], frames: tuple[str, ...]) -> None:
-        self._frames, count = frames, len(frames)
+    def __init__(self, model: Any, geoms: tuple[str, ...]) -> None:
+        self._count, self._step = len(geoms), float(model.opt.timestep)
         # MuJoCo names the plane of a contact first, so the contact pushes the second geom.  A ball may be either.
         self._shape_of = np.full(model.ngeom, -1)
         for k, name in enumerate(geoms):
             self._shape_of[model.geom(name).id] = k
         self._body_of, self._root_of = np.array(model.geom_bodyid), np.array(model.body_rootid)
-        self._step = float(model.opt.timestep)
-        self.forces: Array = np.zeros((count, 3))
-        self._normal, self._impulses, self._peaks = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
-        self._began = np.full(count, np.nan)
-        # The same geoms touch for many steps: what only depends on which ones do, by their pairs.
-        self._pairs: dict[bytes, _Pairs] = {}
-        self.pushing = False
-        """Whether a surface pushed a shape in the last step."""
+        self.reset()
 
     def reset(self) -> None:
-        """Set everything to zero."""
-        for values in (self.forces, self._normal, self._impulses, self._peaks):
-            values[:] = 0.0
-        self._began[:] = np.nan
-        self.pushing = False
+        """Forget everything."""
+        count = self._count
+        self._steps: list[_Step] = []
+        self._marks: list[tuple[int, _Mark | None]] = []
+        self._number = 0
+        self._force, self._normal, self._impulse = np.zeros((count, 3)), np.zeros(count), np.zeros((count, 3))
+        self._peak, self._began = np.zeros(count), np.full(count, np.inf)
 
-    def step(self, data: Any) -> None:
-        """Add the forces of a step from ``data.time − timestep`` to ``data.time``."""
-        if not data.ncon:
-            if self.pushing:
-                self.forces[:], self._normal[:], self.pushing = 0.0, 0.0, False
-            return
+    def step(self, data: Any, number: int) -> None:
+        """Write down the contacts of a step, which ends at ``data.time`` and has some."""
         contact = data.contact
-        first, geoms, sizes = contact.efc_address, contact.geom, contact.dim
-        frames = contact.frame.reshape(-1, 3, 3)
-        if first.min() < 0:
-            # A contact just outside the surface does not push and has no address.
-            there = first >= 0
-            first, geoms, sizes, frames = first[there], geoms[there], sizes[there], frames[there]
+        parts = contact.geom, contact.dim, contact.efc_address, contact.frame, data.efc_force
+        self._steps.append(_Step(number, data.time, *(part.copy() for part in parts)))
+
+    def fold(self, number: int) -> None:
+        """Evaluate the steps until now if they are many and no state waits for a look."""
+        if len(self._steps) >= _MOST and not self._marks:
+            self._marks.append((number, None))
+            *_, peak, began, _ = self.look()
+            self._peak, self._began = peak[0], np.where(np.isnan(began[0]), np.inf, began[0])
+
+    def mark(self, data: Any, number: int) -> None:
+        """Let the state after a step be one to look at."""
+        found = None
+        if data.ncon:
+            parts = data.contact.geom, data.contact.pos, data.contact.frame, data.cvel, data.subtree_com
+            found = _Mark(*(part.copy() for part in parts))
+        self._marks.append((number, found))
+
+    def force(self, shape: int) -> list[float]:
+        """Return the force on a shape in the last step with contact, world, N, shape (3,)."""
+        # For few contacts, as in the middle of a run, this is faster than what evaluates many steps.
+        step, force = self._steps[-1], np.zeros(3)
+        contacts = zip(step.rows, step.sizes, self._shape_of[step.geoms], step.frames, strict=True)
+        for row, size, pair, frame in contacts:
+            if row >= 0 and pair.max() == shape:
+                pushed = step.forces[row : row + size] @ frame.reshape(3, 3)[:size]
+                force = force + pushed if pair[1] >= 0 else force - pushed
+        return list(force.tolist())
+
+    def look(self) -> tuple[Array, ...]:
+        """Return the contacts at all n marks, and begin again.
+
+        Returns:
+            The numbers of :class:`ShapeTruth` in their order, but for the frame.  The first axis is that of the
+            marks, the second that of the shapes.  Where a shape was not touched anew, ``began`` is NaN.
+        """
+        ends, count = np.array([number for number, _ in self._marks]), self._count
+        numbers, n = np.array([step.number for step in self._steps]), ends.size
+        # A run that ends within a tick has steps behind its last mark.
+        looked = int(np.searchsorted(numbers, ends[-1], side="right"))
+        steps, numbers, self._steps = self._steps[:looked], numbers[:looked], self._steps[looked:]
+        # What was there at the last look is still there where no step has been taken since.
+        unmoved = ends == self._number
+        force, normal = self._force * unmoved[:, None, None], self._normal * unmoved[:, None]
+        impulse, peak, began = np.zeros((n, count, 3)), np.zeros((n, count)), np.full((n, count), np.inf)
+        peak[0], began[0] = self._peak, self._began
+        if steps:
+            forces, normals = self._evaluated(steps)
+            into, times = np.searchsorted(ends, numbers), np.array([s.time for s in steps])
+            np.add.at(impulse, into, self._step * forces)
+            np.maximum.at(peak, into, normals)
+            at, shape = np.nonzero(normals > 0)
+            np.minimum.at(began, (into[at], shape), times[at] - self._step)
+            last = np.minimum(np.searchsorted(numbers, ends), len(steps) - 1)
+            now = numbers[last] == ends
+            force[now], normal[now] = forces[last[now]], normals[last[now]]
+        impulse = self._impulse + impulse.cumsum(axis=0)
+        slip = self._slips() * (normal > 0)
+        self._number, self._force, self._normal, self._impulse = int(ends[-1]), force[-1], normal[-1], impulse[-1]
+        self._peak, self._began = np.zeros(count), np.full(count, np.inf)
+        self._marks = []
+        return normal > 0, force, impulse, peak, np.where(np.isinf(began), np.nan, began), slip
+
+    def _evaluated(self, steps: list[_Step]) -> tuple[Array, Array]:
+        """Return forces, shape (steps, shapes, 3), and sums of normal forces, shape (steps, shapes)."""
+        counts, sizes = [s.sizes.size for s in steps], np.concatenate([s.sizes for s in steps])
+        starts = np.cumsum([0, *(s.forces.size for s in steps[:-1])])
+        first, at = np.concatenate([s.rows for s in steps]), np.repeat(np.arange(len(steps)), counts)
+        geoms, frames = np.concatenate([s.geoms for s in steps]), np.concatenate([s.frames for s in steps])
+        # A contact just outside the surface does not push and has no address.
+        there = first >= 0
+        first = (first + np.repeat(starts, counts))[there]
+        at, geoms, sizes, frames = at[there], geoms[there], sizes[there], frames[there].reshape(-1, 3, 3)
         # A contact has one number without friction, else three.
         rough = (sizes == 3)[:, None]
-        local = data.efc_force[first[:, None] + _ROWS * rough] * (rough | _FIRST)
-        pairs = self._known(geoms)
+        local = np.concatenate([s.forces for s in steps])[first[:, None] + _ROWS * rough] * (rough | _FIRST)
+        one, other = self._shape_of[geoms].T
+        shape, sign = np.maximum(one, other), np.where(other >= 0, 1.0, -1.0)
+        forces, normals = np.zeros((len(steps), self._count, 3)), np.zeros((len(steps), self._count))
         # The rows of a contact frame are its axes, the normal first.
-        self.forces[:] = pairs.signed @ (local[:, None, :] @ frames)[:, 0]
-        self._normal[:] = pairs.of_shape @ local[:, 0]
-        self._impulses += self._step * self.forces
-        np.maximum(self._peaks, self._normal, out=self._peaks)
-        pushed = self._normal > 0
-        self.pushing = bool(pushed.any())
-        fresh = pushed & np.isnan(self._began)
-        if fresh.any():
-            self._began[fresh] = data.time - self._step
+        np.add.at(forces, (at, shape), sign[:, None] * (local[:, None, :] @ frames)[:, 0])
+        np.add.at(normals, (at, shape), local[:, 0])
+        return forces, normals
 
-    def look(self, data: Any) -> tuple[ShapeTruth, ...]:
-        """Return the contact of every shape, and begin new peaks and new first touches."""
-        slips, pushed = self._slips(data).tolist(), (self._normal > 0).tolist()
-        peaks, began = self._peaks.tolist(), self._began.tolist()
-        # One copy for all shapes, whose rows nobody writes.
-        forces, impulses = self.forces.copy(), self._impulses.copy()
-        found = tuple(
-            ShapeTruth(
-                frame=frame,
-                touching=pushed[k],
-                force=forces[k],
-                impulse=impulses[k],
-                peak=peaks[k],
-                began=None if math.isnan(began[k]) else began[k],
-                slip=slips[k],
-            )
-            for k, frame in enumerate(self._frames)
-        )
-        self._peaks[:], self._began[:] = 0.0, np.nan
-        return found
-
-    def _slips(self, data: Any) -> Array:
-        """Return tangential speeds, shape (shapes,), of the shapes that were pushed in the last step."""
-        if not (data.ncon and self.pushing):
-            return np.zeros(len(self._frames))
-        contact = data.contact
-        pairs, normals = self._known(contact.geom), contact.frame[:, :3]
-        twists, arms = data.cvel[pairs.bodies], contact.pos - data.subtree_com[pairs.roots]
-        spins = twists[:, :3]
-        velocities = twists[:, 3:] + spins[:, _NEXT] * arms[:, _LAST] - spins[:, _LAST] * arms[:, _NEXT]
+    def _slips(self) -> Array:
+        """Return the largest tangential speed of the contact points of each shape at all marks, shape (n, shapes)."""
+        slips = np.zeros((len(self._marks), self._count))
+        there = [k for k, (_, found) in enumerate(self._marks) if found]
+        if not there:
+            return slips
+        geoms, points, frames, twists, centers = zip(*(self._marks[k][1] for k in there), strict=True)
+        at = np.repeat(np.arange(len(there)), [len(own) for own in geoms])
+        geom, normals = np.concatenate(geoms), np.concatenate(frames)[:, :3]
+        bodies, other = self._body_of[geom[:, 1]], self._shape_of[geom[:, 1]]
+        twist, center = np.array(twists)[at, bodies], np.array(centers)[at, self._root_of[bodies]]
+        arms, spins = np.concatenate(points) - center, twist[:, :3]
+        velocities = twist[:, 3:] + spins[:, _NEXT] * arms[:, _LAST] - spins[:, _LAST] * arms[:, _NEXT]
         velocities -= (normals * velocities).sum(axis=1, keepdims=True) * normals
-        slips = (pairs.on_ground * np.sqrt((velocities * velocities).sum(axis=1))).max(axis=1)
-        return np.asarray(slips * (self._normal > 0))
-
-    def _known(self, geoms: Array) -> _Pairs:
-        """Return what depends on the geoms of the contacts alone, shape (contacts, 2)."""
-        key = geoms.tobytes()
-        if key not in self._pairs:
-            one, other = self._shape_of[geoms].T
-            shapes, bodies = np.maximum(one, other), self._body_of[geoms[:, 1]]
-            of_shape = (shapes == np.arange(len(self._frames))[:, None]).astype(float)
-            # A ball is no place to slide on.
-            ground = (self._body_of[geoms[:, 0]] == 0) & (other >= 0)
-            signed, on_ground = of_shape * np.where(other >= 0, 1.0, -1.0), of_shape * ground
-            self._pairs[key] = _Pairs(of_shape, signed, on_ground, bodies, self._root_of[bodies])
-        return self._pairs[key]
+        # A ball is no place to slide on.
+        ground = (self._body_of[geom[:, 0]] == 0) & (other >= 0)
+        speeds = np.sqrt((velocities * velocities).sum(axis=1))[ground]
+        np.maximum.at(slips, (np.array(there)[at[ground]], other[ground]), speeds)
+        return slips

@@ -69,9 +69,6 @@ _PLAIN = {
 }
 # Drivers that a controller in C can serve.
 _IN_C = (Driver, RobustDriver, FlowDriver, PostureDriver)
-# Runs from which building pays: a humanoid's library takes about 10 s, and saves 4 s of each run.  The cache does not
-# count, because a run would then depend on what ran before, and differ from another one by amplified rounding.
-_PAYS = 3
 _KINDS: dict[str, ObjectiveKind] = {
     "robust-speed": "speed",
     "robust-sticking": "sticking",
@@ -89,8 +86,8 @@ class ControllerFactory:
         setup: The experiment.
         free: Whether gradients and the offline optimum ignore the feet.
         gradient_of: Makes the gradient of an objective, compiled or interpreted.
-        compile: Whether controllers run as machine code: ``auto`` where building it pays, always, or never.
-        runs: Number of runs of each controller that building has to pay for.
+        compile: Whether controllers run as machine code: ``auto`` where they can, always, or never.
+        in_c: Whether the last driver does.
         warnings: What of the last driver is not compiled although it should have been, and why.
     """
 
@@ -98,7 +95,7 @@ class ControllerFactory:
     free: bool = False
     gradient_of: Callable[[ImpactObjective], Gradient] = compiled
     compile: CompileMode = "never"
-    runs: int = 1
+    in_c: bool = False
     warnings: list[str] = field(default_factory=list)
     _fault: str = ""
     _objectives: dict[ObjectiveKind, ImpactObjective] = field(default_factory=dict)
@@ -159,6 +156,7 @@ class ControllerFactory:
             InputError: There is no such mode, the controller has no term to hold, or another package fails.
         """
         self.warnings.clear()
+        self.in_c = False
         modes = get_args(Mode)
         if mode not in modes:
             raise InputError(f"there is no mode '{mode}'", where="--mode", hint=f"one of: {', '.join(modes)}")
@@ -170,6 +168,7 @@ class ControllerFactory:
             raise InputError(f"'{name}' has no term to hold", where="--mode", hint="only robust… and walker have one")
         driver = self._made(name, mode, gain)
         driver.compiled = self._compiled(driver, name)
+        self.in_c = driver.compiled is not None
         return driver
 
     def _made(self, name: str, mode: Mode, gain: float | None) -> Driver:
@@ -207,7 +206,7 @@ class ControllerFactory:
         Other drivers look into their controller, and only Python has one to look into.
         """
         always, controller = self.compile == "always", driver.controller
-        if not always and (self.compile == "never" or self.runs < _PAYS or self._fault or find_compiler() is None):
+        if not always and (self.compile == "never" or self._fault or find_compiler() is None):
             return None
         try:
             if type(driver) not in _IN_C:

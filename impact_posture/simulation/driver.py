@@ -46,10 +46,11 @@ class Driver:
         self._inward = np.zeros(3 if self._end_effector is None else self._end_effector.size)
         self._inward[:3] = -setup.scenario.normal
         self._home: pin.SE3 | Array | None = None
+        self._followed: ReferencePoint | None = None
 
     def reset(self, q: Array) -> Command:
         """Begin at rest.  The tasks hold what is there, whatever an earlier run has moved."""
-        task = self._end_effector
+        task, self._followed = self._end_effector, None
         if task is not None:
             task.target = None
             task.target_velocity = task.target_acceleration = np.zeros(task.size)
@@ -62,8 +63,9 @@ class Driver:
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
         """Return the command, where ``reference`` is the target of the end effector along its way in."""
-        if reference is not None:
+        if reference != self._followed and reference is not None:
             self._follow(reference)
+            self._followed = reference
         if self.compiled is not None:
             return self.compiled.tick(reading)
         return self.controller.tick(reading.t, reading.q, reading.v, reading.force)

@@ -52,7 +52,8 @@ def _falls(setup: Setup, series: Series) -> list[Event]:
         return []
     bounds, built, places = setup.scenario.bounds, setup.world.built, series.q[:, :3]
     upright = pin.Quaternion(setup.q[3:7]).matrix()[2]
-    tilt = np.array([pin.Quaternion(q).matrix()[2] @ upright for q in series.q[:, 3:7]])
+    x, y, z, w = series.q[:, 3:7].T
+    tilt = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1) @ upright
     normal = setup.scenario.normal if setup.scenario.contacts else np.zeros(3)
     sunk = setup.q[2] - normal[2] * series.reference - places[:, 2]
     broken = {

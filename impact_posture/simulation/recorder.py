@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -10,13 +9,15 @@ import numpy as np
 from impact_posture.arrays import Array
 from impact_posture.errors import ImpactPostureError
 from impact_posture.impact.contact import point_on
-from impact_posture.simulation.actuator_command import Truth
+from impact_posture.simulation.actuator_command import Trace
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.series import STATUSES, Series
 from impact_posture.tsid.controller import Command
 
 # Ticks from one evaluation of the metric to the next.  The metric is only drawn.
 _EVERY = 10
+# Ticks after which their true states are taken from the world, so that few contacts wait there.
+_BLOCK = 1000
 _NUMBERS = {status: k for k, status in enumerate(STATUSES)}
 
 
@@ -39,23 +40,17 @@ class Recorder:
     """
 
     def __init__(self, setup: Setup, metric: Callable[[Array], float]) -> None:
-        self._setup, self._metric = setup, metric
+        self._setup, self._metric, self._world = setup, metric, setup.world
         robot, scenario = setup.robot, setup.scenario
         shapes = [s.frame for s in setup.scenario.shapes]
         self._shape = None if scenario.push else shapes.index(scenario.task.frame)
         feet = feet_of(setup)
         self._feet = [k for k, frame in enumerate(shapes) if frame in feet]
-        self._joints = {name: k for k, name in enumerate(robot.tangent_names)}
-        self._rows: list[tuple[object, ...]] = []
-        # Few ticks have a joint at a stop.
-        self._stopped: dict[int, tuple[str, ...]] = {}
-        self._touches: list[float] = []
-        self._touching = False
+        self._rows: list[tuple[Array, float, int, float]] = []
+        self._traces: list[Trace] = []
         self._push = (np.zeros(3), np.inf, -np.inf)
         propulsion = robot.spec.propulsion
         self._rotors = (0.0, 0.0) if propulsion is None else (propulsion.speed_min, propulsion.speed_max)
-        self.speed = 0.0
-        """``‖ν‖`` at the last tick."""
 
     def pushed(self, force: Array, begin: float, end: float) -> None:
         """Record a push that acts from ``begin`` to ``end``."""
@@ -66,47 +61,50 @@ class Recorder:
         """Number of recorded ticks."""
         return len(self._rows)
 
-    def take(self, truth: Truth, command: Command, level: float, distance: float) -> None:
-        """Record a tick."""
-        self.speed = math.sqrt(truth.v.dot(truth.v))
-        if self._shape is not None:
-            hit = truth.shapes[self._shape]
-            # Every look reports a contact that lasts again.
-            if hit.began is not None and not self._touching:
-                self._touches.append(hit.began)
-            self._touching = hit.touching
-            force, peak, slip = hit.force, hit.peak, hit.slip
-        else:
-            force, begin, end = self._push
-            force = force if begin < truth.t <= end + 1e-9 else np.zeros(3)
-            peak = math.sqrt(force.dot(force))
-            slip = max((s.slip for s in truth.shapes), default=0.0)
-        if truth.at_stops:
-            self._stopped[len(self._rows)] = truth.at_stops
-        self._rows.append((
-            truth.t, truth.q, truth.v, truth.torques, command.rotor_speed, truth.rotor_speeds, force, peak, slip,
-            sum(s.touching for s in truth.shapes), [truth.shapes[k].touching for k in self._feet], level,
-            _NUMBERS[command.status], distance,
-        ))  # fmt: skip
+    def take(self, command: Command, level: float, distance: float) -> None:
+        """Record a tick and the state of the world after it."""
+        self._rows.append((command.rotor_speed, level, _NUMBERS[command.status], distance))
+        self._world.mark()
+        if not len(self._rows) % _BLOCK:
+            self._traces.append(self._world.trace())
 
     def first_touch(self, begin: float, end: float) -> float | None:
         """Return when the shape that hits first began to touch within ``[begin, end)``, s."""
-        return next((t for t in self._touches if begin <= t < end), None)
+        trace, k = self._trace(), self._shape
+        assert k is not None  # noqa: S101 (a push has no shape that hits)
+        # A contact that lasts is pushed anew in every tick.
+        before = np.concatenate([[False], trace.touching[:-1, k]])
+        touches = trace.began[~before, k]
+        touches = touches[(begin <= touches) & (touches < end)]
+        return float(touches[0]) if touches.size else None
 
     def series(self) -> Series:
         """Return the time series, with what follows from the recorded states and commands."""
-        t, q, v, torque, command, speed, force, peak, slip, touching, feet, level, status, distance = (
-            np.array(column) for column in zip(*self._rows, strict=True)
-        )
-        stopped = np.zeros(v.shape, dtype=bool)
-        for tick, names in self._stopped.items():
-            stopped[tick, [self._joints[name] for name in names if name in self._joints]] = True
+        trace = self._trace()
+        command, level, status, distance = (np.array(column) for column in zip(*self._rows, strict=True))
+        t, q, (pushed, begin, end) = trace.t, trace.q, self._push
+        if self._shape is not None:
+            force, peak, slip = (x[:, self._shape] for x in (trace.force, trace.peak, trace.slip))
+        else:
+            force = pushed * ((begin < t) & (t <= end + 1e-9))[:, None]
+            peak, slip = np.linalg.norm(force, axis=1), trace.slip.max(axis=1, initial=0.0)
+        stopped, names = np.zeros(trace.v.shape, dtype=bool), self._setup.robot.tangent_names
+        for name, there in zip(self._world.limited, trace.stopped.T, strict=True):
+            if name in names:
+                stopped[:, names.index(name)] = there
         objective = np.full(t.size, np.nan)
         objective[::_EVERY] = [self._value(posture) for posture in q[::_EVERY]]
         return Series(
-            t, q, v, torque, np.clip(command, *self._rotors), speed, force, peak, slip, touching, feet, objective,
-            level, status, stopped, distance,
+            t, q, trace.v, trace.torques, np.clip(command, *self._rotors), trace.rotor_speeds, force, peak, slip,
+            trace.touching.sum(axis=1), trace.touching[:, self._feet], objective, level, status, stopped, distance,
         )  # fmt: skip
+
+    def _trace(self) -> Trace:
+        """Return the true states of all ticks."""
+        if len(self._rows) > sum(trace.t.size for trace in self._traces):
+            self._traces.append(self._world.trace())
+        self._traces = [Trace(*map(np.concatenate, zip(*self._traces, strict=True)))]
+        return self._traces[0]
 
     def _value(self, q: Array) -> float:
         try:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from bisect import bisect_right
+from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,8 +12,7 @@ from impact_posture.errors import InputError
 from impact_posture.simulation.scenario import RepeatedContacts
 
 
-@dataclass(frozen=True)
-class ReferencePoint:
+class ReferencePoint(NamedTuple):
     """Reference along the way in, from the place of the shape at the start.
 
     Attributes:
@@ -70,8 +71,8 @@ class Reference:
             (task.pause, 0.0, 0.0, 0.0),
         ]
         self.task, self.legs = task, (*inward, *rest)
-        self._ends = np.cumsum([leg[0] for leg in self.legs])
-        self.inward, self.cycle = float(self._ends[len(inward) - 1]), float(self._ends[-1])
+        self._ends = [float(end) for end in accumulate(leg[0] for leg in self.legs)]
+        self.inward, self.cycle = self._ends[len(inward) - 1], self._ends[-1]
         self.total = task.settle + task.count * self.cycle
 
     def start(self, contact: int) -> float:
@@ -82,9 +83,9 @@ class Reference:
         """Return the reference at a time, s."""
         contact = min(max(int((t - self.task.settle) // self.cycle), 0), self.task.count - 1)
         since = t - self.start(contact)
-        k = int(np.searchsorted(self._ends, since, side="right"))
+        k = bisect_right(self._ends, since)
         if since < 0 or k == len(self.legs):
             return ReferencePoint(0.0, 0.0, 0.0)
         duration, acceleration, distance, speed = self.legs[k]
-        s = float(since - (self._ends[k] - duration))
+        s = since - (self._ends[k] - duration)
         return ReferencePoint(distance + speed * s + acceleration * s**2 / 2, speed + acceleration * s, acceleration)

@@ -34,6 +34,8 @@ class Rotors:
         self._up, self._down = -timestep / propulsion.time_constant_up, -timestep / propulsion.time_constant_down
         self._coefficient = propulsion.thrust_coefficient
         self.speeds: Array = np.full(len(propulsion.rotors), self._lowest)
+        # The part of the way to its command that a speed goes in 1, 2, ... steps, up and down, by their number.
+        self._gone: dict[int, tuple[Array, Array]] = {}
 
     def reset(self, speeds: ArrayLike) -> None:
         """Set the speeds, cut to the limits.
@@ -52,10 +54,12 @@ class Rotors:
 
     def steps(self, command: Array, count: int) -> Array:
         """Take time steps under one command within the limits.  Return the speeds, shape (count, rotors)."""
+        if count not in self._gone:
+            passed = np.arange(1.0, count + 1)[:, None]
+            self._gone[count] = np.expm1(self._up * passed), np.expm1(self._down * passed)
         away = command - self.speeds
         # A speed never passes its command, so its time constant does not change in between.
-        gone = np.expm1(np.where(away > 0, self._up, self._down) * np.arange(1.0, count + 1)[:, None])
-        speeds = self.speeds - gone * away
+        speeds = self.speeds - np.where(away > 0, *self._gone[count]) * away
         self.speeds = speeds[-1]
         return np.asarray(speeds)
 

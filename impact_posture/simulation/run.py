@@ -116,7 +116,7 @@ class _Loop:
             self.away = error.time
             return False
         distance = 0.0 if point is None else point.distance
-        self.recorder.take(self.world.truth(), command, self.driver.level, distance)
+        self.recorder.take(command, self.driver.level, distance)
         if not self.recorder.ticks % _TELL:
             tell(f"simulating, t = {self.t:.1f} s", None if reference is None else self.t / reference.total)
         return True
@@ -195,5 +195,5 @@ def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Cal
         if brace and loop.t >= BRACE - 1e-9:
             brace.pop()()
         loop.tick()
-        still = still + loop.period if loop.recorder.speed < task.quiet else 0.0
+        still = still + loop.period if loop.world.speed < task.quiet else 0.0
     return True

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -14,9 +15,11 @@ from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.scene import Sensors
 
+# Readings whose noise is drawn at once.
+_DRAWS = 64
 
-@dataclass(frozen=True, eq=False)
-class Reading:
+
+class Reading(NamedTuple):
     """Measured state.
 
     Attributes:
@@ -33,7 +36,29 @@ class Reading:
     force: Array | None
 
 
-@dataclass(frozen=True, eq=False)
+NO_FORCE = [0.0, 0.0, 0.0]
+
+
+class ForceFilter:
+    """Low-pass filter of a force sensor.
+
+    Attributes:
+        force: The filtered force, N, three numbers.
+
+    Args:
+        turns: Cutoff frequency times the time step.
+    """
+
+    def __init__(self, turns: float) -> None:
+        self._share, self.force = -math.expm1(-2 * math.pi * turns), NO_FORCE
+
+    def feel(self, force: list[float]) -> None:
+        """Take the force of a step."""
+        if force is not NO_FORCE or any(self.force):
+            self.force = [old + self._share * (new - old) for old, new in zip(self.force, force, strict=True)]
+
+
+@dataclass(eq=False, slots=True)
 class Sample:
     """True state after a step, which the sensors see, with speeds and angles of the propellers and the felt force."""
 
@@ -42,12 +67,15 @@ class Sample:
     qvel: Array
     speeds: Array
     phases: Array
-    force: Array
+    force: list[float]
+    _state: tuple[Array, Array] | None = field(default=None, init=False)
 
-    @cached_property
+    @property
     def state(self) -> tuple[Array, Array]:
         """The Pinocchio ``(q, ν)``, which callers must copy."""
-        return self.layout.state(self.qpos, self.qvel)
+        if self._state is None:
+            self._state = self.layout.state(self.qpos, self.qvel)
+        return self._state
 
 
 class SensorNoise:
@@ -64,22 +92,32 @@ class SensorNoise:
         if robot.floating:
             angles[:6] = [sensors.base_position] * 3 + [sensors.base_angle] * 3
             rates[:6] = [sensors.base_velocity] * 3 + [sensors.base_rate] * 3
-        self._angles = angles if angles.any() else None
-        self._rates = rates if rates.any() else None
+        # What has no noise draws none.
+        force = np.full(0 if sensors.force_frame is None else 3, sensors.force)
+        parts = [scale if scale.any() else scale[:0] for scale in (angles, rates, force)]
+        self._scales = np.concatenate(parts)
+        self._ends = np.cumsum([part.size for part in parts]).tolist()
         # Only joints with one number have an encoder.
         slots = Chart(robot.model).slots
         self._counted = np.array([s.q.start for s in slots if s.kind.family in ("revolute", "prismatic")], dtype=int)
+        self.reset(np.random.default_rng(0))
 
-    def read(self, t: float, q: Array, v: Array, force: Array | None, generator: np.random.Generator) -> Reading:
+    def reset(self, generator: np.random.Generator) -> None:
+        """Draw all noise from a generator from now on, which nobody else may use."""
+        self._generator, self._drawn = generator, iter(np.zeros((0, 0)))
+
+    def read(self, t: float, q: Array, v: Array, force: Array | None) -> Reading:
         """Add noise to the true state.  The given arrays are not changed."""
-        sensors = self._sensors
-        if self._angles is not None:
-            q = pin.integrate(self._model, q, self._angles * generator.standard_normal(self._angles.size))
+        sensors, (first, second, third) = self._sensors, self._ends
+        drawn = next(self._drawn, None)
+        if drawn is None:
+            # The numbers are those that single draws would give.
+            self._drawn = iter(self._scales * self._generator.standard_normal((_DRAWS, third)))
+            drawn = next(self._drawn)
+        q = pin.integrate(self._model, q, drawn[:first]) if first else q.copy()
         if sensors.joint_resolution:
-            q = q.copy()
-            q[self._counted] = np.round(q[self._counted] / sensors.joint_resolution) * sensors.joint_resolution
-        if self._rates is not None:
-            v = v + self._rates * generator.standard_normal(self._rates.size)
-        if force is not None and sensors.force:
-            force = force + sensors.force * generator.standard_normal(3)
+            q[self._counted] = np.rint(q[self._counted] / sensors.joint_resolution) * sensors.joint_resolution
+        v = v + drawn[first:second] if second > first else v.copy()
+        if force is not None and third > second:
+            force = force + drawn[second:]
         return Reading(t, q, v, force)

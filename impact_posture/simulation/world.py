@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,11 +14,11 @@ from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import hover
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.actuator_command import ActuatorCommand, Push, Truth
-from impact_posture.simulation.contact_forces import ContactLog
+from impact_posture.simulation.actuator_command import ActivePushes, ActuatorCommand, Push, Trace, Truth
+from impact_posture.simulation.contact_forces import ContactLog, ShapeTruth
 from impact_posture.simulation.rotors import Rotors, Vibration
 from impact_posture.simulation.scene import Scene
-from impact_posture.simulation.sensor_noise import Reading, Sample, SensorNoise
+from impact_posture.simulation.sensor_noise import NO_FORCE, ForceFilter, Reading, Sample, SensorNoise
 from impact_posture.simulation.throw import Ball, Throw
 from impact_posture.simulation.world_builder import BuiltScene, build_scene
 from impact_posture.tsid.controller import Command
@@ -27,16 +26,11 @@ from impact_posture.tsid.state import checked_velocity
 
 # No robot is so far away or so fast, m, m/s, rad/s, and no torque so large, N·m.
 _RUNAWAY = 1e6
+_NOTHING = np.zeros(0)
 
 
-@dataclass(frozen=True, eq=False)
-class _ActivePush:
-    """A push on a point of a body until a step."""
-
-    body: int
-    point: Array
-    force: Array
-    end: int
+def _ignore(message: str) -> None:
+    """Take a warning and do nothing."""
 
 
 class World:
@@ -49,6 +43,7 @@ class World:
         scene: Its surroundings.
         built: The MuJoCo model, and where the surfaces are.
         timestep: Time step of the physics, s.
+        limited: Names of the joints with position limits, in the order of :class:`Trace`.
     """
 
     def __init__(self, robot: Robot, scene: Scene, built: BuiltScene) -> None:
@@ -65,7 +60,7 @@ class World:
         self._data = self._mujoco.MjData(self._model)
         frames, sensors, propulsion = tuple(s.frame for s in scene.shapes), scene.sensors, robot.spec.propulsion
         self.ball = None if built.throw is None else Ball(self._model, built.throw)
-        self._log = ContactLog(self._model, built.shape_geoms, frames)
+        self._frames, self._log = frames, ContactLog(self._model, built.shape_geoms)
         self._noise = SensorNoise(robot, sensors)
         self._rotors = None if propulsion is None else Rotors(propulsion, self.timestep)
         self._vibration = None
@@ -77,16 +72,15 @@ class World:
         self._effort = np.where(effort > 0, effort, np.inf)
         self._torques: Array = np.zeros(self._effort.size)
         self._felt = None if sensors.force_frame is None else frames.index(sensors.force_frame)
-        self._smoothing = -np.expm1(-2 * np.pi * sensors.force_cutoff * self.timestep)
-        self._force: Array = np.zeros(3)
-        self._feels = False
+        self._filter = ForceFilter(sensors.force_cutoff * self.timestep)
+        self._marks: list[tuple[float, Sample, Array, Array]] = []
         self._past: deque[Sample] = deque(maxlen=1 + round(sensors.delay / self.timestep))
-        self._pushes: list[_ActivePush] = []
+        self._pushes = ActivePushes(self._model)
         self._steps = 0
         limited = np.array(self._model.jnt_limited, dtype=bool)
         self._limited = np.array(self._model.jnt_qposadr)[limited]
         self._low, self._high = np.array(self._model.jnt_range)[limited].T
-        self._limited_names = [self._model.joint(int(k)).name for k in np.flatnonzero(limited)]
+        self.limited = tuple(self._model.joint(int(k)).name for k in np.flatnonzero(limited))
 
     def reset(
         self, q: ArrayLike, v: ArrayLike | None = None, seed: int = 0, *, rotor_speed: ArrayLike | None = None
@@ -108,22 +102,28 @@ class World:
         self._mujoco.mj_resetData(self._model, self._data)
         self._data.qpos[: self._layout.nqpos] = self._layout.qpos(q)
         self._data.qvel[: self._layout.nv] = self._layout.qvel(q, v)
-        self._generator = np.random.default_rng(seed)
-        propulsion = self.robot.spec.propulsion
-        if self._rotors is not None and propulsion is not None:
+        generator = np.random.default_rng(seed)
+        if self._rotors is not None and (propulsion := self.robot.spec.propulsion) is not None:
             self._rotors.reset(hover(self.robot.model, propulsion, q).speeds if rotor_speed is None else rotor_speed)
         if self._vibration is not None:
-            self._vibration.reset(q, self._generator.uniform(0, 2 * np.pi, self._count))
+            self._vibration.reset(q, generator.uniform(0, 2 * np.pi, self._count))
+        self._noise.reset(generator)
         self._log.reset()
-        self._force[:], self._feels = 0.0, False
+        self._marks.clear()
+        self._filter.force = NO_FORCE
         self._torques = np.zeros(self._effort.size)
-        self._pushes.clear()
+        self._pushes.active.clear()
         self._steps = 0
         self._mujoco.mj_step1(self._model, self._data)
         self._past.clear()
-        speeds = np.zeros(0) if self._rotors is None else self._rotors.speeds
-        phases = np.zeros(0) if self._vibration is None else self._vibration.phases
-        self._past.append(self._sample(speeds, phases))
+        speeds = _NOTHING if self._rotors is None else self._rotors.speeds
+        self._past.append(self._sample(speeds, _NOTHING if self._vibration is None else self._vibration.phases))
+
+    @property
+    def speed(self) -> float:
+        """``‖ν‖``."""
+        rates = self._past[-1].qvel
+        return math.sqrt(rates.dot(rates))
 
     @property
     def time(self) -> float:
@@ -143,8 +143,7 @@ class World:
             raise InputError("has no force or no duration", where=f"push at '{push.frame}'",
                              hint="give newtons, and seconds of at least a time step")  # fmt: skip
         body = int(self._model.body(self.built.mjcf.bodies[point.joint]).id)
-        force = np.array(push.force, dtype=float)
-        self._pushes.append(_ActivePush(body, point.position, force, self._steps + steps))
+        self._pushes.active.append((body, point.position, np.array(push.force, dtype=float), self._steps + steps))
 
     def throw(self, sign: int = 1) -> None:
         """Throw the ball of the scenario now.
@@ -175,16 +174,15 @@ class World:
             return
         # MuJoCo itself would write a warning to a log file in the working directory.  The state shows the problem.
         before = self._mujoco.get_mju_user_warning()
-        self._mujoco.set_mju_user_warning(lambda message: None)
+        self._mujoco.set_mju_user_warning(_ignore)
         try:
             self._advance(speed, count)
         finally:
             self._mujoco.set_mju_user_warning(before)
-        places, rates = self._data.qpos, self._data.qvel
+        state = self._data.qpos, self._data.qvel
         # The largest number is computed only where the sum of squares does not settle it.
-        if not places.dot(places) + rates.dot(rates) < _RUNAWAY**2 and not (
-            np.abs(rates).max() < _RUNAWAY and np.abs(places).max() < _RUNAWAY
-        ):
+        usual = state[0].dot(state[0]) + state[1].dot(state[1]) < _RUNAWAY**2
+        if not usual and not all(np.abs(part).max() < _RUNAWAY for part in state):
             raise SimulationDiverged(self.time, where=self.robot.name)
 
     def _advance(self, command: Array, count: int) -> None:
@@ -196,79 +194,87 @@ class World:
             speeds = rotors.steps(command, count)
             thrusts = rotors.thrusts(speeds)
             phases = phases if vibration is None else vibration.steps(speeds, self.timestep)
-        control = data.ctrl[: self._count]
+        control, log, delayed = data.ctrl[: self._count], self._log, self._past.maxlen != 1
+        log.fold(self._steps)
         for k in range(count):
             if rotors is not None:
                 control[:] = thrusts[k]
-            if self._pushes:
-                self._apply_pushes()
+            if self._pushes.active:
+                self._pushes.apply(data, self._steps)
             second(model, data)
             self._steps += 1
-            self._log.step(data)
-            self._feels = self._feels or self._log.pushing
-            if self._felt is not None and self._feels:
-                self._force += self._smoothing * (self._log.forces[self._felt] - self._force)
+            if data.ncon:
+                log.step(data, self._steps)
+            if self._felt is not None:
+                self._filter.feel(log.force(self._felt) if data.ncon else NO_FORCE)
             # Now positions, contacts and velocities are those of the new state, and forces those of the step.
             first(model, data)
-            if self._past.maxlen != 1 or k == count - 1:
+            if delayed or k == count - 1:
                 self._past.append(self._sample(speeds[k], phases[k]))
+
+    def _sample(self, speeds: Array, phases: Array) -> Sample:
+        data, layout = self._data, self._layout
+        return Sample(
+            layout,
+            data.qpos[: layout.nqpos].copy(),
+            data.qvel[: layout.nv].copy(),
+            speeds,
+            phases,
+            self._filter.force,
+        )
 
     def read(self) -> Reading:
         """Return what the sensors measure now.  Every call draws new noise."""
         self._check_ready()
         sample = self._past[0]
-        q, v = (part.copy() for part in sample.state)
+        q, v = sample.state
         if self._vibration is not None:
+            v = v.copy()
             v[:6] += self._vibration.twist(sample.speeds, sample.phases)
-        force = None if self._felt is None else sample.force
-        return self._noise.read(self.time, q, v, force, self._generator)
+        return self._noise.read(self.time, q, v, None if self._felt is None else np.array(sample.force))
+
+    def mark(self) -> None:
+        """Let the present state be one of those that the next :meth:`trace` returns."""
+        self._check_ready()
+        speeds = _NOTHING if self._rotors is None else self._rotors.speeds
+        self._marks.append((self.time, self._past[-1], self._torques, speeds))
+        self._log.mark(self._data, self._steps)
+
+    def trace(self) -> Trace:
+        """Return the true states at all marks, of which there must be some, and begin again."""
+        if not self._marks:
+            raise InputError("has no marks", where="world", hint="call mark() first")
+        times, samples, torques, speeds = zip(*self._marks, strict=True)
+        self._marks = []
+        q, v = zip(*(sample.state for sample in samples), strict=True)
+        values = np.array([sample.qpos for sample in samples])[:, self._limited]
+        stopped = (values <= self._low) | (values >= self._high)
+        parts = [np.array(column) for column in (times, q, v, speeds, torques)]
+        return Trace._make([*parts, stopped, *self._log.look()])
 
     def truth(self) -> Truth:
-        """Return the true state.  The peak force and the first touch of each shape begin again."""
-        self._check_ready()
-        q, v = (part.copy() for part in self._past[-1].state)
-        values = self._data.qpos[self._limited]
-        stopped = ((values <= self._low) | (values >= self._high)).nonzero()[0]
-        rotors = self._rotors
-        return Truth(
-            t=self.time,
-            q=q,
-            v=v,
-            rotor_speeds=np.zeros(0) if rotors is None else rotors.speeds,
-            thrusts=np.zeros(0) if rotors is None else rotors.thrusts(rotors.speeds),
-            torques=self._torques,
-            shapes=self._log.look(self._data),
-            at_stops=tuple(self._limited_names[k] for k in stopped),
+        """Return the true state.  The peak force and the first touch of each shape begin again, as do all marks."""
+        self.mark()
+        t, q, v, speeds, torques, stopped, *contacts = (column[-1] for column in self.trace())
+        shapes = tuple(
+            ShapeTruth(frame, bool(on), force, impulse, float(peak), None if np.isnan(began) else float(began), slip)
+            for frame, on, force, impulse, peak, began, slip in zip(self._frames, *contacts, strict=True)
         )
-
-    def _sample(self, speeds: Array, phases: Array) -> Sample:
-        data = self._data
-        qpos, qvel = data.qpos[: self._layout.nqpos].copy(), data.qvel[: self._layout.nv].copy()
-        return Sample(self._layout, qpos, qvel, speeds, phases, self._force.copy())
-
-    def _apply_pushes(self) -> None:
-        data = self._data
-        data.qfrc_applied[:] = 0.0
-        self._pushes = [push for push in self._pushes if push.end > self._steps]
-        for push in self._pushes:
-            place = data.xpos[push.body] + data.xmat[push.body].reshape(3, 3) @ push.point
-            self._mujoco.mj_applyFT(self._model, data, push.force, np.zeros(3), place, push.body, data.qfrc_applied)
+        thrusts = speeds if self._rotors is None else self._rotors.thrusts(speeds)
+        stops = tuple(name for name, there in zip(self.limited, stopped, strict=True) if there)
+        return Truth(float(t), q, v, speeds, thrusts, torques, shapes, stops)
 
     def _checked(self, command: Command | ActuatorCommand) -> tuple[Array, Array]:
         speed, torque = np.asarray(command.rotor_speed, dtype=float), np.asarray(command.torque, dtype=float)
         if speed.shape != (self._count,) or torque.shape != self._effort.shape:
-            raise InputError(
-                f"{speed.size} rotor speeds and {torque.size} torques",
-                where="command",
-                hint=f"give {self._count} and {self._effort.size}",
-            )
-        # A sum of finite numbers is finite as long as they are not absurd.
-        if not math.isfinite(speed.sum() + torque.sum()) and not (
-            np.isfinite(speed).all() and np.isfinite(torque).all()
-        ):
+            sizes = f"give {self._count} and {self._effort.size}"
+            raise InputError(f"{speed.size} rotor speeds and {torque.size} torques", where="command", hint=sizes)
+        # A sum of squares that is not absurd settles it.
+        usual = speed.dot(speed) + torque.dot(torque) < _RUNAWAY**2
+        if not usual and not (np.isfinite(speed).all() and np.isfinite(torque).all()):
             raise InputError("is not finite", where="command", hint="hold the last one instead")
         torque = np.minimum(np.maximum(torque, -self._effort), self._effort)
-        if not torque.dot(torque) < _RUNAWAY**2 and not np.abs(torque).max(initial=0.0) < _RUNAWAY:
+        if not usual and not np.abs(torque).max(initial=0.0) < _RUNAWAY:
             raise InputError("has an endless torque", where="command", hint="give the joints effort limits")
         return speed if self._rotors is None else self._rotors.within(speed), torque
 

@@ -23,8 +23,9 @@ from impact_posture.sweep.grid import Grid
 from impact_posture.sweep.point_search import Place, Timer, Walk
 from impact_posture.sweep.sweep_file import OFFSETS, Case
 
-# Problems and programs that a process keeps.  Both are small beside the solver itself.
-_TEMPLATES, _PROGRAMS = 16, 16
+# Problems and programs that a process keeps, and most problems if the speed varies.  Each takes about a MB, and all
+# but the speeds of one normal are done for good.
+_KEPT, _MOST_SPEEDS = 4, 16
 
 _Value = TypeVar("_Value")
 
@@ -34,6 +35,7 @@ class CaseSolver:
 
     Args:
         case: The case.
+        speeds: Number of speeds, which vary fastest.
 
     Attributes:
         timer: Time of the solver.
@@ -43,10 +45,11 @@ class CaseSolver:
         ImpactPostureError: A setting is wrong.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: Case, speeds: int = 1) -> None:
         self._case, self.timer = case, Timer()
         self._loaded = load_robot(case.settings.robot, case.settings)
-        self.template = lru_cache(_TEMPLATES)(self._template)
+        self._templates = min(max(_KEPT, speeds), _MOST_SPEEDS)
+        self.template = lru_cache(self._templates)(self._template)
         self._programs: OrderedDict[str, PostureNLP] = OrderedDict()
         self._known: OrderedDict[tuple[Any, ...], Prepared] = OrderedDict()
         self.robot = self.template(*self.normal_and_speed({})).impact.robot
@@ -63,7 +66,7 @@ class CaseSolver:
         # Most problems do not depend on the speed, and then all speeds share their solutions.
         objective = made.impact.objective
         key = objective.structure, tuple(objective.parameters), made.problem.requirements
-        return replace(kept(self._known, key, lambda: made, _TEMPLATES), impact=made.impact)
+        return replace(kept(self._known, key, lambda: made, self._templates), impact=made.impact)
 
     def target(self, values: Mapping[str, Any]) -> Place:
         """Return the position and orientation of the contact frame at values of the grid."""
@@ -97,7 +100,7 @@ class CaseSolver:
         A program never grows out of another here, so its rounding depends on its problem alone.
         """
         key = f"{problem.objective.structure}\n{problem.structure}"
-        made = kept(self._programs, key, lambda: build_nlp(problem, compile="never"), _PROGRAMS)
+        made = kept(self._programs, key, lambda: build_nlp(problem, compile="never"), _KEPT)
         return replace(made, problem=problem)
 
     def walk(self, template: PostureProblem) -> Walk:

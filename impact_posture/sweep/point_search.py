@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -155,7 +155,7 @@ class _Attempt:
         price = SLACK_PRICE
         for _ in range(_ROUNDS):
             problem = self.problem
-            nlp = replace(self._walk.nlp, problem=problem)
+            nlp = self._walk.nlp.at(problem)
             scale = problem.objective.value(guesses[0] if len(guesses) else problem.given)
             home = [] if alone else [problem.given]
             ends = [self._run(nlp, start, scale, price) for start in [*guesses, *home]]
@@ -169,7 +169,8 @@ class _Attempt:
                 self.fault = f"stationarity {certificate.stationarity:.1e}, violation {certificate.primal:.1e}"
             if not found:
                 return None
-            self.problem, guesses = problem.grown([end.q for end in found]), [end.q for end in found]
+            guesses = [end.q for end in found]
+            self.problem = problem.grown(guesses, nlp.program.numeric)
             if self.problem is not problem:
                 self._walk.grow(self.problem)
             elif price == SLACK_PRICE:

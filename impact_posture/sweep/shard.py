@@ -71,7 +71,8 @@ def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
 
 
 def _solver(sweep: Sweep, key: str, case: int) -> CaseSolver:
-    return kept(_SOLVERS, (key, case), lambda: CaseSolver(sweep.cases[case]), _KEPT)
+    speeds = max((len(axis.values) for axis in sweep.grid.axes if axis.name == "speed"), default=1)
+    return kept(_SOLVERS, (key, case), lambda: CaseSolver(sweep.cases[case], speeds), _KEPT)
 
 
 def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:

@@ -13,8 +13,10 @@ from impact_posture.tsid.qp import QP, Solved
 _SOLVED, _NONE = (1, 2), -1
 # Flag of a program that could not be solved for another reason.
 FAILED = 0
-# Largest violation of a bound, and largest number of iterations for one program.
-_SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000}
+# Largest violation of a bound, largest number of iterations for one program, and squared sine of the angle between a
+# row and the active rows below which it depends on them.  The cost of a quadruped, with the condition 4e10, turns
+# rows so close to each other that DAQP's default, 3.7e-11, takes them for dependent, and finds no answer.
+_SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000, "sing_tol": 1e-13}
 
 
 class DaqpSolver:
@@ -23,11 +25,18 @@ class DaqpSolver:
     After a reset, equal programs give bitwise equal answers.
     """
 
-    def __init__(self, n: int, m: int) -> None:
-        """Allocate a workspace for ``n`` variables and ``m`` rows."""
+    def __init__(self, n: int, m: int, *, proximal: float | None = None) -> None:
+        """Allocate a workspace for ``n`` variables and ``m`` rows.
+
+        Args:
+            n: Number of variables.
+            m: Number of rows.
+            proximal: Weight of proximal-point iterations, which solve programs whose cost is too flat for one
+                factorization, in more time.  DAQP decides by itself without it.
+        """
         self._flag = 1
         self._model = daqp.Model()
-        self._model.settings = _SETTINGS
+        self._model.settings = _SETTINGS if proximal is None else _SETTINGS | {"eps_prox": proximal}
         # The first program only sets the dimensions.  None of its bounds can be active.
         blank, upper = QP.empty(n, m), np.full(n + m, 1e30)
         self._model.setup(blank.H, blank.g, blank.A, upper, -upper, blank.sense)

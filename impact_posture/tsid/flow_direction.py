@@ -19,6 +19,8 @@ from impact_posture.tsid.state import State
 _SOFT = 2e-2
 # Least ``H/H₀`` whose root counts.
 _LEAST = 1e-8
+# What a limit may be missed by where the flow brakes, rad (m), or as a share.
+_NEAR = 1e-3
 # Stiffness of those springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
 _STIFFNESS = 3e4
 
@@ -96,7 +98,7 @@ class FlowDirection:
         # The sizes never change.  Directions that the constraints take keep columns of zeros.
         self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + controls)
         self._solver = DaqpSolver(nv, self._qp.m)
-        self._rows = np.zeros((self._qp.m, nv))
+        self._rows, self._room = np.zeros((self._qp.m, nv)), np.zeros((2, self._qp.m))
         self._rows[np.arange(self._joints.size), self._joints] = 1.0
         self.T = self._rows[self._qp.m - controls :]
 
@@ -128,6 +130,8 @@ class FlowDirection:
         upper[count + k :] = 1.0 - shares
         lower[count + k :] = -1.0 - shares
         ahead = self._rows @ coasting
+        np.maximum(upper, 0.0, out=self._room[0])
+        np.minimum(lower, 0.0, out=self._room[1])
         np.maximum(upper - np.maximum(ahead, 0.0), 0.0, out=upper)
         np.minimum(lower - np.minimum(ahead, 0.0), 0.0, out=lower)
 
@@ -158,18 +162,26 @@ class FlowDirection:
         return self._solve(Z, -Z.T @ way)
 
     def downhill(self, Z: Array, gradient: Array, flow: Array, stop: Array, step: Array) -> Array:
-        """Return a step of the flow without the part of it by which ``H`` would rise where the flow can stop.
+        """Return a step of the flow without the part of it by which ``H`` would rise now, or where the flow stops.
 
         Args:
             Z: Basis of the redundancy, shape (nv, r).
             gradient: ``∇H/H₀``, shape (nv,).
             flow: ``u``, shape (nv,).
-            stop: Way on which it stops if it brakes now, shape (nv,).
+            stop: Way on which it stops, shape (nv,).
             step: Change of ``u``, shape (nv,).
         """
-        uphill = Z @ (Z.T @ (gradient + self.B @ stop))
-        climb = float(uphill @ (flow + step))
-        return step - uphill * (climb / float(uphill @ uphill)) if climb > 0 else step
+        for slope in (gradient + self.B @ stop, gradient):
+            uphill = Z @ (Z.T @ slope)
+            climb = float(uphill @ (flow + step))
+            if climb > 0:
+                step = step - uphill * (climb / float(uphill @ uphill))
+        return step
+
+    def stops(self, flow: Array, time: float) -> bool:
+        """Return whether ``flow``, shape (nv,), stays within the limits for so many seconds."""
+        ahead = self._rows @ (flow * time)
+        return not float(np.maximum(ahead - self._room[0], self._room[1] - ahead).max(initial=0.0)) > _NEAR
 
     def _solve(self, way: Array, slope: Array) -> Array:
         """Return ``δ = way·y`` for the least ``½‖y‖² + slope·y``; zero if the solver fails."""

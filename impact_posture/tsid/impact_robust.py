@@ -271,7 +271,9 @@ def curvature_scale(gradient: Gradient, model: pin.Model, q: Array, redundancy: 
         MetricError: The gradient does not exist there, or ``H`` and its curvature vanish.
     """
     Z = redundancy if redundancy.shape[1] else np.eye(model.nv)
-    scale = max(float(np.linalg.norm(Z.T @ curvature(gradient, model, q, Z), 2)), _FLAT * abs(gradient(q)[0]))
+    # Along the axes, because differences along a basis of the redundancy would depend on how it is computed.
+    change = curvature(gradient, model, q, np.eye(model.nv))
+    scale = max(float(np.linalg.norm(Z.T @ change @ Z, 2)), _FLAT * abs(gradient(q)[0]))
     if not (np.isfinite(scale) and scale > 0):
         raise MetricError(
             "the objective vanishes with its curvature", where=name, hint="start elsewhere, or give `scale`"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -27,6 +26,8 @@ Gradient = Callable[[Array], tuple[float, Array]]
 
 # Step of the differences along the redundancy, rad.
 _STEP = 1e-4
+# Way of the flow that is long enough to learn from, rad (m).
+_MOVED = 1e-6
 # Time constant with which the reference comes back to contacts and tasks, s.
 _RETURN = 0.1
 # Step below which a posture on the way is reached, or as near as the limits permit, rad (m).
@@ -146,7 +147,9 @@ class ReferenceFlow:
         options, state = self.options, self._state
         self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
         self._first, self._here = self.q.copy(), self.q.copy()
-        self._wanted, self._flow = np.zeros((2, self.velocity.size))
+        self._wanted, self._flow, self._slope = np.zeros((3, self.velocity.size))
+        self._before = np.zeros_like(self._J)
+        self.shares = np.zeros(self._static.limited.size)
         self._phase, self._next, self._visited, self._elapsed, self._clock = 0, 0, 0, 0.0, 0.0
         self._deadline = np.inf
         self.on, self.resting, self.failed = False, False, False
@@ -169,8 +172,7 @@ class ReferenceFlow:
         self.start = abs(self.value)
         self._look()
         for _ in range(self._space.basis.shape[1]):
-            self._probe(1.0)
-            self._probe(-1.0)
+            self._probe()
         self._next = 0
 
     def advance(self, dt: float, measured: Array) -> None:
@@ -195,8 +197,9 @@ class ReferenceFlow:
     # ---- the parts of an update, one a tick -----------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Evaluate objective, constraints and limits at ``q_r``."""
+        """Evaluate objective, constraints and limits at ``q_r``, and learn from the way since the last look."""
         state, direction = self._state, self.direction
+        way, slope, shares = pin.difference(self._model, self.q, self._here), self._slope, self.shares
         self._place(self.q)
         self._here[:] = self.q
         for task, rows in zip(self._held, self._places, strict=True):
@@ -204,40 +207,45 @@ class ReferenceFlow:
         self.value, self._slope = self._evaluate(self.q)
         self._space = space = Redundancy.of(self._J)
         self._multipliers = space.inverse.T @ self._slope
+        self._reduced = self._slope - self._J.T @ self._multipliers
+        self.shares = self._static.shares(state, self._J)
+        length = math.sqrt(float(way @ way))
+        # A look that failed has no slope.
+        if length > _MOVED and not self.failed and slope.any():
+            self._compare(way / length, length, slope - self._before.T @ self._multipliers, shares)
+        self._before[:] = self._J
         rooms = self._offsets
         if rooms.size:
             rooms = -rooms - self.options.com_margin - self._edges @ state.center_of_mass()[0][:2]
-        self.shares = self._static.shares(state, self._J)
         coasting = self._flow * (self.options.speed / self.options.acceleration / 2)
         direction.limit(state, rooms, self.shares, coasting)
 
-    def _probe(self, sign: float) -> None:
-        """Evaluate the reduced gradient and the static controls beside ``q_r``, and learn from both sides."""
+    def _probe(self) -> None:
+        """Evaluate the reduced gradient and the static controls beside the posture of the last look, and learn."""
         Z = self._space.basis
         if self.failed or not Z.shape[1]:
             return
         k = self._next % Z.shape[1]
-        z = self._seen[k]
-        if sign > 0:
-            # The columns of Z are as good as any others of that space.  What a fixed direction has in it is unique.
-            seen, z[:] = self._seen[:k], self._mixed[k]
-            for _ in range(2):
-                z[:] = Z @ (Z.T @ (z - (seen @ z) @ seen))
-                length = math.sqrt(max(float(z @ z), _EMPTY))
-                z /= length
-                if length > _NEW:
-                    break
-        # Both sides of the posture of the last look, because the flow has moved on since.
-        q = pin.integrate(self._model, self._here, sign * _STEP * z)
+        # The columns of Z are as good as any others of that space.  What a fixed direction has in it is unique.
+        z, seen = self._seen[k], self._seen[:k]
+        z[:] = self._mixed[k]
+        for _ in range(2):
+            z[:] = Z @ (Z.T @ (z - (seen @ z) @ seen))
+            length = math.sqrt(max(float(z @ z), _EMPTY))
+            z /= length
+            if length > _NEW:
+                break
+        q = pin.integrate(self._model, self._here, _STEP * z)
         _, slope = self._evaluate(q)
         self._place(q)
-        found = slope - self._J.T @ self._multipliers, self._static.shares(self._state, self._J)
-        if sign > 0:
-            self._ahead = found
-        elif not self.failed:
-            curvature, controls = ((a - b) / (2 * _STEP) for a, b in zip(self._ahead, found, strict=True))
-            self.direction.learn(z, curvature, controls)
+        if not self.failed:
+            reduced = slope - self._J.T @ self._multipliers
+            self._compare(z, _STEP, reduced, self._static.shares(self._state, self._J))
             self._next += 1
+
+    def _compare(self, z: Array, length: float, reduced: Array, shares: Array) -> None:
+        """Learn from reduced gradient and static controls at the end of a way ``z · length`` from the last look."""
+        self.direction.learn(z, (reduced - self._reduced) / length, (shares - self.shares) / length)
 
     def _direct(self) -> None:
         """Find the step, and whether it is worth moving."""
@@ -267,7 +275,6 @@ class ReferenceFlow:
         wanted = self._wanted * (options.acceleration / options.speed)
         if not self.on or self.resting:
             fastest = 0.0
-        most = options.acceleration * period
         rate = self.error / _RETURN
         for task, rows in zip(self._held, self._places, strict=True):
             rate[rows] += task.target_velocity
@@ -279,15 +286,31 @@ class ReferenceFlow:
             square.flat[:: square.shape[0] + 1] += _IDLE
             back -= Z @ np.linalg.solve(square, joints.T @ back[self._base :])
         self._flow = Z @ (Z.T @ self._flow)
-        # Each joint turns as fast as it can, and then all stay on the constraints.
-        step = limited(Z @ (Z.T @ np.clip(limited(wanted, fastest) - self._flow, -most, most)), most)
-        if fastest > 0 and self._visited == len(self._path):
-            stop = self._flow * (np.abs(self._flow).max() / (2 * options.acceleration))
-            step = limited(self.direction.downhill(Z, self._slope, self._flow, stop, step), most)
+        step = self._change(limited(wanted, fastest), options.acceleration * period, fastest > 0)
         known = (self._flow + back - self.velocity) / period
         step *= self._static.permitted(self._state.M, known, step / period, self.shares, options.haste)
         self._flow += step
         self.acceleration[:] = known + step / period
+
+    def _change(self, wanted: Array, most: float, moving: bool) -> Array:
+        """Return the change of the flow towards the wanted one, shape (nv,), by at most ``most`` an entry.
+
+        Each joint turns as fast as it can, and then all stay on the constraints; or all change evenly; or all brake
+        evenly.  The first of these counts from which the flow can stop within the limits by braking evenly.
+        """
+        Z, flow, acceleration = self._space.basis, self._flow, self.options.acceleration
+        away = wanted - flow
+        fast = Z @ (Z.T @ np.minimum(np.maximum(away, -most), most))
+        for step in (fast, away):
+            step = limited(step, most)
+            if moving and self._visited == len(self._path):
+                # Twice the way on which it stops, because the curvature may grow on it.
+                stop = flow * (np.abs(flow).max() / acceleration)
+                step = limited(self.direction.downhill(Z, self._slope, flow, stop, step), most)
+            time = np.abs(flow + step).max() / (2 * acceleration) + most / acceleration
+            if self.direction.stops(flow + step, time):
+                return step
+        return limited(-flow, most)
 
     def _place(self, q: Array) -> None:
         """Evaluate the Jacobian of the constraints at a posture."""
@@ -318,8 +341,7 @@ def mixed_directions(nv: int) -> Array:
 
 PHASES: tuple[Callable[[ReferenceFlow], None], ...] = (
     ReferenceFlow._look,
-    partial(ReferenceFlow._probe, sign=1.0),
-    partial(ReferenceFlow._probe, sign=-1.0),
+    ReferenceFlow._probe,
     ReferenceFlow._direct,
     ReferenceFlow._govern,
 )

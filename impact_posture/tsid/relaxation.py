@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.tsid.assembly import Assembly
+from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.hierarchy import Level, lexicographic
 from impact_posture.tsid.qp import EQUALITY, INEQUALITY, QP, Solved, Solver
 
@@ -20,6 +21,8 @@ _STRAY = ((_OFF, 1e-6), (0.0, 1e-6), (0.0, 1e-4), (0.0, 1e-2))
 # Proximal weights that are tried in order, relative to the largest weight of the cost, with the number of steps each.
 # The first weight that conditions the QP well enough changes its solution least.  The steps undo the change.
 _PROXIMAL, _STEPS = (0.0, 1e-6, 1e-3, 1e3), 3
+# Weight of the proximal-point iterations with which DAQP decides whether strict levels can hold.
+_FLAT = 1e-6
 # Largest violation of a bound in the end, times the scale of the numbers.
 _EXACT = 1e-9
 # Numbers are scaled below this, because the tolerances of the solver are absolute.
@@ -74,6 +77,10 @@ def solve(assembly: Assembly, solver: Solver, aside: Solver) -> Outcome:
         # The solver gave up from its warm start.  Try once without.
         solver.reset()
         solved = solver.solve(qp)
+    if solved is None and qp.finite:
+        # Rows that are nearly dependent look infeasible.  Proximal steps decide, in a new workspace, because they
+        # start from its last answer.
+        solved = DaqpSolver(qp.n, qp.m, proximal=_FLAT).solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
     return _relax(assembly, aside)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from impact_posture.arrays import Array
+from impact_posture.codegen.build_check import RESULTS
 from impact_posture.codegen.export import export
 from impact_posture.codegen.functions import casadi_reference, oracle_along
 from impact_posture.codegen.impact_gradient import ImpactGradient
@@ -16,8 +17,8 @@ from impact_posture.dynamics.mjcf_numeric import MujocoNumeric
 from impact_posture.dynamics.numeric import hold_locked
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import build_library, load_library
-from impact_posture.output_folder import scratch_folder
 from impact_posture.robot.model_joints import finite_armature
+from impact_posture.scratch_folder import scratch_folder
 from impact_posture.verification.differences import difference_gradient
 from impact_posture.verification.samples import Sample
 
@@ -89,18 +90,15 @@ def compiled_source(objective: ImpactObjective) -> Iterator[Source]:
 
         def numbers(sample: Sample) -> Numbers:
             values: dict[str, Array] = {}
-            for function, names in _RESULTS.items():
+            for function in ("eval", "jump", "ellipsoid"):
                 code, results = compiled.call(function, sample.q, sample.normal)
                 # Code 3 of jump says that V does not exist, because G is zero.  G does exist.
                 good = code == 0 or (function, code) == ("jump", 3)
-                for name, result in zip(names, results, strict=True):
+                for name, result in zip(RESULTS[function], results, strict=True):
                     values[name] = result.copy() if good else np.full(result.shape, np.nan)
             return _named(values)
 
         yield numbers
-
-
-_RESULTS = {"eval": ("H", "grad"), "jump": ("jump", "G", "V"), "ellipsoid": ("ellipsoid",)}
 
 
 def _impulse(objective: ImpactObjective) -> ImpactObjective:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.toolchain import GET_ONE, find_compiler
-from impact_posture.verification.samples import random_samples
+from impact_posture.verification.samples import Sample, random_samples
 from impact_posture.verification.sources import (
     MujocoSource,
     Numbers,
@@ -25,30 +26,79 @@ from impact_posture.verification.sources import (
     pinocchio_differences,
     pinocchio_numbers,
 )
-from impact_posture.verification.verification_report import Row, VerificationReport
 
+Verdict = Literal["pass", "fail", "skipped"]
+
+REFERENCE = "Pinocchio"
 CASADI, COMPILED, DIFFERENCES, MUJOCO = "CasADi", "compiled C", "finite differences", "MuJoCo"
 NO_COMPILER = f"no C compiler: {GET_ONE}"
 
 
+# Largest relative errors that pass.  _MODEL is for M and J from MuJoCo, which has the same rigid bodies and solves no
+# system, _VALUES for H, G, Λ_c and gradients by adjoints, and _DIFFERENCES for gradients by finite differences.
+_MODEL, _VALUES, _DIFFERENCES = 1e-9, 1e-9, 1e-8
+# The last two on feet.  Feet at compliance ε make a system of condition 1/ε, which costs digits.
+_ON_FEET = 1e-7, 1e-6
+
+
 @dataclass(frozen=True)
-class Tolerances:
-    """Largest relative errors that pass.
+class Row:
+    """One quantity of one source, compared with the numbers of Pinocchio.
 
     Attributes:
-        model: For ``M`` and ``J`` from MuJoCo, which has the same rigid bodies and solves no system.
-        values: For ``H``, ``G``, ``Λ_c``, and gradients by adjoints.
-        differences: For gradients by finite differences.
+        source: Name of the source.
+        quantity: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M`` or ``J``.
+        verdict: ``skipped`` where this machine lacks the source.
+        error: Largest relative error over all samples; ``None`` where there is none or it is not finite.
+        tolerance: Largest relative error that passes.
+        sample: Number of the sample with that error, from 0.
+        entry: Entry of the quantity with that error; empty for a number.
+        note: Reason of a skip or failure.
     """
 
-    model: float = 1e-9
-    values: float = 1e-9
-    differences: float = 1e-8
+    source: str
+    quantity: str
+    verdict: Verdict
+    error: float | None = None
+    tolerance: float | None = None
+    sample: int | None = None
+    entry: str = ""
+    note: str = ""
 
-    @staticmethod
-    def of(objective: ImpactObjective) -> Tolerances:
-        """Return the tolerances.  Feet at compliance ε make a system of condition 1/ε, which costs digits."""
-        return Tolerances(values=1e-7, differences=1e-6) if objective.supports else Tolerances()
+
+@dataclass(frozen=True, eq=False)
+class VerificationReport:
+    """All sources side by side.
+
+    Attributes:
+        rows: The rows, in the order of the sources.
+        samples: The samples.
+        seed: The seed of the samples.
+    """
+
+    rows: tuple[Row, ...]
+    samples: tuple[Sample, ...]
+    seed: int
+
+    @property
+    def passed(self) -> bool:
+        """Whether no row failed; skipped rows do not count."""
+        return all(row.verdict != "fail" for row in self.rows)
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON content: verdict, rows, and the samples that rows name."""
+        named = sorted({row.sample for row in self.rows if row.sample is not None})
+        return {
+            "passed": self.passed,
+            "reference": REFERENCE,
+            "seed": self.seed,
+            "count": len(self.samples),
+            "rows": [asdict(row) for row in self.rows],
+            "samples": [
+                {"sample": k, "q": self.samples[k].q.tolist(), "normal": self.samples[k].normal.tolist()}
+                for k in named
+            ],
+        }
 
 
 def verify(
@@ -83,15 +133,15 @@ def verify(
         raise InputError(f"the seed is {seed}", where="--seed", hint="give zero or more")
     drawn = random_samples(objective.robot, samples, seed, np.array(objective.contact.normal))
     expected = [pinocchio_numbers(objective, sample) for sample in drawn]
-    allowed = Tolerances.of(objective)
-    values = dict.fromkeys(("H", "G", "Λ_c", "∇H"), allowed.values)
-    of_mujoco = {"M": allowed.model, "J": allowed.model} | values | {"∇H": allowed.differences}
+    allowed, by_differences = _ON_FEET if objective.supports else (_VALUES, _DIFFERENCES)
+    values = dict.fromkeys(("H", "G", "Λ_c", "∇H"), allowed)
+    of_mujoco = {"M": _MODEL, "J": _MODEL} | values | {"∇H": by_differences}
     with ExitStack() as stack:
         compiled = None if find_compiler() is None else stack.enter_context(compiled_source(objective))
         candidates = (
             _Candidate(CASADI, values, casadi_source(objective)),
             _Candidate(COMPILED, values, compiled, NO_COMPILER),
-            _Candidate(DIFFERENCES, {"∇H": allowed.differences}, partial(pinocchio_differences, objective)),
+            _Candidate(DIFFERENCES, {"∇H": by_differences}, partial(pinocchio_differences, objective)),
             _mujoco(objective, of_mujoco),
         )
         compared, total = 0, sum(own.source is not None for own in candidates) * len(drawn)

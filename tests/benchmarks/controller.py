@@ -1,6 +1,7 @@
-"""The exported controller against the one in Python: equal commands, and what a tick takes of one core.
+"""The exported controller beside the one in Python, in three parts: equal answers, growth, and what a tick takes.
 
-``python -m tests.benchmarks.controller FOLDER [TICKS]`` writes ``FOLDER/controller.md``.
+``python -m tests.benchmarks.controller FOLDER [TICKS] [equality|growth|times]`` writes a part, or all of them, into
+``FOLDER``, and what is there into the page of the documentation.  Times need a quiet machine, the others do not.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,120 +19,43 @@ import pinocchio as pin
 
 from impact_posture.controller_export.compiled_controller import CompiledController
 from impact_posture.controller_export.manifest import read_controller
-from impact_posture.robot.robot import Robot
 from impact_posture.toolchain import find_compiler
-from impact_posture.tsid.controller import Command, Controller, Status
-from tests.benchmarks import controller_peer
-from tests.benchmarks.core import Vector, machine, one_core, table
-from tests.benchmarks.flow import CASES
-from tests.exported_controller import (
-    KINDS,
-    abuse_program,
-    compiled,
-    exported,
-    formulation_of,
-    impact_of,
-    random_state,
-)
+from impact_posture.tsid.controller import Controller
+from tests.benchmarks import controller_equality, controller_peer
+from tests.benchmarks.controller_equality import objective_of
+from tests.benchmarks.core import Vector, machine, one_core, page_of, table
+from tests.exported_controller import KINDS, exported, formulation_of, impact_of
 
 HARNESS = Path(__file__).with_name("controller_times.c")
-# Push (acceleration of each joint, relative), or size of a random state.
-STATES = {"quiet": 0.0, "pushed": 3.0, "saturated": 30.0, "random": 0.05, "far": 0.3}
 # A repetition is interrupted by other programs; the least of some is the tick's own.
 REPETITIONS = 7
-# Frames of the impacts with which the impact-robust term is timed; robots that tick a million times.
+# Ticks that are timed, and random ticks in which the memory must not grow.
+TIMED, RANDOM = 1000, 1_000_000
+# Frames of the impacts with which the impact-robust term is timed.
 IMPACTS = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "solo8": "base_link", "talos": "torso_2_link"}
-GROWTH = ("tilthex_arm", "panda", "solo8")
 BUILDS = {"-O2": ["-O2"], "native": ["-O3", "-march=native"]}
+_HEAD = "<!-- Written by `make study-controller`; do not edit. -->"
 
 
-@dataclass
-class Agreement:
-    """Ticks of one kind of state.
-
-    Attributes:
-        solved: Ticks that both solved.
-        worst: Largest relative difference of their controls.
-        differ: Solved ticks whose controls differ by more than 1e-9.
-        better: Those of them in which C answers as well as Python, or better (:func:`no_worse`).
-        relaxed: Ticks that both relaxed.
-        other: Ticks with different statuses, as ``Python/C``.
-        states: The states, row by row.
-        python: Time of each tick in Python, µs.
-    """
-
-    solved: int = 0
-    worst: float = 0.0
-    differ: int = 0
-    better: int = 0
-    relaxed: int = 0
-    other: dict[str, int] = field(default_factory=dict)
-    states: list[Vector] = field(default_factory=list)
-    python: list[float] = field(default_factory=list)
-
-
-def states(robot: Robot, kind: str, controller: Controller, ticks: int) -> Iterator[tuple[Vector, Vector, Command]]:
-    """Yield states and the commands of Python: random ones, or those of a robot that is pushed now and then."""
-    rng, size = np.random.default_rng(7), STATES[kind]
-    q, v = robot.posture(), np.zeros(robot.nv)
-    push = np.zeros(robot.nv)
-    for k in range(ticks):
-        if kind in ("random", "far"):
-            q, v = random_state(robot, rng, size)
-        elif k % 1000 == 0:
-            # A robot that fell is set up again.
-            q, v = robot.posture(), np.zeros(robot.nv)
-        command = controller.tick(1e-3 * k, q, v)
-        yield q, v, command
-        if k % 50 == 0:
-            push = size * rng.normal(size=robot.nv) * (k % 100 == 0)
-        v = v + 1e-3 * (command.acceleration + push)
-        q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
-
-
-def agreement(name: str, kind: str, ticks: int) -> Agreement:
-    """Run both controllers over the same states."""
+def quiet(name: str, ticks: int) -> tuple[list[Vector], list[float]]:
+    """Return the states of a robot that Python's controller holds, and what its ticks took, µs."""
     robot, formulation = formulation_of(name)
-    ours, theirs, found = Controller(robot, formulation), compiled(name), Agreement()
-    for controller in (ours, theirs):
-        controller.reset(robot.posture(), np.zeros(robot.nv))
-    before = time.process_time_ns()
-    for k, (q, v, a) in enumerate(states(robot, kind, ours, ticks)):
-        found.python.append((time.process_time_ns() - before) / 1e3)
-        b = theirs.tick(1e-3 * k, q, v)
-        found.states.append(np.concatenate([q, v]))
-        if a.status is b.status is Status.SOLVED:
-            found.solved += 1
-            difference = float(np.max(np.abs(a.u - b.u)) / max(1.0, float(np.max(np.abs(a.u)))))
-            found.worst = max(found.worst, difference)
-            if difference > 1e-9:
-                found.differ += 1
-                found.better += no_worse(ours, a, b)
-        elif a.status is b.status is Status.RELAXED:
-            found.relaxed += 1
-        else:
-            pair = f"{a.status.value}/{b.status.value}"
-            found.other[pair] = found.other.get(pair, 0) + 1
+    controller, recorded, taken = Controller(robot, formulation), list[Vector](), list[float]()
+    q, v = robot.posture(), np.zeros(robot.nv)
+    controller.reset(q, v)
+    for k in range(ticks):
         before = time.process_time_ns()
-    return found
-
-
-def no_worse(controller: Controller, a: Command, b: Command) -> bool:
-    """Return whether ``b`` answers the last program as well as ``a``: it violates less, or it costs no more.
-
-    Python opens bounds a little where its solver fails at the program as it stands, and then it costs less.
-    """
-    qp = controller.assembly.rank.qp
-    z, other = (np.concatenate([c.acceleration, c.forces]) for c in (a, b))
-    size = 1.0 + float(np.max(np.abs(qp.A) @ np.abs(z)))
-    cost, its = (float(0.5 * x @ qp.H @ x + qp.g @ x) for x in (z, other))
-    exact, ours, theirs = 1e-10 * size, qp.violation(z), qp.violation(other)
-    return theirs <= max(ours, exact) and (ours > exact or its <= cost + 1e-10 * (1.0 + abs(cost)))
+        command = controller.tick(1e-3 * k, q, v)
+        taken.append((time.process_time_ns() - before) / 1e3)
+        recorded.append(np.concatenate([q, v]))
+        v = v + 1e-3 * command.acceleration
+        q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
+    return recorded, taken
 
 
 def flowing(name: str, ticks: int) -> tuple[Path, list[Vector]]:
     """Return the folder of a controller with a reference flow, and the states of a robot that follows the flow."""
-    objective = next(case for case in CASES if case.robot == name).problem().objective
+    objective = objective_of(name)
     folder, robot = exported(name, objective, path=()), objective.robot
     controller, recorded = CompiledController.load(folder), list[Vector]()
     q, v = robot.posture(), np.zeros(robot.nv)
@@ -178,90 +101,89 @@ def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: lis
     return least
 
 
-def growth(name: str, ticks: int) -> str:
-    """Return what random ticks, half of them with limits that permit nearly nothing, take of memory."""
-    with tempfile.TemporaryDirectory() as scratch:
-        ran = subprocess.run(
-            [abuse_program(exported(name), Path(scratch)), str(ticks)], capture_output=True, text=True, check=True
-        )
-    return ran.stdout.partition(";")[0]
+def equality(ticks: int) -> Iterator[str]:
+    """Yield what differs between both controllers over the same states."""
+    some, most = controller_equality.SOME, controller_equality.MOST
+    yield (
+        f"{ticks} ticks of each kind of states. Controls are compared relative to the largest. *Its own*: largest "
+        "change of Python's controls, in ticks over 1e-9, where each number of the program moves by its last digit. "
+        f"Where answers differ (the first {most}), and of every {some}th relaxed tick: largest violation of what "
+        "always holds, and largest residual of optimality, by a certificate that neither controller shares; Python "
+        "solves relaxed levels to six digits."
+    )
+    yield ""
+    yield from table(controller_equality.HEAD, controller_equality.equality(ticks))
 
 
-def main(out: Path, ticks: int) -> None:
-    """Write the tables."""
-    rows, speeds, ratios = list[list[str]](), list[list[str]](), list[list[str]]()
+def growth(_: int) -> Iterator[str]:
+    """Yield what random ticks take of memory."""
+    head = ["robot", "random ticks", "growth", "statuses: solved, relaxed, infeasible, unsolved, not finite"]
+    yield from table(head, controller_equality.growth(RANDOM))
+
+
+def times_of_ticks(_: int) -> Iterator[str]:
+    """Yield what a tick takes in Python, in C, and by hand in C++, each row as soon as it is known."""
+    ratios = list[list[str]]()
+    yield f"Median / p99 of {TIMED} quiet states, µs; each tick of C and C++ is the least of {REPETITIONS}."
+    yield ""
     with ExitStack() as stack:
         try:
             peer, why = stack.enter_context(controller_peer.peer()), ""
         except controller_peer.Missing as missing:
             peer, why = None, str(missing)
-        _measure(rows, speeds, ratios, ticks, peer)
-    agree = [
-        "robot",
-        "states",
-        "solved",
-        "largest difference of u",
-        "over 1e-9: C as good or better",
-        "relaxed",
-        "other (Python/C)",
-    ]
-    theirs = f"Pinocchio and DAQP, C++ {why}".strip()
-    flow = "on the way of a flow, C -O2"
-    speed = ["robot", "Python, µs", "C -O2", "C native", "C -O2, caches flushed", flow, theirs]
+        theirs = f"Pinocchio and DAQP, C++ {why}".strip()
+        head = [
+            "robot",
+            "Python",
+            "C -O2",
+            "C native",
+            "C -O2, caches flushed",
+            "on the way of a flow, C -O2",
+            theirs,
+        ]
+        yield from table(head, _speeds(peer, ratios))
+    yield from ("", "With the impact-robust term, means over quiet states.", "")
     ratio = ["robot", "nominal, µs", "gradient", "every fifth tick, over nominal", "every tick: more, over gradient"]
-    lines = [
-        machine("daqp"),
-        "",
-        *table(agree, rows),
-        "",
-        "Median / p99 over quiet states, and while the posture flows.",
-        "",
-        *table(speed, speeds),
-        "",
-        "With the impact-robust term, means over quiet states.",
-        "",
-        *table(ratio, ratios),
-        "",
-        *(f"{name}: {growth(name, 1_000_000)} in a million random ticks" for name in GROWTH),
-    ]
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "controller.md").write_text("\n".join([*lines, ""]), encoding="utf-8")
-    print(*lines, sep="\n")
+    yield from table(ratio, ratios)
 
 
-def _measure(
-    rows: list[list[str]], speeds: list[list[str]], ratios: list[list[str]], ticks: int, peer: Path | None
-) -> None:
+def _speeds(peer: Path | None, ratios: list[list[str]]) -> Iterator[list[str]]:
     for name in KINDS:
-        quiet = []
-        for kind in STATES:
-            found = agreement(name, kind, ticks)
-            others = ", ".join(f"{count} {pair}" for pair, count in found.other.items()) or "none"
-            rows.append(
-                [
-                    name,
-                    kind,
-                    str(found.solved),
-                    f"{found.worst:.0e}",
-                    f"{found.better} of {found.differ}",
-                    str(found.relaxed),
-                    others,
-                ]
-            )
-            quiet = quiet or [found]
-            print(*rows[-1], flush=True)
-        recorded, python = quiet[0].states, np.array(quiet[0].python)
-        speeds.append([name, f"{np.median(python):.0f} / {np.percentile(python, 99):.0f}"])
+        recorded, python = quiet(name, TIMED)
+        row = [name, f"{np.median(python):.0f} / {np.percentile(python, 99):.0f}"]
         for flags, cold in ((BUILDS["-O2"], False), (BUILDS["native"], False), (BUILDS["-O2"], True)):
-            speeds[-1].append("{:.1f} / {:.1f}".format(*times(exported(name), recorded, flags, cold)))
-        speeds[-1].append("{:.1f} / {:.1f}".format(*times(*flowing(name, 4 * ticks), BUILDS["-O2"], False)))
+            row.append("{:.1f} / {:.1f}".format(*times(exported(name), recorded, flags, cold)))
+        row.append("{:.1f} / {:.1f}".format(*times(*flowing(name, 3 * TIMED), BUILDS["-O2"], False)))
         found = None if peer is None else controller_peer.times(peer, name, recorded)
-        speeds[-1].append("–" if found is None else "{:.1f} / {:.1f}".format(*found))
-        print(*speeds[-1], flush=True)
+        row.append("–" if found is None else "{:.1f} / {:.1f}".format(*found))
         if name in IMPACTS:
             ratios.append(robust_over_nominal(name, IMPACTS[name], recorded))
+        yield row
+
+
+PARTS = {"equality": equality, "growth": growth, "times": times_of_ticks}
+
+
+def main(out: Path, ticks: int, parts: list[str]) -> None:
+    """Write parts, and the page of all that are there."""
+    out.mkdir(parents=True, exist_ok=True)
+    for part in parts:
+        lines = [machine("daqp"), ""]
+        for line in PARTS[part](ticks):
+            print(line, flush=True)
+            lines.append(line)
+        (out / f"{part}.md").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    texts = [file.read_text(encoding="utf-8") for part in PARTS if (file := out / f"{part}.md").is_file()]
+    page_of("controller").write_text("\n".join([_HEAD, "", *texts]), encoding="utf-8")
 
 
 if __name__ == "__main__":
+    words = sys.argv[1:]
+    if (
+        not 1 <= len(words) <= 3
+        or not all(word.isdecimal() for word in words[1:2])
+        or words[2:] not in ([], *([part] for part in PARTS))
+    ):
+        sys.exit(f"usage: python -m tests.benchmarks.controller FOLDER [TICKS] [{'|'.join(PARTS)}]")
     with one_core():
-        main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 2000)
+        main(Path(words[0]), int(words[1]) if len(words) > 1 else 10_000, words[2:] or list(PARTS))

@@ -80,7 +80,7 @@ def result(scenario: str, name: str) -> dict[str, Any]:
     try:
         factory = ControllerFactory(set_up(scenario_of(scenario)))
         before = predicted(factory, name)
-        _, document = execute(Job(shipped, name, 0), factory)
+        _, document = execute(Job(shipped, name, 0, compile="auto"), factory)
         found = {"predicted": before, "status": document["status"], "metrics": document["metrics"]}
         found["offline"] = (document["offline"] or {}).get("note", "")
         found["why"] = "; ".join(dict.fromkeys(event["what"] for event in document["events"]))

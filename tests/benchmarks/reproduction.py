@@ -15,7 +15,7 @@ from pathlib import Path
 from impact_posture.experiment.batch import Store
 from impact_posture.experiment.figures import draw_reproduction
 from impact_posture.experiment.paper import PAPER
-from impact_posture.experiment.reproduction import Reproduction, controllers_of, jobs_of, reproduce
+from impact_posture.experiment.reproduction import Reproduction, controllers_of, reproduce
 from impact_posture.experiment.reproduction_summary import LEGEND, advice, remarks, scenario_table, table_one
 from tests.benchmarks.core import ROOT, Request, say
 
@@ -36,7 +36,7 @@ def lines(request: Request) -> Iterator[str]:
     yield "\n\n".join(_parts(found, every))
     if request.write:
         with tempfile.TemporaryDirectory() as folder:
-            draw_reproduction(found, jobs_of(plan, 1), store, Path(folder), ["png"])
+            draw_reproduction(found, store, Path(folder), ["png"])
             _take_shown(Path(folder))
 
 

@@ -21,8 +21,11 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from impact_posture.sweep.atlas import open_atlas
 from impact_posture.sweep.executors import SlurmJobs, dask_cluster, process_pool
@@ -180,26 +183,49 @@ def _resident(process: int | str = "self") -> float:
     return pages * resource.getpagesize() / 1e6
 
 
+class Watched(Executor):
+    """A pool that adds up what its shards took.
+
+    Args:
+        pool: The pool.
+
+    Attributes:
+        finished: Processor time within IPOPT and in all, s, of each finished shard.
+    """
+
+    def __init__(self, pool: Executor) -> None:
+        self._pool, self.finished = pool, list[tuple[float, float]]()
+
+    def submit(self, *task: Any, **options: Any) -> Future[Any]:
+        """See ``Executor``."""
+        future = self._pool.submit(*task, **options)
+        future.add_done_callback(lambda one: self.finished.append((one.result().solver_s, one.result().total_s)))
+        return future
+
+
 def atlas(folder: Path, name: str, points: int) -> None:
     """Solve a large sweep by two processes, or go on with it, and print what it took and what it found."""
     folder.mkdir(parents=True, exist_ok=True)
-    file, count = folder / f"{name}.toml", max(2, round(points**0.5))
+    file, count = folder / f"{name}.toml", math.isqrt(points - 1) + 1
     file.write_text(tilted(count) if name == "tilthex_arm" else TALOS.replace("COUNT", str(count)))
-    sweep, began, seen = read_sweep(file), time.perf_counter(), list[tuple[int, float]]()
+    sweep, began, told = read_sweep(file), time.perf_counter(), 0
 
     def progress(done: int, count: int) -> None:
-        workers = [child.pid for child in multiprocessing.active_children()]
-        seen.append((done, max([0.0, *[_resident(pid) for pid in workers if pid]])))
+        nonlocal told
+        if done * 10 // points == told and done < count:
+            return
+        told = done * 10 // points
+        within, total = np.sum(watched.finished, axis=0) if watched.finished else (0.0, 1.0)
+        children = [child.pid for child in multiprocessing.active_children()]
+        memory = " ".join(f"{_resident(pid):.1f}" for pid in children if pid)
+        spent = f"{1e3 * total / max(1, done):.2f} ms each, {100 * within / total:.1f} % of it within IPOPT"
+        print(f"{name}: {done} of {count}, {spent}, resident memory {memory} MB", flush=True)
 
     with process_pool(2) as pool:
-        found = run_sweep(sweep, folder / name, pool, progress=progress, in_hand=4)
+        watched = Watched(pool)
+        found = run_sweep(sweep, folder / name, watched, progress=progress, in_hand=4)
     solved, took = sum(found.counts.values()), time.perf_counter() - began
     print(f"{name}: {solved} of {found.points} problems in this run, {took:.0f} s, {solved / took:.1f} a second")
-    if solved:
-        share = f"{100 * found.solver_s / found.total_s:.1f} % of it within IPOPT"
-        print(f"processor time {1e3 * found.total_s / solved:.2f} ms each, {share}")
-        tenths = [f"{mb:.0f}" for _, mb in seen[:: max(1, len(seen) // 12)]]
-        print("resident memory of the larger worker, MB:", *tenths)
     table = open_atlas(folder / name).to_table(columns=["status", "reason"]).to_pylist()
     for status, count in Counter(row["status"] for row in table).most_common():
         print(f"{status}: {count} ({100 * count / len(table):.1f} %)")

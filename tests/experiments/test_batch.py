@@ -13,11 +13,13 @@ from impact_posture.errors import ControllerNotFound, ScenarioNotFound, Simulati
 from impact_posture.experiment import batch
 from impact_posture.experiment.batch import Store, key_of, run_batch
 from impact_posture.experiment.jobs import SCHEMA, Job, controller_factory, execute
+from impact_posture.experiment.reproduction import jobs_of
 
 
 def test_a_run_answers_with_its_document(aerial: Path) -> None:
     runs, found = execute(Job(str(aerial), "nominal"))
     assert found["schema"] == SCHEMA and found["controller"] == "nominal" and found["seed"] == 0
+    assert found["language"] == "Python"
     assert found["metrics"]["contacts"] == 1 and found["metrics"]["q_total_impact"] > 0
     assert {"inside", "outside"} <= set(found["metrics"]["saturation_s"])
     assert [w["kind"] for w in found["windows"]] == ["impact", "dwell", "recovery"]
@@ -95,13 +97,27 @@ def test_a_changed_scenario_or_a_broken_file_is_run_anew(aerial: Path, tmp_path:
     assert key_of(Job(str(path), "nominal", gain=3.0)) != key_of(job)
 
 
+def test_runs_in_python_and_in_c_are_kept_apart(aerial: Path, tmp_path: Path) -> None:
+    plan, store = {str(aerial): ["nominal"]}, Store(tmp_path / "kept")
+    few, many = jobs_of(plan, 2), jobs_of(plan, 3)
+    for job in few:
+        store.keep(job, {"language": "Python"})
+    # However many seeds the first call had: what more seeds run in C is not taken from Python, nor the other way.
+    assert [store.find(job) for job in many] == [None] * 3
+    for job in many:
+        store.keep(job, {"language": "C"})
+    assert [store.find(job) for job in few] == [{"language": "Python"}] * 2
+    assert [store.find(job) for job in jobs_of(plan, 2, "auto")] == [{"language": "Python"}] * 2
+    assert [store.find(job) for job in jobs_of(plan, 2, "always")] == [None] * 2
+
+
 @pytest.mark.parametrize("damage", ["empty", "half", "bytes", "other text", "another job's", "deep", "a folder"])
 def test_a_damaged_file_is_run_anew(aerial: Path, tmp_path: Path, damage: str) -> None:
     job, store = Job(str(aerial), "nominal"), Store(tmp_path / "kept")
     store.keep(Job(str(aerial), "nominal", 1), {"status": "completed", "runs": []})
     store.keep(job, {"status": "completed", "runs": []})
     assert store.find(job) is not None
-    path, other = (store.folder / f"aerial-nominal-{seed}.json".replace("aerial", job.name[:-10]) for seed in (0, 1))
+    path, other = (store._path(Job(str(aerial), "nominal", seed)) for seed in (0, 1))
     whole = path.read_bytes()
     made = {
         "empty": b"", "half": whole[: len(whole) // 2], "bytes": b"\xff\xfe\x00", "another job's": other.read_bytes(),

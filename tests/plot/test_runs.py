@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.plot import (
     FORMATS,
     Bar,
@@ -57,7 +57,7 @@ def make_run(
     q = np.array([pin.integrate(robot.model, robot.posture(), way) for way in ways])
     rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
     objective = np.where(np.arange(TICKS) % 10 == 0, 3.0 + np.cos(t), np.nan)
-    supports = tuple(Support.from_spec(s) for s in robot.spec.supports)
+    supports = robot.spec.supports
     hits = (1.0,) if push else (1.0, 2.5)
     windows = [Span("impact", at, at + 0.3, k) for k, at in enumerate(hits)]
     windows += [] if push else [Span("dwell", at, at + 0.8, k) for k, at in enumerate(hits)]

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from matplotlib.figure import Figure
 
-from impact_posture.impact.contact import ImpactContact, Support
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.path.posture_path import PosturePath
@@ -47,7 +47,7 @@ def make_view(
     **keys: object,
 ) -> ResultView:
     robot = load_robot(name)
-    supports = tuple(Support.from_spec(s) for s in robot.spec.supports)
+    supports = robot.spec.supports
     frame = frame or robot.spec.contact.frame or robot.frame_names[-1]
     normal_frame = keys.pop("normal_frame", "world")
     contact = ImpactContact(frame, normal, normal_frame=normal_frame)  # type: ignore[arg-type]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import CompilerError, InputError
+from impact_posture.experiment.jobs import Job, execute, worth_compiling
 from impact_posture.libraries import cache_path
 from impact_posture.simulation.compiled_tick import CompiledTick
 from impact_posture.simulation.controller_factory import ControllerFactory
@@ -57,12 +58,19 @@ def test_a_run_in_c_is_that_of_python(name: str, controller: str, mode: Any) -> 
     np.testing.assert_allclose(theirs.series.torque[calm], ours.series.torque[calm], rtol=0, atol=1e-7)
 
 
-def test_auto_builds_where_runs_pay_for_it() -> None:
-    assert in_c("solo8-push", compile="auto").driver("nominal").compiled is None
-    assert in_c("solo8-push", compile="never", runs=9).driver("robust").compiled is None
-    assert in_c("solo8-push", compile="auto", runs=3).driver("robust").compiled is not None
+def test_auto_builds_where_it_can_and_a_job_says_so_where_its_runs_pay_for_it() -> None:
+    assert [worth_compiling("auto", runs) for runs in (1, 2, 3)] == ["never", "never", "auto"]
+    assert (worth_compiling("always", 1), worth_compiling("never", 9)) == ("always", "never")
+    assert in_c("solo8-push", compile="never").driver("robust").compiled is None
+    made = in_c("solo8-push", compile="auto")
+    assert made.driver("robust").compiled is not None and made.in_c
     # Looks into its controller.
-    assert in_c("solo8-push", compile="auto", runs=3).driver("walker").compiled is None
+    assert made.driver("walker").compiled is None and not made.in_c
+
+
+def test_a_document_says_that_c_computed_the_ticks() -> None:
+    _, document = execute(Job("solo8-push", "robust", sign=1, compile="always"), in_c("solo8-push"))
+    assert document["language"] == "C"
 
 
 def test_what_cannot_run_in_c_is_named_or_runs_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,7 +81,7 @@ def test_what_cannot_run_in_c_is_named_or_runs_in_python(monkeypatch: pytest.Mon
     monkeypatch.setenv("CC", "false")
     with pytest.raises(CompilerError):
         in_c("solo8-push").driver("nominal")
-    made = in_c("solo8-push", compile="auto", runs=3)
+    made = in_c("solo8-push", compile="auto")
     assert made.driver("nominal").compiled is None
     (warning,) = made.warnings
     assert warning.startswith("the controller runs in Python")

@@ -55,7 +55,7 @@ def drop(law: ContactLaw, q: Vector, speed: float = 0.5, timestep: float = 2.5e-
     rest = Command(np.zeros(3), np.zeros(3), NONE, Status.SOLVED, np.zeros(9), NONE)
     for _ in range(60):
         world.step(ActuatorCommand(np.zeros(3), NONE), round(1e-3 / timestep))
-        recorder.take(world.truth(), rest, 0.0, 0.0)
+        recorder.take(rest, 0.0, 0.0)
     touch = recorder.first_touch(0.0, np.inf)
     assert touch is not None
     run = Run(recorder.series(), (Window("impact", 0, touch, touch + 0.03, True),))

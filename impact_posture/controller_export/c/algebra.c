@@ -3,6 +3,28 @@
 /* Families of joints in ip_joint_family. */
 enum { IP_DIRECT, IP_CONTINUOUS, IP_FREE_FLYER, IP_SPHERICAL };
 
+/* As fmin and fmax where b is no NaN, and without a call. */
+static double ip_least(double a, double b)
+{
+  return a < b ? a : b;
+}
+
+static double ip_most(double a, double b)
+{
+  return a > b ? a : b;
+}
+
+/* Part of a heading across the unit vector n; return its length. */
+static double ip_across(const double *n, const double *heading, double *across)
+{
+  const double along = ip_dot(n, heading, 3);
+  int i;
+  for (i = 0; i < 3; ++i) {
+    across[i] = heading[i] - n[i] * along;
+  }
+  return sqrt(ip_dot(across, across, 3));
+}
+
 static void ip_cross(const double *a, const double *b, double *out)
 {
   out[0] = a[1] * b[2] - a[2] * b[1];
@@ -206,9 +228,7 @@ static int ip_cholesky(double *A, int n)
       return 0;
     }
     s = 1.0 / sqrt(row[i]);
-    for (j = i; j < n; ++j) {
-      row[j] *= s;
-    }
+    ip_scaled(row + i, s, row + i, n - i);
     for (k = i + 1; k < n; ++k) {
       const double c = row[k];
       double *below = A + k * n;

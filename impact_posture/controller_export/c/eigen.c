@@ -1,15 +1,6 @@
 /* Eigenvalues of a symmetric matrix: Householder's tridiagonal form, then QR steps with Wilkinson's shift (Golub and Van
  * Loan, Matrix Computations, sections 8.3.1 and 8.3.3). */
 
-/* out += s x. */
-static void ip_add(double *restrict out, double s, const double *restrict x, int n)
-{
-  int i;
-  for (i = 0; i < n; ++i) {
-    out[i] += s * x[i];
-  }
-}
-
 /* Take the reflection I - beta v v' of the entries from k + 1 on out of A, and put it into the rows of V. */
 static void ip_reflect(double *A, double *V, int n, int k, const double *v, double beta)
 {

@@ -65,81 +65,75 @@ static void ip_activate(ip_context *c, double dt)
   }
 }
 
+/* C = A B, all n x n. */
+static void ip_multiply(const double *A, const double *B, double *C, int n)
+{
+  int i;
+  for (i = 0; i < n; ++i) {
+    ip_combine(C + i * n, n, A + i * n, 1, B, n, n);
+  }
+}
+
 /* Measure lambda, the largest curvature of H along the redundancy.  Return 0 where there is none. */
 static int ip_normalize(ip_context *c)
 {
   enum { N = IP_NV };
-  double *A = c->scratch, *V = A + N * N, *B = V + N * N, q[IP_NQ], g[2][N], value, largest = 0.0;
-  int all, i, j, k, free_count = 0, at[N];
+  double *A = c->scratch, *V = A + N * N, *P = V + N * N, q[IP_NQ], g[2][N], value, largest = 0.0;
+  int all, i, j, k, found = 0;
   c->scale = c->p.robust_scale[0];
   if (c->scale > 0.0) {
     return 1;
   }
   /* What weighted tasks leave; if that is nothing, what contacts and strict levels leave; else everything. */
-  for (all = 1; all >= 0 && free_count == 0; --all) {
+  for (all = 1; all >= 0 && !found; --all) {
     double most = 0.0;
     memset(A, 0, sizeof(double) * N * N);
+    memset(P, 0, sizeof(double) * N * N);
     for (k = 0; k < IP_FORCES + (all ? IP_ROWS : IP_STRICT); ++k) {
-      const double *row = k < IP_FORCES ? NULL : c->J[k - IP_FORCES];
-      for (i = 0; i < IP_CONTACTS && !row; ++i) {
-        row = k < ip_contact_row[i + 1] ? c->m.jacobian[ip_contact_point[i]] + (k - ip_contact_row[i]) * N : NULL;
-      }
+      const double *row = k < IP_FORCES ? ip_contact_motion(c, k) : c->J[k - IP_FORCES];
       for (i = 0; i < N; ++i) {
-        for (j = 0; j < N; ++j) {
-          A[i * N + j] += row[i] * row[j];
-        }
+        ip_add(A + i * N, row[i], row, N);
       }
     }
     ip_eigen(A, V, N);
     for (i = 0; i < N; ++i) {
       most = fmax(most, A[i * (N + 1)]);
     }
-    for (i = 0; i < N; ++i) {
-      if (!(A[i * (N + 1)] > 1e-12 * fmax(most, 1e-24))) {
-        at[free_count++] = i;
+    for (k = 0; k < N; ++k) {
+      const double *z = V + k * N;
+      for (i = 0; i < N * N && !(A[k * (N + 1)] > 1e-12 * fmax(most, 1e-24)); ++i) {
+        P[i] += z[i / N] * z[i % N];
+        found = 1;
       }
     }
   }
-  if (free_count == 0) {
-    for (i = 0; i < N * N; ++i) {
-      V[i] = i % (N + 1) == 0 ? 1.0 : 0.0;
-    }
-    for (i = 0; i < N; ++i) {
-      at[free_count++] = i;
-    }
+  for (i = 0; i < N && !found; ++i) {
+    P[i * (N + 1)] = 1.0;
   }
-  for (k = 0; k < free_count; ++k) {
-    double z[N];
-    for (i = 0; i < N; ++i) {
-      z[i] = V[at[k] * N + i];
-    }
+  /* Along the axes, because differences along a basis of the redundancy would depend on how it is computed. */
+  for (k = 0; k < N; ++k) {
+    double z[N] = {0};
+    z[k] = 1.0;
     for (j = 0; j < 2; ++j) {
       ip_integrate(c->q, z, j ? -1e-5 : 1e-5, q);
       if (IP_GRADIENT(q, &value, g[j]) != 0) {
         return 0;
       }
     }
-    for (i = 0; i < free_count; ++i) {
-      double sum = 0.0;
-      for (j = 0; j < N; ++j) {
-        sum += V[at[i] * N + j] * (g[0][j] - g[1][j]) / 2e-5;
-      }
-      B[i * free_count + k] = sum;
+    for (i = 0; i < N; ++i) {
+      A[i * N + k] = (g[0][i] - g[1][i]) / 2e-5;
     }
   }
-  /* The spectral norm of B. */
-  for (i = 0; i < free_count; ++i) {
-    for (j = 0; j < free_count; ++j) {
-      double sum = 0.0;
-      for (k = 0; k < free_count; ++k) {
-        sum += B[k * free_count + i] * B[k * free_count + j];
-      }
-      A[i * free_count + j] = sum;
-    }
+  /* The spectral norm of PAP, with the projection P on the redundancy. */
+  ip_multiply(A, P, V, N);
+  memcpy(A, V, sizeof(double) * N * N);
+  ip_multiply(P, A, V, N);
+  for (i = 0; i < N; ++i) {
+    ip_combine(P + i * N, N, V + i, N, V, N, N);
   }
-  ip_eigen(A, V, free_count);
-  for (i = 0; i < free_count; ++i) {
-    largest = fmax(largest, A[i * (free_count + 1)]);
+  ip_eigen(P, V, N);
+  for (i = 0; i < N; ++i) {
+    largest = fmax(largest, P[i * (N + 1)]);
   }
   if (IP_GRADIENT(c->q, &value, g[0]) != 0) {
     return 0;

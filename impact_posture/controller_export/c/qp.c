@@ -22,15 +22,8 @@ static void ip_whiten(const ip_context *c, const double *row, double *restrict o
 {
   int i, j;
 #if IP_DENSE
-  for (j = 0; j < IP_NV; ++j) {
-    out[j] = 0.0;
-  }
-  for (i = 0; i < IP_NV; ++i) {
-    const double s = row[i], *factor = c->factor + i * IP_NV;
-    for (j = i; j < IP_NV; ++j) {
-      out[j] += s * factor[j];
-    }
-  }
+  (void)i, (void)j;
+  ip_combine(out, IP_NV, row, 1, c->factor, IP_NV, IP_NV);
 #elif IP_MOMENTUM
   const double *M = c->m.M, *R = c->m.base, scale = 1.0 / M[0];
   const double x = row[0] * scale, y = row[1] * scale, z = row[2] * scale;
@@ -82,23 +75,20 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
  * pulls towards g: weighted tasks, contacts that are not hard, and the posture. */
 static void ip_cost(const ip_context *c, double *H, int stride, double *g)
 {
-  int i, j, k, r;
+  int i, k, r;
   for (r = IP_STRICT; r < IP_ROWS + IP_FORCES; ++r) {
-    const double *J = r < IP_ROWS ? c->J[r] : NULL;
-    double a = r < IP_ROWS ? c->a[r] : c->contact_a[r - IP_ROWS], weight = r < IP_ROWS ? c->p.task_weight[r] : 0.0;
+    const int f = r - IP_ROWS;
+    const double *J = f < 0 ? c->J[r] : ip_contact_motion(c, f), a = f < 0 ? c->a[r] : c->contact_a[f];
+    double weight = f < 0 ? c->p.task_weight[r] : 0.0;
     for (k = 0; k < IP_CONTACTS; ++k) {
-      const int own = r - IP_ROWS - ip_contact_row[k];
-      if (own >= 0 && r - IP_ROWS < ip_contact_row[k + 1] && !ip_contact_hard[k]) {
-        J = c->m.jacobian[ip_contact_point[k]] + own * IP_NV;
+      if (f >= ip_contact_row[k] && f < ip_contact_row[k + 1] && !ip_contact_hard[k]) {
         weight = c->p.contact_weight[k];
       }
     }
     for (i = 0; i < IP_NV && weight > 0.0; ++i) {
       const double s = weight * J[i];
       g[i] += s * a;
-      for (j = i; j < IP_NV; ++j) {
-        H[i * stride + j] += s * J[j];
-      }
+      ip_add(H + i * stride + i, s, J + i, IP_NV - i);
     }
   }
   for (i = 0; i < IP_NV; ++i) {
@@ -160,10 +150,9 @@ static double ip_force_row(const ip_context *c, const double *s, int first, int 
   int i, j, k;
   ip_scaled(c->m.M + first * IP_NV, s[0], row, IP_NV);
   for (i = 1; i < count; ++i) {
-    const double t = s[i], *M = c->m.M + (first + i) * IP_NV;
-    bias += t * c->free_force[first + i];
-    for (j = 0; j < IP_NV && t != 0.0; ++j) {
-      row[j] += t * M[j];
+    bias += s[i] * c->free_force[first + i];
+    if (s[i] != 0.0) {
+      ip_add(row, s[i], c->m.M + (first + i) * IP_NV, IP_NV);
     }
   }
   memset(row + IP_NV, 0, sizeof(double) * IP_SPARE);

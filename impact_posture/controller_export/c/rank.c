@@ -6,6 +6,21 @@
 #define IP_DROPPED 1e-9
 #define IP_LEAST 1e-8
 
+/* Value of a variable that compares with an acceleration of 1. */
+static double ip_size(const ip_context *c, int k)
+{
+  return k < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
+}
+
+/* out = a row of the equations, less another one, in these units and times s. */
+static void ip_in_units(const ip_context *c, const double *row, const double *less, double s, double *out)
+{
+  int k;
+  for (k = 0; k < IP_VARIABLES; ++k) {
+    out[k] = (row[k] - (less ? less[k] : 0.0)) * s * ip_size(c, k);
+  }
+}
+
 /* Whether the equations are independent, as LevelRank decides: no singular value of the scaled rows is below 0.02.  No
  * singular value moves further than the matrix does, so most ticks need no decomposition. */
 static void ip_measure_rank(ip_context *c)
@@ -14,17 +29,11 @@ static void ip_measure_rank(ip_context *c)
   enum { N = IP_EQUATIONS };
   const double least = IP_SINGULAR;
   double *G = c->scratch, *S = c->scratch + N * N, way = 0.0, low, high, trace = 0.0;
-  double way_of[IP_VARIABLES];
+  double one[IP_VARIABLES], other[IP_VARIABLES];
   int i, j, k;
   for (i = 0; i < N; ++i) {
-    const double s = 1.0 / c->length[i];
-    for (j = 0; j < IP_NV + IP_SPARE; ++j) {
-      way_of[j] = (c->rows[i][j] - c->reference[i][j]) * s;
-    }
-    for (; j < IP_VARIABLES; ++j) {
-      way_of[j] = (c->rows[i][j] - c->reference[i][j]) * s * c->m.M[0];
-    }
-    way += ip_dot(way_of, way_of, IP_VARIABLES);
+    ip_in_units(c, c->rows[i], c->reference[i], 1.0 / c->length[i], one);
+    way += ip_dot(one, one, IP_VARIABLES);
   }
   if (way < c->space) {
     return;
@@ -36,13 +45,10 @@ static void ip_measure_rank(ip_context *c)
     return;
   }
   for (i = 0; i < N; ++i) {
+    ip_in_units(c, c->rows[i], NULL, 1.0 / c->length[i], one);
     for (j = 0; j <= i; ++j) {
-      double sum = 0.0;
-      for (k = 0; k < IP_VARIABLES; ++k) {
-        const double unit = k < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
-        sum += c->rows[i][k] * c->rows[j][k] * unit * unit;
-      }
-      G[i * N + j] = G[j * N + i] = sum / (c->length[i] * c->length[j]);
+      ip_in_units(c, c->rows[j], NULL, 1.0 / c->length[j], other);
+      G[i * N + j] = G[j * N + i] = ip_dot(one, other, IP_VARIABLES);
     }
     trace += G[i * (N + 1)];
   }
@@ -73,14 +79,11 @@ static void ip_measure_rank(ip_context *c)
 /* Lengths of the equations, by which their rank is measured: the longest row of a level. */
 static void ip_begin_rank(ip_context *c)
 {
-  int r = IP_BLIND, i, j, k;
+  double row[IP_VARIABLES];
+  int r = IP_BLIND, i, k;
   for (i = 0; i < IP_EQUATIONS; ++i) {
-    double sum = 0.0;
-    for (j = 0; j < IP_VARIABLES; ++j) {
-      const double x = c->rows[i][j] * (j < IP_NV + IP_SPARE ? 1.0 : c->m.M[0]);
-      sum += x * x;
-    }
-    c->length[i] = sqrt(sum);
+    ip_in_units(c, c->rows[i], NULL, 1.0, row);
+    c->length[i] = sqrt(ip_dot(row, row, IP_VARIABLES));
   }
   for (k = 0; k < IP_LEVELS; ++k) {
     double most = 0.0;
@@ -141,12 +144,9 @@ static void ip_orthogonalize(double *B, double *U, int k, int n)
 /* Z = Z (I - share v v'/v'v) for a row v of length s. */
 static void ip_remove(double *Z, const double *v, double s, double share, int n)
 {
-  int i, j;
+  int i;
   for (i = 0; i < n; ++i) {
-    const double along = share * ip_dot(Z + i * n, v, n) / (s * s);
-    for (j = 0; j < n; ++j) {
-      Z[i * n + j] -= along * v[j];
-    }
+    ip_add(Z + i * n, -share * ip_dot(Z + i * n, v, n) / (s * s), v, n);
   }
 }
 
@@ -160,13 +160,11 @@ static void ip_reduce(ip_context *c, double *H, double *g)
   int i, j, k, l, r = IP_BLIND;
   for (i = 0; i < N; ++i) {
     for (j = 0; j < N; ++j) {
-      Z[i * N + j] = i != j ? 0.0 : i < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
+      Z[i * N + j] = i == j ? ip_size(c, i) : 0.0;
     }
   }
   for (i = 0; i < IP_BLIND; ++i) {
-    for (j = 0; j < N; ++j) {
-      B[i * N + j] = c->rows[i][j] * Z[j * (N + 1)] / c->length[i];
-    }
+    ip_in_units(c, c->rows[i], NULL, 1.0 / c->length[i], B + i * N);
   }
   ip_orthogonalize(B, U, IP_BLIND, N);
   for (i = 0; i < IP_BLIND; ++i) {
@@ -176,27 +174,12 @@ static void ip_reduce(ip_context *c, double *H, double *g)
     const int count = ip_level_rows[k];
     double top = 0.0, bottom = 0.0, weight;
     for (i = 0; i < count; ++i) {
-      for (j = 0; j < N; ++j) {
-        B[i * N + j] = 0.0;
-      }
-      for (l = 0; l < N; ++l) {
-        for (j = 0; j < N; ++j) {
-          B[i * N + j] += c->rows[r + i][l] * Z[l * N + j];
-        }
-      }
+      ip_combine(B + i * N, N, c->rows[r + i], 1, Z, N, N);
     }
     ip_orthogonalize(B, U, count, N);
     for (i = 0; i < count; ++i) {
-      wanted[i] = 0.0;
-      for (j = 0; j < N; ++j) {
-        turned[i * N + j] = 0.0;
-      }
-      for (l = 0; l < count; ++l) {
-        wanted[i] += U[i * count + l] * c->low[IP_SIMPLE + r + l];
-        for (j = 0; j < N; ++j) {
-          turned[i * N + j] += U[i * count + l] * c->rows[r + l][j];
-        }
-      }
+      wanted[i] = ip_dot(U + i * count, c->low + IP_SIMPLE + r, count);
+      ip_combine(turned + i * N, N, U + i * count, 1, c->rows[r], N, count);
     }
     /* The mean weight of the cost over the directions that are left. */
     for (i = 0; i < IP_NV; ++i) {

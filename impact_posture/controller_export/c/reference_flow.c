@@ -1,10 +1,12 @@
 /* The reference flow: a posture q_r that goes down the gradient on contacts and tasks, limited in speed and acceleration,
- * before the posture task follows it.  An update takes five ticks, one part each.  The formulas are in
+ * before the posture task follows it.  An update takes four ticks, one part each.  The formulas are in
  * impact_posture/tsid/reference_flow.py. */
 
 /* Step of the differences, rad; step below which a posture on the way is reached, rad (m). */
 #define IP_PROBE 1e-4
 #define IP_REACHED 0.02
+/* Way of the flow that is long enough to learn from, rad (m). */
+#define IP_MOVED 1e-6
 /* Length of what is new in a direction below which it is taken twice. */
 #define IP_NEW 0.1
 
@@ -65,11 +67,39 @@ static void ip_flow_evaluate(ip_flow *f, const double *q, double *slope)
   }
 }
 
-/* Evaluate objective, constraints and limits at q_r. */
+/* The gradient on the constraints, slope - J'multiplier, in place. */
+static void ip_flow_reduce(const ip_flow *f, double (*J)[IP_NV], double *slope)
+{
+  int i;
+  for (i = 0; i < IP_HELD; ++i) {
+    ip_add(slope, -f->multiplier[i], J[i], IP_NV);
+  }
+}
+
+/* Learn from the reduced gradients and the static controls at both ends of a way, z times its length. */
+static void ip_flow_compare(ip_flow *f, const double *z, double length, const double *slope, const double *shares)
+{
+  double curvature[IP_NV], controls[IP_CONTROLS];
+  int i;
+  for (i = 0; i < IP_NV; ++i) {
+    curvature[i] = (slope[i] - f->reduced[i]) / length;
+  }
+  for (i = 0; i < IP_CONTROLS; ++i) {
+    controls[i] = (shares[i] - f->shares[i]) / length;
+  }
+  ip_flow_learn(f, z, curvature, controls);
+}
+
+/* Evaluate objective, constraints and limits at q_r, and learn from the way since the last look. */
 static void ip_flow_look(ip_context *c)
 {
   ip_flow *f = &c->flow;
+  double way[IP_NV], slope[IP_NV], shares[IP_CONTROLS], length;
   int i;
+  ip_difference(f->q, f->here, way);
+  length = sqrt(ip_dot(way, way, IP_NV));
+  memcpy(slope, f->slope, sizeof slope);
+  memcpy(shares, f->shares, sizeof shares);
   memcpy(f->here, f->q, sizeof f->here);
   ip_flow_place(c, f->q, f->error);
   ip_flow_evaluate(f, f->q, f->slope);
@@ -79,7 +109,18 @@ static void ip_flow_look(ip_context *c)
   for (i = 0; i < IP_NV; ++i) {
     ip_add(f->multiplier, f->slope[i], f->inverse + i * IP_HELD, IP_HELD);
   }
+  memcpy(f->reduced, f->slope, sizeof f->reduced);
+  ip_flow_reduce(f, f->J, f->reduced);
   ip_flow_shares(c, f->shares);
+  /* A look that failed has no slope. */
+  if (length > IP_MOVED && !f->failed && ip_dot(slope, slope, IP_NV) > 0.0) {
+    ip_flow_reduce(f, f->before, slope);
+    for (i = 0; i < IP_NV; ++i) {
+      way[i] /= length;
+    }
+    ip_flow_compare(f, way, length, slope, shares);
+  }
+  memcpy(f->before, f->J, sizeof f->before);
   ip_flow_limits(c);
 }
 
@@ -106,38 +147,23 @@ static void ip_flow_aim(ip_flow *f)
   }
 }
 
-/* Evaluate the reduced gradient and the static controls beside q_r, and learn from both sides. */
-static void ip_flow_probe(ip_context *c, double sign)
+/* Evaluate the reduced gradient and the static controls beside the posture of the last look, and learn. */
+static void ip_flow_probe(ip_context *c)
 {
   ip_flow *f = &c->flow;
   double q[IP_NQ], slope[IP_NV], shares[IP_CONTROLS];
-  int i;
   if (f->failed || !f->left) {
     return;
   }
-  if (sign > 0.0) {
-    f->probed = f->next % f->left;
-    ip_flow_aim(f);
-  }
-  /* Both sides of the posture of the last look, because the flow has moved on since. */
-  ip_integrate(f->here, f->seen[f->probed], sign * IP_PROBE, q);
+  f->probed = f->next % f->left;
+  ip_flow_aim(f);
+  ip_integrate(f->here, f->seen[f->probed], IP_PROBE, q);
   ip_flow_evaluate(f, q, slope);
   ip_flow_place(c, q, NULL);
-  for (i = 0; i < IP_HELD; ++i) {
-    ip_add(slope, -f->multiplier[i], f->J[i], IP_NV);
-  }
+  ip_flow_reduce(f, f->J, slope);
   ip_flow_shares(c, shares);
-  if (sign > 0.0) {
-    memcpy(f->ahead_slope, slope, sizeof slope);
-    memcpy(f->ahead_shares, shares, sizeof shares);
-  } else if (!f->failed) {
-    for (i = 0; i < IP_NV; ++i) {
-      slope[i] = (f->ahead_slope[i] - slope[i]) / (2.0 * IP_PROBE);
-    }
-    for (i = 0; i < IP_CONTROLS; ++i) {
-      shares[i] = (f->ahead_shares[i] - shares[i]) / (2.0 * IP_PROBE);
-    }
-    ip_flow_learn(f, slope, shares);
+  if (!f->failed) {
+    ip_flow_compare(f, f->seen[f->probed], IP_PROBE, slope, shares);
     ++f->next;
   }
 }

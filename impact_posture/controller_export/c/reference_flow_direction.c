@@ -4,6 +4,14 @@
 /* Least H/H0 whose root counts. */
 #define IP_LEAST_VALUE 1e-8
 
+/* How much a row changes along a way. */
+static double ip_flow_along(const ip_flow *f, int r, const double *way)
+{
+  return r < IP_JOINTS_V              ? way[IP_BASE + r]
+         : r < IP_JOINTS_V + IP_EDGES ? ip_dot(f->row[r - IP_JOINTS_V], way, IP_NV)
+                                      : ip_dot(f->T[r - IP_JOINTS_V - IP_EDGES], way, IP_NV);
+}
+
 /* Bounds of the rows on the step, at the model of the flow, less what the flow needs to brake. */
 static void ip_flow_limits(ip_context *c)
 {
@@ -43,6 +51,8 @@ static void ip_flow_limits(ip_context *c)
         ahead = ip_dot(f->T[k], coasting, IP_NV);
       }
     }
+    f->room[0][r] = fmax(high, 0.0);
+    f->room[1][r] = fmin(low, 0.0);
     f->high[r] = fmax(high - fmax(ahead, 0.0), 0.0);
     f->low[r] = fmin(low - fmin(ahead, 0.0), 0.0);
   }
@@ -66,9 +76,7 @@ APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *
   for (r = 0; r < M; ++r) {
     double *row = rows + r * n, length, shift;
     for (k = 0; k < n; ++k) {
-      row[k] = r < IP_JOINTS_V            ? way[k][IP_BASE + r]
-               : r < IP_JOINTS_V + IP_EDGES ? ip_dot(f->row[r - IP_JOINTS_V], way[k], N)
-                                            : ip_dot(f->T[r - IP_JOINTS_V - IP_EDGES], way[k], N);
+      row[k] = ip_flow_along(f, r, way[k]);
     }
     length = ip_dot(row, row, n);
     shift = ip_dot(row, slope, n);
@@ -87,7 +95,8 @@ APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *
   w.dlower = lower;
   w.scaling = scaling;
   w.sense = sense;
-  if (daqp_reactivate_constraints(&w) < 0 || daqp_ldp(&w) <= 0) {
+  if (daqp_reactivate_constraints(&w) < 0 || daqp_ldp(&w) <= 0 || w.state & DAQP_STATE_NOISE_FLOOR) {
+    /* The last is an answer that violates bounds after circles. */
     ++f->failures;
     return;
   }
@@ -146,9 +155,8 @@ static void ip_flow_newton(ip_context *c)
 }
 
 /* Learn the curvature and the slope of the static controls along the direction of the last probe. */
-static void ip_flow_learn(ip_flow *f, const double *curvature, const double *controls)
+static void ip_flow_learn(ip_flow *f, const double *z, const double *curvature, const double *controls)
 {
-  const double *z = f->seen[f->probed];
   double missing[IP_NV], along;
   int i;
   for (i = 0; i < IP_NV; ++i) {
@@ -165,18 +173,19 @@ static void ip_flow_learn(ip_flow *f, const double *curvature, const double *con
   }
 }
 
-/* Take out of a step of the flow the part by which H would rise where the flow can stop. */
+/* Take out of a step of the flow the part by which H would rise now, or where the flow stops. */
 static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
 {
-  double uphill[IP_NV], climb, square;
-  int i;
-  for (i = 0; i < IP_NV; ++i) {
-    uphill[i] = f->slope[i] + ip_dot(f->B + i * IP_NV, stop, IP_NV);
-  }
-  ip_flow_project(f, uphill);
-  climb = ip_dot(uphill, f->flow, IP_NV) + ip_dot(uphill, step, IP_NV);
-  square = ip_dot(uphill, uphill, IP_NV);
-  if (climb > 0.0) {
-    ip_add(step, -climb / square, uphill, IP_NV);
+  double uphill[IP_NV], climb;
+  int i, k;
+  for (k = 0; k < 2; ++k) {
+    for (i = 0; i < IP_NV; ++i) {
+      uphill[i] = f->slope[i] + (k ? 0.0 : ip_dot(f->B + i * IP_NV, stop, IP_NV));
+    }
+    ip_flow_project(f, uphill);
+    climb = ip_dot(uphill, f->flow, IP_NV) + ip_dot(uphill, step, IP_NV);
+    if (climb > 0.0) {
+      ip_add(step, -climb / ip_dot(uphill, uphill, IP_NV), uphill, IP_NV);
+    }
   }
 }

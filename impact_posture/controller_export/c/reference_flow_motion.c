@@ -3,6 +3,8 @@
 /* Time constant of the return to contacts and tasks, s; speed of a flow that stands still, rad/s (m/s). */
 #define IP_RETURN 0.1
 #define IP_STILL 1e-5
+/* What a limit may be missed by where the flow brakes, rad (m), or as a share. */
+#define IP_NEAR 1e-3
 /* Pull to zero of the base's share in a motion that the joints do not determine. */
 #define IP_IDLE 1e-9
 
@@ -53,13 +55,64 @@ static void ip_flow_back(ip_context *c, double *back)
 #endif
 }
 
+/* Whether the flow stays within the limits if it changes by a step and then brakes, all entries evenly. */
+static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *step, double period)
+{
+  double way[IP_NV], time;
+  int i, r;
+  for (i = 0; i < IP_NV; ++i) {
+    way[i] = f->flow[i] + step[i];
+  }
+  time = ip_largest(way, 0) / (2.0 * p->flow_acceleration[0]) + period;
+  for (r = 0; r < IP_FLOW_ROWS; ++r) {
+    const double ahead = time * ip_flow_along(f, r, way);
+    if (ahead > f->room[0][r] + IP_NEAR || ahead < f->room[1][r] - IP_NEAR) {
+      return 0;
+    }
+  }
+  return 1;
+}
+
+/* The change of the flow towards the wanted step, by at most so much an entry: as fast as each joint can, or straight, or
+ * braking.  The first of them counts from which the flow can stop within the limits. */
+static void ip_flow_change(const ip_flow *f, const ip_params *p, double period, double fastest, double *step)
+{
+  enum { N = IP_NV, FAST = 0, BRAKE = 2 };
+  const double a = p->flow_acceleration[0], most = a * period, time = ip_largest(f->flow, 0) / a;
+  double wanted[N], stop[N];
+  int i, k;
+  for (i = 0; i < N; ++i) {
+    wanted[i] = f->wanted[i] * a / p->flow_speed[0];
+    /* Twice the way on which it stops, because the curvature may grow on it. */
+    stop[i] = time * f->flow[i];
+  }
+  ip_shorten(wanted, fastest);
+  for (k = FAST; k <= BRAKE; ++k) {
+    for (i = 0; i < N; ++i) {
+      step[i] = (k == BRAKE ? 0.0 : wanted[i]) - f->flow[i];
+      step[i] = k == FAST ? fmin(fmax(step[i], -most), most) : step[i];
+    }
+    if (k == FAST) {
+      ip_flow_project(f, step);
+    }
+    ip_shorten(step, most);
+    if (k < BRAKE && fastest > 0.0 && f->visited == IP_PATH) {
+      ip_flow_downhill(f, stop, step);
+      ip_shorten(step, most);
+    }
+    if (ip_flow_stops(f, p, step, period)) {
+      return;
+    }
+  }
+}
+
 /* Limit speed and acceleration, and return to contacts and tasks. */
 static void ip_flow_govern(ip_context *c)
 {
   enum { N = IP_NV };
   ip_flow *f = &c->flow;
   const ip_params *p = &c->p;
-  const double period = f->elapsed, most = p->flow_acceleration[0] * period;
+  const double period = f->elapsed;
   double e[N], back[N], step[N], known[N], more[N], fastest, part;
   int i;
   f->elapsed = 0.0;
@@ -72,24 +125,7 @@ static void ip_flow_govern(ip_context *c)
   fastest = !f->on || f->resting ? 0.0 : fastest;
   ip_flow_back(c, back);
   ip_flow_project(f, f->flow);
-  /* Each joint turns as fast as it can, and then all stay on the constraints. */
-  for (i = 0; i < N; ++i) {
-    step[i] = f->wanted[i] * p->flow_acceleration[0] / p->flow_speed[0];
-  }
-  ip_shorten(step, fastest);
-  for (i = 0; i < N; ++i) {
-    step[i] = fmin(fmax(step[i] - f->flow[i], -most), most);
-  }
-  ip_flow_project(f, step);
-  ip_shorten(step, most);
-  if (fastest > 0.0 && f->visited == IP_PATH) {
-    const double stop = ip_largest(f->flow, 0) / (2.0 * p->flow_acceleration[0]);
-    for (i = 0; i < N; ++i) {
-      e[i] = f->flow[i] * stop;
-    }
-    ip_flow_downhill(f, e, step);
-    ip_shorten(step, most);
-  }
+  ip_flow_change(f, p, period, fastest, step);
   for (i = 0; i < N; ++i) {
     known[i] = (f->flow[i] + back[i] - f->velocity[i]) / period;
     more[i] = step[i] / period;
@@ -121,6 +157,7 @@ static int ip_flow_begin(ip_context *c)
   memset(c->posture_acceleration, 0, sizeof c->posture_acceleration);
   memcpy(f->q, c->q, sizeof f->q);
   memcpy(f->first, c->q, sizeof f->first);
+  memcpy(f->here, c->q, sizeof f->here);
   f->deadline = INFINITY;
   ip_dynamics_constants(&f->m);
   ip_dynamics_constants(&f->ahead);
@@ -145,8 +182,7 @@ static int ip_flow_begin(ip_context *c)
   f->start = fabs(f->found);
   ip_flow_look(c);
   for (k = 0; k < f->left; ++k) {
-    ip_flow_probe(c, 1.0);
-    ip_flow_probe(c, -1.0);
+    ip_flow_probe(c);
   }
   f->next = 0;
   c->value = f->value;
@@ -165,16 +201,15 @@ static void ip_flow_lead(ip_context *c, double dt)
   f->clock += dt;
   f->elapsed += dt;
   k = f->phase;
-  f->phase = (f->phase + 1) % 5;
+  f->phase = (f->phase + 1) % 4;
   switch (k) {
   case 0:
     ip_flow_look(c);
     break;
   case 1:
-  case 2:
-    ip_flow_probe(c, k == 1 ? 1.0 : -1.0);
+    ip_flow_probe(c);
     break;
-  case 3:
+  case 2:
     ip_flow_direct(c);
     break;
   default:

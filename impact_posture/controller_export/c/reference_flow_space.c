@@ -8,6 +8,8 @@
 /* Weight of a moment (N m) relative to that of a force (N), and a share that makes equations solvable. */
 #define IP_MOMENT 100.0
 #define IP_TINY 1e-12
+/* Points nearer to a line than this lie on it, m. */
+#define IP_ON_LINE 1e-9
 /* Least share of the half range of a control that counts as left. */
 #define IP_LEFT 0.1
 
@@ -222,14 +224,17 @@ static void ip_flow_polygon(ip_context *c)
       /* Points have no rotation in the model. */
       x[i][j] += sole ? (i & 1 ? 1.0 : -1.0) * half[0] * R[3 * j] + (i & 2 ? 1.0 : -1.0) * half[1] * R[3 * j + 1] : 0.0;
     }
-    start = x[i][0] < x[start][0] || (x[i][0] == x[start][0] && x[i][1] < x[start][1]) ? i : start;
+    /* A corner, and no point on the way between two. */
+    start = x[i][0] < x[start][0] - IP_ON_LINE || (x[i][0] <= x[start][0] + IP_ON_LINE && x[i][1] < x[start][1]) ? i
+                                                                                                                : start;
   }
   for (at = start; edges < IP_EDGES; at = next) {
     double way[2] = {0.0, 0.0}, length = 0.0;
     for (i = 0, next = at; i < COUNT; ++i) {
       const double step[2] = {x[i][0] - x[at][0], x[i][1] - x[at][1]}, far = hypot(step[0], step[1]);
       const double turn = way[0] * step[1] - way[1] * step[0];
-      if (far > 1e-9 && (next == at || turn < -IP_TINY || (turn <= IP_TINY && far > length))) {
+      const double near = IP_ON_LINE * length;
+      if (far > IP_ON_LINE && (next == at || turn < -near || (turn <= near && far > length))) {
         next = i;
         length = far;
         memcpy(way, step, sizeof way);
@@ -242,7 +247,7 @@ static void ip_flow_polygon(ip_context *c)
     f->edge[edges][1] = -way[0] / length;
     f->offset[edges] = -ip_dot(f->edge[edges], x[at], 2);
     ++edges;
-    if (hypot(x[next][0] - x[start][0], x[next][1] - x[start][1]) <= 1e-9) {
+    if (hypot(x[next][0] - x[start][0], x[next][1] - x[start][1]) <= IP_ON_LINE) {
       break;
     }
   }

@@ -33,7 +33,7 @@ typedef struct {
     const double *lower;  /* n + m: of the variables, then of the rows */
     const double *upper;
     const int *level;     /* n + m: 0 ... levels; equal bounds make an equation */
-    const double *H;      /* n x n, symmetric, positive definite; only its lower triangle is read */
+    const double *H;      /* n x n, symmetric, positive definite */
     const double *g;      /* n */
     const double *unit;   /* n: value of a variable that compares with an acceleration of 1 (forces: the mass) */
 } relaxation_problem;

@@ -2,7 +2,7 @@
 
 void ip_last_report(const ip_context *c, ip_report *report)
 {
-  int r, i, k, j;
+  int r, i, j;
   memset(report, 0, sizeof *report);
   report->status = c->status;
   report->level = c->level;
@@ -27,10 +27,8 @@ void ip_last_report(const ip_context *c, ip_report *report)
   for (i = 0; i < IP_NV; ++i) {
     double error = ip_dot(c->m.M + i * IP_NV, c->z, IP_NV) + c->free_force[i];
     report->posture[i] = c->z[i] - c->wanted[i];
-    for (k = 0; k < IP_CONTACTS; ++k) {
-      for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
-        error -= c->m.jacobian[ip_contact_point[k]][(j - ip_contact_row[k]) * IP_NV + i] * c->z[IP_NV + IP_SPARE + j];
-      }
+    for (j = 0; j < IP_FORCES; ++j) {
+      error -= ip_contact_motion(c, j)[i] * c->z[IP_NV + IP_SPARE + j];
     }
     for (j = 0; j < IP_ROTORS && i < IP_BASE; ++j) {
       error -= ip_allocation[i * IP_ROTORS + j] * c->held[j];
@@ -38,10 +36,7 @@ void ip_last_report(const ip_context *c, ip_report *report)
     error -= i < IP_BASE ? 0.0 : c->held[IP_ROTORS + i - IP_BASE];
     report->dynamics = fmax(report->dynamics, fabs(error));
   }
-  for (k = 0; k < IP_CONTACTS; ++k) {
-    for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
-      const double *J = c->m.jacobian[ip_contact_point[k]] + (j - ip_contact_row[k]) * IP_NV;
-      report->contacts[j] = ip_dot(J, c->z, IP_NV) - c->contact_a[j];
-    }
+  for (j = 0; j < IP_FORCES; ++j) {
+    report->contacts[j] = ip_dot(ip_contact_motion(c, j), c->z, IP_NV) - c->contact_a[j];
   }
 }

@@ -4,16 +4,13 @@
 static void ip_add_turned(const ip_context *c, const double *x, double *out)
 {
   int i, j;
+  (void)j;
 #if IP_MOMENTUM
   double moved[3] = {0};
 #endif
   for (i = 0; i < IP_NV; ++i) {
 #if IP_DENSE
-    double sum = 0.0;
-    for (j = i; j < IP_NV; ++j) {
-      sum += c->factor[i * IP_NV + j] * x[j];
-    }
-    out[i] += sum;
+    out[i] += ip_dot(c->factor + i * (IP_NV + 1), x + i, IP_NV - i);
 #elif IP_MOMENTUM
     const double step = c->ease[i] * x[i];
     const int at = ip_entry(i);
@@ -22,7 +19,6 @@ static void ip_add_turned(const ip_context *c, const double *x, double *out)
       moved[j] += at < 3 ? c->m.base[3 * at + j] * step : -c->m.M[j * IP_NV + at] / c->m.M[0] * step;
     }
 #else
-    (void)j;
     out[ip_entry(i)] += c->ease[i] * x[i];
 #endif
   }
@@ -41,7 +37,7 @@ static void ip_add_turned(const ip_context *c, const double *x, double *out)
 static void ip_decode(ip_context *c, DAQPWorkspace *w)
 {
   double x[IP_VARIABLES];
-  int i, j;
+  int i;
   for (i = 0; i < IP_VARIABLES; ++i) {
     x[i] = c->center[i] + c->u[i];
     c->z[i] = 0.0;
@@ -69,11 +65,10 @@ static void ip_decode(ip_context *c, DAQPWorkspace *w)
   for (i = 0; i < w->n_active; ++i) {
     const int at = w->WS[i];
     w->lam_star[i] += w->xldl[i];
-    for (j = 0; at >= IP_SIMPLE && j < IP_VARIABLES; ++j) {
-      x[j] -= c->M[at - IP_SIMPLE][j] * w->xldl[i];
-    }
     if (IP_SIMPLE && at < IP_SIMPLE) {
       x[at] -= w->xldl[i];
+    } else {
+      ip_add(x, -w->xldl[i], c->M[at - IP_SIMPLE], IP_VARIABLES);
     }
   }
   ip_add_turned(c, x, c->z);
@@ -91,37 +86,18 @@ typedef struct {
 /* Prepare a program of n variables, `simple` bounds and m bounds and rows.  The caller sets rows and bounds. */
 static void ip_prepare(ip_memory *s, int n, int simple, int m, double *u, DAQPWorkspace *w)
 {
-  memset(w, 0, sizeof *w);
   memset(s->prox, 0, sizeof s->prox);
-  memset(&s->settings, 0, sizeof s->settings);
-  s->settings.primal_tol = 1e-9;
-  s->settings.dual_tol = DAQP_DEFAULT_DUAL_TOL;
-  s->settings.zero_tol = DAQP_DEFAULT_ZERO_TOL;
-  s->settings.pivot_tol = DAQP_DEFAULT_PIVOT_TOL;
-  s->settings.progress_tol = DAQP_DEFAULT_PROG_TOL;
-  s->settings.cycle_tol = DAQP_DEFAULT_CYCLE_TOL;
-  s->settings.iter_limit = IP_ITERATIONS;
-  s->settings.fval_bound = DAQP_INF;
-  s->settings.rho_soft = DAQP_DEFAULT_RHO_SOFT;
-  s->settings.sing_tol = DAQP_DEFAULT_SING_TOL;
-  s->settings.refactor_tol = DAQP_DEFAULT_REFACTOR_TOL;
-  s->settings.eq_reduction = DAQP_EQ_REDUCTION_OFF;
-  w->settings = &s->settings;
-  w->n = n;
-  w->m = m;
-  w->ms = simple;
-  w->Mu = s->Mu;
-  w->lam = s->lam;
-  w->lam_star = s->lam_star;
-  w->WS = s->WS;
-  w->D = s->D;
-  w->L = s->L;
-  w->xldl = s->xldl;
-  w->zldl = s->zldl;
-  w->u = w->x = u;
-  w->xold = s->xold;
-  w->prox_mask = s->prox;
-  w->outer_iter = 1;
+  s->settings = (DAQPSettings){
+    .primal_tol = 1e-9, .dual_tol = DAQP_DEFAULT_DUAL_TOL, .zero_tol = DAQP_DEFAULT_ZERO_TOL,
+    .pivot_tol = DAQP_DEFAULT_PIVOT_TOL, .progress_tol = DAQP_DEFAULT_PROG_TOL, .cycle_tol = DAQP_DEFAULT_CYCLE_TOL,
+    .iter_limit = IP_ITERATIONS, .fval_bound = DAQP_INF, .rho_soft = DAQP_DEFAULT_RHO_SOFT,
+    .sing_tol = 1e-13 /* as in Python */, .refactor_tol = DAQP_DEFAULT_REFACTOR_TOL, .eq_reduction = DAQP_EQ_REDUCTION_OFF
+  };
+  *w = (DAQPWorkspace){
+    .settings = &s->settings, .n = n, .m = m, .ms = simple, .Mu = s->Mu, .lam = s->lam, .lam_star = s->lam_star,
+    .WS = s->WS, .D = s->D, .L = s->L, .xldl = s->xldl, .zldl = s->zldl, .u = u, .x = u, .xold = s->xold,
+    .prox_mask = s->prox, .outer_iter = 1
+  };
   memset(u, 0, sizeof(double) * (size_t)n);
 }
 

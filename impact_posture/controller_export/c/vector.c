@@ -7,7 +7,7 @@ typedef double ip_pair __attribute__((vector_size(16), aligned(8), may_alias));
 #define IP_PUT_PAIR(p, values) (*(ip_pair *)(p) = (values))
 #endif
 
-static double ip_dot(const double *a, const double *b, int n)
+static inline double ip_dot(const double *a, const double *b, int n)
 {
   double sum = 0.0;
   int i = 0;
@@ -41,25 +41,58 @@ static void ip_scaled(const double *x, double s, double *out, int n)
   }
 }
 
-/* As fmin and fmax where b is no NaN, and without a call. */
-static double ip_least(double a, double b)
+/* out += s x. */
+static inline void ip_add(double *restrict out, double s, const double *restrict x, int n)
 {
-  return a < b ? a : b;
-}
-
-static double ip_most(double a, double b)
-{
-  return a > b ? a : b;
-}
-
-/* Part of a heading across the unit vector n; return its length. */
-static double ip_across(const double *n, const double *heading, double *across)
-{
-  const double along = ip_dot(n, heading, 3);
-  int i;
-  for (i = 0; i < 3; ++i) {
-    across[i] = heading[i] - n[i] * along;
+  int i = 0;
+#if defined(__GNUC__)
+  for (; i + 1 < n; i += 2) {
+    IP_PUT_PAIR(out + i, IP_PAIR(out + i) + s * IP_PAIR(x + i));
   }
-  return sqrt(ip_dot(across, across, 3));
+#endif
+  for (; i < n; ++i) {
+    out[i] += s * x[i];
+  }
 }
 
+/* out = sum of a[k step] x[k stride ...] over k, of n numbers each. */
+static inline void ip_combine(double *restrict out, int n, const double *a, int step, const double *x, int stride, int count)
+{
+  int i = 0, k;
+#if defined(__GNUC__)
+  /* Eight or four sums stay in registers. */
+  for (; i + 7 < n; i += 8) {
+    ip_pair s0 = {0.0, 0.0}, s1 = {0.0, 0.0}, s2 = {0.0, 0.0}, s3 = {0.0, 0.0};
+    const double *c = a, *y = x + i;
+    for (k = 0; k < count; ++k, c += step, y += stride) {
+      if (*c != 0.0) {
+        s0 += *c * IP_PAIR(y);
+        s1 += *c * IP_PAIR(y + 2);
+        s2 += *c * IP_PAIR(y + 4);
+        s3 += *c * IP_PAIR(y + 6);
+      }
+    }
+    IP_PUT_PAIR(out + i, s0);
+    IP_PUT_PAIR(out + i + 2, s1);
+    IP_PUT_PAIR(out + i + 4, s2);
+    IP_PUT_PAIR(out + i + 6, s3);
+  }
+  for (; i + 3 < n; i += 4) {
+    ip_pair s0 = {0.0, 0.0}, s1 = {0.0, 0.0};
+    const double *c = a, *y = x + i;
+    for (k = 0; k < count; ++k, c += step, y += stride) {
+      s0 += *c * IP_PAIR(y);
+      s1 += *c * IP_PAIR(y + 2);
+    }
+    IP_PUT_PAIR(out + i, s0);
+    IP_PUT_PAIR(out + i + 2, s1);
+  }
+#endif
+  for (; i < n; ++i) {
+    double sum = 0.0;
+    for (k = 0; k < count; ++k) {
+      sum += a[k * step] * x[k * stride + i];
+    }
+    out[i] = sum;
+  }
+}

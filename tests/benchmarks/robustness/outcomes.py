@@ -24,7 +24,7 @@ from impact_posture.simulation.scenario_objective import interpreted
 from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, Draw, draw, prepare
 from tests.benchmarks.robustness.variations import RANGES
 
-SCHEMA = 2
+SCHEMA = 3
 NOMINAL = "nominal"
 # Nominal first.
 COMPARED = (NOMINAL, "robust", "robust-flow", "posture", "stiff")
@@ -32,6 +32,8 @@ COMPARED = (NOMINAL, "robust", "robust-flow", "posture", "stiff")
 SATURATED = 0.05
 # Random draws of a point before it is given up.
 ATTEMPTS = 40
+# What changes the model of the robot.
+_MODEL = {"armature", "x", "z"}
 # What a record does not keep of a document.
 _LEFT_OUT = ("windows", "versions", "runs")
 _Play = Callable[[Job, ControllerFactory], tuple[tuple[Run, ...], Document]]
@@ -124,7 +126,7 @@ def _complete(record: Record, factory: ControllerFactory, play: _Play) -> Record
     documents = dict(record.documents)
     for label in COMPARED:
         if label not in documents:
-            documents[label] = _document(factory, record.draw.scenario, label, play)
+            documents[label] = _document(factory, record.draw, label, play)
     return replace(record, documents=documents)
 
 
@@ -142,7 +144,7 @@ def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
     factory = ControllerFactory(setup, gradient_of=interpreted)
     if not is_held(setup, factory.objective()):
         raise NotAdmissible(f"the motors do not hold the start with {100 * SHARE:.0f} % of their limits")
-    nominal = _document(factory, chosen.scenario, NOMINAL, play)
+    nominal = _document(factory, chosen, NOMINAL, play)
     if nominal["status"] != "completed":
         raise NotAdmissible(f"nominal {nominal['status']}")
     metrics = nominal["metrics"]
@@ -153,10 +155,12 @@ def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
     return factory, nominal
 
 
-def _document(factory: ControllerFactory, scenario: str, label: str, play: _Play) -> Document:
+def _document(factory: ControllerFactory, chosen: Draw, label: str, play: _Play) -> Document:
     """Let a controller run with the noise of seed 0; what it raises is what becomes of it."""
     name, mode, free = parse_controller(label)
-    job = Job(scenario, name, 0, mode, free)
+    # A library is of one model, so only points with the model of the scenario share one, in which they run.
+    shared = not _MODEL & set(chosen.values)
+    job = Job(chosen.scenario, name, 0, mode, free, compile="auto" if shared else "never")
     try:
         runs, found = play(job, factory)
     except (ImpactPostureError, np.linalg.LinAlgError) as error:

@@ -42,16 +42,6 @@ def configuration_names(robot: Robot) -> list[str]:
     return [f"{slot.name} {part}" for slot in Chart(robot.model).slots for part in parts[slot.kind.family]]
 
 
-def unit_slices(robot: Robot) -> list[slice]:
-    """Return where ``q`` holds quaternions and cosine-sine pairs, which have unit norm."""
-    found = []
-    for slot in Chart(robot.model).slots:
-        width = {"free-flyer": 4, "spherical": 4, "planar": 2, "continuous": 2}.get(slot.kind.family)
-        if width:
-            found.append(slice(slot.q.stop - width, slot.q.stop))
-    return found
-
-
 def sample_postures(robot: Robot, count: int, seed: int) -> list[Array]:
     """Return random configurations around the default posture, each of shape (nq,)."""
     rng = np.random.default_rng(seed)

@@ -1,0 +1,49 @@
+/* Rows of the program, and the coordinates in which the point may still move. */
+
+static double norm(const double *a, int n) { return sqrt(ip_dot(a, a, n)); }
+
+/* How an entry moves in the coordinates that are left. */
+static const double *motion(const Relaxation *r, int entry) {
+    const int n = r->n, row = entry - n;
+    if (row < 0) return r->Z + entry * n + r->fixed;
+    double *T = r->T + row * n + r->fixed;
+    if (r->known[row] != r->fixed) {
+        const int first = r->first[row];
+        r->known[row] = r->fixed;
+        ip_combine(T, n - r->fixed, r->p->A + row * n + first, 1, r->Z + first * n + r->fixed, n, r->last[row] - first);
+    }
+    return T;
+}
+
+/* Entry of [z; A z]. */
+static double entry_of(const Relaxation *r, const double *z, int entry) {
+    const int row = entry - r->n;
+    if (row < 0) return z[entry];
+    const int first = r->first[row];
+    return ip_dot(r->p->A + row * r->n + first, z + first, r->last[row] - first);
+}
+
+static int is_equation(const Relaxation *r, int entry) { return r->p->lower[entry] == r->p->upper[entry]; }
+
+static double violation(const Relaxation *r, int entry) {
+    return fmax(r->lower[entry] - r->value[entry], r->value[entry] - r->upper[entry]);
+}
+
+/* Smallest violation of an entry that counts. */
+static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
+
+/* Compute [z; A z]. */
+static void update_values(Relaxation *r) {
+    for (int i = 0; i < r->entries; i++) r->value[i] = entry_of(r, r->z, i);
+}
+
+/* Make r->way the motion of z by a step in the coordinates that are left. */
+static void find_way(Relaxation *r, const double *step) {
+    for (int i = 0; i < r->n; i++) r->way[i] = ip_dot(r->Z + i * r->n + r->fixed, step, r->n - r->fixed);
+}
+
+/* Go a part of r->way. */
+static void go(Relaxation *r, double part) {
+    ip_add(r->z, part, r->way, r->n);
+    update_values(r);
+}

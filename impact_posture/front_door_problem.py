@@ -1,0 +1,217 @@
+"""The objective and the problem behind ``import impact_posture as ip``.
+
+They use the defaults of the robot, as the command line does, and check their arguments when they are built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from impact_posture.errors import InputError, not_one_of
+from impact_posture.impact import objective as core
+from impact_posture.impact.contact import ImpactContact
+from impact_posture.impact.contact_compression import ContactStiffness
+from impact_posture.impact.evaluation import Evaluation, evaluate
+from impact_posture.impact.metric import Metric, build_metric
+from impact_posture.impact.resolved_impact import ResolvedImpact, missing_support
+from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
+from impact_posture.posture.build_problem import build_problem
+from impact_posture.posture.problem import PostureProblem as CoreProblem
+from impact_posture.posture.problem_settings import Prepared, prepare, requirements
+from impact_posture.robot.joint_model import with_joint_model
+from impact_posture.robot.model_variant import ModelVariant, Payload, build_model_variants
+from impact_posture.robot.postures import read_posture
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.spec import Support
+from impact_posture.settings import (
+    ImpactSettings,
+    JointModel,
+    MetricKind,
+    ObjectiveKind,
+    ProblemSettings,
+    RobotSettings,
+)
+from impact_posture.tables import validate
+
+# The C export is imported where it is used, because that takes longer than a small problem.
+if TYPE_CHECKING:
+    from impact_posture.codegen.export import Export
+
+
+class ImpactObjective(core.ImpactObjective):
+    """The objective of one or several impacts, by default with the supports of the robot.
+
+    Args:
+        robot: The robot.
+        contact: Contact of the impact, or several contacts that act at once.  A contact without an offset at the
+            contact frame of robot.toml takes the offset from there.
+        metric: ``euclidean``, ``kinetic`` or ``weighted``, or a :class:`~impact_posture.impact.metric.Metric`.
+        kind: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy`` (E).
+        supports: Feet that stay, as ``FRAME[:point|surface]``; ``None`` for those of robot.toml, ``()`` for none.
+        compliance: ε of the supports, 1/kg; 0 for 1e-4 over the robot's mass.
+        normal_cone_deg: Half angle of the cone of normals whose worst counts, degrees.
+        others: More contacts that act at the same time.
+        bilateral: Whether several contacts can pull as well as push.
+        model_variants: Robot models whose worst counts, the robot as modeled first.
+        weights: Weights of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
+        armature_range: Lowest and highest factor on the armature; the worst counts.
+        payloads: Frame and mass in kg of payloads that the robot may carry, one at a time; the worst counts.
+        joint_model: Inertia at the joints: ``reflected``, ``link`` or ``locked``
+            (:func:`~impact_posture.robot.joint_model.with_joint_model`); ``None`` for that of the robot.
+
+    Raises:
+        ImpactPostureError: An argument does not fit the robot.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        contact: ImpactContact | Sequence[ImpactContact],
+        metric: MetricKind | Metric = "euclidean",
+        kind: ObjectiveKind = "impulse",
+        supports: Sequence[str | Support] | None = None,
+        compliance: float = 0.0,
+        normal_cone_deg: float = 0.0,
+        others: Sequence[ImpactContact] = (),
+        bilateral: bool = False,
+        model_variants: Sequence[ModelVariant] = (),
+        *,
+        weights: str | Sequence[float] | None = None,
+        armature_range: tuple[float, float] | None = None,
+        payloads: Sequence[tuple[str, float]] = (),
+        joint_model: JointModel | None = None,
+    ) -> None:
+        check_choice("joint_model", joint_model or robot.joint_model, get_args(JointModel))
+        check_choice("kind", kind, get_args(ObjectiveKind))
+        robot = with_joint_model(robot, joint_model or robot.joint_model)
+        given = [contact] if isinstance(contact, ImpactContact) else list(contact)
+        if not given:
+            raise InputError("names no contact", where="contact", hint="give an ImpactContact")
+        leading, *more = (_at_own_frame(robot, one) for one in (*given, *others))
+        feet = _supports(robot, supports)
+        for one in (leading, *more):
+            refuse_held(robot, one, feet)
+        refuse_rigid(robot, feet)
+        if not isinstance(metric, Metric):
+            values = weights if weights is None or isinstance(weights, str) else tuple(weights)
+            metric = build_metric(robot, metric, values)
+        loads = [Payload(*payload) for payload in payloads]
+        variants = tuple(model_variants) or build_model_variants(robot, armature_range, loads)
+        super().__init__(
+            robot, leading, metric, kind, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
+        )
+        # This is a hint and no error, because evaluating an impact needs no support.
+        object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
+
+    def evaluate(self, q: ArrayLike, speed: float = 1.0, restitution: float = 0.0) -> Evaluation:
+        """Compute H, G, V, S, E, the ellipsoid and the predicted jump at ``q``; see :func:`evaluate`."""
+        return evaluate(self, self.robot.check_posture(np.asarray(q, dtype=float), limits=False), speed, restitution)
+
+    def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
+        """Write the C code of H, its gradient and this objective into a folder, and build its library.
+
+        Args:
+            out: The folder.
+            build: Whether to build and check the library, if a C compiler is installed.
+            options: Options ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
+        """
+        from impact_posture.codegen.export import write_export
+
+        return write_export([self], Path(out), build=build, **options)
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    """Refuse a value that is none of the choices."""
+    if value not in choices:
+        what, hint = not_one_of(value, choices)
+        raise InputError(what, where=name, hint=hint)
+
+
+def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
+    own = robot.spec.contact
+    if contact.frame != own.frame or any(contact.offset) or not any(own.offset):
+        return contact
+    return replace(contact, offset=own.offset)
+
+
+def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[Support, ...]:
+    if supports is None:
+        return resolve_supports(robot, None)
+    texts = tuple(support for support in supports if isinstance(support, str))
+    return (*resolve_supports(robot, texts), *(support for support in supports if isinstance(support, Support)))
+
+
+# Settings that the objective and its robot hold already.
+_OF_THE_OBJECTIVE = {field.name for field in fields(ImpactSettings)} - {"contact_stiffness", "contact_duration"}
+
+
+class PostureProblem:
+    """``min_q objective(q)`` under the constraints of a task; a missing argument comes from the robot.
+
+    Args:
+        objective: An :class:`ImpactObjective`, or another implementation of
+            :class:`~impact_posture.impact.objective.Objective`.
+        posture: Start of the search: a name, a file, or a configuration (nq,); ``None`` for the default posture.
+        speed: Approach speed of the predicted jumps, m/s.
+        restitution: Coefficient of restitution of the predicted jumps.
+        task: Other fields of :class:`~impact_posture.settings.ProblemSettings` about the task, such as
+            ``base="level"``, ``target_position=(x, y, z)``, ``keep_contacts=True`` or ``hold=("joint",)``.
+
+    Attributes:
+        problem: Constraints and bounds, before any solver sees them.
+        prepared: The problem with its settings; ``None`` for an objective that is not that of an impact.
+
+    Raises:
+        ImpactPostureError: An argument is wrong.
+    """
+
+    def __init__(
+        self,
+        objective: core.Objective,
+        posture: str | ArrayLike | None = None,
+        *,
+        speed: float = 1.0,
+        restitution: float = 0.0,
+        **task: Any,
+    ) -> None:
+        robot = objective.robot
+        if posture is None or isinstance(posture, str):
+            q, name = read_posture(robot, posture), posture or robot.default_posture
+        else:
+            q, name = robot.check_posture(np.asarray(posture, dtype=float), where="posture"), "a configuration"
+        loaded = robot.settings or RobotSettings(robot=robot.source)
+        given = {field.name: getattr(loaded, field.name) for field in fields(RobotSettings)}
+        given |= {"speed": speed, "restitution": restitution, "joint_model": robot.joint_model}
+        if isinstance(objective, core.ImpactObjective):
+            given["friction"] = objective.contact.friction
+        for name in _OF_THE_OBJECTIVE & set(task):
+            raise InputError(
+                "belongs to the objective", where=name, hint="give it to ImpactObjective or ImpactContact"
+            )
+        settings = validate(ProblemSettings, given | task, "PostureProblem")
+        self.prepared: Prepared | None = None
+        if isinstance(objective, core.ImpactObjective):
+            missing = getattr(objective, "_missing", "")
+            contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
+            impact = ResolvedImpact(objective, q, name, speed, restitution, missing, contact)
+            self.prepared = prepare(settings, impact)
+            self.problem: CoreProblem = self.prepared.problem
+        else:
+            self.problem = build_problem(robot, objective, q, requirements(settings, objective))
+
+    @classmethod
+    def of(cls, prepared: Prepared) -> PostureProblem:
+        """Return the problem of settings from a file or a command line."""
+        made = cls.__new__(cls)
+        made.prepared, made.problem = prepared, prepared.problem
+        return made
+
+    def describe(self) -> list[str]:
+        """Describe the constraints, one line each."""
+        return self.problem.describe()

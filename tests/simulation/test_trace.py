@@ -1,0 +1,96 @@
+"""What a world tells of many ticks at once, against what it tells tick by tick, and against MuJoCo itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from impact_posture.errors import InputError
+from impact_posture.simulation import contact_forces
+from impact_posture.simulation.actuator_command import ActuatorCommand
+from impact_posture.simulation.world import World
+from tests.helpers import rng
+from tests.simulation.factories import factory
+
+mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
+
+# A robot that flies, one that stands, and one with a fixed base, each let fall or swing into its surface.
+SCENARIOS = ("aerial-vertical", "solo8-push", "panda-tap")
+
+
+def shaken(name: str, ticks: int = 40) -> tuple[World, list[ActuatorCommand]]:
+    """A world near its surface, and commands that move the robot."""
+    setup, random = factory(name).setup, rng(name)
+    robot, world = setup.robot, setup.world
+    rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
+    joints = robot.nv - (6 if robot.floating else 0)
+    v = np.zeros(robot.nv)
+    if robot.floating:
+        # The one that flies has to come down within the ticks.
+        v[2] = -10.0 if rotors else -1.0
+    world.reset(setup.q, v, seed=1)
+    return world, [ActuatorCommand(random.normal(size=joints), np.full(rotors, 16.0)) for _ in range(ticks)]
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_trace_is_the_truth_of_every_tick(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    world, commands = shaken(name)
+    truths = []
+    for command in commands:
+        world.step(command, 3)
+        truths.append(world.truth())
+    shaken(name)
+    monkeypatch.setattr(contact_forces, "_MOST", 5)
+    for k, command in enumerate(commands):
+        world.step(command, 3)
+        # The first ticks are not marked, so that their steps are evaluated before anybody looks.
+        if k > 15:
+            world.mark()
+    trace = world.trace()
+    for k, truth in enumerate(truths[16:]):
+        for key in ("t", "q", "v", "rotor_speeds", "torques"):
+            np.testing.assert_array_equal(getattr(trace, key)[k], getattr(truth, key), key)
+        stops = [name for name, there in zip(world.limited, trace.stopped[k], strict=True) if there]
+        assert tuple(stops) == truth.at_stops
+        for j, shape in enumerate(truth.shapes):
+            assert trace.touching[k, j] == shape.touching and trace.slip[k, j] == shape.slip
+            np.testing.assert_array_equal(trace.force[k, j], shape.force)
+            np.testing.assert_allclose(trace.impulse[k, j], shape.impulse, rtol=1e-12, atol=1e-15)
+            if k:
+                assert trace.peak[k, j] == shape.peak
+                assert np.isnan(trace.began[k, j]) if shape.began is None else trace.began[k, j] == shape.began
+    # What happened before the first mark is told at it.
+    for j in range(len(truths[0].shapes)):
+        assert trace.peak[0, j] == max(truth.shapes[j].peak for truth in truths[:17])
+        began = [t.shapes[j].began for t in truths[:17] if t.shapes[j].began is not None]
+        assert np.isnan(trace.began[0, j]) if not began else trace.began[0, j] == began[0]
+    assert name == "panda-tap" or trace.touching.any()
+
+
+def test_forces_are_those_of_mujoco() -> None:
+    world, commands = shaken("solo8-push")
+    model, data, copy = world._model, world._data, mujoco.MjData(world._model)
+    shape_of = {model.geom(name).id: k for k, name in enumerate(world.built.shape_geoms)}
+    pushed = 0
+    for command in commands:
+        mujoco.mj_copyData(copy, model, data)
+        world.step(command)
+        truth = world.truth()
+        # The contacts of a step are those at its begin, which the world has left behind.
+        copy.ctrl[:] = truth.torques
+        mujoco.mj_step2(model, copy)
+        forces = np.zeros((len(shape_of), 3))
+        for k in range(copy.ncon):
+            wrench = np.zeros(6)
+            mujoco.mj_contactForce(model, copy, k, wrench)
+            forces[shape_of[int(copy.contact.geom[k, 1])]] += wrench[:3] @ copy.contact.frame[k].reshape(3, 3)
+        pushed += bool(np.any(forces))
+        for shape, force in zip(truth.shapes, forces, strict=True):
+            np.testing.assert_allclose(shape.force, force, rtol=1e-12, atol=1e-12)
+    assert pushed > 10
+
+
+def test_a_trace_without_marks_is_refused() -> None:
+    world, _ = shaken("solo8-push")
+    with pytest.raises(InputError, match="call mark"):
+        world.trace()
