@@ -16,7 +16,7 @@ from impact_posture.posture.problem import PostureProblem
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.ranges import JointRanges
-from impact_posture.tsid.reference_flow import FlowOptions
+from impact_posture.tsid.reference_flow import PHASES, FlowOptions
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task_formulation import (
     TaskFormulation,
@@ -26,7 +26,8 @@ from impact_posture.tsid.task_formulation import (
 )
 from tests.benchmarks.core import Vector
 
-DT, UPDATE = 1e-3, 4e-3
+DT = 1e-3
+UPDATE = DT * len(PHASES)
 _DRIVER = Path(__file__).with_suffix(".c")
 _BUILDERS = {"aerial": aerial_formulation, "arm": arm_formulation}
 

@@ -1,5 +1,5 @@
 /* The reference flow: a posture q_r that goes down the gradient on contacts and tasks, limited in speed and acceleration,
- * before the posture task follows it.  An update takes four ticks, one part each.  The formulas are in
+ * before the posture task follows it.  An update takes five ticks, the last of them empty.  The formulas are in
  * impact_posture/tsid/reference_flow.py. */
 
 /* Step of the differences, rad; step below which a posture on the way is reached, rad (m). */

@@ -201,7 +201,7 @@ static void ip_flow_lead(ip_context *c, double dt)
   f->clock += dt;
   f->elapsed += dt;
   k = f->phase;
-  f->phase = (f->phase + 1) % 4;
+  f->phase = (f->phase + 1) % 5;
   switch (k) {
   case 0:
     ip_flow_look(c);
@@ -212,8 +212,11 @@ static void ip_flow_lead(ip_context *c, double dt)
   case 2:
     ip_flow_direct(c);
     break;
-  default:
+  case 3:
     ip_flow_govern(c);
+    break;
+  default: /* Nothing, as in Python. */
+    break;
   }
   ip_add(f->velocity, dt, f->acceleration, IP_NV);
   ip_integrate(f->q, f->velocity, dt, f->q);
