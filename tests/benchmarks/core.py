@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -20,10 +21,12 @@ from numpy.typing import NDArray
 
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.starts import feasible_start
+from impact_posture.processes import fork_map
 from impact_posture.toolchain import find_compiler
 from tests.benchmarks.build import compiler_version, processor
 
 Vector = NDArray[np.float64]
+_T = TypeVar("_T")
 
 ROOT = Path(__file__).parents[2]
 CRBA_CALLS = 2000
@@ -106,6 +109,17 @@ def page_of(name: str) -> Path:
 def say(words: str, end: str = "\n") -> None:
     """Tell the progress, beside the page."""
     print(words, end=end, file=sys.stderr, flush=True)
+
+
+def collected(work: Callable[[int], _T], count: int, jobs: int, what: str) -> list[_T]:
+    """Return ``work(0)`` to ``work(count - 1)`` from several processes, and tell the progress."""
+    found: dict[int, _T] = {}
+    with fork_map(work, count, jobs) as results:
+        for index, result in results:
+            found[index] = result
+            say(f"\r{what}: {len(found)} of {count}", end="")
+    say("")
+    return [found[k] for k in range(count)]
 
 
 def table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> Iterator[str]:

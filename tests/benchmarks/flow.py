@@ -18,7 +18,7 @@ from impact_posture.posture.starts import feasible_start
 from impact_posture.processes import fork_map
 from impact_posture.tsid.reference_flow import FlowOptions
 from tests.benchmarks.cases import AHEAD, DOWN, Case
-from tests.benchmarks.core import Request, Vector, machine, say, table
+from tests.benchmarks.core import Request, Vector, collected, machine, table
 from tests.benchmarks.flow_course import CompiledFlow, Course
 
 # The time in which a flow is to rest, the longest that one may take, and that of a fine one, s.
@@ -126,14 +126,9 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
         finer = flow.course(found.q, FINE, FINER)
         return Outcome(found, float(finer.values[-1]), finer.q, False)
 
-    outcomes: dict[int, Outcome] = {}
-    with fork_map(one, len(starts), request.jobs) as results:
-        for index, outcome in results:
-            outcomes[index] = outcome
-            say(f"\r{case.name}: {len(outcomes)} of {len(starts)}", end="")
-    say("")
-    best = min(outcomes.values(), key=lambda o: o.optimum)
-    apart = [i for i, o in outcomes.items() if o.optimum - best.optimum > CLOSE * o.start]
+    outcomes = collected(one, len(starts), request.jobs, case.name)
+    best = min(outcomes, key=lambda o: o.optimum)
+    apart = [i for i, o in enumerate(outcomes) if o.optimum - best.optimum > CLOSE * o.start]
 
     def again(k: int) -> bool:
         found = flow.course(starts[apart[k]], LONGEST, FlowOptions(), first=best.q)
@@ -141,7 +136,7 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
 
     with fork_map(again, len(apart), request.jobs) as results:
         arrived = [good for _, good in results]
-    return _cells(case.name, list(outcomes.values()), best.optimum, arrived)
+    return _cells(case.name, outcomes, best.optimum, arrived)
 
 
 def _cells(name: str, outcomes: Sequence[Outcome], best: float, arrived: Sequence[bool]) -> list[str]:

@@ -17,13 +17,12 @@ import numpy as np
 from impact_posture.errors import ImpactPostureError, MetricError
 from impact_posture.experiment.jobs import Job, execute
 from impact_posture.impact.coulomb import coulomb_impact
-from impact_posture.processes import fork_map
 from impact_posture.simulation.baselines import resting_posture
 from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory
 from impact_posture.simulation.scenario import RepeatedContacts, Scenario, set_up
 from impact_posture.simulation.scenario_file import read_scenario, scenario_path
 from impact_posture.simulation.throw import Throw, thrown_jumps
-from tests.benchmarks.core import ROOT, Request, say, table
+from tests.benchmarks.core import ROOT, Request, collected, table
 
 # A number is another speed of the hand than that of the scenario, m/s.
 SCENARIOS = (
@@ -97,11 +96,8 @@ def lines(request: Request) -> Iterator[str]:
     # At other speeds, those whose posture depends on what the impact gives, beside the nominal one.
     others = [c for c in controllers if c.endswith(("nominal", "robust", "sticking"))]
     pairs = [(s, c) for s in SCENARIOS if request.only in s for c in (others if " " in s else controllers)]
-    found: dict[tuple[str, str], dict[str, Any]] = {}
-    with fork_map(lambda k: result(*pairs[k]), len(pairs), request.jobs) as answers:
-        for k, answer in answers:
-            found[pairs[k]] = answer
-            say(f"\r{len(found)} of {len(pairs)} runs", end="")
+    answers = collected(lambda k: result(*pairs[k]), len(pairs), request.jobs, "runs")
+    found = dict(zip(pairs, answers, strict=True))
     for scenario in dict.fromkeys(s for s, _ in pairs):
         yield from (
             f"### {scenario}" + " m/s" * (" " in scenario),

@@ -17,13 +17,12 @@ from impact_posture.experiment.jobs import Job, execute
 from impact_posture.plot.style import AFTER, BEFORE, FREE_BEFORE, GRAY, GREEN, WIDTH, style
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.starts import Projector
-from impact_posture.processes import fork_map
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.offline import offline_posture, scenario_requirements
 from impact_posture.simulation.scenario import Setup, SinglePush
 from impact_posture.simulation.scenario_objective import interpreted, scenario_objective
 from impact_posture.simulation.world import build_world
-from tests.benchmarks.core import ROOT, Request, Vector, cell, say, table
+from tests.benchmarks.core import ROOT, Request, Vector, cell, collected, table
 from tests.benchmarks.robustness.draws import Draw, prepare
 from tests.benchmarks.robustness.envelope import percent
 from tests.benchmarks.robustness.page import MARK
@@ -111,13 +110,7 @@ def _scan(name: str, request: Request) -> list[Place]:
     def one(index: int) -> Place:
         return _place(steps[index], setups[steps[index]])
 
-    found: dict[int, Place] = {}
-    with fork_map(one, len(steps), request.jobs) as done:
-        for index, place in done:
-            found[index] = place
-            say(f"\r{name}: {len(found)} of {len(steps)} postures", end="")
-    say("")
-    return [found[k] for k in range(len(steps))]
+    return collected(one, len(steps), request.jobs, name)
 
 
 def _places(name: str, count: int) -> Vector:
