@@ -85,7 +85,7 @@ def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str) -> None:
         separator, q = _separator(robot, kind), _random(robot, rng)
         distance = separator.distance(numeric.at(q))[0]
         corners = separator.corners(numeric)
-        lifted = separator.lift(tree, "")
+        lifted = separator.lift(tree, "", ca.SX(separator.b.plane))
         sides = separator.sides(lifted.variables, corners)
         rows = ca.Function("rows", [x, lifted.variables], [ca.vertcat(lifted.rows, sides)])
         guess = separator.guess(numeric).values.copy()
@@ -283,7 +283,7 @@ def test_a_relaxed_program_serves_other_targets_and_is_let_go() -> None:
         )
         assert bool(kept.conflicts) is bool(height > 1) and kept.conflicts.keys() == fresh.conflicts.keys()
         assert sum(kept.conflicts.values()) == pytest.approx(sum(fresh.conflicts.values()), rel=0.05)
-    assert program.cpu_s > 0 and program.problem is not problem
+    assert program.time_s > 0 and program.problem is not problem
     shared = [c._lifted for c in problem.constraints if isinstance(c, Clearance)]
     assert any(len(lifted) for lifted in shared)
     del program, kept, fresh

@@ -56,7 +56,6 @@ class Clearance(Constraint):
         self.name, self._separators, self._words = name, tuple(separators), words
         self.active: Mapping[int, Corners] = active or {}
         self._lifted = WeakKeyDictionary[Tree, dict[int, LiftedRows]]() if lifted is None else lifted
-        self.parameters = np.zeros(0)
         self.lower, self.upper = np.zeros(len(self._separators)), np.full(len(self._separators), np.inf)
         bodies: dict[int, Body] = {}
         for one in self._separators:
@@ -84,6 +83,9 @@ class Clearance(Constraint):
             for k, body in enumerate(self._bodies)
             if body.normal is not None
         ]
+        # Programs with other planes are the same.
+        self.parameters = np.concatenate([np.zeros(0), *[body.plane for body in self._bodies]])
+        self._first_parameter = {k: 4 * index for index, (k, *_) in enumerate(self._planes)}
 
     def describe(self) -> str:
         """See :class:`Constraint`."""
@@ -92,8 +94,9 @@ class Clearance(Constraint):
     @property
     def structure(self) -> str:
         """See :class:`Constraint`."""
-        content = "".join(one.content(corners) for _, one, corners in self._program)
-        return f"{super().structure}:{hashlib.sha256(content.encode()).hexdigest()[:16]}"
+        content = "".join(f"{self._own_plane(k)}{one.content(corners)}" for k, one, corners in self._program)
+        digest = hashlib.sha256(content.encode()).hexdigest()[:16]
+        return f"{super().structure}:{self.parameters.size}:{digest}"
 
     def row_name(self, row: int) -> str:
         """See :class:`Constraint`."""
@@ -181,12 +184,17 @@ class Clearance(Constraint):
     def _program(self) -> list[tuple[int, Separator, Corners]]:
         return [(k, self._separators[k], corners) for k, corners in self.active.items()]
 
+    def _own_plane(self, k: int) -> slice:
+        """Where the plane of a pair with a half-space is among the parameters; empty for another pair."""
+        first = self._first_parameter.get(int(self._second[k]))
+        return slice(0) if first is None else slice(first, first + 4)
+
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
         """See :class:`Constraint`; a pair keeps its equations while others, and more corners, come in."""
         pieces, lifted = [], self._lifted.setdefault(tree, {})
         for k, one, corners in self._program:
             if k not in lifted:
-                lifted[k] = one.lift(tree, f"{self.name}{k}")
+                lifted[k] = one.lift(tree, f"{self.name}{k}", parameters[self._own_plane(k)])
             pair = lifted[k]
             pieces.append(replace(pair, sides=one.sides(pair.variables, corners)))
         return LiftedRows.joined(pieces)

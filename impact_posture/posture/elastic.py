@@ -82,7 +82,7 @@ def _relax(problem: PostureProblem, chart: Chart, program: ElasticProgram, start
     norms = np.zeros(len(chart.quaternion_slices()))
     x = np.clip(chart.to_x(start), problem.lower, problem.upper)
     guess = problem.guess(Numeric(problem.robot.model).at(chart.to_q(x)))
-    solver, busy = program.solver(problem), time.process_time()
+    solver, began = program.solver(problem), time.perf_counter()
     answer = run_solver(
         solver,
         x0=np.concatenate([x, np.full(2 * rows, 0.1), guess.values]),
@@ -92,7 +92,7 @@ def _relax(problem: PostureProblem, chart: Chart, program: ElasticProgram, start
         lbg=np.concatenate([norms, lower_rows]),
         ubg=np.concatenate([norms, upper_rows]),
     )
-    program.cpu_s += time.process_time() - busy
+    program.time_s += time.perf_counter() - began
     q = chart.to_q(np.array(answer["x"]).reshape(-1)[: chart.nx])
     return _judge(problem.grown([q]), chart, q)
 
@@ -105,11 +105,11 @@ class ElasticProgram:
 
     Attributes:
         problem: The problem as far as it has grown.
-        cpu_s: Processor time within the solver so far, s.
+        time_s: Wall time within the solver so far, s.
     """
 
     def __init__(self, problem: PostureProblem) -> None:
-        self.problem, self.cpu_s, chart = problem, 0.0, Chart.of(problem.robot.model)
+        self.problem, self.time_s, chart = problem, 0.0, Chart.of(problem.robot.model)
         self._latest: tuple[str, ca.Function] | None = None
         self._x, self._reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
         tree = Tree(problem.robot.model, chart.configuration(self._x), self._x)

@@ -68,6 +68,11 @@ class Body:
         """Return a body of the robot, or of the world."""
         return Body(hull.name, hull, PointOnLink(hull.joint, np.zeros(3), np.eye(3)))
 
+    @property
+    def plane(self) -> Array:
+        """Normal and offset of the half-space, shape (4,); empty for a swept hull."""
+        return np.zeros(0) if self.normal is None else np.append(self.normal, self.offset)
+
     def placement(self, model: Numeric) -> pin.SE3:
         """Return the placement of its axes in the world."""
         found = model.placement(self.point)
@@ -135,20 +140,23 @@ class Separator:
         return lower, upper
 
     def content(self, corners: Corners) -> str:
-        """Return a text with everything that shapes the rows."""
+        """Return a text with everything that shapes the rows, but a known plane, which is a parameter."""
         bodies = [(b.point.joint, b.point.position.tolist(), b.point.rotation.tolist()) for b in (self.a, self.b)]
-        normal = None if self.b.normal is None else self.b.normal.tolist()
         points = self._x[sorted(corners.a)].tolist(), self._y[sorted(corners.b)].tolist()
-        return repr((bodies, self.b.turns, normal, self.b.offset, points))
+        return repr((bodies, self.b.turns, self.known, points))
 
-    def lift(self, tree: Tree, label: str) -> LiftedRows:
-        """Return the equations, the unknowns ``n, c, m, d, s`` (``m, d, s`` for a half-space), and the slack."""
+    def lift(self, tree: Tree, label: str, known: ca.SX) -> LiftedRows:
+        """Return the equations, the unknowns ``n, c, m, d, s`` (``m, d, s`` for a half-space), and the slack.
+
+        Args:
+            tree: The dynamics at the posture.
+            label: End of the names of the unknowns.
+            known: ``n, c`` of a half-space, shape (4, 1); empty without one.
+        """
         plane = ca.SX(0, 1) if self.known else ca.SX.sym(f"plane{label}", 4)
         m, d, s = ca.SX.sym(f"m{label}", 3), ca.SX.sym(f"d{label}"), ca.SX.sym(f"s{label}")
-        if self.b.normal is None:
-            n, c = plane[:3], plane[3]
-        else:
-            n, c = ca.SX(self.b.normal), ca.SX(self.b.offset)
+        both = known if self.known else plane
+        n, c = both[:3], both[3]
         Q, t = self._relative(tree)
         return LiftedRows(ca.vertcat(m - Q.T @ n, d - (ca.dot(n, t) - c)), ca.vertcat(plane, m, d, s), s)
 

@@ -42,7 +42,7 @@ class PointResult(NamedTuple):
 
 @dataclass
 class Timer:
-    """Processor time within IPOPT and the functions that it calls, s."""
+    """Wall time within IPOPT and the functions that it calls, s."""
 
     solver_s: float = 0.0
 
@@ -80,9 +80,9 @@ class Walk:
     def relax(self, place: Place, tries: int) -> ElasticAnswer:
         """Relax the constraints at a place, with the parts that the places before needed for it."""
         program = self._relaxed = self._relaxed or ElasticProgram(self.problem)
-        before = program.cpu_s
+        before = program.time_s
         found = elastic(self.at(program.problem, place), self.settings.seed, tries, program)
-        self.timer.solver_s += program.cpu_s - before
+        self.timer.solver_s += program.time_s - before
         return found
 
 
@@ -192,7 +192,7 @@ class _Attempt:
     def _run(self, nlp: PostureNLP, start: Array, scale: float, price: float) -> _End:
         record = nlp.solve(start, scale=scale, price=price)
         self.runs += 1
-        self._walk.timer.solver_s += record.cpu_s
+        self._walk.timer.solver_s += record.time_s
         value = scale * record.minimized if record.converged else np.inf
         return _End(record.q, value, record.auxiliaries)
 

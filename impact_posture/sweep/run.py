@@ -26,8 +26,8 @@ class SweepRun:
         points: Number of problems of the sweep.
         counts: Number of points of each status that this run solved.
         shards: Shards that this run wrote.
-        solver_s: Processor time within IPOPT, s, all workers together.
-        total_s: Processor time of all shards, s.
+        solver_s: Wall time of the workers within IPOPT, s, added up.
+        total_s: Wall time of all shards, s, added up.
     """
 
     folder: Path

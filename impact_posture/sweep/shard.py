@@ -37,8 +37,8 @@ class ShardResult:
         index: Index of the shard.
         content: Its Parquet file.
         counts: Number of points of each status.
-        solver_s: Processor time within IPOPT, s.
-        total_s: Processor time of the shard, s.
+        solver_s: Wall time within IPOPT and the functions that it calls, s.
+        total_s: Wall time of the shard, s.
     """
 
     index: int
@@ -60,14 +60,14 @@ def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
         ImpactPostureError: A setting is wrong.
     """
     with _ALONE, one_blas_thread():
-        began = time.process_time()
+        began = time.perf_counter()
         case, points = sweep.span(index)
         solver = _solver(sweep, key, case)
         solver.timer.solver_s = 0.0
         results = _walk(sweep, solver, points)
         content = _parquet(sweep, key, case, points, results, solver)
         counts = {status: sum(one.row["status"] == status for one in results) for status in STATUS}
-        return ShardResult(index, content, counts, solver.timer.solver_s, time.process_time() - began)
+        return ShardResult(index, content, counts, solver.timer.solver_s, time.perf_counter() - began)
 
 
 def _solver(sweep: Sweep, key: str, case: int) -> CaseSolver:
