@@ -16,7 +16,6 @@ from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.world import SimulationDiverged
 from impact_posture.tsid import relaxation
 from impact_posture.tsid.assembly import Assembly
-from impact_posture.tsid.qp import Solver
 
 # Scenario, force (N) on the frame of the push from 0.2 s to 0.6 s, seconds.
 RUNS = {
@@ -59,7 +58,7 @@ def problem_of(assembly: Assembly, z: np.ndarray | None) -> RelaxedTick:
     level[assembly.limits] = 1
     for k, (_, rows) in enumerate(assembly.levels):
         level[qp.n + rows.start : qp.n + rows.stop] = 2 + k
-    unit = assembly.rank._units.copy()
+    unit = assembly.rank.units.copy()
     answer = np.full(qp.n, np.nan) if z is None else z
     return RelaxedTick(qp.H, qp.g, qp.A, qp.lower, qp.upper, level, unit, answer)
 
@@ -69,8 +68,8 @@ def recording() -> Iterator[list[RelaxedTick]]:
     """Record each relaxed tick of any controller."""
     found, relax = list[RelaxedTick](), relaxation._relax
 
-    def recorded(assembly: Assembly, solver: Solver) -> relaxation.Outcome:
-        outcome = relax(assembly, solver)
+    def recorded(assembly: Assembly) -> relaxation.Outcome:
+        outcome = relax(assembly)
         found.append(problem_of(assembly, None if outcome.solved is None else outcome.solved.z))
         return outcome
 

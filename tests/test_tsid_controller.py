@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -241,32 +242,37 @@ class Refusing:
         return None
 
 
+def _without_cost(solve: Callable[..., Any]) -> Callable[..., Any]:
+    """The solver of levels alone, which have no cost."""
+    return lambda H, *rest, **settings: (None, 0.0, -1, {}) if H is not None else solve(H, *rest, **settings)
+
+
 def test_a_solver_that_gives_up_holds_the_last_command(monkeypatch: pytest.MonkeyPatch) -> None:
     r = robot(ARM)
     controller = Controller(r, aerial_formulation(r, JointPosture(r)))
     controller.reset(r.posture(), np.zeros(r.nv))
     before = controller.tick(0.0, r.posture(), np.zeros(r.nv))
-    working, aside = controller._solver, controller._aside
-    # The one that is called aside helps out...
+    working = controller._solver
+    # The relaxed programs help out...
     controller._solver = Refusing()
     monkeypatch.setattr(relaxation, "DaqpSolver", lambda n, m, **options: Refusing())
     command = controller.tick(0.001, r.posture(), np.zeros(r.nv))
     assert command.status is Status.SOLVED and np.allclose(command.u, before.u, rtol=0, atol=1e-6)
     # ... where it does not, the levels without the cost do ...
-    controller._aside = Refusing()
+    monkeypatch.setattr(relaxation.daqp, "solve", _without_cost(relaxation.daqp.solve))
     bare = controller.tick(0.001, r.posture(), 0.05 * rng("bare").normal(size=r.nv))
     assert bare.status is Status.SOLVED
     assert np.abs(controller.report().residuals["tilt"]).max() <= 1e-5
     assert np.abs(controller.report().residuals["ee pose"]).max() <= 1e-4
     assert_limits(controller, bare)
     # ... and where not even those have an answer, the command is held, from what was sent last.
-    monkeypatch.setattr(relaxation, "lexicographic", lambda levels: None)
+    monkeypatch.setattr(relaxation, "lexicographic", lambda levels, units: None)
     held = controller.tick(0.001, r.posture(), np.zeros(r.nv))
     assert held.status is Status.UNSOLVED
     assert np.allclose(held.u, bare.u, rtol=0, atol=1e-8)
     monkeypatch.undo()
-    controller._solver, controller._aside = working, aside
-    assert solve(controller.assembly, working, aside).solved is not None
+    controller._solver = working
+    assert solve(controller.assembly, working).solved is not None
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.1])

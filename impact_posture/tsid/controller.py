@@ -131,7 +131,6 @@ class Controller:
         self.assembly = Assembly(robot, formulation, self.actuators)
         n, m = self.assembly.qp.n, self.assembly.qp.m
         self._solver: Solver = DaqpSolver(n, m)
-        self._aside = DaqpSolver(n, m)
         if formulation.weighted and robot.nv >= _LARGE:
             # Imported here, because SciPy takes long to import and only humanoids need it.
             from impact_posture.tsid.whitened import WhitenedSolver
@@ -173,7 +172,7 @@ class Controller:
         held = self.actuators.solve(state.h, np.zeros(self.actuators.spare.shape[1]))
         self._u = np.clip(held, self.actuators.lower, self.actuators.upper)
         self._solver.reset()
-        first = self._finish(solve(assembly, self._solver, self._aside))
+        first = self._finish(solve(assembly, self._solver))
         self._solver.reset()
         self._t: float | None = None
         self._ready = True
@@ -212,7 +211,7 @@ class Controller:
         for task in self._advancing:
             task.advance(state, dt)
         self.assembly.build_qp(state)
-        return self._finish(solve(self.assembly, self._solver, self._aside))
+        return self._finish(solve(self.assembly, self._solver))
 
     def report(self) -> Report:
         """Return the diagnosis of the last tick, computed by this call."""

@@ -10,7 +10,7 @@ from impact_posture.tsid.qp import QP, Solved
 # Exit flags of DAQP for a solution (2: soft constraints are active) and for a program without one.  4 is an answer
 # that violates bounds after it went in circles.  -6 (dependent equations) does not count, because DAQP also returns
 # it for bounds that were active before.
-_SOLVED, _NONE = (1, 2), -1
+SOLVED, _NONE = (1, 2), -1
 # Flag of a program that could not be solved for another reason.
 FAILED = 0
 # Largest violation of a bound, largest number of iterations for one program, and squared sine of the angle between a
@@ -53,7 +53,7 @@ class DaqpSolver:
         if self._flag >= 0:
             z, _, self._flag, info = self._model.solve()
         # The active set of a failed attempt is useless.
-        self._cold = self._flag not in _SOLVED
+        self._cold = self._flag not in SOLVED
         if self._cold:
             return None
         return Solved(z, info["lam"], int(info["iterations"]))

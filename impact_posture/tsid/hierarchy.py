@@ -13,6 +13,11 @@ from impact_posture.tsid.qp import EQUALITY, INEQUALITY
 
 # Bounds are scaled below this, because the tolerances of DAQP are absolute.
 _LARGEST = 1e4
+# A row that is this near to its bound may be at it, relative to the length of the row times the size of the point.
+# The answer is refined with the first of these that does not make it worse.
+_AT = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
+# Rank of rows, relative to the longest.
+_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,17 +35,88 @@ class Level:
     upper: Array
 
 
-def lexicographic(levels: Sequence[Level]) -> Array | None:
+def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array | None:
     """Return the ``z`` that violates the first level least, then the second, and so on (least squares).
 
-    The hierarchical programs of DAQP have a solution for all bounds.  DAQP measures a violation in units of the row's
-    length.  The equations of a level are therefore rotated among themselves (:func:`balanced`) until all its rows
-    have the same length, which does not change the sum of squares.
+    DAQP finds which rows are missed and which bounds are met.  With these as equations, the answer is refined to the
+    last digits.
+
+    Args:
+        levels: The levels, the most important first.
+        units: Value of each variable that compares with 1, shape (n,).
 
     Returns:
-        Shape (n,), to about six digits; ``None`` if the solver gave up.
+        Shape (n,); ``None`` if the solver gave up.
     """
     given = [level for level in levels if level.lower.size]
+    z = _nearest(given)
+    if z is None:
+        return None
+    y, scaled = z / units, [Level(level.A * units, level.lower, level.upper) for level in given]
+    refined = (_refined(scaled, y, at) for at in _AT)
+    return np.asarray(units * next((one for one in refined if _no_worse(scaled, one, y)), y))
+
+
+def null_space(A: Array) -> Array:
+    """Return an orthonormal basis of the directions that rows of like length do not see, as columns."""
+    _, values, V = np.linalg.svd(A)
+    return np.asarray(V[int((values > _RANK).sum()) :].T)
+
+
+def _size(y: Array) -> float:
+    return max(1.0, float(np.max(np.abs(y))))
+
+
+def _lengths(level: Level) -> Array:
+    lengths = np.linalg.norm(level.A, axis=1)
+    return np.where(lengths > 0.0, lengths, 1.0)
+
+
+def _refined(levels: Sequence[Level], y: Array, near: float) -> Array:
+    """Return the answer of the rows that are equations, missed or at a bound at ``y``, level by level.
+
+    A bound that is met holds for all levels: the answer of each of them lies on it.
+    """
+    exact, targets, missed = list[Array](), list[Array](), list[tuple[Array, Array]]()
+    for k, level in enumerate(levels):
+        lengths, values, equal = _lengths(level), level.A @ y, level.lower == level.upper
+        at = near * _size(y) * lengths
+        low, high = values < level.lower + at, values > level.upper - at
+        target = np.where(low, level.lower, level.upper)
+        # What always holds is not missed but by rounding.
+        off = equal | ((low | high) & (np.abs(values - target) > at)) if k else np.zeros_like(equal)
+        met = (equal | low | high) & ~off
+        exact.append(level.A[met] / lengths[met, None])
+        targets.append(target[met] / lengths[met])
+        missed.append((level.A[off], target[off]))
+    free = np.eye(y.size)
+    for A, b in [(np.vstack(exact), np.concatenate(targets)), *missed]:
+        if not b.size or not free.shape[1]:
+            continue
+        U, s, V = np.linalg.svd(A @ free)
+        rank = int((s > _RANK * max(1.0, float(np.linalg.norm(A, 2)))).sum())
+        y = y + free @ (V[:rank].T @ (U[:, :rank].T @ (b - A @ y) / s[:rank]))
+        free = free @ V[rank:].T
+    return y
+
+
+def _no_worse(levels: Sequence[Level], new: Array, old: Array) -> bool:
+    """Whether no level is violated more at ``new``, unless one above it is violated less."""
+    for level in levels:
+        now, before = (
+            float(np.linalg.norm(level.A @ y - np.clip(level.A @ y, level.lower, level.upper))) for y in (new, old)
+        )
+        if abs(now - before) > 1e-6 * before + 1e-10 * _size(old) * float(_lengths(level).max()):
+            return now < before
+    return True
+
+
+def _nearest(given: Sequence[Level]) -> Array | None:
+    """Return the answer of the hierarchical programs of DAQP, which have one for all bounds, to about six digits.
+
+    DAQP measures a violation in units of the row's length.  The equations of a level are therefore rotated among
+    themselves (:func:`balanced`) until all its rows have the same length, which does not change the sum of squares.
+    """
     blocks = []
     for level in given:
         equal, rows, low, high = level.lower == level.upper, level.A, level.lower, level.upper

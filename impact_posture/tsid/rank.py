@@ -42,6 +42,7 @@ class LevelRank:
     Attributes:
         qp: The QP to solve.
         wanted: Right-hand sides of the first rows of ``qp.A``, also of rows that are no equations.
+        units: Value of each variable that compares with an acceleration of 1, shape (n,).
         changed: Whether the set of equations differs from that before the last :meth:`update`.
     """
 
@@ -56,7 +57,7 @@ class LevelRank:
             units: Value of each variable that compares with an acceleration of 1, shape (n,).
         """
         self._given, self._always, self._levels = qp, always, tuple(levels)
-        self._accelerations, self._units = accelerations, units
+        self._accelerations, self.units = accelerations, units
         self._count = self._levels[-1].stop if levels else 0
         self._rows = qp.A[: self._count]
         self._reference, self._way = np.zeros(self._rows.shape), np.zeros(self._rows.shape)
@@ -95,11 +96,11 @@ class LevelRank:
         return np.asarray(np.arange(rows.start, rows.stop)[held == equations])
 
     def _begin(self) -> None:
-        lengths = np.linalg.norm(self._rows * self._units, axis=1)
+        lengths = np.linalg.norm(self._rows * self.units, axis=1)
         for level in self._levels:
             lengths[level] = lengths[level].max()
         lengths[lengths == 0.0] = 1.0
-        self._lengths, self._scale, self._begun = lengths, self._units / lengths[:, None], True
+        self._lengths, self._scale, self._begun = lengths, self.units / lengths[:, None], True
         self._measure()
 
     def _measure(self) -> None:
@@ -116,7 +117,7 @@ class LevelRank:
         n = given.n
         qp = given.copy()
         self.wanted = self._asked.copy()
-        Z = np.diag(self._units)
+        Z = np.diag(self.units)
         if self._always:
             Z = Z @ np.linalg.svd((self._rows * self._scale)[: self._always])[2][self._always :].T
         for rows in self._levels:

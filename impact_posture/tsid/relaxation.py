@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import daqp
 import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.tsid.assembly import Assembly
-from impact_posture.tsid.daqp_solver import DaqpSolver
-from impact_posture.tsid.hierarchy import Level, lexicographic
-from impact_posture.tsid.qp import EQUALITY, INEQUALITY, QP, Solved, Solver
+from impact_posture.tsid.daqp_solver import SOLVED, DaqpSolver
+from impact_posture.tsid.hierarchy import Level, lexicographic, null_space
+from impact_posture.tsid.qp import EQUALITY, QP, Solved, Solver
 
-# Miss that counts, relative to the terms of a row, because the hierarchy is solved to about six digits.
+# Miss that counts, relative to the terms of a row.
 _OFF = 1e-6
-# Pairs that are tried in order, relative to the terms of a row: a level that misses by more than the first number may
-# stray by the second from the point it reached.  Without this room, the hard rows could not hold to the last digit.
-_STRAY = ((_OFF, 1e-6), (0.0, 1e-6), (0.0, 1e-4), (0.0, 1e-2))
-# Proximal weights that are tried in order, relative to the largest weight of the cost, with the number of steps each.
-# The first weight that conditions the QP well enough changes its solution least.  The steps undo the change.
-_PROXIMAL, _STEPS = (0.0, 1e-6, 1e-3, 1e3), 3
+# A row that misses by more stays where it is, relative to the length of the row times the size of the point.
+_MISSES = 1e-9
+# Largest violation of a bound in the end, in the same units.
+_ROUNDING = 1e-13
+# Bounds beyond this are none, and settings of DAQP for the cost in the end, in numbers that were scaled.
+_FAR, _SETTINGS = 1e30, {"primal_tol": 1e-11, "sing_tol": 1e-13, "iter_limit": 1000}
+# Least curvature of the cost in the end, relative to the largest.
+_FLATTEST = 1e-14
 # Weight of the proximal-point iterations with which DAQP decides whether strict levels can hold.
 _FLAT = 1e-6
-# Largest violation of a bound in the end, times the scale of the numbers.
-_EXACT = 1e-9
-# Numbers are scaled below this, because the tolerances of the solver are absolute.
-_LARGEST = 1e3
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Outcome:
     relaxed: tuple[Relaxed, ...] = ()
 
 
-def solve(assembly: Assembly, solver: Solver, aside: Solver) -> Outcome:
+def solve(assembly: Assembly, solver: Solver) -> Outcome:
     """Solve the QP of the assembly; if that fails, relax it lexicographically.
 
     Dynamics, control limits and friction always hold, because every state has an acceleration that satisfies them.
@@ -67,7 +66,6 @@ def solve(assembly: Assembly, solver: Solver, aside: Solver) -> Outcome:
     Args:
         assembly: With :attr:`Assembly.qp` built.
         solver: Solver of the ticks, which keeps its active set.
-        aside: Solver of the relaxed QPs, of the same size.
     """
     qp = assembly.rank.qp
     if assembly.rank.changed:
@@ -83,39 +81,56 @@ def solve(assembly: Assembly, solver: Solver, aside: Solver) -> Outcome:
         solved = DaqpSolver(qp.n, qp.m, proximal=_FLAT).solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
-    return _relax(assembly, aside)
+    return _relax(assembly)
 
 
-def _relax(assembly: Assembly, solver: Solver) -> Outcome:
-    nearest = lexicographic(_hierarchy(assembly))
+def _relax(assembly: Assembly) -> Outcome:
+    nearest = lexicographic(_hierarchy(assembly), assembly.rank.units)
     if nearest is None:
         return Outcome(None)
-    for least, stray in _STRAY:
-        solved = _minimize(_opened(assembly, nearest, least, stray), nearest, solver)
-        if solved is not None:
-            break
-    else:
-        # Only the cost has no minimum that the solver finds.  Without it there is an answer.
-        solved = Solved(nearest, np.zeros(assembly.qp.n + assembly.qp.m), 0)
+    solved = _cheapest(assembly.rank.qp, assembly.rank.units, nearest)
     return Outcome(solved, _gave_way(assembly, solved.z))
 
 
-def _opened(assembly: Assembly, nearest: Array, least: float, stray: float) -> QP:
-    """Return the QP in which rows that ``nearest`` misses by more than ``least`` stay there, up to ``stray``."""
-    asked, limits = assembly.rank.qp, assembly.limits
-    qp, values = asked.copy(), asked.values(nearest)[limits]
-    room = np.where(_passed(asked, nearest, limits) > 0, stray * (1.0 + np.abs(values)), 0.0)
-    qp.lower[limits] = np.minimum(qp.lower[limits], values) - room
-    qp.upper[limits] = np.maximum(qp.upper[limits], values) + room
-    for _, level in assembly.levels:
-        rows = assembly.rank.rows(level, equations=True)
-        off, size = _missed(assembly, nearest, rows)
-        if float(np.max(np.abs(off), initial=0.0)) > least * size:
-            at = qp.n + rows
-            qp.sense[at] = INEQUALITY
-            qp.lower[at] += off - stray * size
-            qp.upper[at] += off + stray * size
-    return qp
+def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
+    """Minimize the cost over what a lexicographic answer leaves free.
+
+    Equations and missed rows stay where they are, so the cost moves in their null space: ``z = nearest + W y``, with
+    a basis ``W`` in which the cost is a sum of squares.  The other bounds hold.  Where they leave the solver no room
+    beyond rounding, the answer is ``nearest``.
+    """
+    values, rows = qp.values(nearest), np.vstack([np.eye(qp.n), qp.A]) * units
+    size, lengths = max(1.0, float(np.max(np.abs(nearest / units)))), np.linalg.norm(rows, axis=1)
+    lengths[lengths == 0.0] = 1.0
+    rows /= lengths[:, None]
+    lower, upper = ((bounds - values) / (lengths * size) for bounds in (qp.lower, qp.upper))
+    held = (qp.sense == EQUALITY) | (np.maximum(lower, -upper) > _MISSES)
+    free, only = null_space(rows[held]), Solved(nearest, np.zeros(qp.n + qp.m), 0)
+    if not free.shape[1]:
+        return only
+    lower, upper = np.minimum(lower, 0.0), np.maximum(upper, 0.0)
+    curvatures, axes = np.linalg.eigh((free.T * units) @ qp.H @ (units[:, None] * free))
+    largest = float(curvatures[-1])
+    W = free @ (axes / np.sqrt(np.maximum(curvatures / largest, _FLATTEST)))
+    seen, g = rows @ W, W.T @ (units * (qp.H @ nearest + qp.g)) / (size * largest)
+    reach = np.linalg.norm(seen, axis=1)
+    bound = np.flatnonzero(~held & (reach > 0.0) & (np.isfinite(lower) | np.isfinite(upper)))
+    reach, senses = reach[bound], np.zeros(bound.size, dtype=np.int32)
+    ends = (np.clip(side[bound] / reach, -_FAR, _FAR) for side in (upper, lower))
+    y, _, flag, info = daqp.solve(np.eye(g.size), g, seen[bound] / reach[:, None], *ends, senses, **_SETTINGS)
+    if flag not in SOLVED:
+        return only
+    # What is held, and active bounds, hold to the last digit.
+    way, multipliers = W @ y, np.zeros(qp.n + qp.m)
+    multipliers[bound] = largest * size / (lengths[bound] * reach) * info["lam"]
+    active = multipliers != 0.0
+    aim = np.where(multipliers > 0.0, upper, np.where(active, lower, 0.0)) - rows @ way
+    exact = held | active
+    way += np.linalg.lstsq(rows[exact], aim[exact], rcond=1e-12)[0]
+    moved = rows @ way
+    if not (np.abs(moved - np.clip(moved, lower, upper))[~held] <= _ROUNDING).all():
+        return only
+    return Solved(nearest + size * units * way, multipliers, int(info["iterations"]))
 
 
 def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, ...]:
@@ -162,34 +177,3 @@ def _passed(qp: QP, z: Array, limits: NDArray[np.intp]) -> Array:
     """Return the violation of the bounds of joint limits by ``z``; negative where they hold."""
     values = qp.values(z)[limits]
     return np.asarray(np.maximum(qp.lower[limits] - values, values - qp.upper[limits]))
-
-
-def _minimize(qp: QP, start: Array, solver: Solver) -> Solved | None:
-    """Return the minimum of the cost near ``start``, which satisfies all bounds to about six digits."""
-    values = np.abs(np.concatenate([start, qp.A @ start]))
-    scale = max(1.0, float(values.max()) / _LARGEST)
-    lower, upper, start = qp.lower / scale, qp.upper / scale, start / scale
-    weight = float(np.max(np.abs(np.diag(qp.H))))
-    for share in _PROXIMAL:
-        answer, center = None, start
-        for _ in range(_STEPS if share else 1):
-            # These QPs differ in their constraints, hence a warm start does not help.
-            solver.reset()
-            H, g = qp.H + share * weight * np.eye(qp.n), qp.g / scale - share * weight * center
-            found = solver.solve(replace(qp, H=H, g=g, lower=lower, upper=upper))
-            if found is None:
-                break
-            answer, center = found, found.z
-        if answer is not None:
-            z = _polished(qp, scale * answer.z, answer.multipliers)
-            if qp.violation(z) <= _EXACT * scale:
-                return Solved(z, scale * answer.multipliers, answer.iterations)
-    return None
-
-
-def _polished(qp: QP, z: Array, multipliers: Array) -> Array:
-    """Return the point nearest to ``z`` at which equations and active bounds hold to the last digit."""
-    above, below = (multipliers > 0) & (qp.sense != EQUALITY), (multipliers < 0) & (qp.sense != EQUALITY)
-    held = above | below | (qp.sense == EQUALITY)
-    off = np.where(below, qp.lower, qp.upper)[held] - qp.values(z)[held]
-    return np.asarray(z + np.linalg.lstsq(np.vstack([np.eye(qp.n), qp.A])[held], off, rcond=1e-12)[0])
