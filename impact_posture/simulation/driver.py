@@ -8,12 +8,13 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
+from impact_posture.path.posture_path import PosturePath
 from impact_posture.simulation.compiled_tick import CompiledTick
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.simulation.task_formulations import build_formulation, end_effector_task
-from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
+from impact_posture.tsid.body_tasks import BaseOrientation, BodyTaskLead, CenterOfMass
 from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.posture_tasks import JointPosture
@@ -84,9 +85,9 @@ class Driver:
         """Level of the term that prepares for the impact, 0 to 1."""
         return self.posture.level if self.compiled is None else self.compiled.library.level
 
-    def _tell(self, posture: JointPosture, method: str, *given: Any, **named: Any) -> None:
-        """Call a method of a posture task, or that of its counterpart in C."""
-        getattr(posture if self.compiled is None else self.compiled.library, method)(*given, **named)
+    def _tell(self, method: str, *given: Any, **named: Any) -> None:
+        """Call a method of the posture task, or that of its counterpart in C."""
+        getattr(self.posture if self.compiled is None else self.compiled.library, method)(*given, **named)
 
     def _follow(self, reference: ReferencePoint) -> None:
         task, home = self._end_effector, self._home
@@ -99,34 +100,22 @@ class Driver:
 
 
 class RobustDriver(Driver):
-    """Impact-robust controller, which uses the impact-robust term from :meth:`brace` on.
+    """Impact-robust controller, which uses the impact-robust term of its posture task from :meth:`brace` on."""
 
-    Attributes:
-        term: The impact-robust term, which is the posture task or part of it.
-    """
-
-    def __init__(self, setup: Setup, posture: JointPosture, term: ImpactRobustPosture) -> None:
-        """Build the tasks of the scenario around a posture task with a term."""
-        super().__init__(setup, posture)
-        self.term = term
+    posture: ImpactRobustPosture
 
     def brace(self) -> None:
         """Switch the term on."""
-        self._tell(self.term, "brace")
+        self._tell("brace")
 
     def hold(self) -> None:
         """Hold the present posture, center of mass and base orientation, and switch the term off."""
-        self._tell(self.term, "contact")
+        self._tell("contact")
         if self.compiled is not None:
             self.compiled.catch_up()
         for task in self._body_tasks:
             task.target = None
             task.reset(self.controller.state)
-
-    @property
-    def level(self) -> float:
-        """Activation of the term, 0 to 1."""
-        return self.term.level if self.compiled is None else self.compiled.library.level
 
 
 class FlowDriver(Driver):
@@ -142,16 +131,16 @@ class FlowDriver(Driver):
 
     def brace(self) -> None:
         """Let the posture flow."""
-        self._tell(self.posture, "brace")
+        self._tell("brace")
 
     def hold(self) -> None:
         """Hold the posture that the flow has reached."""
-        self._tell(self.posture, "contact")
+        self._tell("contact")
 
     def expect(self, t: float) -> None:
         """Rest early enough before an impact at a time, s."""
         if self.level > 0:
-            self._tell(self.posture, "brace", t_impact=t - self._now)
+            self._tell("brace", t_impact=t - self._now)
 
 
 class PostureDriver(Driver):
@@ -172,7 +161,7 @@ class PostureDriver(Driver):
 
     def brace(self) -> None:
         """Move posture, center of mass and base orientation to the goal within :data:`MOVE`."""
-        self._tell(self.posture, "move_to", self._goal, MOVE)
+        self._tell("move_to", self._goal, MOVE)
         model = self.setup.robot.model
         for task in self._body_tasks:
             # The feet stay in place, because the goal was found with them there.
@@ -198,3 +187,58 @@ class PostureDriver(Driver):
     def level(self) -> float:
         """Share of the way to the goal, 0 to 1."""
         return 0.0 if self._since is None else smooth(self._since / MOVE)
+
+
+class PathDriver(Driver):
+    """Nominal controller whose posture follows a timed path, from :meth:`brace` on.
+
+    Between two points of the path, the posture is interpolated on the manifold, velocity and acceleration linearly.
+    Center of mass and base orientation follow too.
+
+    Attributes:
+        path: The path, which begins at the start of the scenario, as far as that satisfies the constraints.
+    """
+
+    def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
+        """Set the path."""
+        super().__init__(setup, posture)
+        self.path = path
+        self._since: float | None = None
+        self._body = BodyTaskLead(setup.robot.model)
+
+    def reset(self, q: Array) -> Command:
+        """Begin at rest."""
+        self._since = None
+        rest = np.zeros(self.setup.robot.nv)
+        self.posture.lead(q, rest, rest)
+        return super().reset(q)
+
+    def brace(self) -> None:
+        """Start the path."""
+        self._since = 0.0
+
+    def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
+        """Return the command on the way."""
+        if self._since is not None and self.level < 1:
+            self._since += self.controller.period
+            self._lead(self._since)
+        return super().tick(reading, reference)
+
+    @property
+    def level(self) -> float:
+        """Share of the duration of the path that has passed, 0 to 1."""
+        if self._since is None:
+            return 0.0
+        return min(1.0, self._since / self.path.duration) if self.path.duration else 1.0
+
+    def _lead(self, since: float) -> None:
+        path, model = self.path, self.setup.robot.model
+        if since >= path.duration:
+            q, v, a = path.q[-1], np.zeros(model.nv), np.zeros(model.nv)
+        else:
+            k = int(np.searchsorted(path.t, since, side="right")) - 1
+            share = (since - path.t[k]) / (path.t[k + 1] - path.t[k])
+            q = np.asarray(pin.interpolate(model, path.q[k], path.q[k + 1], share))
+            v, a = ((1 - share) * x[k] + share * x[k + 1] for x in (path.v, path.a))
+        self.posture.lead(q, v, a)
+        self._body.lead(self._body_tasks, q, v, a)
