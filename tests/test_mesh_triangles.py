@@ -15,7 +15,7 @@ from impact_posture.arrays import Array
 from impact_posture.collision.geometry import load_geometry
 from impact_posture.collision.mesh_check import mesh_collisions
 from impact_posture.collision.mesh_triangles import Corrected, mesh_points, mesh_triangles, renumbered
-from impact_posture.collision.swept_hull import obstacle_hull
+from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.urdf_shapes import read_urdf_shapes
 from impact_posture.report.shapes import draw_robot
 from impact_posture.robot.robot_loader import load_robot

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from typing import Any, NamedTuple
 
 import coal
@@ -12,7 +11,6 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.settings import Obstacle
 from impact_posture.stored_text import StoredArray
 
 MOST_VERTICES = 40
@@ -157,13 +155,3 @@ def hull_corners(points: Array) -> Array:
         return np.asarray(points[ConvexHull(points).vertices])
     except QhullError:
         return np.asarray(points[ConvexHull(points, qhull_options="QJ").vertices])
-
-
-def obstacle_hull(obstacle: Obstacle) -> SweptHull:
-    """Return a box or a ball as a swept hull in the world."""
-    name, center = obstacle.name, np.array(obstacle.position)
-    if obstacle.box is None:
-        return SweptHull(name, name, 0, center[None], float(obstacle.sphere or 0.0))
-    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * obstacle.box
-    x, y, z, w = np.array(obstacle.quaternion) / np.linalg.norm(obstacle.quaternion)
-    return SweptHull(name, name, 0, center + corners @ pin.Quaternion(w, x, y, z).matrix().T, 0.0)
