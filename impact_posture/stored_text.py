@@ -39,7 +39,7 @@ StoredArray = Annotated[NDArray[Any], PlainValidator(_unpacked), PlainSerializer
 
 def read_stored(kind: str, key: str, cls: type[_Value]) -> _Value | None:
     """Return the dataclass of a kind and key; ``None`` where no file can be used."""
-    with suppress(OSError, OutputError, ValueError):
+    with suppress(OSError, OutputError, TypeError, ValueError):
         path = _path(kind, key)
         check_private(path)
         if path.stat().st_size <= _LONGEST:

@@ -248,7 +248,7 @@ def test_the_cache_is_used_and_depends_on_content(tmp_path: Path, own_cache: Pat
     assert len(list(own_cache.glob("*.json"))) == 2
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "binary", "number", "fields", "folder"])
+@pytest.mark.parametrize("damage", ["cut", "empty", "binary", "number", "fields", "array", "folder"])
 def test_a_damaged_cache_is_fitted_again(tmp_path: Path, own_cache: Path, damage: str) -> None:
     first = arm(tmp_path, BOX)
     path = stored(own_cache)
@@ -256,10 +256,13 @@ def test_a_damaged_cache_is_fitted_again(tmp_path: Path, own_cache: Path, damage
     if damage == "folder":
         path.unlink()
         path.mkdir()
-    elif damage == "fields":
+    elif damage in ("fields", "array"):
         # Whole, with its seal, and yet no shapes.
         content = json.loads(raw.split(b"\n", 1)[1])
-        del content["pairs"]
+        if damage == "fields":
+            del content["pairs"]
+        else:
+            content["pairs"] = [[0, 1]] * 3
         changed = json.dumps(content)
         path.write_text(f"{stored_text._seal(changed)}\n{changed}")
     else:
