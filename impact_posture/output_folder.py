@@ -97,7 +97,7 @@ def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None
     """
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
     content = {"schema": SCHEMA, "kind": kind, "files": files, "products": sorted(products), **made_by()}
-    (folder / RECORD).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_json(folder / RECORD, content)
 
 
 def typed_command(folder: Path) -> str:
@@ -126,6 +126,11 @@ def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
     added = {path.absolute().relative_to(folder.absolute()).as_posix() for path in paths}
     content["files"] = sorted(added.union(content["files"]))
     write_whole(folder / RECORD, json.dumps(content, indent=1) + "\n")
+
+
+def write_json(path: Path, document: object) -> None:
+    """Write a document; NaN fails here and not in the program that reads it."""
+    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

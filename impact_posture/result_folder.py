@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import numpy as np
 
 from impact_posture.errors import CompilerError, one_line
 from impact_posture.escape import file_name
-from impact_posture.output_folder import whole_folder, write_record
+from impact_posture.output_folder import whole_folder, write_json, write_record
 from impact_posture.posture.global_search import SelfMotionMap
 from impact_posture.posture.null_space_path import NullSpacePath, null_space_path
 from impact_posture.posture.problem_settings import Prepared, dump_settings, resolved_settings
@@ -108,9 +107,9 @@ def write_result(
     made: Export | None = None
     failure = report_error = ""
     with whole_folder(out, force=force, kind="result") as folder:
-        _write_json(folder / "result.json", document)
+        write_json(folder / "result.json", document)
         np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff, mapped))  # type: ignore[arg-type]
-        _write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
+        write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
         (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
         if motion is not None:
             from impact_posture.path.files import write_path
@@ -227,8 +226,3 @@ def _drawings(
         return figures(folder, f"{name}.*") if report else []
 
     return [partial(draw, name) for name in drawable(view)]
-
-
-def _write_json(path: Path, document: dict[str, object]) -> None:
-    # allow_nan=False: a result with NaN must fail here and not in the program that reads it.
-    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -20,7 +20,7 @@ from impact_posture.codegen.build_check import largest_difference
 from impact_posture.codegen.export import Export, export
 from impact_posture.codegen.functions import casadi_reference, oracle_reference
 from impact_posture.codegen.manifest_builder import sample_postures
-from impact_posture.codegen.render import Verbatim, _environment
+from impact_posture.codegen.render import Verbatim, environment
 from impact_posture.escape import c_comment
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.metric import Metric
@@ -287,9 +287,9 @@ def test_texts_name_what_they_are_of(built: Built) -> None:
 
 
 def test_templates_escape_every_text_and_refuse_unknown_names() -> None:
-    environment = _environment(c_comment)
-    assert environment.from_string("{{ name }} {{ code }}").render(name="*/", code=Verbatim("*/")) == "_/ */"
-    assert environment.from_string("{{ values | doubles }}").render(values=[-1.5]) == "{\n    -1.5\n  }"
+    templates = environment("impact_posture.codegen", c_comment)
+    assert templates.from_string("{{ name }} {{ code }}").render(name="*/", code=Verbatim("*/")) == "_/ */"
+    assert templates.from_string("{{ values | doubles }}").render(values=[-1.5]) == "{\n    -1.5\n  }"
     for text in (
         "{{ nobody }}",
         "{{ name.nobody }}",
@@ -297,4 +297,4 @@ def test_templates_escape_every_text_and_refuse_unknown_names() -> None:
         "{% for x in nobody %}{% endfor %}",
     ):
         with pytest.raises(UndefinedError):
-            environment.from_string(text).render(name="x")
+            templates.from_string(text).render(name="x")

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 import impact_posture as ip
 from impact_posture.errors import InputError
-from impact_posture.posture.global_search import GlobalSearch, search_globally
-from impact_posture.posture.missed_optima import estimated_optima, unseen_share
+from impact_posture.posture.global_search import GlobalSearch, estimated_optima, search_globally, unseen_share
 from impact_posture.posture.problem_settings import prepare, read_settings
 from impact_posture.posture.solve import solve
 from impact_posture.result_view import load_view

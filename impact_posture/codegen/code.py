@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,6 @@ from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.sums import rebuilt
 from impact_posture.libraries import source_key
 from impact_posture.stored_text import read_stored, write_stored
-from impact_posture.tables import adapter
 
 LARGEST_VECTOR = 64
 """Bytes of the widest vectors that the source uses, and of the widest group of narrower vectors in a batch."""
@@ -80,14 +78,10 @@ def build_code(exported: Sequence[NamedObjective], prefix: str, real: Real, *, p
     ]
     content = (ca.CasadiMeta.version(), found.constants, found.seeds, found.functions, models, prefix, real, portable)
     key = source_key([repr(content), found.function.serialize()], "codegen")
-    text = read_stored("code", key)
-    # A pydantic fault is a ValueError.
-    with suppress(ValueError):
-        if text is not None:
-            code: Code = adapter(Code).validate_json(text)
-            return code
-    code = _generate(exported, found, prefix, real, portable=portable)
-    write_stored("code", key, adapter(Code).dump_json(code).decode())
+    code = read_stored("code", key, Code)
+    if code is None:
+        code = _generate(exported, found, prefix, real, portable=portable)
+        write_stored("code", key, code)
     return code
 
 

@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -18,23 +18,24 @@ if TYPE_CHECKING:
 
 SCHEMA = "impact-posture/codegen/1"
 
+_Checked = TypeVar("_Checked", bound=BaseModel)
 Numbers = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 
 
-class _Loose(BaseModel):
+class Loose(BaseModel):
     """A block whose other keys may be there or not."""
 
     model_config = ConfigDict(strict=True)
 
 
-class _SelfTest(_Loose):
+class _SelfTest(Loose):
     q: Numbers
     n: Annotated[Numbers, Field(min_length=3, max_length=3)]
     H: float
     grad: Numbers
 
 
-class _Variant(_Loose):
+class _Variant(Loose):
     symbols: dict[str, str]
     self_test: _SelfTest
 
@@ -44,11 +45,11 @@ class _Frame(_Variant):
     free: _Variant | None = None
 
 
-class _Several(_Loose):
+class _Several(Loose):
     symbols: dict[str, str]
 
 
-class _Manifest(_Loose):
+class _Manifest(Loose):
     """The keys that a loader needs; the library vouches for all of them (:func:`check_library`)."""
 
     prefix: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -72,42 +73,60 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
     Raises:
         SpecError: There is no manifest, there are several, or it is broken.
     """
-    files = [path] if not path.is_dir() else sorted(p for p in path.glob("*.json") if _is_manifest(p))
-    if len(files) != 1:
-        what = "holds no export" if not files else f"holds {len(files)} exports"
-        hint = "name the folder that codegen wrote" if not files else f"name one, such as {files[0].name}"
-        raise SpecError(what, where=str(path), hint=hint)
-    try:
-        manifest = json.loads(files[0].read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        words = getattr(error, "strerror", None) or str(error)
-        raise SpecError(f"cannot be read ({words})", where=str(files[0]), hint="run codegen again") from None
-    fault = "is no manifest of an export"
-    if isinstance(manifest, dict) and manifest.get("schema") == SCHEMA:
-        fault = _fault(manifest)
-    if fault:
-        hint = "name the folder that codegen wrote, or run codegen again"
-        raise SpecError(fault, where=str(files[0]), hint=hint)
-    return manifest, files[0].parent
-
-
-def _fault(manifest: dict[str, Any]) -> str:
-    """Return the first fault of a manifest; empty for none."""
-    try:
-        # From JSON, because strict validation takes a list for a tuple there and converts nothing else.
-        found = _Manifest.model_validate_json(json.dumps(manifest, allow_nan=False))
-    except ValidationError as error:
-        first = error.errors()[0]
-        return f"is no whole manifest: {'.'.join(map(str, first['loc']))}: {first['msg']}"
-    except (ValueError, RecursionError) as error:
-        return f"is no whole manifest: {error}"
+    manifest, found, file = read_checked(path, SCHEMA, _Manifest, "export", "codegen")
     sizes = [("armature", len(found.armature), found.nv)]
     for block in found.frames:
         for part in filter(None, (block, block.free)):
             sizes.append((f"self_test.q at {block.frame}", len(part.self_test.q), found.nq))
             sizes.append((f"self_test.grad at {block.frame}", len(part.self_test.grad), found.nv))
-    wrong = next(((name, size, expected) for name, size, expected in sizes if size != expected), None)
-    return "" if wrong is None else f"is no whole manifest: {wrong[0]} has {wrong[1]} numbers instead of {wrong[2]}"
+    for name, size, expected in sizes:
+        if size != expected:
+            raise _not_whole(file, f"{name} has {size} numbers instead of {expected}")
+    return manifest, file.parent
+
+
+def read_checked(
+    path: Path, schema: str, model: type[_Checked], what: str, command: str
+) -> tuple[dict[str, Any], _Checked, Path]:
+    """Read a manifest of a schema; return it, checked too, and its file.
+
+    Args:
+        path: The folder, or the manifest itself.
+        schema: The schema.
+        model: What the manifest has to hold.
+        what: What is in the folder, in messages.
+        command: The command that writes it.
+
+    Raises:
+        SpecError: There is no manifest, there are several, or it is broken.
+    """
+    files = [path] if not path.is_dir() else sorted(p for p in path.glob("*.json") if _is_manifest(p, schema))
+    if len(files) != 1:
+        words = f"holds no {what}" if not files else f"holds {len(files)} {what}s"
+        hint = f"name the folder that {command} wrote" if not files else f"name one, such as {files[0].name}"
+        raise SpecError(words, where=str(path), hint=hint)
+    (file,) = files
+    try:
+        manifest = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        words = getattr(error, "strerror", None) or str(error)
+        raise SpecError(f"cannot be read ({words})", where=str(file), hint="run codegen again") from None
+    if not isinstance(manifest, dict) or manifest.get("schema") != schema:
+        hint = f"name the folder that {command} wrote, or run codegen again"
+        raise SpecError(f"is no manifest of an {what}", where=str(file), hint=hint)
+    try:
+        # From JSON, because strict validation takes a list for a tuple there and converts nothing else.
+        return manifest, model.model_validate_json(json.dumps(manifest, allow_nan=False)), file
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise _not_whole(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    except (ValueError, RecursionError) as error:
+        raise _not_whole(file, str(error)) from None
+
+
+def _not_whole(file: Path, why: str) -> SpecError:
+    hint = "name the folder that codegen wrote, or run codegen again"
+    return SpecError(f"is no whole manifest: {why}", where=str(file), hint=hint)
 
 
 def identity(manifest: Mapping[str, Any]) -> str:
@@ -145,13 +164,13 @@ def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: s
             )
 
 
-def _is_manifest(path: Path) -> bool:
+def _is_manifest(path: Path, schema: str) -> bool:
     """Return whether a file is the manifest of an export."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return False
-    return isinstance(document, dict) and document.get("schema") == SCHEMA
+    return isinstance(document, dict) and document.get("schema") == schema
 
 
 def check_robot(manifest: Mapping[str, Any], robot: Robot, *, where: str = "manifest") -> None:

@@ -47,19 +47,20 @@ def load_templates(prefix: str = "") -> dict[str, Template]:
         f"{prefix}.h": "header.h", f"{prefix}.c": "source.c",
         **{name: name for name in ("example.c", "example.cpp", "Makefile", "CMakeLists.txt", "README.md")},
     }  # fmt: skip
-    languages = {name: _environment(markdown if name.endswith(".md") else c_comment) for name in names}
+    package = "impact_posture.codegen"
+    languages = {name: environment(package, markdown if name.endswith(".md") else c_comment) for name in names}
     return {name: languages[name].get_template(f"{template}.jinja") for name, template in names.items()}
 
 
 @cache
-def _environment(escape: Callable[[str], str]) -> Environment:
-    """Templates of one language."""
+def environment(package: str, escape: Callable[[str], str]) -> Environment:
+    """Return the templates of a package, for one language."""
 
     def insert(value: object) -> str:
         return value if isinstance(value, Verbatim) else escape(str(value))
 
-    environment = Environment(
-        loader=PackageLoader("impact_posture.codegen"),
+    found = Environment(
+        loader=PackageLoader(package),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -76,8 +77,8 @@ def _environment(escape: Callable[[str], str]) -> Environment:
         "wrapped": lambda words, indent: wrapped(map(escape, words), indent),
         "lines": lambda parts, between: between.join(map(escape, parts)),
     }
-    environment.filters |= {name: _verbatim(function) for name, function in filters.items()}
-    return environment
+    found.filters |= {name: _verbatim(function) for name, function in filters.items()}
+    return found
 
 
 def _verbatim(function: Callable[..., str]) -> Callable[..., Verbatim]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any
 
 import coal
 import numpy as np
@@ -21,24 +22,21 @@ TOLERANCE = 1e-6
 Standing = tuple[SweptHull, pin.SE3, Collection[int]]
 
 
-class Plane(Protocol):
-    """A plane that shapes stay in front of."""
+@dataclass(frozen=True, eq=False)
+class HalfSpace:
+    """The half-space behind a plane, at one posture.
 
-    @property
-    def name(self) -> str:
-        """Name in messages."""
+    Attributes:
+        name: Name in messages.
+        point: A point of the plane, world, shape (3,), m.
+        normal: Unit normal out of it, world, shape (3,).
+        exempt: Joints whose links may be behind it.
+    """
 
-    @property
-    def point(self) -> Array:
-        """A point of the plane in the world, shape (3,), m."""
-
-    @property
-    def normal(self) -> Array:
-        """Unit normal in world axes, shape (3,), towards the robot."""
-
-    @property
-    def exempt(self) -> Collection[int]:
-        """Joints whose shapes may be behind the plane."""
+    name: str
+    point: Array
+    normal: Array
+    exempt: Collection[int]
 
 
 class MeshCheck:
@@ -63,7 +61,7 @@ class MeshCheck:
         self._reach = np.array([shape.geometry.aabb_radius for shape in self._shapes])
 
     def collisions(
-        self, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[Plane] = ()
+        self, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[HalfSpace] = ()
     ) -> list[tuple[str, str]]:
         """Return what collides at a posture.
 
@@ -112,7 +110,7 @@ class MeshCheck:
 
 
 def mesh_collisions(
-    robot: Robot, shapes: RobotShapes, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[Plane] = ()
+    robot: Robot, shapes: RobotShapes, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[HalfSpace] = ()
 ) -> list[tuple[str, str]]:
     """Return what collides at one posture; see :class:`MeshCheck`."""
     return MeshCheck(robot, shapes).collisions(q, obstacles, planes)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import product
 
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from impact_posture.collision.bodies import Body, merged_bodies
 from impact_posture.collision.geometry import Geometry, geometry_key, load_geometry
@@ -17,18 +16,18 @@ from impact_posture.collision.hollows import open_hollows
 from impact_posture.collision.hull_fit import Fit, fit_hull
 from impact_posture.collision.pairs import Pair, hindered, mostly_touching, pairs_of, touch_of
 from impact_posture.collision.parts import triangles_of
-from impact_posture.collision.shape_cache import StoredHull, StoredShapes, read_shapes, write_shapes
 from impact_posture.collision.swept_hull import SweptHull
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.progress import tell
 from impact_posture.robot.robot import Robot
+from impact_posture.stored_text import StoredArray, read_stored, write_stored
 
 NO_SHAPES = "the robot has no shapes, so collisions are checked by joint origins only"
 
 
 @dataclass(frozen=True, eq=False)
-class RobotShapes:
-    """The collision shapes of a robot.
+class FittedShapes:
+    """The collision shapes of a robot, as they are stored.
 
     Attributes:
         bodies: Swept hulls that hold all shapes.
@@ -38,14 +37,19 @@ class RobotShapes:
         hulls_touching: Names of bodies whose hulls touch at most of the postures at which their shapes do not, even
             if they are cut.  They are in no pair, and only the check on the shapes finds their collisions.
         warnings: Shapes that are left out, and what a robot without shapes means; one line each.
-        robot: The robot, for the shapes themselves.
     """
 
     bodies: tuple[SweptHull, ...]
-    pairs: NDArray[np.int_]
+    pairs: StoredArray
     always_touching: tuple[tuple[str, str], ...]
     hulls_touching: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RobotShapes(FittedShapes):
+    """The same, with the robot, for the shapes themselves."""
+
     robot: Robot
 
     @cached_property
@@ -82,17 +86,15 @@ def load_shapes(robot: Robot) -> RobotShapes:
 
 @lru_cache(maxsize=16)
 def _shapes(source: _Source) -> RobotShapes:
-    stored = read_shapes(source.key, int(source.robot.model.njoints))
-    if stored is None:
-        stored = fit_shapes(source.robot, source.described)
-        write_shapes(source.key, stored)
-    bodies = tuple(_hull(hull) for hull in stored.bodies)
-    warnings = (*source.warnings, *stored.warnings, *(() if bodies else (NO_SHAPES,)))
-    pairs = np.array(stored.pairs, dtype=int).reshape(-1, 2)
-    return RobotShapes(bodies, pairs, stored.always_touching, stored.hulls_touching, warnings, source.robot)
+    found = read_stored("shapes", source.key, FittedShapes)
+    if found is None:
+        found = fit_shapes(source.robot, source.described)
+        write_stored("shapes", source.key, found)
+    warnings = (*source.warnings, *found.warnings, *(() if found.bodies else (NO_SHAPES,)))
+    return RobotShapes(**vars(found) | {"warnings": warnings}, robot=source.robot)
 
 
-def fit_shapes(robot: Robot, described: list[UrdfShape]) -> StoredShapes:
+def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
     """Load the shapes, fit their hulls, find the pairs, and cut bodies in each other's hollows into parts."""
     tell("fitting collision shapes")
     loaded = load_geometry(robot, described)
@@ -116,9 +118,10 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> StoredShapes:
     bodies = [hull for parts in opened.parts for hull in parts]
     index = {hull: k for k, hull in enumerate(bodies)}
     kept = [pair for pair in pairs if pair not in opened.hindered]
-    return StoredShapes(
-        bodies=tuple(_stored(hull) for hull in bodies),
-        pairs=tuple((index[a], index[b]) for i, j in kept for a, b in product(opened.parts[i], opened.parts[j])),
+    apart_bodies = [(index[a], index[b]) for i, j in kept for a, b in product(opened.parts[i], opened.parts[j])]
+    return FittedShapes(
+        bodies=tuple(replace(hull, known_faces=hull.faces) for hull in bodies),
+        pairs=np.array(apart_bodies, dtype=int).reshape(-1, 2),
         always_touching=tuple((shapes[i].name, shapes[j].name) for i, j in touching),
         hulls_touching=tuple((hulls[i].name, hulls[j].name) for i, j in sorted(opened.hindered)),
         warnings=loaded.warnings,
@@ -138,15 +141,3 @@ def _fitted(body: Body, loaded: Geometry) -> SweptHull:
         fit = fit_hull(np.vstack(body.corners))
     link = loaded.links[body.shapes[0]]
     return SweptHull(shape.name, link, int(shape.parentJoint), fit.vertices, fit.radius)
-
-
-def _stored(hull: SweptHull) -> StoredHull:
-    vertices = tuple((float(x), float(y), float(z)) for x, y, z in hull.vertices)
-    faces = tuple((int(a), int(b), int(c)) for a, b, c in hull.faces)
-    return StoredHull(hull.name, hull.link, hull.joint, vertices, hull.radius, faces)
-
-
-def _hull(stored: StoredHull) -> SweptHull:
-    faces = np.array(stored.faces, dtype=int).reshape(-1, 3)
-    vertices = np.array(stored.vertices, dtype=float)
-    return SweptHull(stored.name, stored.link, stored.joint, vertices, stored.radius, faces)

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
+from impact_posture.stored_text import StoredArray
 
 MOST_VERTICES = 40
 """Most vertices of a hull, because each one is a row of a separating plane."""
@@ -38,9 +39,9 @@ class SweptHull:
     name: str
     link: str
     joint: int
-    vertices: Array
+    vertices: StoredArray
     radius: float
-    known_faces: Array | None = None
+    known_faces: StoredArray | None = None
 
     @cached_property
     def center(self) -> Array:

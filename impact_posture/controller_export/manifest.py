@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
-from impact_posture.errors import SpecError
+from impact_posture.codegen.reader import Loose, read_checked
 from impact_posture.libraries import build_library
 
 SCHEMA = "impact-posture/controller/1"
@@ -19,16 +18,12 @@ Size = Annotated[int, Field(ge=-1, le=_MOST)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(strict=True)
-
-
-class _Task(_Strict):
+class _Task(Loose):
     name: str
     rows: Annotated[int, Field(ge=1, le=6)]
 
 
-class Manifest(_Strict):
+class Manifest(Loose):
     """The keys that a loader needs; the library vouches for all of them."""
 
     prefix: Name
@@ -58,25 +53,7 @@ def read_controller(path: Path) -> tuple[dict[str, Any], Manifest, Path]:
     Raises:
         SpecError: There is no manifest, there are several, or it is broken.
     """
-    found = []
-    for file in [path] if not path.is_dir() else sorted(path.glob("*.json")):
-        try:
-            document = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
-            continue
-        if isinstance(document, dict) and document.get("schema") == SCHEMA:
-            found.append((file, document))
-    if len(found) != 1:
-        what = "holds no exported controller" if not found else f"holds {len(found)} exported controllers"
-        raise SpecError(what, where=str(path), hint="name the folder that codegen --controller wrote")
-    file, document = found[0]
-    try:
-        # From JSON, because strict validation takes a list for a tuple there and converts nothing else.
-        checked = Manifest.model_validate_json(json.dumps(document, allow_nan=False))
-    except (ValidationError, ValueError) as error:
-        first = error.errors()[0] if isinstance(error, ValidationError) else {"loc": (), "msg": str(error)}
-        what = f"is no whole manifest: {'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise SpecError(what, where=str(file), hint="run codegen again") from None
+    document, checked, file = read_checked(path, SCHEMA, Manifest, "exported controller", "codegen --controller")
     return document, checked, file.parent
 
 

@@ -10,14 +10,13 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from impact_posture.arrays import Array
 from impact_posture.codegen.emitter import DOUBLE, BlockText, Constants, Emitter, c_double
 from impact_posture.codegen.graph import graph_of
 from impact_posture.codegen.layout import lay_out
 from impact_posture.codegen.manifest_builder import configuration_names
-from impact_posture.codegen.render import wrapped
+from impact_posture.codegen.render import environment
 from impact_posture.codegen.sums import rebuilt
 from impact_posture.controller_export.parameters import RULES, Field
 from impact_posture.controller_export.rigid_body import MovingTree
@@ -145,17 +144,9 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
         "places": _braced(map(str, code.angles)), "outputs": code.outputs, "constant_outputs": code.constant_outputs,
         "core": "\n".join(_own(name) for name in _files(sizes)),
     }  # fmt: skip
-    environment = Environment(
-        loader=PackageLoader("impact_posture.controller_export"), undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True, keep_trailing_newline=True, finalize=_insert,
-    )  # fmt: skip
-    environment.filters |= {
-        "verbatim": _Verbatim,
-        "wrapped": lambda words, indent: _Verbatim(wrapped(map(c_comment, words), indent)),
-        "lines": lambda parts, between: _Verbatim(between.join(map(c_comment, parts))),
-    }
+    templates = environment("impact_posture.controller_export", c_comment)
     texts = {
-        name: environment.get_template(template).render(context)
+        name: templates.get_template(template).render(context)
         for name, template in ((f"{prefix}.h", "controller.h.jinja"), (f"{prefix}.c", "controller.c.jinja"))
     }
     return {name: named(text, prefix) for name, text in texts.items()} | _relaxation(prefix)
@@ -190,16 +181,6 @@ def named(text: str, prefix: str) -> str:
     """Return C text in which all names begin with the prefix."""
     text = re.sub(r"\brelaxation_([a-z])", rf"{prefix}_relaxation_\1", text)
     return re.sub(r"\bip_", f"{prefix}_", re.sub(r"\bIP_", f"{prefix.upper()}_", text))
-
-
-class _Verbatim(str):
-    """Text that a template inserts as it is."""
-
-    __slots__ = ()
-
-
-def _insert(value: object) -> object:
-    return c_comment(value) if isinstance(value, str) and not isinstance(value, _Verbatim) else value
 
 
 def _own(name: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from impact_posture.experiment.jobs import Job
 from impact_posture.experiment.reproduction import Reproduction
 from impact_posture.experiment.reproduction_summary import summary
 from impact_posture.experiment.run_reports import COMPARISON, SIMULATION, keep_runs, try_report
-from impact_posture.output_folder import whole_folder
+from impact_posture.output_folder import whole_folder, write_json
 from impact_posture.simulation.run import Run
 
 REPRODUCTION = "reproduction.json"
@@ -50,7 +49,7 @@ def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: di
         OutputError: The folder exists without ``force``, is not ours, or cannot be written.
     """
     with whole_folder(output.folder, force=output.force, kind="run") as folder:
-        _write_json(folder / SIMULATION, document)
+        write_json(folder / SIMULATION, document)
         for one in runs:
             one.series.save(folder / f"series{'' if one.sign > 0 else '-minus'}.npz")
         draw_runs(job, runs, document, folder, output.formats)
@@ -67,7 +66,7 @@ def write_comparison(output: Output, found: Reproduction, store: Store) -> str:
         OutputError: As :func:`write_simulation`.
     """
     with whole_folder(output.folder, force=output.force, kind="comparison") as folder:
-        _write_json(folder / COMPARISON, found.comparison())
+        write_json(folder / COMPARISON, found.comparison())
         draw_side_by_side(found.shown, store, folder, output.formats)
         failure = ""
         if output.report:
@@ -88,11 +87,11 @@ def write_reproduction(output: Output, found: Reproduction, store: Store) -> dic
     """
     document = {**found.to_dict(), "summary": summary(found)}
     with whole_folder(output.folder, force=output.force, kind="reproduction") as folder:
-        _write_json(folder / REPRODUCTION, document)
+        write_json(folder / REPRODUCTION, document)
         (folder / "SUMMARY.md").write_text(document["summary"], encoding="utf-8")
         (folder / "runs").mkdir()
         for job in found.jobs:
-            _write_json(folder / "runs" / f"{job.name}.json", store.find(job))
+            write_json(folder / "runs" / f"{job.name}.json", store.find(job))
         draw_reproduction(found, store, folder, output.formats)
     store.remove()
     return document
@@ -101,7 +100,3 @@ def write_reproduction(output: Output, found: Reproduction, store: Store) -> dic
 def store_beside(out: Path) -> Store:
     """Return the store that keeps the runs of an output folder until it is written."""
     return Store(out.absolute().parent / f".{out.name}.runs")
-
-
-def _write_json(path: Path, document: object) -> None:
-    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")

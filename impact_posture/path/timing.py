@@ -14,8 +14,8 @@ from impact_posture.path.path_space import PathSpace
 
 # Time between two points of a trajectory, s, and the least number of points.
 SAMPLE_TIME, _LEAST_POINTS = 0.01, 21
-# Intervals of the time-optimal parametrization, within which a limit may be exceeded by less than this share.
-_GRID, DISCRETIZATION = 400, 0.01
+# Intervals of the time-optimal parametrization, within which a limit may be exceeded by less than 1 %.
+_GRID = 400
 # Instants at which a scaled motion is checked.
 INSTANTS = 61
 # Joint speed where the robot's data limit nothing, rad/s or m/s.

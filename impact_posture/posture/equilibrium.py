@@ -9,10 +9,9 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
+from impact_posture.posture.linear_program import solve_linear
 from impact_posture.posture.static_load import ForceSource, StaticLoad
 
-# The default of HiGHS, 1e-7, is coarser than what a certificate accepts.
-_EXACT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 # Shares closer to the largest than this are as large.
 _TIED = 1e-9
 # Rate above which a load meets no limit.
@@ -166,20 +165,18 @@ class Equilibrium:
 
         ``None`` if they do not even allow ``rest``.
         """
-        from scipy.optimize import linprog
-
         A, b, S, c = self._affine(rest, self._by_force(q))
         rate = self.rows @ dynamic
         into = np.append(rate[self.balanced :], np.zeros(len(self._free)))
-        found = linprog(
+        found = solve_linear(
             np.append(np.zeros(self.load.count), -1.0),
-            A_ub=np.block([[S, into[:, None]], [-S, -into[:, None]]]),
-            b_ub=np.concatenate([1 - c, 1 + c]),
-            A_eq=np.column_stack([A, rate[: self.balanced]]),
-            b_eq=-b,
-            bounds=[*np.column_stack([self.load.lower, self.load.upper]), (0.0, _MOST)],
+            np.vstack([np.column_stack([A, rate[: self.balanced]]), np.column_stack([S, into])]),
+            np.concatenate([-b, -1 - c]),
+            np.concatenate([-b, 1 - c]),
+            np.append(self.load.lower, 0.0),
+            np.append(self.load.upper, _MOST),
         )
-        if found.status != 0:
+        if found is None:
             return None
         return float("inf") if found.x[-1] > _MOST * (1 - 1e-9) else float(found.x[-1])
 
@@ -188,40 +185,36 @@ class Equilibrium:
 
     def _least_share(self, A: Array, b: Array, S: Array, c: Array) -> tuple[Array, float, Array] | None:
         """``min s`` with ``A z + b = 0`` and ``|S z + c| ≤ s``; ``None`` if the feet cannot balance the robot."""
-        # Imported here, because SciPy takes long to import and not every robot needs it.
-        from scipy.optimize import linprog
-
-        count = self.load.count
-        bounds = np.column_stack([self.load.lower, self.load.upper])
+        count, one, infinite = self.load.count, np.ones((len(S), 1)), np.full(2 * len(S), np.inf)
+        low, high = np.append(self.load.lower, 0.0), np.append(self.load.upper, np.inf)
         # A thrust beyond its limits shows as a share above one.
-        bounds[self._free] = -np.inf, np.inf
-        found = linprog(
+        low[self._free], high[self._free] = -np.inf, np.inf
+        found = solve_linear(
             np.append(np.zeros(count), 1.0),
-            A_ub=np.block([[S, -np.ones((len(S), 1))], [-S, -np.ones((len(S), 1))]]),
-            b_ub=np.concatenate([-c, c]),
-            A_eq=np.column_stack([A, np.zeros(len(A))]),
-            b_eq=-b,
-            bounds=[*bounds, (0.0, np.inf)],
-            options=_EXACT,
+            np.vstack([np.block([[S, -one], [-S, -one]]), np.column_stack([A, np.zeros(len(A))])]),
+            np.concatenate([-infinite, -b]),
+            np.concatenate([-c, c, -b]),
+            low,
+            high,
         )
-        if found.status != 0:
+        if found is None:
             return None
-        above, below = np.split(found.ineqlin.marginals, 2)
-        duals = -np.concatenate([found.eqlin.marginals, above - below])
+        above, below, balance = np.split(found.multipliers, [len(S), 2 * len(S)])
+        duals = np.concatenate([balance, above - below])
         return found.x[:count], 0.0, duals[: len(self.rows)]
 
     def _least_imbalance(self, A: Array, b: Array) -> tuple[Array, float, Array]:
         """``min Σ|A z + b|`` within the limits of thrusts and feet."""
-        from scipy.optimize import linprog
-
-        one = np.eye(len(A))
-        found = linprog(
-            np.concatenate([np.zeros(self.load.count), np.ones(2 * len(A))]),
-            A_eq=np.hstack([A, -one, one]),
-            b_eq=-b,
-            bounds=[*np.column_stack([self.load.lower, self.load.upper]), *[(0.0, np.inf)] * (2 * len(A))],
-            options=_EXACT,
+        one, apart = np.eye(len(A)), np.zeros(2 * len(A))
+        found = solve_linear(
+            np.concatenate([np.zeros(self.load.count), apart + 1]),
+            np.hstack([A, -one, one]),
+            -b,
+            -b,
+            np.append(self.load.lower, apart),
+            np.append(self.load.upper, apart + np.inf),
         )
+        assert found is not None  # noqa: S101 (narrows a type: any imbalance is allowed)
         duals = np.zeros(len(self.rows))
-        duals[: len(A)] = -found.eqlin.marginals
-        return found.x[: self.load.count], float(found.fun), duals
+        duals[: len(A)] = found.multipliers
+        return found.x[: self.load.count], found.value, duals

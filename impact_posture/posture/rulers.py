@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -18,46 +17,16 @@ from impact_posture.posture.posture_distance import WithinDistance, distance
 from impact_posture.settings import Against
 
 
-class Ruler(Protocol):
-    """A price of a posture that may be bounded.
-
-    Attributes:
-        against: Name of the price in options and files.
-        nearest: The posture at the least price, shape (nq,).
-        nothing: What to say if the optimum has the least price.
-    """
-
-    @property
-    def against(self) -> Against:
-        """See the attributes."""
-        ...
-
-    @property
-    def nearest(self) -> Array:
-        """See the attributes."""
-        ...
-
-    @property
-    def nothing(self) -> str:
-        """See the attributes."""
-        ...
-
-    def measure(self, q: Array) -> float:
-        """Return the price of ``q``."""
-        ...
-
-    def bound(self, level: float) -> Constraint:
-        """Return the constraint that the price is at most ``level``; one program serves all levels."""
-        ...
-
-    def within(self, q: Array, level: float) -> Array:
-        """Return a start for the program with this bound, from a posture that may exceed it."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class DistanceRuler:
-    """The distance from the initial posture, rad mixed with m."""
+    """The distance from the initial posture, rad mixed with m.
+
+    Attributes:
+        model: The robot.
+        nearest: The posture at the least price, shape (nq,).
+        against: Name of the price in options and files.
+        nothing: What to say if the optimum has the least price.
+    """
 
     model: pin.Model
     nearest: Array
@@ -65,15 +34,15 @@ class DistanceRuler:
     nothing: str = "the optimum is the initial posture"
 
     def measure(self, q: Array) -> float:
-        """See :class:`Ruler`."""
+        """Return the price of ``q``."""
         return distance(Chart(self.model), q, self.nearest)
 
     def bound(self, level: float) -> Constraint:
-        """See :class:`Ruler`."""
+        """Return the constraint that the price is at most ``level``; one program serves all levels."""
         return WithinDistance(Chart(self.model), self.nearest, level)
 
     def within(self, q: Array, level: float) -> Array:
-        """See :class:`Ruler`."""
+        """Return a start for the program with this bound, from a posture that may exceed it."""
         away = self.measure(q)
         return q if away <= level else np.array(pin.interpolate(self.model, self.nearest, q, level / away))
 
@@ -90,13 +59,16 @@ class ForceRuler:
     nothing: str = "the optimum has the least force"
 
     def measure(self, q: Array) -> float:
-        """See :class:`Ruler`."""
+        """See :class:`DistanceRuler`."""
         return self.contact.peak_force(self.objective.oracle.quantities(q).G, self.speed)
 
     def bound(self, level: float) -> Constraint:
-        """See :class:`Ruler`."""
+        """See :class:`DistanceRuler`."""
         return ImpactLimits(self.objective, self.contact.least_mobility(level, self.speed), float("inf"))
 
     def within(self, q: Array, level: float) -> Array:
-        """See :class:`Ruler`."""
+        """See :class:`DistanceRuler`."""
         return q
+
+
+Ruler = DistanceRuler | ForceRuler

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.collision.mesh_check import MeshCheck
+from impact_posture.collision.mesh_check import HalfSpace, MeshCheck
 from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import load_shapes
 from impact_posture.collision.swept_hull import SweptHull
@@ -27,23 +27,6 @@ from impact_posture.settings import PATCH, Obstacle
 _BESIDE = 0.03
 # A body that cannot move and lies this far (m) behind the plane of the surface shows that the surface ends before it.
 _BEHIND = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class HalfSpace:
-    """The half-space behind a plane, at one posture.
-
-    Attributes:
-        name: Name in messages.
-        point: A point of the plane, world, shape (3,), m.
-        normal: Unit normal out of it, world, shape (3,).
-        exempt: Joints whose links may be behind it.
-    """
-
-    name: str
-    point: Array
-    normal: Array
-    exempt: frozenset[int]
 
 
 @dataclass(frozen=True, eq=False)

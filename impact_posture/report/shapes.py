@@ -20,6 +20,7 @@ from impact_posture.libraries import source_key
 from impact_posture.report.mesh_license import MeshLicense, license_of
 from impact_posture.report.solid import PlacedSolids, Solid
 from impact_posture.robot.robot import Robot
+from impact_posture.stored_text import read_stored, write_stored
 
 # Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
 _MOST_TRIANGLES = 150_000
@@ -64,10 +65,10 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
     known = {shape.name: license_of(shape.mesh) for shape in described if shape.mesh is not None}
     hulls = {name for name, terms in known.items() if not (meshes or (terms and terms.allows))}
     key = source_key([geometry_key(robot, described), repr(sorted(hulls))], "report")
-    found = PlacedSolids.stored(key)
+    found = read_stored("solids", key, PlacedSolids)
     if found is None:
         found = _placed_solids(robot, described, hulls)
-        found.store(key)
+        write_stored("solids", key, found)
     parts = [(joint, k, at, _color(by_name[name])) for name, joint, k, at in found.places]
     drawn = {name for name, *_ in found.places}
     licenses = {terms.package: terms for name, terms in known.items() if terms and name in drawn - hulls}
@@ -117,7 +118,7 @@ def _welded(solid: Solid, bits: int) -> Solid:
     # In the order of their first use corners differ little from the last ones, so that they compress well.
     used, at = np.unique(faces, return_index=True)
     order = used[np.argsort(at)]
-    renamed = np.empty(len(first), dtype=int)
+    renamed = np.empty(len(first), dtype=np.uint32)
     renamed[order] = np.arange(len(order))
     return Solid(solid.corners[first[order]], renamed[faces], solid.low, solid.step)
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import json
-from base64 import b64decode, b64encode
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+from pydantic import PlainSerializer, PlainValidator
 
 from impact_posture.arrays import Array
-from impact_posture.collision.mesh_triangles import Triangles
-from impact_posture.stored_text import read_stored, write_stored
+from impact_posture.stored_text import StoredArray
+
+_Placement = Annotated[
+    pin.SE3,
+    PlainValidator(lambda rows: pin.SE3(np.array(rows))),
+    PlainSerializer(lambda at: at.homogeneous.tolist()),
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +30,9 @@ class Solid:
         step: Length of a unit, m.
     """
 
-    corners: NDArray[np.uint16]
-    faces: Triangles
-    low: Array
+    corners: StoredArray
+    faces: StoredArray
+    low: StoredArray
     step: float
 
     @property
@@ -50,39 +52,5 @@ class PlacedSolids:
     """
 
     solids: tuple[Solid, ...]
-    places: tuple[tuple[str, int, int, pin.SE3], ...]
+    places: tuple[tuple[str, int, int, _Placement], ...]
     warnings: tuple[str, ...]
-
-    def store(self, key: str) -> None:
-        """Keep the meshes in the cache of the user, if it can be written."""
-        content = {
-            "solids": [
-                [_packed(one.corners, "<u2"), _packed(one.faces, "<u4"), one.low.tolist(), one.step]
-                for one in self.solids
-            ],
-            "places": [[*place, at.homogeneous.tolist()] for *place, at in self.places],
-            "warnings": self.warnings,
-        }
-        write_stored("solids", key, json.dumps(content))
-
-    @staticmethod
-    def stored(key: str) -> PlacedSolids | None:
-        """Return the meshes that were kept; ``None`` where no file can be used."""
-        text = read_stored("solids", key)
-        with suppress(ValueError, TypeError, LookupError):
-            content: dict[str, Any] = json.loads(text or "")
-            solids = tuple(
-                Solid(_unpacked(corners, "<u2"), _unpacked(faces, "<u4").astype(int), np.array(low), step)
-                for corners, faces, low, step in content["solids"]
-            )
-            places = tuple((name, joint, k, pin.SE3(np.array(at))) for name, joint, k, at in content["places"])
-            return PlacedSolids(solids, places, tuple(content["warnings"]))
-        return None
-
-
-def _packed(rows: NDArray[Any], kind: str) -> str:
-    return b64encode(rows.astype(kind).tobytes()).decode("ascii")
-
-
-def _unpacked(text: str, kind: str) -> NDArray[Any]:
-    return np.frombuffer(b64decode(text), kind).reshape(-1, 3)

@@ -12,9 +12,9 @@ from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient
 from impact_posture.simulation.sensor_noise import Reading
+from impact_posture.tsid.activation import Phase
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.impact_robust import ImpactRobustPosture, curvature, curvature_scale
-from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.state import State
 
 
@@ -65,47 +65,40 @@ def resting_posture(driver: Driver, seconds: float, quiet: float = 1e-3) -> Arra
     return q
 
 
-class FlowPosture(JointPosture):
+class FlowPosture(ImpactRobustPosture):
     """Projected gradient flow of Walker 1994 as the reference of a posture task.
 
     ``ν_ref = −α k Z Zᵀ ∇H/λ``, where the columns of ``Z`` span what the other tasks leave free.  ``q_des`` is the
-    integral of ``ν_ref``, and ``ν_ref`` is the velocity reference.  ``k = K/K_d`` makes the flow as fast as the
-    impact-robust term with the gain K would be.  It has the bound and the fade near joint limits of that term.
+    integral of ``ν_ref``, and ``ν_ref`` is the velocity reference, in place of the impact-robust term.  ``k = K/K_d``
+    makes the flow as fast as that term would be.  It has the bound and the fade near joint limits of the term.
 
     Attributes:
-        term: The impact-robust term whose gradient, scale, bound and activation are used.  It is no task itself.
         basis: ``Z``, shape (nv, r); without it, nothing flows.
     """
-
-    def __init__(self, robot: Robot, term: ImpactRobustPosture) -> None:
-        """Set the gains and weights of the term."""
-        super().__init__(robot, kp=term.kp, kd=term.kd, weight=term.weight)
-        self.term = term
-        self._flow = np.zeros(robot.nv)
-        self.basis: Array | None = None
 
     def reset(self, state: State) -> None:
         """Hold the present posture."""
         super().reset(state)
-        self.term.reset(state)
-        self.basis = None
-        self._flow[:] = 0.0
+        self.basis: Array | None = None
+        self._flow = np.zeros(state.nv)
+
+    def contact(self) -> None:
+        """Let the flow fade; its reference is ahead of the robot, so :class:`WalkerDriver` moves it back at once."""
+        self.activation.enter(Phase.CONTACT)
 
     def advance(self, state: State, dt: float) -> None:
         """Move ``q_des``."""
         super().advance(state, dt)
-        self.term.advance(state, dt)
-        level = self.term.activation.level
-        if self.basis is None or level <= 0:
+        if self.basis is None or self.level <= 0:
             self._flow[:] = 0.0
             return
-        wanted = level * self.term.term / np.maximum(self.kd, 1e-9)
+        wanted = self.level * self.term / np.maximum(self.kd, 1e-9)
         self._flow = self.basis @ (self.basis.T @ wanted)
         self._target[:] = pin.integrate(self._model, self._target, dt * self._flow)
 
-    def desired(self, state: State) -> Array:
-        """Return ``ν̇*``, shape (nv,), with the flow as velocity reference."""
-        return super().desired(state) + self.kd * self._flow
+    def feedforward(self, state: State) -> Array:
+        """Return the flow as velocity reference."""
+        return np.asarray(self.kd * self._flow)
 
 
 class WalkerDriver(RobustDriver):
@@ -114,18 +107,16 @@ class WalkerDriver(RobustDriver):
     posture: FlowPosture
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest, and measure the scale of the term there."""
+        """Begin at rest."""
         command = super().reset(q)
-        state = self.controller.state
-        self.posture.basis = self.controller.assembly.redundancy(state)
-        self.term.normalize(state, self.posture.basis)
+        self.posture.basis = self.controller.assembly.redundancy(self.controller.state)
         self._ticks = 0
         return command
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
         """Return the command.  The redundancy is computed as often as the gradient."""
         if self.level > 0:
-            if self._ticks % self.term.every == 0:
+            if self._ticks % self.posture.every == 0:
                 self.posture.basis = self.controller.assembly.redundancy(self.controller.state)
             self._ticks += 1
         return super().tick(reading, reference)
@@ -134,7 +125,7 @@ class WalkerDriver(RobustDriver):
         """Stop the flow and hold the present posture, center of mass and base orientation."""
         super().hold()
         # The reference is ahead of the robot wherever other tasks kept the robot back.
-        self.posture.move_to(self.controller.state.q, self.term.activation.ramp)
+        self.posture.move_to(self.controller.state.q, self.posture.activation.ramp)
 
 
 class ReleaseDriver(RobustDriver):
@@ -156,7 +147,7 @@ class ReleaseDriver(RobustDriver):
 
     def __init__(self, setup: Setup, term: ImpactRobustPosture, gradient: Gradient, optimum: Array) -> None:
         """Measure both curvatures."""
-        super().__init__(setup, term, term)
+        super().__init__(setup, term)
         scales = []
         for q in (setup.q, optimum):
             self.controller.reset(q, np.zeros(setup.robot.nv))
@@ -168,7 +159,7 @@ class ReleaseDriver(RobustDriver):
     def reset(self, q: Array) -> Command:
         """Begin at rest."""
         command = super().reset(q)
-        self.term.scale = self._scale
+        self.posture.scale = self._scale
         self._ticks, self._reached, self._braced = 0, np.inf, False
         return command
 
@@ -182,8 +173,8 @@ class ReleaseDriver(RobustDriver):
         if self._braced and self.level == 1:
             self._ticks += 1
             if self._ticks * self.controller.period >= self.PATIENCE:
-                if self.term.value > (1 - self.LEAST) * self._reached:
+                if self.posture.value > (1 - self.LEAST) * self._reached:
                     self._braced = False
                     self.hold()
-                self._ticks, self._reached = 0, self.term.value
+                self._ticks, self._reached = 0, self.posture.value
         return super().tick(reading, reference)

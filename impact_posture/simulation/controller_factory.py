@@ -195,10 +195,8 @@ class ControllerFactory:
             )
             return ReleaseDriver(setup, released, gradient, self.offline.q)
         activation = Activation(ramp=term.ramp, live=mode == "live")
-        robust = ImpactRobustPosture(robot, gradient, K=K, fade=term.fade, activation=activation, **options)
-        posture = FlowPosture(robot, robust) if name == "walker" else robust
-        driver = WalkerDriver if name == "walker" else RobustDriver
-        return driver(setup, posture, robust)
+        driver, task = (WalkerDriver, FlowPosture) if name == "walker" else (RobustDriver, ImpactRobustPosture)
+        return driver(setup, task(robot, gradient, K=K, fade=term.fade, activation=activation, **options))
 
     def _compiled(self, driver: Driver, name: str) -> CompiledTick | None:
         """Return the controller of a driver as machine code, or ``None`` where Python runs it.
@@ -236,7 +234,7 @@ class ControllerFactory:
         reached = resting_posture(robust, seconds)
         if at != "robust":
             reached = resting_posture(self.driver(at), seconds)
-        driver, strength = self._made(name, "live", None), robust.term.K / robust.term.scale
+        driver, strength = self._made(name, "live", None), robust.posture.K / robust.posture.scale
         driver.posture.stiffen(spring_of_term(self.setup.robot, self.gradient(), reached, strength))
         return driver
 

@@ -84,9 +84,9 @@ class Driver:
         """Level of the term that prepares for the impact, 0 to 1."""
         return self.posture.level if self.compiled is None else self.compiled.library.level
 
-    def _tell(self, posture: JointPosture, method: str, *given: Any, **named: Any) -> None:
-        """Call a method of a posture task, or that of its counterpart in C."""
-        getattr(posture if self.compiled is None else self.compiled.library, method)(*given, **named)
+    def _tell(self, method: str, *given: Any, **named: Any) -> None:
+        """Call a method of the posture task, or that of its counterpart in C."""
+        getattr(self.posture if self.compiled is None else self.compiled.library, method)(*given, **named)
 
     def _follow(self, reference: ReferencePoint) -> None:
         task, home = self._end_effector, self._home
@@ -99,34 +99,22 @@ class Driver:
 
 
 class RobustDriver(Driver):
-    """Impact-robust controller, which uses the impact-robust term from :meth:`brace` on.
+    """Impact-robust controller, which uses the impact-robust term of its posture task from :meth:`brace` on."""
 
-    Attributes:
-        term: The impact-robust term, which is the posture task or part of it.
-    """
-
-    def __init__(self, setup: Setup, posture: JointPosture, term: ImpactRobustPosture) -> None:
-        """Build the tasks of the scenario around a posture task with a term."""
-        super().__init__(setup, posture)
-        self.term = term
+    posture: ImpactRobustPosture
 
     def brace(self) -> None:
         """Switch the term on."""
-        self._tell(self.term, "brace")
+        self._tell("brace")
 
     def hold(self) -> None:
         """Hold the present posture, center of mass and base orientation, and switch the term off."""
-        self._tell(self.term, "contact")
+        self._tell("contact")
         if self.compiled is not None:
             self.compiled.catch_up()
         for task in self._body_tasks:
             task.target = None
             task.reset(self.controller.state)
-
-    @property
-    def level(self) -> float:
-        """Activation of the term, 0 to 1."""
-        return self.term.level if self.compiled is None else self.compiled.library.level
 
 
 class FlowDriver(Driver):
@@ -142,16 +130,16 @@ class FlowDriver(Driver):
 
     def brace(self) -> None:
         """Let the posture flow."""
-        self._tell(self.posture, "brace")
+        self._tell("brace")
 
     def hold(self) -> None:
         """Hold the posture that the flow has reached."""
-        self._tell(self.posture, "contact")
+        self._tell("contact")
 
     def expect(self, t: float) -> None:
         """Rest early enough before an impact at a time, s."""
         if self.level > 0:
-            self._tell(self.posture, "brace", t_impact=t - self._now)
+            self._tell("brace", t_impact=t - self._now)
 
 
 class PostureDriver(Driver):
@@ -172,7 +160,7 @@ class PostureDriver(Driver):
 
     def brace(self) -> None:
         """Move posture, center of mass and base orientation to the goal within :data:`MOVE`."""
-        self._tell(self.posture, "move_to", self._goal, MOVE)
+        self._tell("move_to", self._goal, MOVE)
         model = self.setup.robot.model
         for task in self._body_tasks:
             # The feet stay in place, because the goal was found with them there.

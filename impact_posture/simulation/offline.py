@@ -9,7 +9,6 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
-from impact_posture.posture.load_cases import load_cases
 from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.problem_settings import requirements
@@ -109,12 +108,6 @@ def scenario_requirements(setup: Setup, objective: ImpactObjective) -> Requireme
     )
     demands = requirements(settings, objective)
     return replace(demands, com_over_feet=bool(objective.supports), com_asked=False, limit_share=SHARE)
-
-
-def is_held(setup: Setup, objective: ImpactObjective) -> bool:
-    """Whether at most :data:`SHARE` of the limits holds the start of a scenario, as far as the robot's data say."""
-    holding = load_cases(objective, setup.q, scenario_requirements(setup, objective)).holding(setup.q)
-    return holding is None or holding.feasible
 
 
 def _tell(done: int, total: int) -> None:

@@ -64,7 +64,7 @@ def test_stiff_has_the_spring_that_robust_is_where_it_rests(name: str) -> None:
     posture, control = made.driver("stiff").posture, setup.scenario.control
     assert posture.stiffness is not None
     assert posture.damping is not None
-    spring = spring_of_term(setup.robot, made.gradient(), reached, control.robust.gain / robust.term.scale)
+    spring = spring_of_term(setup.robot, made.gradient(), reached, control.robust.gain / robust.posture.scale)
     np.testing.assert_allclose(posture.stiffness, np.diag(posture.kp) + spring, rtol=1e-9, atol=1e-9)
     # Critical in every direction at once: (s + K^½)² = s² + D s + K.
     np.testing.assert_allclose(posture.damping @ posture.damping / 4, posture.stiffness, rtol=1e-9, atol=1e-9)
@@ -81,7 +81,7 @@ def test_without_the_spring_the_posture_goes_further_and_is_held_there(monkeypat
     assert isinstance(driver, ReleaseDriver)
     reached = resting_posture(driver, 6.0)
     assert driver.level == 0
-    assert not driver.term.activation.live
+    assert not driver.posture.activation.live
     assert value(reached) < 0.5 * value(resting_posture(made.driver("robust"), 3.0))
     assert value(reached) < 1.05 * value(made.offline.q)
     # What is held is the posture, as the term left it.
@@ -89,7 +89,7 @@ def test_without_the_spring_the_posture_goes_further_and_is_held_there(monkeypat
     assert np.abs(away).max() < 0.02
     driver.reset(setup.q)
     assert driver.level == 0
-    assert driver.term.scale >= made.driver("robust").term.scale
+    assert driver.posture.scale >= made.driver("robust").posture.scale
 
 
 @pytest.mark.parametrize("name", ["aerial-lateral", "solo8-push"])
@@ -183,9 +183,9 @@ def test_the_flow_is_the_projected_gradient() -> None:
     J = np.vstack([np.eye(2, 9, 3), frame_jacobian(made.setup.robot.model, q, made.setup.robot.frame_id("ee"))])
     Z = np.linalg.svd(J)[2][8:].T
     assert Z.shape == (9, 1)
-    term = -control.robust.gain / driver.posture.term.scale * made.objective().gradient(q)
+    term = -control.robust.gain / driver.posture.scale * made.objective().gradient(q)
     # Not further than K times its reach.
-    bound = control.robust.gain * driver.posture.term.reach
+    bound = control.robust.gain * driver.posture.reach
     term *= min(1.0, bound / np.linalg.norm(term))
     expected = Z @ (Z.T @ term) / control.posture.kd
     found = pin.difference(made.setup.robot.model, last, driver.posture.target) / 1e-3

@@ -13,10 +13,11 @@ from impact_posture.posture.load_cases import load_cases
 from impact_posture.posture.search import feasible
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits
 from impact_posture.simulation import offline
-from impact_posture.simulation.offline import SHARE, is_held, offline_posture, scenario_requirements
+from impact_posture.simulation.offline import SHARE, offline_posture, scenario_requirements
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
+from tests.benchmarks.robustness.outcomes import is_held
 from tests.simulation.factories import needs_mujoco
 
 needs_mujoco()

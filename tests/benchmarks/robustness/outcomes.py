@@ -16,10 +16,13 @@ from impact_posture.experiment.jobs import Job, execute, lost, parse_controller
 from impact_posture.experiment.reproduction import missed_targets
 from impact_posture.experiment.statistics import Row, row_of
 from impact_posture.impact.contact import point_on
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.load_cases import load_cases
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import before
-from impact_posture.simulation.offline import SHARE, is_held
+from impact_posture.simulation.offline import SHARE, scenario_requirements
 from impact_posture.simulation.run import Run
+from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import interpreted
 from tests.benchmarks.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, Draw, draw, prepare
 from tests.benchmarks.robustness.variations import RANGES
@@ -133,6 +136,12 @@ def _complete(record: Record, factory: ControllerFactory, play: _Play) -> Record
 def is_complete(record: Record | None) -> bool:
     """Whether a record has every controller, or is of a variation that cannot be tried."""
     return record is not None and (not record.documents or set(COMPARED) <= set(record.documents))
+
+
+def is_held(setup: Setup, objective: ImpactObjective) -> bool:
+    """Whether at most :data:`SHARE` of the limits holds the start of a scenario, as far as the robot's data say."""
+    holding = load_cases(objective, setup.q, scenario_requirements(setup, objective)).holding(setup.q)
+    return holding is None or holding.feasible
 
 
 def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
