@@ -9,12 +9,13 @@ import pinocchio as pin
 import pytest
 import scipy
 
+from impact_posture.arrays import null_space
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.contact import point_on
 from impact_posture.posture.certificate import certify, nonnegative_least_squares, objective_gradients
 from impact_posture.posture.null_space_path import null_space_path
-from impact_posture.posture.problem import PostureProblem, equality_jacobian, null_space, rank
+from impact_posture.posture.problem import RANK_TOLERANCE, PostureProblem, equality_jacobian, rank
 from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.solve import PostureSolution, distinct, solve
 from impact_posture.posture.starts import Projector, feasible_start
@@ -147,10 +148,10 @@ def test_multipliers_and_free_motions_are_those_of_scipy() -> None:
         found, (_, least) = nonnegative_least_squares(matrix, right), scipy.optimize.nnls(matrix, right)
         assert found.min() >= 0
         assert np.linalg.norm(matrix @ found - right) == pytest.approx(least, abs=1e-12)
-        free, own = null_space(matrix), scipy.linalg.null_space(matrix, rcond=1e-7)
+        free, own = null_space(matrix, RANK_TOLERANCE), scipy.linalg.null_space(matrix, rcond=1e-7)
         np.testing.assert_allclose(free @ free.T, own @ own.T, atol=1e-12)
     assert not nonnegative_least_squares(np.zeros((3, 2)), np.ones(3)).any()
-    np.testing.assert_array_equal(null_space(np.zeros((0, 3))), np.eye(3))
+    np.testing.assert_array_equal(null_space(np.zeros((0, 3)), RANK_TOLERANCE), np.eye(3))
 
 
 def test_objective_gradient_with_regularization_is_that_of_the_programme() -> None:

@@ -96,7 +96,7 @@ def sweep(
     page.table(("status", "problems"), [(k, str(v)) for k, v in done.counts.items() if v], right=(1,))
     if solved:
         page.line(
-            f"{number(1e3 * done.total_s / solved, 'ms')} of a worker a problem, "
+            f"{number(1e3 * done.total_s / solved, 'ms')} of a worker's time for each problem, "
             f"{100 * done.solver_s / max(done.total_s, 1e-9):.0f} % of it in the solver"
         )
     page.line(f"written to {place}")

@@ -9,12 +9,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.arrays import Array
+from impact_posture.arrays import Array, null_space
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.constraint import Linearization
 from impact_posture.posture.posture_distance import distance_gradient
-from impact_posture.posture.problem import PostureProblem, held_rows, null_space
+from impact_posture.posture.problem import RANK_TOLERANCE, PostureProblem, held_rows
 from impact_posture.tables import json_block
 
 # An inequality closer than this (m, rad) may have a multiplier.  The product of both is the complementarity.
@@ -209,7 +209,7 @@ def _multipliers(gradients: Array, equalities: Array, near: Sequence[_Near]) -> 
         Weights, multipliers and residual.
     """
     count = len(gradients)
-    free = null_space(equalities)
+    free = null_space(equalities, RANK_TOLERANCE)
     reduced = gradients @ free
     if not free.shape[1] or (count == 1 and not near):
         return np.eye(count)[0], np.zeros(len(near)), free @ reduced[0]

@@ -194,16 +194,6 @@ def rank(jacobian: Array) -> int:
     return int(np.linalg.matrix_rank(jacobian, tol=RANK_TOLERANCE)) if jacobian.size else 0
 
 
-def null_space(jacobian: Array) -> Array:
-    """Return an orthonormal basis of the motions that a Jacobian does not see, as columns; tolerance as in rank.
-
-    SciPy has the same function, but takes longer to import than many problems take to solve.
-    """
-    _, values, rows = np.linalg.svd(jacobian)
-    # Relative to the largest singular value, where rank is absolute.
-    return np.asarray(rows[int((values > RANK_TOLERANCE * values.max(initial=0.0)).sum()) :].T)
-
-
 def equality_jacobian(problem: PostureProblem, numeric: Numeric) -> Array:
     """Return the tangent Jacobian of all equalities and held joints at ``numeric.q``, shape (rows, nv)."""
     blocks = [held_rows(problem.robot, problem.requirements.hold)]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
+from impact_posture.arrays import Array, null_space
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.objective import Objective
 from impact_posture.posture.constraint import Constraint
@@ -19,7 +19,6 @@ from impact_posture.posture.problem import (
     Requirements,
     equality_jacobian,
     held_rows,
-    null_space,
     rank,
 )
 from impact_posture.posture.starts import Projector, feasible_start
@@ -63,7 +62,7 @@ def pin_undetermined(
         rows = [c.evaluate(numeric)[1] @ motions for c in (*constraints, *added)]
         if not rows:
             return np.asarray(numeric.jacobian(base) @ motions)
-        allowed = null_space(np.vstack(rows))
+        allowed = null_space(np.vstack(rows), RANK_TOLERANCE)
         return np.asarray(numeric.jacobian(base) @ motions @ allowed)
 
     # A turn about another point moves the base as well, so turns are fixed before positions.
@@ -117,7 +116,7 @@ def _only_to_first_order(problem: PostureProblem, numeric: Numeric, turn: HeldTu
     """Whether the linearized equalities at ``q`` allow a turn that the equalities themselves undo."""
     model = problem.robot.model
     jacobian = equality_jacobian(problem, numeric.at(q))
-    free = null_space(jacobian)
+    free = null_space(jacobian, RANK_TOLERANCE)
     along = free @ (free.T @ turn.evaluate(numeric)[1][0])
     size = float(turn.evaluate(numeric)[1][0] @ along)
     if size < 1e-3:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from impact_posture.arrays import Array
+from impact_posture.arrays import Array, null_space
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.contacts import ContactStack
@@ -19,6 +19,8 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 _IDLE = 1e-8
 # Weight of a moment (N·m) relative to that of a force (N).
 _MOMENT = 100.0
+# Share of the largest singular value of the tasks up to which they leave a direction free.
+_REDUNDANT = 1e-6
 
 
 class Assembly:
@@ -150,8 +152,8 @@ class Assembly:
         If weighted tasks determine all of them, return the accelerations that contacts and strict levels leave.
         """
         rows = [self.contacts.J, self.strict.J, self.weighted.J]
-        Z = _null_space(np.vstack(rows))
-        return Z if Z.shape[1] else _null_space(np.vstack(rows[:2]))
+        Z = null_space(np.vstack(rows), _REDUNDANT)
+        return np.ascontiguousarray(Z if Z.shape[1] else null_space(np.vstack(rows[:2]), _REDUNDANT))
 
     # ---- filling the QP -------------------------------------------------------------------------------------------
 
@@ -265,12 +267,3 @@ class Assembly:
             g[:] = 0.0
         if posture is not None:
             g -= self._posture_weight * posture.desired(state)
-
-
-def _null_space(J: Array) -> Array:
-    """Return an orthonormal basis of the null space of ``J``, shape (nv, r)."""
-    if not J.shape[0]:
-        return np.eye(J.shape[1])
-    _, values, right = np.linalg.svd(J)
-    rank = int(np.count_nonzero(values > 1e-6 * max(float(values[0]), 1e-12)))
-    return np.ascontiguousarray(right[rank:].T)

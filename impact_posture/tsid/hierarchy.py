@@ -54,13 +54,8 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
         return None
     y, scaled = z / units, [Level(level.A * units, level.lower, level.upper) for level in given]
     refined = (_refined(scaled, y, at) for at in _AT)
-    return np.asarray(units * next((one for one in refined if _no_worse(scaled, one, y)), y))
-
-
-def null_space(A: Array) -> Array:
-    """Return an orthonormal basis of the directions that rows of like length do not see, as columns."""
-    _, values, V = np.linalg.svd(A)
-    return np.asarray(V[int((values > _RANK).sum()) :].T)
+    best = next((one for one in refined if _no_worse(scaled, one, y)), None)
+    return np.asarray(units * (_onto(scaled[0], y) if best is None else best))
 
 
 def _size(y: Array) -> float:
@@ -109,6 +104,16 @@ def _no_worse(levels: Sequence[Level], new: Array, old: Array) -> bool:
         if abs(now - before) > 1e-6 * before + 1e-10 * _size(old) * float(_lengths(level).max()):
             return now < before
     return True
+
+
+def _onto(level: Level, y: Array) -> Array:
+    """Return the point nearest to ``y`` at which a level holds; ``y`` itself if the solver finds none."""
+    lengths, size = _lengths(level), _size(y)
+    A = np.ascontiguousarray(level.A / lengths[:, None])
+    high, low = (np.clip((bound / lengths - A @ y) / size, -1e30, 1e30) for bound in (level.upper, level.lower))
+    sense = np.where(level.lower == level.upper, EQUALITY, INEQUALITY).astype(np.int32)
+    way, _, flag, _ = daqp.solve(np.eye(y.size), np.zeros(y.size), A, high, low, sense, primal_tol=1e-12)
+    return y + size * np.asarray(way) if flag > 0 else y
 
 
 def _nearest(given: Sequence[Level]) -> Array | None:

@@ -8,10 +8,10 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.arrays import Array
+from impact_posture.arrays import Array, null_space
 from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.daqp_solver import SOLVED, DaqpSolver
-from impact_posture.tsid.hierarchy import Level, lexicographic, null_space
+from impact_posture.tsid.hierarchy import Level, lexicographic
 from impact_posture.tsid.qp import EQUALITY, QP, Solved, Solver
 
 # Miss that counts, relative to the terms of a row.
@@ -105,19 +105,20 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
     rows /= lengths[:, None]
     lower, upper = ((bounds - values) / (lengths * size) for bounds in (qp.lower, qp.upper))
     held = (qp.sense == EQUALITY) | (np.maximum(lower, -upper) > _MISSES)
-    free, only = null_space(rows[held]), Solved(nearest, np.zeros(qp.n + qp.m), 0)
+    free, only = null_space(rows[held], _MISSES), Solved(nearest, np.zeros(qp.n + qp.m), 0)
     if not free.shape[1]:
         return only
     lower, upper = np.minimum(lower, 0.0), np.maximum(upper, 0.0)
     curvatures, axes = np.linalg.eigh((free.T * units) @ qp.H @ (units[:, None] * free))
     largest = float(curvatures[-1])
     W = free @ (axes / np.sqrt(np.maximum(curvatures / largest, _FLATTEST)))
-    seen, g = rows @ W, W.T @ (units * (qp.H @ nearest + qp.g)) / (size * largest)
-    reach = np.linalg.norm(seen, axis=1)
-    bound = np.flatnonzero(~held & (reach > 0.0) & (np.isfinite(lower) | np.isfinite(upper)))
-    reach, senses = reach[bound], np.zeros(bound.size, dtype=np.int32)
+    # A row that held rows determine sees the rest by rounding alone.
+    sees = np.linalg.norm(rows @ free, axis=1) > _MISSES
+    bound = np.flatnonzero(~held & sees & (np.isfinite(lower) | np.isfinite(upper)))
+    seen, g = rows[bound] @ W, W.T @ (units * (qp.H @ nearest + qp.g)) / (size * largest)
+    reach, senses = np.linalg.norm(seen, axis=1), np.zeros(bound.size, dtype=np.int32)
     ends = (np.clip(side[bound] / reach, -_FAR, _FAR) for side in (upper, lower))
-    y, _, flag, info = daqp.solve(np.eye(g.size), g, seen[bound] / reach[:, None], *ends, senses, **_SETTINGS)
+    y, _, flag, info = daqp.solve(np.eye(g.size), g, seen / reach[:, None], *ends, senses, **_SETTINGS)
     if flag not in SOLVED:
         return only
     # What is held, and active bounds, hold to the last digit.
