@@ -26,6 +26,8 @@ FEASIBLE = 1e-8
 _FIRST, _ROUNDS = 2, 8
 # A fork takes as long as the runs of programs with so many unknowns in all.
 _FORK = 200
+# Starts that go on from postures this close (rad, m) share one run, which would end at the same posture.
+_SAME = 1e-6
 # Price of a meter of slack for runs that ended in a trap.
 HIGH_PRICE = 20 * SLACK_PRICE
 
@@ -126,8 +128,9 @@ class Search:
         if self.problem.grows and starts > _FIRST:
             waiting, later = waiting[:_FIRST], waiting[_FIRST:]
         for left in reversed(range(_ROUNDS)):
-            for index, run in self._round(waiting, jobs, last=not left):
-                runs[index] = run
+            shared = self._shared(waiting)
+            for leader, run in self._round(list(shared), jobs, last=not left):
+                runs |= dict.fromkeys(shared[leader], run)
                 if progress:
                     progress(min(len(runs), starts), starts)
             lacking = {k: r.q for k in waiting if (r := runs[k].record) is not None and runs[k].lacks}
@@ -145,6 +148,15 @@ class Search:
                 break
             later = []
         return [runs[index] for index in range(starts)]
+
+    def _shared(self, waiting: list[int]) -> dict[int, list[int]]:
+        """Group starts that go on from the same posture: the first of each group runs for all."""
+        groups: dict[int, list[int]] = {}
+        for index in waiting:
+            end = self._ends.get(index)
+            same = (k for k in groups if end is not None and k in self._ends and _near(end, self._ends[k]))
+            groups.setdefault(next(same, index), []).append(index)
+        return groups
 
     def _round(self, waiting: list[int], jobs: int, *, last: bool) -> Iterator[tuple[int, Run]]:
         unknowns = len(waiting) * int(self.nlp.solver.size1_in("x0"))
@@ -182,6 +194,10 @@ class Search:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
         trapped = record.converged and index not in self._trapped and not feasible(problem, record.q)
         return Run(start, record, objective, minimized, certificate, lacks, trapped and not lacks)
+
+
+def _near(one: Array, other: Array) -> bool:
+    return bool(np.abs(one - other).max() < _SAME)
 
 
 def feasible(problem: PostureProblem, q: Array) -> bool:

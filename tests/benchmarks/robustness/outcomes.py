@@ -35,8 +35,6 @@ COMPARED = (NOMINAL, "robust", "robust-flow", "posture", "stiff")
 SATURATED = 0.05
 # Random draws of a point before it is given up.
 ATTEMPTS = 40
-# What changes the model of the robot.
-_MODEL = {"armature", "x", "z"}
 # What a record does not keep of a document.
 _LEFT_OUT = ("windows", "versions", "runs")
 _Play = Callable[[Job, ControllerFactory], tuple[tuple[Run, ...], Document]]
@@ -149,7 +147,7 @@ def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
         setup = prepare(chosen)
     except ImpactPostureError as error:
         raise NotAdmissible(f"no start ({type(error).__name__})") from None
-    # Interpreted gradients take a run no longer, and every armature and mounting would be compiled anew.
+    # What Python still evaluates is less than compiling the gradient anew for every armature and mounting.
     factory = ControllerFactory(setup, gradient_of=interpreted)
     if not is_held(setup, factory.objective()):
         raise NotAdmissible(f"the motors do not hold the start with {100 * SHARE:.0f} % of their limits")
@@ -167,9 +165,7 @@ def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
 def _document(factory: ControllerFactory, chosen: Draw, label: str, play: _Play) -> Document:
     """Let a controller run with the noise of seed 0; what it raises is what becomes of it."""
     name, mode, free = parse_controller(label)
-    # A library is of one model, so only points with the model of the scenario share one, in which they run.
-    shared = not _MODEL & set(chosen.values)
-    job = Job(chosen.scenario, name, 0, mode, free, compile="auto" if shared else "never")
+    job = Job(chosen.scenario, name, 0, mode, free, compile="auto")
     try:
         runs, found = play(job, factory)
     except (ImpactPostureError, np.linalg.LinAlgError) as error:
