@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -15,13 +16,11 @@ from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, SolveRecord, build_nlp, one_blas_thread
 from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.starts import feasible_start
+from impact_posture.posture.starts import ATTEMPTS, CANDIDATES, FEASIBLE, feasible_start
 from impact_posture.processes import fork_map
 
 Progress = Callable[[int, int], None]
 
-# A constraint with a violation up to this (m, rad) is satisfied.
-FEASIBLE = 1e-8
 # Starts that run before the others, and most rounds in which the program grows.
 _FIRST, _ROUNDS = 2, 8
 # A fork takes as long as the runs of programs with so many unknowns in all.
@@ -44,6 +43,7 @@ class Run:
         certificate: Certificate of the end; ``None`` while the program lacks parts.
         lacks: Whether the program lacks parts at the end.
         trapped: Whether the end violates something although the program lacks nothing, for the first time.
+        time_s: Wall time of this run and of those before it from the same start.
     """
 
     start: Array | None = None
@@ -53,6 +53,7 @@ class Run:
     certificate: Certificate | None = None
     lacks: bool = False
     trapped: bool = False
+    time_s: float = 0.0
 
     @property
     def good(self) -> bool:
@@ -80,12 +81,8 @@ def run_start(
             break
         again = nlp.solve(start, scale=scale, attempt=attempt, price=price)
         certificate = certify(nlp.problem, again.q, scale, again.auxiliaries, nlp.program.numeric)
-        record = replace(
-            again,
-            iterations=record.iterations + again.iterations,
-            time_s=record.time_s + again.time_s,
-            cpu_s=record.cpu_s + again.cpu_s,
-        )
+        iterations, time_s = record.iterations + again.iterations, record.time_s + again.time_s
+        record = replace(again, iterations=iterations, time_s=time_s)
     return record, certificate
 
 
@@ -130,7 +127,8 @@ class Search:
         for left in reversed(range(_ROUNDS)):
             shared = self._shared(waiting)
             for leader, run in self._round(list(shared), jobs, last=not left):
-                runs |= dict.fromkeys(shared[leader], run)
+                for k in shared[leader]:
+                    runs[k] = replace(run, time_s=run.time_s + (runs[k].time_s if k in runs else 0.0))
                 if progress:
                     progress(min(len(runs), starts), starts)
             lacking = {k: r.q for k in waiting if (r := runs[k].record) is not None and runs[k].lacks}
@@ -161,7 +159,7 @@ class Search:
     def _round(self, waiting: list[int], jobs: int, *, last: bool) -> Iterator[tuple[int, Run]]:
         unknowns = len(waiting) * int(self.nlp.solver.size1_in("x0"))
         with fork_map(
-            lambda k: self._run(waiting[k], last=last), len(waiting), jobs if unknowns > _FORK else 1
+            lambda k: self._timed(waiting[k], last=last), len(waiting), jobs if unknowns > _FORK else 1
         ) as results:
             if around := self.problem.surroundings:
                 # The last word needs the shapes themselves, and this process would only wait.
@@ -169,16 +167,23 @@ class Search:
             for k, run in results:
                 yield waiting[k], run
 
+    def _timed(self, index: int, *, last: bool) -> Run:
+        began = time.perf_counter()
+        return replace(self._run(index, last=last), time_s=time.perf_counter() - began)
+
     @one_blas_thread()
     def _run(self, index: int, *, last: bool) -> Run:
         """Run one start; an end that the program lacks parts for is certified in the last round only."""
         nlp, scale, problem = self.nlp, self._scale, self.problem
-        start = self._ends.get(index)
-        if start is None:
-            start = self._known[index] if index < len(self._known) else feasible_start(problem, index, self._seed)
+        trapped, start = index in self._trapped, self._ends.get(index)
+        if start is None and index < len(self._known):
+            start = self._known[index]
+        elif start is None:
+            # What is not clear of other bodies may not get out from between them.
+            start = feasible_start(problem, index, self._seed, ATTEMPTS if trapped else CANDIDATES)
         if start is None:
             return Run()
-        price = HIGH_PRICE if index in self._trapped else SLACK_PRICE
+        price = HIGH_PRICE if trapped else SLACK_PRICE
         try:
             record = nlp.solve(start, scale=scale, price=price)
             lacks = record.converged and problem.grown([record.q]) is not problem
@@ -192,8 +197,8 @@ class Search:
         minimized = objective / scale
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
-        trapped = record.converged and index not in self._trapped and not feasible(problem, record.q)
-        return Run(start, record, objective, minimized, certificate, lacks, trapped and not lacks)
+        anew = record.converged and not (trapped or lacks) and not feasible(problem, record.q)
+        return Run(start, record, objective, minimized, certificate, lacks, anew)
 
 
 def _near(one: Array, other: Array) -> bool:

@@ -62,6 +62,7 @@ class PostureSolution:
         status: Return status of IPOPT for the best run.
         iterations: Iterations of the best run.
         solve_time_s: Wall time of all runs together.
+        start_time_s: Median wall time of the runs from one start.
         build_time_s: Time to build the program.
         compiled: Whether it ran as machine code.
         notes: Notes for the user about the solution.
@@ -82,6 +83,7 @@ class PostureSolution:
     status: str
     iterations: int
     solve_time_s: float
+    start_time_s: float
     build_time_s: float
     compiled: bool
     notes: tuple[str, ...]
@@ -164,6 +166,7 @@ def solve(
         status=best.record.status,
         iterations=best.record.iterations,
         solve_time_s=time.perf_counter() - began - search.build_time_s,
+        start_time_s=float(np.median([r.time_s for r in runs])),
         build_time_s=search.build_time_s,
         compiled=nlp.compiled,
         notes=(*problem.notes, *notes),

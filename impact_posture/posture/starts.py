@@ -13,10 +13,13 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.problem import PostureProblem, held_rows
 
-_ATTEMPTS = 20
+# A constraint with a violation up to this (m, rad) is satisfied.
+FEASIBLE = 1e-8
+# Postures that one start tries to pull onto the constraints.
+ATTEMPTS = 20
 _STEPS = 80
 # Most postures on the projected constraints that one start chooses from.
-_CANDIDATES = 3
+CANDIDATES = 3
 # This share of the size of a singular matrix makes it regular.
 _ROUNDING = 1e-13
 
@@ -108,29 +111,30 @@ class Projector:
         return blocked
 
 
-def feasible_start(problem: PostureProblem, index: int, seed: int, tolerance: float = 1e-8) -> Array | None:
+def feasible_start(problem: PostureProblem, index: int, seed: int, candidates: int = CANDIDATES) -> Array | None:
     """Return the ``index``-th feasible start of a seed; ``None`` if no attempt reached the constraints.
 
     Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near it, even starts anywhere within
-    the limits.  Near starts reach the constraints more often, far starts find other optima.  Of a few postures that
-    reach them, the first counts that satisfies the constraints without projection too, else the first of all.
+    the limits.  Near starts reach the constraints more often, far starts find other optima.  Of ``candidates``
+    postures that reach them, the first counts that satisfies the constraints without projection too, else the one
+    that violates them least.
     """
     projector = Projector(problem)
     if index == 0:
         found = projector.project(problem.given)
-        return found.q if found.violation <= tolerance else None
+        return found.q if found.violation <= FEASIBLE else None
     rng = np.random.default_rng([seed, index])
-    first, tried = None, 0
-    for attempt in range(_ATTEMPTS):
+    best, least, tried = None, np.inf, 0
+    for attempt in range(ATTEMPTS):
         near = (index + attempt) % 2 == 1
         found = projector.project(random_posture(problem, projector.chart, rng, near=near))
-        if found.violation <= tolerance:
-            if projector.outside(found.q) <= tolerance:
-                return found.q
-            first, tried = found.q if first is None else first, tried + 1
-            if tried == _CANDIDATES:
+        if found.violation <= FEASIBLE:
+            outside, tried = projector.outside(found.q), tried + 1
+            if outside < least:
+                best, least = found.q, outside
+            if least <= FEASIBLE or tried == candidates:
                 break
-    return first
+    return best
 
 
 def random_posture(problem: PostureProblem, chart: Chart, rng: np.random.Generator, *, near: bool) -> Array:

@@ -15,9 +15,9 @@ from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.elastic import ElasticAnswer, ElasticProgram, elastic
 from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP
 from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.search import FEASIBLE, HIGH_PRICE
+from impact_posture.posture.search import HIGH_PRICE
 from impact_posture.posture.solve import distinct
-from impact_posture.posture.starts import Projector, random_posture
+from impact_posture.posture.starts import FEASIBLE, Projector, random_posture
 from impact_posture.settings import ProblemSettings
 
 # Most rounds in which the program of a point grows.
