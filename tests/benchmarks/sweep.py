@@ -157,7 +157,7 @@ def robustness(folder: Path, only: str = "") -> None:
 
 
 def speed(folder: Path, points: int) -> None:
-    """Measure the share of the solver, and the memory of this process while it works."""
+    """Measure the share of the solver, the memory of this process while it works, and what a second process adds."""
     file = folder / "long.toml"
     file.write_text(SMALL.replace("count = 10", f"count = {max(2, round((points / 6) ** 0.5))}").replace("20", "256"))
     sweep, seen = read_sweep(file), list[tuple[int, float]]()
@@ -176,6 +176,13 @@ def speed(folder: Path, points: int) -> None:
     )
     size = sum(path.stat().st_size for path in (folder / "long" / "data").rglob("*.parquet"))
     print(f"{size / solved:.0f} bytes a problem")
+    began = time.perf_counter()
+    with process_pool(2) as pool:
+        run_sweep(sweep, folder / "two", pool)
+    # The solver alone is one process that stores nothing: the shards of the first run, without the rest of it.
+    alone, together = solved / found.total_s, solved / (time.perf_counter() - began)
+    share = together / (2 * alone)
+    print(f"the search alone {alone:.0f} a second, the sweep with two workers {together:.0f}: {100 * share:.0f} %")
 
 
 def _resident(process: int | str = "self") -> float:
