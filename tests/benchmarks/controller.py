@@ -108,8 +108,7 @@ def equality(ticks: int) -> Iterator[str]:
         f"{ticks} ticks of each kind of states. Controls are compared relative to the largest. *Its own*: largest "
         "change of Python's controls, in ticks over 1e-9, where each number of the program moves by its last digit. "
         f"Where answers differ (the first {most}), and of every {some}th relaxed tick: largest violation of what "
-        "always holds, and largest residual of optimality, by a certificate that neither controller shares; Python "
-        "solves relaxed levels to six digits."
+        "always holds, and largest residual of optimality, by a certificate that neither controller shares."
     )
     yield ""
     yield from table(controller_equality.HEAD, controller_equality.equality(ticks))
