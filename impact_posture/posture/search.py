@@ -43,7 +43,7 @@ class Run:
         certificate: Certificate of the end; ``None`` while the program lacks parts.
         lacks: Whether the program lacks parts at the end.
         trapped: Whether the end violates something although the program lacks nothing, for the first time.
-        time_s: Wall time of this run and of those before it from the same start.
+        time_s: Wall time of this run and of those before it from the same start; an even share of shared runs.
     """
 
     start: Array | None = None
@@ -127,8 +127,9 @@ class Search:
         for left in reversed(range(_ROUNDS)):
             shared = self._shared(waiting)
             for leader, run in self._round(list(shared), jobs, last=not left):
+                own = run.time_s / len(shared[leader])
                 for k in shared[leader]:
-                    runs[k] = replace(run, time_s=run.time_s + (runs[k].time_s if k in runs else 0.0))
+                    runs[k] = replace(run, time_s=own + (runs[k].time_s if k in runs else 0.0))
                 if progress:
                     progress(min(len(runs), starts), starts)
             lacking = {k: r.q for k in waiting if (r := runs[k].record) is not None and runs[k].lacks}
