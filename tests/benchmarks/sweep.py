@@ -168,7 +168,7 @@ def speed(folder: Path, points: int) -> None:
     found: SweepRun = run_sweep(sweep, folder / "long", progress=progress)
     solved = sum(found.counts.values())
     share, each = found.solver_s / found.total_s, 1e3 * found.total_s / solved
-    print(f"{solved} problems: {each:.2f} ms of processor time each, {100 * share:.1f} % of it within IPOPT")
+    print(f"{solved} problems: {each:.2f} ms each, {100 * share:.1f} % of it within IPOPT")
     late = seen[len(seen) // 3 :]
     slope = (late[-1][1] - late[0][1]) / max(1, late[-1][0] - late[0][0]) * 1e3
     print(
