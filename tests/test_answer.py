@@ -24,6 +24,8 @@ from impact_posture.posture import search as search_module
 from impact_posture.posture.load_cases import load_cases
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.search import Search
+from impact_posture.posture.solve import solve
+from impact_posture.posture.starts import Projector, feasible_start
 from impact_posture.report import shapes as report_shapes
 from impact_posture.report.shapes import DrawnRobot, draw_robot
 from impact_posture.robot.robot_loader import load_robot
@@ -176,3 +178,39 @@ def test_an_answer_of_a_small_robot_imports_no_part_of_scipy() -> None:
         """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
+@pytest.mark.parametrize(("robot", "normal"), [("borinot", (0, 0, 1)), ("tiago", (-1, 0, 0))])
+def test_starts_that_share_a_run_end_where_their_own_runs_would(
+    robot: str, normal: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = prepare(ProblemSettings(robot=robot, normal=normal)).problem
+    ran, run = list[int](), Search._run
+
+    def counted(search: Search, index: int, *, last: bool) -> search_module.Run:
+        ran.append(index)
+        return run(search, index, last=last)
+
+    monkeypatch.setattr(Search, "_run", counted)
+    together = solve(problem, starts=16, jobs=1, compile="never")
+    shared = len(ran)
+    monkeypatch.setattr(search_module, "_SAME", 0.0)
+    apart = solve(problem, starts=16, jobs=1, compile="never")
+    assert shared < len(ran) - shared
+    assert together.certified_starts == apart.certified_starts
+    assert [o.hits for o in together.optima] == [o.hits for o in apart.optima]
+    np.testing.assert_allclose([o.objective for o in together.optima], [o.objective for o in apart.optima], rtol=1e-6)
+
+
+@pytest.mark.parametrize("robot", ["xarm7", "anymal_c"])
+def test_more_candidates_make_a_start_clearer(robot: str) -> None:
+    problem = prepare(ProblemSettings(robot=robot, normal=(-1, 0, 0))).problem
+    projector, gained = Projector(problem), 0
+    for index in range(1, 7):
+        few, many = (feasible_start(problem, index, 0, count) for count in (1, 8))
+        assert few is not None and many is not None
+        violations = projector.outside(few), projector.outside(many)
+        assert violations[1] <= violations[0]
+        gained += violations[1] < violations[0]
+        assert projector.project(many).violation <= 1e-8
+    assert gained or violations == (0.0, 0.0)
