@@ -140,6 +140,27 @@ def test_it_does_not_climb_where_it_turns() -> None:
     assert found.values[-1] < 0.3
 
 
+@pytest.mark.parametrize("name", ["solo8", "talos"])
+def test_the_base_tilts_no_further_than_it_may(name: str) -> None:
+    """An objective that falls as the base tilts, about an axis that is neither roll nor pitch."""
+    r, way = robot(name), np.array([0.4, 1.0, 0.0])
+
+    def tilted(q: Vector) -> tuple[float, Vector]:
+        vertical = pin.Quaternion(q[3:7]).matrix()[2]
+        slope = np.zeros(r.nv)
+        slope[3:6] = np.cross(way, vertical)
+        return 2.0 + float(way @ vertical), slope
+
+    def tilt(q: Vector) -> float:
+        """The angle of the base's z axis from the vertical."""
+        return float(np.arccos(pin.Quaternion(q[3:7]).matrix()[2, 2]))
+
+    bound = 0.12
+    free, kept = (course(flow_of(r, tilted, tilt=t), r.posture(), 4.0) for t in (1.0, bound))
+    assert tilt(free.q) > 1.5 * bound
+    assert 0.9 * bound < tilt(kept.q) < bound + 2e-3
+
+
 @pytest.mark.parametrize(("name", "weaker"), [("panda", 0.5), ("talos", 1.0)])
 def test_haste_takes_its_share_of_what_rest_leaves_of_the_motors(name: str, weaker: float) -> None:
     """Pinocchio's recursive Newton-Euler algorithm and a least-norm division of the base's wrench are the oracle."""

@@ -186,6 +186,8 @@ def _add_flow(
     held = [task.size for task, leading in zip(tasks, leads, strict=True) if not leading]
     fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
     edges = max(4, 4 * sizes["CONTACTS"]) if sizes["CONTACTS"] else 0
+    # And the tilt of the base.
+    placed = edges + int(robot.floating)
     size = int(flow is not None)
     if flow is not None:
         tables["flow_led"] = [sum(leads[: k + 1]) if leading else 0 for k, leading in enumerate(leads)]
@@ -196,7 +198,8 @@ def _add_flow(
         "HELD": size * rows,
         "LARGEST": max(sizes["NV"], rows),
         "EDGES": size * edges,
-        "FLOW_ROWS": size * (sizes["NV"] - sizes["BASE"] + edges + sizes["CONTROLS"]),
+        "PLACED": size * placed,
+        "FLOW_ROWS": size * (sizes["NV"] - sizes["BASE"] + placed + sizes["CONTROLS"]),
         "PATH": 0 if flow is None else len(flow._path),
     }
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.robot.robot import Robot
 from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.qp import QP
 from impact_posture.tsid.ranges import JointRanges
@@ -19,6 +18,8 @@ from impact_posture.tsid.state import State
 _SOFT = 2e-2
 # Least ``H/H₀`` whose root counts.
 _LEAST = 1e-8
+# Sine of an angle of the base below which the tilt has no slope.
+_LEVEL = 1e-6
 # What a limit may be missed by where the flow brakes, rad (m), or as a share.
 _NEAR = 1e-3
 # Stiffness of those springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
@@ -65,8 +66,9 @@ class FlowDirection:
     ``y`` minimizes ``½ yᵀ|B_Z| y + (Zᵀ∇Φ)ᵀ y``, where ``B_Z`` is the curvature of ``H/H₀`` times ``√(H₀/H)``, and
     that of the pull.  ``|B_Z|`` has its eigenvectors and ``max(|λᵢ|, μ)`` for its eigenvalues (saddle-free Newton,
     Dauphin et al. 2014), so that the step leaves saddles.  The curvature ``B`` is learned from secants by Powell's
-    symmetric Broyden update, the slope ``T`` of the static controls by Broyden's.  Rows keep joints, center of mass
-    and static controls within their limits.  A limit that does not hold at ``q_r`` is not crossed further.
+    symmetric Broyden update, the slope ``T`` of the static controls by Broyden's.  Rows keep joints, center of mass,
+    tilt of the base and static controls within their limits.  A limit that does not hold at ``q_r`` is not crossed
+    further.
 
     Attributes:
         B: Curvature of ``H/H₀`` on the constraints, shape (nv, nv).
@@ -75,28 +77,33 @@ class FlowDirection:
         failures: Number of steps that the solver did not find.  They are zero.
     """
 
-    def __init__(self, robot: Robot, edges: Array, controls: int, *, rho: float, mu: float, margin: float) -> None:
+    def __init__(
+        self, state: State, edges: Array, controls: int, *, rho: float, mu: float, margin: float, tilt: float
+    ) -> None:
         """Size the buffers.
 
         Args:
-            robot: The robot.
+            state: The state where the flow starts.
             edges: Normals of the support polygon, shape (k, 2).
             controls: Number of static controls with limits.
             rho: ρ, per rad².
             mu: μ, per rad².
             margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
+            tilt: Largest angle between the vertical and the base's direction that is vertical at the start, rad.
         """
+        robot = state.robot
         nv, ranges = robot.nv, JointRanges(robot)
         self._joints = np.flatnonzero(np.isfinite(ranges.lower) & np.isfinite(ranges.upper))
         width = (ranges.upper - ranges.lower)[self._joints]
         self._margin = np.minimum(margin, width / 8)
-        self._edges, self._mu = edges, mu
+        self._edges, self._mu, self._tilt = edges, mu, tilt
+        self._up = state.base_rotation[2].copy() if robot.floating else None
         # The pull towards the start acts on joints.  Others lead the base.
         self._pull = np.full(nv, rho)
         self._pull[: 6 if robot.floating else 0] = 0.0
         self.B, self.gain, self.failures = np.zeros((nv, nv)), 0.0, 0
         # The sizes never change.  Directions that the constraints take keep columns of zeros.
-        self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + controls)
+        self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + (1 if robot.floating else 0) + controls)
         self._solver = DaqpSolver(nv, self._qp.m)
         self._rows, self._room = np.zeros((self._qp.m, nv)), np.zeros((2, self._qp.m))
         self._rows[np.arange(self._joints.size), self._joints] = 1.0
@@ -127,8 +134,16 @@ class FlowDirection:
         if k:
             np.matmul(self._edges, state.center_of_mass()[1][:2], out=self._rows[count : count + k])
             upper[count : count + k] = rooms
-        upper[count + k :] = 1.0 - shares
-        lower[count + k :] = -1.0 - shares
+        count += k
+        if self._up is not None:
+            vertical = state.base_rotation[2]
+            axis = np.cross(vertical, self._up)
+            sine = math.sqrt(float(axis @ axis))
+            self._rows[count, 3:6] = axis / sine if sine > _LEVEL else 0.0
+            upper[count] = self._tilt - math.atan2(sine, float(vertical @ self._up))
+            count += 1
+        upper[count:] = 1.0 - shares
+        lower[count:] = -1.0 - shares
         ahead = self._rows @ coasting
         np.maximum(upper, 0.0, out=self._room[0])
         np.minimum(lower, 0.0, out=self._room[1])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -54,6 +54,7 @@ class FlowOptions:
         epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.
         joint_margin: Distance from the joint limits, rad (m).
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
+        tilt: Largest angle by which a floating base tilts from where it started, rad.
         share: Share of the actuators' limits that holding ``q_r`` may take.
         haste: Share that accelerating may take of what is then left of the actuators' limits.
         tracking: Error of the joints at which the flow waits for the robot, rad (m).
@@ -66,15 +67,16 @@ class FlowOptions:
     epsilon: float = 3e-4
     joint_margin: float = 0.1
     com_margin: float = 0.05
+    tilt: float = 0.8
     share: float = 0.8
     haste: float = 0.5
     tracking: float = 0.3
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
-        positive = (self.speed, self.acceleration, self.mu, self.epsilon, self.share, self.haste, self.tracking)
-        rest = (self.rho, self.joint_margin, self.com_margin)
-        if not (min(positive) > 0 and min(rest) >= 0 and max(self.share, self.haste) <= 1):
+        numbers = asdict(self)
+        least = min(numbers.pop(name) for name in ("rho", "joint_margin", "com_margin"))
+        if not (min(numbers.values()) > 0 and least >= 0 and max(self.share, self.haste) <= 1):
             raise InputError("a number is out of range", where="flow options", hint="see the docstring")
 
 
@@ -162,8 +164,8 @@ class ReferenceFlow:
         self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
         self._edges, self._offsets = support_edges(state, self._contacts)
         self.direction = FlowDirection(
-            self.robot, self._edges, self._static.limited.size,
-            rho=options.rho, mu=options.mu, margin=options.joint_margin,
+            state, self._edges, self._static.limited.size,
+            rho=options.rho, mu=options.mu, margin=options.joint_margin, tilt=options.tilt,
         )  # fmt: skip
         self.start = 1.0
         self.value, _ = self._evaluate(self.q)

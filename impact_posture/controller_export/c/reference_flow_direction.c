@@ -3,14 +3,32 @@
 
 /* Least H/H0 whose root counts. */
 #define IP_LEAST_VALUE 1e-8
+/* Sine of an angle of the base below which the tilt has no slope. */
+#define IP_LEVEL 1e-6
 
 /* How much a row changes along a way. */
 static double ip_flow_along(const ip_flow *f, int r, const double *way)
 {
-  return r < IP_JOINTS_V              ? way[IP_BASE + r]
-         : r < IP_JOINTS_V + IP_EDGES ? ip_dot(f->row[r - IP_JOINTS_V], way, IP_NV)
-                                      : ip_dot(f->T[r - IP_JOINTS_V - IP_EDGES], way, IP_NV);
+  return r < IP_JOINTS_V               ? way[IP_BASE + r]
+         : r < IP_JOINTS_V + IP_PLACED ? ip_dot(f->row[r - IP_JOINTS_V], way, IP_NV)
+                                       : ip_dot(f->T[r - IP_JOINTS_V - IP_PLACED], way, IP_NV);
 }
+
+#if IP_BASE
+/* Angle between the vertical and the base's direction that was vertical at the start, rad, and its slope. */
+static double ip_flow_tilt(const ip_flow *f, double *row)
+{
+  const double *vertical = f->m.base + 6;
+  double axis[3], sine;
+  int i;
+  ip_cross(vertical, f->up, axis);
+  sine = sqrt(ip_dot(axis, axis, 3));
+  for (i = 0; i < 3; ++i) {
+    row[3 + i] = sine > IP_LEVEL ? axis[i] / sine : 0.0;
+  }
+  return atan2(sine, ip_dot(vertical, f->up, 3));
+}
+#endif
 
 /* Bounds of the rows on the step, at the model of the flow, less what the flow needs to brake. */
 static void ip_flow_limits(ip_context *c)
@@ -43,8 +61,13 @@ static void ip_flow_limits(ip_context *c)
         high = -f->offset[k] - p->flow_com_margin[0] - ip_dot(f->edge[k], position, 2);
         ahead = ip_dot(f->row[k], coasting, IP_NV);
       }
+#if IP_BASE
+    } else if (r < IP_JOINTS_V + IP_PLACED) {
+      high = p->flow_tilt[0] - ip_flow_tilt(f, f->row[IP_EDGES]);
+      ahead = ip_dot(f->row[IP_EDGES], coasting, IP_NV);
+#endif
     } else {
-      k = r - IP_JOINTS_V - IP_EDGES;
+      k = r - IP_JOINTS_V - IP_PLACED;
       if (ip_flow_half(p, k) > 0.0) {
         high = 1.0 - f->shares[k];
         low = -1.0 - f->shares[k];
