@@ -217,6 +217,7 @@ def optimize(
     compile: CompileMode = "auto",
     search: Search = "multistart",
     progress: Progress | None = None,
+    finish_all: bool = False,
 ) -> PostureResult:
     """Find the posture with the least objective, from many starts, and certify it.
 
@@ -228,6 +229,7 @@ def optimize(
         compile: Whether the program is compiled: ``auto`` (if it pays), ``always`` or ``never``.
         search: ``multistart``, or ``global`` (:func:`~impact_posture.posture.global_search.search_globally`).
         progress: Called after each start with the numbers done and in all.
+        finish_all: Finish starts that can no longer become the best, too.  The search ``global`` always does.
 
     Raises:
         InputError: The problem is none for the search ``global``.
@@ -237,7 +239,10 @@ def optimize(
     check_choice("search", search, get_args(Search))
     if search == "global":
         check_searchable(problem.problem)
-    found = solve_robustly(problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress)
+    found = solve_robustly(
+        problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress,
+        finish_all=finish_all or search == "global",
+    )  # fmt: skip
     if search == "multistart":
         return PostureResult(problem, found.solution, found.robustness)
     best = search_globally(found.solution, seed=seed, jobs=jobs, compile=compile, progress=progress)

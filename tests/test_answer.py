@@ -136,7 +136,7 @@ def test_drawn_shapes_from_the_cache_are_the_shapes(
 def test_an_end_that_lacks_parts_is_certified_in_the_last_round_only(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = prepare(ProblemSettings(robot="panda", frame="panda_hand_tcp", normal=(-1.0, 0.0, 0.0))).problem
     scale = problem.objective.value(problem.given)
-    search = Search(problem, (problem.given,), scale, starts=2, seed=0, compile="never")
+    search = Search(problem, (problem.given,), scale, starts=2, seed=0, compile="never", finish_all=True)
     runs = [search._run(index, last=False) for index in range(2)]
     lacking = [index for index, run in enumerate(runs) if run.lacks]
     # Without such an end the test shows nothing.
@@ -192,14 +192,29 @@ def test_starts_that_share_a_run_end_where_their_own_runs_would(
         return run(search, index, last=last)
 
     monkeypatch.setattr(Search, "_run", counted)
-    together = solve(problem, starts=16, jobs=1, compile="never")
+    together = solve(problem, starts=16, jobs=1, compile="never", finish_all=True)
     shared = len(ran)
     monkeypatch.setattr(search_module, "_SAME", 0.0)
-    apart = solve(problem, starts=16, jobs=1, compile="never")
+    apart = solve(problem, starts=16, jobs=1, compile="never", finish_all=True)
     assert shared < len(ran) - shared
     assert together.certified_starts == apart.certified_starts
     assert [o.hits for o in together.optima] == [o.hits for o in apart.optima]
     np.testing.assert_allclose([o.objective for o in together.optima], [o.objective for o in apart.optima], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "robot, normal", [("panda", (-1.0, 0.0, 0.0)), ("tiago", (-1.0, 0.0, 0.0)), ("g1", (-1.0, 0.0, 0.0))]
+)
+def test_a_start_that_is_left_would_not_have_been_the_best(robot: str, normal: tuple[float, float, float]) -> None:
+    problem = prepare(ProblemSettings(robot=robot, normal=normal)).problem
+    few, all_ = (
+        solve(problem, starts=12, jobs=2, compile="never", finish_all=finish_all) for finish_all in (False, True)
+    )
+    assert all_.dominated_starts == 0 < few.dominated_starts
+    assert few.certified_starts + few.dominated_starts + few.colliding_starts <= few.starts
+    best = [one.problem.objective.value(one.q) for one in (few, all_)]
+    assert best[0] == pytest.approx(best[1], rel=1e-5)
+    assert few.optima[0].hits <= all_.optima[0].hits
 
 
 @pytest.mark.parametrize("robot", ["xarm7", "anymal_c"])

@@ -78,6 +78,8 @@ def optimize(
                 compile=compile,
                 search=settings.search,
                 progress=advance,
+                # A path that does not reach the best optimum leads to the next.
+                finish_all=settings.finish_all or settings.path,
             )
         if settings.tradeoff:
             with progress("solving", "points", shown=shown) as advance:
@@ -207,8 +209,9 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
         page.line(f"no collision; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
     optima = ", ".join(f"{number(o.objective)} ({o.hits}×)" for o in solution.optima[:5])
     more = f" and {len(solution.optima) - 5} more" if len(solution.optima) > 5 else ""
+    left = f"; {solution.dominated_starts} left, which could not become the best" if solution.dominated_starts else ""
     page.line(
-        f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
+        f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s{left}; "
         f"optima: {optima}{more}"
     )
     if "global" in document:

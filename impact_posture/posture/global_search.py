@@ -38,7 +38,9 @@ _BETTER = 1e-6
 _MISSED = 1e-3
 _KEYS = ("redundancy", "improvement", "missed_rate", "unseen_share", "estimated_optima", "hops", "word", "line")
 # Attributes of a solution that tell of the multi-start search.
-_OF_THE_STARTS = ("optima", "starts", "feasible_starts", "certified_starts", "solve_time_s", "build_time_s")
+_OF_THE_STARTS = (
+    "optima", "starts", "feasible_starts", "certified_starts", "dominated_starts", "solve_time_s", "build_time_s",
+)  # fmt: skip
 # Largest violation of a start on the constraints.
 _ON = 1e-8
 

@@ -29,7 +29,7 @@ SCHEMA = "impact-posture/result/1"
 # Attributes of a solution in the block ``solver``.
 _SOLVER = (
     "status", "iterations", "solve_time_s", "build_time_s", "compiled",
-    "starts", "feasible_starts", "certified_starts", "colliding_starts",
+    "starts", "feasible_starts", "certified_starts", "colliding_starts", "dominated_starts",
 )  # fmt: skip
 
 

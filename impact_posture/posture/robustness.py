@@ -137,6 +137,7 @@ def solve_robustly(
     jobs: int = 2,
     compile: CompileMode = "auto",
     progress: Progress | None = None,
+    finish_all: bool = False,
 ) -> RobustSolution:
     """Solve a problem; with model variants solve each variant alone first.
 
@@ -147,9 +148,10 @@ def solve_robustly(
     """
     given, wanted = problem.given, problem.requirements
     if not (isinstance(problem.objective, ImpactObjective) and problem.objective.model_variants):
-        return RobustSolution(
-            solve(problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress), None
+        found = solve(
+            problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress, finish_all=finish_all
         )
+        return RobustSolution(found, None)
     # Build each problem anew, because support impulses and the center of mass depend on the model.
     alone = [
         build_problem(variant.robot, member, given, wanted)
@@ -163,7 +165,10 @@ def solve_robustly(
                 progress(min(number * starts + done, total), total)
 
         count = starts + len(guesses)
-        return solve(one, starts=count, seed=seed, jobs=jobs, compile=compile, progress=advance, guesses=guesses)
+        return solve(
+            one, starts=count, seed=seed, jobs=jobs, compile=compile, progress=advance, guesses=guesses,
+            finish_all=finish_all,
+        )  # fmt: skip
 
     optima = [_optimum(partial(run, one, (), k)) for k, one in enumerate(alone)]
     solution = run(

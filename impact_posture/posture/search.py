@@ -21,8 +21,11 @@ from impact_posture.processes import fork_map
 
 Progress = Callable[[int, int], None]
 
-# Starts that run before the others, and most rounds in which the program grows.
+# Starts that run before the others, and most runs from one start, each with a program that has grown.
 _FIRST, _ROUNDS = 2, 8
+# Where only the best counts: unknowns of the starts that go on together, which takes longer than to build a program,
+# and the share above the best from which a bound dominates.  A run that ended in a trap may end below its bound.
+_BATCH, _FAR = 1500, 0.05
 # A fork takes as long as the runs of programs with so many unknowns in all.
 _FORK = 200
 # Starts that go on from postures this close (rad, m) share one run, which would end at the same posture.
@@ -42,6 +45,7 @@ class Run:
         minimized: Objective in units of the initial one, with the regularization.
         certificate: Certificate of the end; ``None`` while the program lacks parts.
         lacks: Whether the program lacks parts at the end.
+        dominated: Whether it was left there, because it could not become the best.
         trapped: Whether the end violates something although the program lacks nothing, for the first time.
         time_s: Wall time of this run and of those before it from the same start; an even share of shared runs.
     """
@@ -52,6 +56,7 @@ class Run:
     minimized: float = np.inf
     certificate: Certificate | None = None
     lacks: bool = False
+    dominated: bool = False
     trapped: bool = False
     time_s: float = 0.0
 
@@ -96,6 +101,7 @@ class Search:
         starts: Number of starts.
         seed: Seed of the starts that are not known.
         compile: Whether to compile the program.
+        finish_all: Whether starts go on that cannot become the best.
     """
 
     def __init__(
@@ -107,9 +113,10 @@ class Search:
         starts: int,
         seed: int,
         compile: CompileMode,
+        finish_all: bool,
     ) -> None:
         self.problem, self._known, self._scale, self._seed, self._compile = problem, known, scale, seed, compile
-        self._starts = starts
+        self._starts, self._finish_all = starts, finish_all
         self.nlp = build_nlp(problem, compile=compile, starts=starts)
         self.build_time_s = self.nlp.build_time_s
         # A run goes on from where it ended without what the program lacked.
@@ -117,36 +124,59 @@ class Search:
         self._trapped: set[int] = set()
 
     def run(self, jobs: int, progress: Progress | None) -> list[Run]:
-        """Run all starts; those whose ends the program did not keep feasible run again with what it lacked."""
+        """Run all starts; those whose ends the program did not keep feasible run again with what it lacked.
+
+        A program without all rows bounds what the start can still reach, because with more rows the objective rises.  The
+        starts with the lowest bounds go on first, and those whose bound is well above a certified end not at all.
+        """
         runs: dict[int, Run] = {}
-        starts = self._starts
-        # What the first starts lack is what most others will.
-        waiting, later = list(range(starts)), []
-        if self.problem.grows and starts > _FIRST:
-            waiting, later = waiting[:_FIRST], waiting[_FIRST:]
-        for left in reversed(range(_ROUNDS)):
-            shared = self._shared(waiting)
-            for leader, run in self._round(list(shared), jobs, last=not left):
+        starts, best = self._starts, np.inf
+        waiting, counts = list(range(starts)), [0] * starts
+        while waiting:
+            batch = self._next(waiting, runs)
+            shared = self._shared(batch)
+            last = {k for k in shared if counts[k] == _ROUNDS - 1}
+            for leader, run in self._round(list(shared), jobs, last):
                 own = run.time_s / len(shared[leader])
                 for k in shared[leader]:
                     runs[k] = replace(run, time_s=own + (runs[k].time_s if k in runs else 0.0))
+                    counts[k] += 1
                 if progress:
                     progress(min(len(runs), starts), starts)
-            lacking = {k: r.q for k in waiting if (r := runs[k].record) is not None and runs[k].lacks}
+                if run.good and run.minimized < best and self._clear(run):
+                    best = run.minimized
+            lacking = {k: r.q for k in batch if (r := runs[k].record) is not None and runs[k].lacks and k not in last}
             # A run without all rows goes through bodies and may end between them.  With the rows and a higher price
             # it keeps what its start satisfies.
-            trapped = {k for k in waiting if runs[k].trapped}
+            trapped = {k for k in batch if runs[k].trapped and counts[k] < _ROUNDS}
             self._trapped |= trapped
             self._ends = {k: q for k, q in (self._ends | lacking).items() if k not in trapped}
-            waiting = sorted({*lacking, *trapped, *later})
+            waiting = sorted({*waiting} - {*batch} | {*lacking, *trapped})
+            if not self._finish_all:
+                dominated = {k for k in waiting if k in runs and runs[k].minimized > best * (1 + _FAR)}
+                runs |= {k: replace(runs[k], dominated=True) for k in dominated}
+                waiting = [k for k in waiting if k not in dominated]
+                lacking = {k: q for k, q in lacking.items() if k not in dominated}
             if lacking:
                 self.problem = self.problem.grown(list(lacking.values()))
                 self.nlp = self.nlp.grown(self.problem, compile=self._compile)
                 self.build_time_s += self.nlp.build_time_s
-            if not waiting:
-                break
-            later = []
         return [runs[index] for index in range(starts)]
+
+    def _next(self, waiting: list[int], runs: dict[int, Run]) -> list[int]:
+        """Return the starts to run next."""
+        if not runs and self.problem.grows:
+            # What the first starts lack is what most others will.
+            return waiting[:_FIRST]
+        if self._finish_all or not all(k in runs for k in waiting):
+            return waiting
+        count = max(_BATCH // int(self.nlp.solver.size1_in("x0")), 1)
+        return sorted(sorted(waiting, key=lambda k: runs[k].minimized)[:count])
+
+    def _clear(self, run: Run) -> bool:
+        """Whether no original shapes touch at the end of a run."""
+        around = self.problem.surroundings
+        return around is None or run.record is None or not around.collisions(run.record.q)
 
     def _shared(self, waiting: list[int]) -> dict[int, list[int]]:
         """Group starts that go on from the same posture: the first of each group runs for all."""
@@ -157,10 +187,10 @@ class Search:
             groups.setdefault(next(same, index), []).append(index)
         return groups
 
-    def _round(self, waiting: list[int], jobs: int, *, last: bool) -> Iterator[tuple[int, Run]]:
+    def _round(self, waiting: list[int], jobs: int, last: set[int]) -> Iterator[tuple[int, Run]]:
         unknowns = len(waiting) * int(self.nlp.solver.size1_in("x0"))
         with fork_map(
-            lambda k: self._timed(waiting[k], last=last), len(waiting), jobs if unknowns > _FORK else 1
+            lambda k: self._timed(waiting[k], last=waiting[k] in last), len(waiting), jobs if unknowns > _FORK else 1
         ) as results:
             if around := self.problem.surroundings:
                 # The last word needs the shapes themselves, and this process would only wait.
@@ -174,7 +204,7 @@ class Search:
 
     @one_blas_thread()
     def _run(self, index: int, *, last: bool) -> Run:
-        """Run one start; an end that the program lacks parts for is certified in the last round only."""
+        """Run one start; an end that the program lacks parts for is certified in its last round only."""
         nlp, scale, problem = self.nlp, self._scale, self.problem
         trapped, start = index in self._trapped, self._ends.get(index)
         if start is None and index < len(self._known):
@@ -186,11 +216,10 @@ class Search:
             return Run()
         price = HIGH_PRICE if trapped else SLACK_PRICE
         try:
-            record = nlp.solve(start, scale=scale, price=price)
+            record, certificate = nlp.solve(start, scale=scale, price=price), None
             lacks = record.converged and problem.grown([record.q]) is not problem
-            if lacks and not last:
-                return Run(start, record, lacks=True)
-            record, certificate = run_start(nlp, start, scale, price, record)
+            if last or not lacks:
+                record, certificate = run_start(nlp, start, scale, price, record)
             objective = problem.objective.value(record.q)
         except MetricError:
             # This start led to a posture where the objective does not exist.  The other starts go on.
@@ -199,7 +228,7 @@ class Search:
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
         anew = record.converged and not (trapped or lacks) and not feasible(problem, record.q)
-        return Run(start, record, objective, minimized, certificate, lacks, anew)
+        return Run(start, record, objective, minimized, certificate, lacks, trapped=anew)
 
 
 def _near(one: Array, other: Array) -> bool:

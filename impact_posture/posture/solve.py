@@ -59,6 +59,7 @@ class PostureSolution:
         feasible_starts: Starts that reached the constraints.
         certified_starts: Starts that ended at a certified posture at which no original shapes touch.
         colliding_starts: Starts that ended at another certified posture.
+        dominated_starts: Starts that were left on the way, because they could not become the best.
         status: Return status of IPOPT for the best run.
         iterations: Iterations of the best run.
         solve_time_s: Wall time of all runs together.
@@ -80,6 +81,7 @@ class PostureSolution:
     feasible_starts: int
     certified_starts: int
     colliding_starts: int
+    dominated_starts: int
     status: str
     iterations: int
     solve_time_s: float
@@ -106,8 +108,11 @@ def solve(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
     guesses: Sequence[Array] = (),
+    finish_all: bool = False,
 ) -> PostureSolution:
     """Solve from the given posture, from feasible ``guesses`` and from random feasible ones: ``starts`` in all.
+
+    Unless ``finish_all``, a start is left where it can no longer become the best.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -116,7 +121,7 @@ def solve(
     problem, initial = _initial(problem, seed)
     scale = _initial_objective(problem, initial)
     began = time.perf_counter()
-    search = Search(problem, (initial, *guesses), scale, starts=starts, seed=seed, compile=compile)
+    search = Search(problem, (initial, *guesses), scale, starts=starts, seed=seed, compile=compile, finish_all=finish_all)
     runs = search.run(jobs, progress)
     problem, nlp = search.problem, search.nlp
     certified = [r for r in runs if r.good]
@@ -146,11 +151,9 @@ def solve(
     if touching:
         count = len(certified) - len(good)
         notes.append(f"{count} certified postures left out, because original shapes touch there: {touching}")
-    hits = sum(o.hits for o in optima)
-    if len(optima) > 1 and optima[0].hits == 1 and hits >= _MANY:
-        notes.append(
-            f"the best of {len(optima)} optima was found once in {hits} starts: more `starts` may find a better one"
-        )
+    dominated = sum(r.dominated for r in runs)
+    if optima[0].hits == 1 and dominated + sum(o.hits for o in optima) >= _MANY:
+        notes.append("only one start ended at the best optimum: more `starts` may find a better one")
     return PostureSolution(
         problem=problem,
         initial=initial,
@@ -163,6 +166,7 @@ def solve(
         feasible_starts=sum(r.start is not None for r in runs),
         certified_starts=len(good),
         colliding_starts=len(certified) - len(good),
+        dominated_starts=dominated,
         status=best.record.status,
         iterations=best.record.iterations,
         solve_time_s=time.perf_counter() - began - search.build_time_s,

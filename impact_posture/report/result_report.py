@@ -128,6 +128,8 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
     title, small = header_lines(view)
     facts = [fact for fact in small[0].split(SEPARATOR) if not fact.startswith(ALONE)]
     certificate, solver = document["certificate"], document["solver"]
+    # Results of former versions have no such number.
+    left = solver.get("dominated_starts", 0)
     checks = [
         ("stationarity", certificate["stationarity"], ""),
         ("violation of the constraints", certificate["primal"], ""),
@@ -151,7 +153,8 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
         ),
         moves=_moves(view, document),
         notes=(
-            f"{solver['certified_starts']} of {solver['starts']} starts ended at a certified posture.",
+            f"{solver['certified_starts']} of {solver['starts']} starts ended at a certified posture."
+            + (f" {left} were left on the way, because they could not become the best." if left else ""),
             f"{document['redundancy']} degrees of freedom are left by the constraints at the optimum.",
             *document["constraints"], *active, *document["notes"], *document["warnings"],
         ),

@@ -20,7 +20,8 @@ from impact_posture.tables import STRICT, read_toml, validate
 OFFSETS = ("x", "y", "z")
 _INNER = ("normal", "target_quaternion", "target_position", *OFFSETS, "speed")
 # Settings that belong to one optimization, to its search or to its output.
-_NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "path", "search", "contact")
+_NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "path", "search", "finish_all",
+            "contact")  # fmt: skip
 _FILES = ("srdf", "config", "weights", "armature", "posture")
 # Most points of a grid, which keeps every index a 64-bit integer.
 _MOST = 10**15

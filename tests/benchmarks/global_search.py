@@ -61,7 +61,7 @@ def _machine(request: Request) -> Iterator[str]:
 def _maps(request: Request) -> Iterator[list[str]]:
     for case in (case for case in _MAPPED if request.only in case.name):
         problem = case.problem()
-        runs = [_run(problem, seed) for seed in range(request.count)]
+        runs = [_run(problem, seed, finish_all=True) for seed in range(request.count)]
         began = time.process_time()
         found = search_globally(runs[0], jobs=1, compile="never")
         took = time.process_time() - began
@@ -109,8 +109,8 @@ def _shown(middle: list[float], best: float) -> tuple[str, str]:
     return f"{middle[2]:.0f}", f"{100 * (middle[0] / best - 1):.2f}"
 
 
-def _run(problem: PostureProblem, seed: int, starts: int = _STARTS) -> PostureSolution:
-    return solve(problem, starts=starts, seed=seed, jobs=1, compile="never")
+def _run(problem: PostureProblem, seed: int, starts: int = _STARTS, finish_all: bool = False) -> PostureSolution:
+    return solve(problem, starts=starts, seed=seed, jobs=1, compile="never", finish_all=finish_all)
 
 
 def _timed(call: Callable[[], tuple[PostureSolution, int]]) -> tuple[float, float, int]:
