@@ -76,7 +76,9 @@ def offline_posture(setup: Setup, objective: ImpactObjective, *, starts: int = 8
     """
     tell("looking for the offline posture")
     wanted, note = scenario_requirements(setup, objective), ""
-    tries = [(collision, *margins) for collision in (True, False) for margins in _MARGINS]
+    # Margins of the center of mass are none for a robot that does not stand.
+    margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
+    tries = [(collision, *each) for collision in (True, False) for each in margins]
     for collision, stops, edges in tries:
         demands = replace(wanted, collision=collision, limit_margin=stops, com_margin=edges)
         try:

@@ -74,6 +74,7 @@ def test_a_note_says_where_collisions_cannot_be_demanded(monkeypatch: pytest.Mon
     # No posture keeps all links a meter apart.
     demands = replace(scenario_requirements(setup, objective), clearance=1.0)
     monkeypatch.setattr(offline, "scenario_requirements", lambda *_: demands)
+    monkeypatch.setattr(offline, "_MARGINS", offline._MARGINS[-1:])
     found = offline_posture(setup, objective, starts=1)
     assert found.note.startswith("links may touch in the offline posture, because none without collisions was found")
     assert "\n" not in found.note and found.objective < found.initial
