@@ -203,7 +203,7 @@ def test_starts_that_share_a_run_end_where_their_own_runs_would(
 
 
 @pytest.mark.parametrize(
-    "robot, normal", [("panda", (-1.0, 0.0, 0.0)), ("tiago", (-1.0, 0.0, 0.0)), ("g1", (-1.0, 0.0, 0.0))]
+    "robot, normal", [("solo8", (0.0, 0.0, 1.0)), ("tiago", (-1.0, 0.0, 0.0)), ("g1", (-1.0, 0.0, 0.0))]
 )
 def test_a_start_that_is_left_would_not_have_been_the_best(robot: str, normal: tuple[float, float, float]) -> None:
     problem = prepare(ProblemSettings(robot=robot, normal=normal)).problem

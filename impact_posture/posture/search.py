@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -30,8 +31,8 @@ _BATCH, _FAR = 1500, 0.05
 _FORK = 200
 # Starts that go on from postures this close (rad, m) share one run, which would end at the same posture.
 _SAME = 1e-6
-# Price of a meter of slack for runs that ended in a trap.
-HIGH_PRICE = 20 * SLACK_PRICE
+# Price of a meter of slack for runs that ended in a trap, and how often they begin anew.
+HIGH_PRICE, _ANEW = 20 * SLACK_PRICE, 2
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Run:
         certificate: Certificate of the end; ``None`` while the program lacks parts.
         lacks: Whether the program lacks parts at the end.
         dominated: Whether it was left there, because it could not become the best.
-        trapped: Whether the end violates something although the program lacks nothing, for the first time.
+        trapped: Whether the end violates something although the program lacks nothing, and another start is tried.
         time_s: Wall time of this run and of those before it from the same start; an even share of shared runs.
     """
 
@@ -121,13 +122,14 @@ class Search:
         self.build_time_s = self.nlp.build_time_s
         # A run goes on from where it ended without what the program lacked.
         self._ends: dict[int, Array] = {}
-        self._trapped: set[int] = set()
+        # Times that each start ended in a trap.
+        self._trapped: Counter[int] = Counter()
 
     def run(self, jobs: int, progress: Progress | None) -> list[Run]:
         """Run all starts; those whose ends the program did not keep feasible run again with what it lacked.
 
-        A program without all rows bounds what the start can still reach, because with more rows the objective rises.  The
-        starts with the lowest bounds go on first, and those whose bound is well above a certified end not at all.
+        A program without all rows bounds what the start can still reach, because with more rows the objective rises.
+        The starts with the lowest bounds go on first, and those whose bound is well above a certified end not at all.
         """
         runs: dict[int, Run] = {}
         starts, best = self._starts, np.inf
@@ -149,7 +151,7 @@ class Search:
             # A run without all rows goes through bodies and may end between them.  With the rows and a higher price
             # it keeps what its start satisfies.
             trapped = {k for k in batch if runs[k].trapped and counts[k] < _ROUNDS}
-            self._trapped |= trapped
+            self._trapped.update(trapped)
             self._ends = {k: q for k, q in (self._ends | lacking).items() if k not in trapped}
             waiting = sorted({*waiting} - {*batch} | {*lacking, *trapped})
             if not self._finish_all:
@@ -206,12 +208,13 @@ class Search:
     def _run(self, index: int, *, last: bool) -> Run:
         """Run one start; an end that the program lacks parts for is certified in its last round only."""
         nlp, scale, problem = self.nlp, self._scale, self.problem
-        trapped, start = index in self._trapped, self._ends.get(index)
-        if start is None and index < len(self._known):
+        trapped, start = self._trapped[index], self._ends.get(index)
+        if start is None and index < len(self._known) and trapped <= 1:
             start = self._known[index]
         elif start is None:
             # What is not clear of other bodies may not get out from between them.
-            start = feasible_start(problem, index, self._seed, ATTEMPTS if trapped else CANDIDATES)
+            other = index + max(trapped - 1, 0) * self._starts
+            start = feasible_start(problem, other, self._seed, ATTEMPTS if trapped else CANDIDATES)
         if start is None:
             return Run()
         price = HIGH_PRICE if trapped else SLACK_PRICE
@@ -227,7 +230,7 @@ class Search:
         minimized = objective / scale
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
-        anew = record.converged and not (trapped or lacks) and not feasible(problem, record.q)
+        anew = record.converged and not lacks and trapped < _ANEW and not feasible(problem, record.q)
         return Run(start, record, objective, minimized, certificate, lacks, trapped=anew)
 
 

@@ -121,7 +121,9 @@ def solve(
     problem, initial = _initial(problem, seed)
     scale = _initial_objective(problem, initial)
     began = time.perf_counter()
-    search = Search(problem, (initial, *guesses), scale, starts=starts, seed=seed, compile=compile, finish_all=finish_all)
+    search = Search(
+        problem, (initial, *guesses), scale, starts=starts, seed=seed, compile=compile, finish_all=finish_all
+    )
     runs = search.run(jobs, progress)
     problem, nlp = search.problem, search.nlp
     certified = [r for r in runs if r.good]

@@ -84,7 +84,8 @@ def _solve(asked: dict[str, object]) -> tuple[PostureSolution | str, tuple[float
     try:
         problem = prepare(make_settings(asked)).problem
         began = time.perf_counter()
-        solution = solve(problem, starts=_STARTS, seed=int(str(asked["seed"])), jobs=1, compile="never", finish_all=True)
+        seed = int(str(asked["seed"]))
+        solution = solve(problem, starts=_STARTS, seed=seed, jobs=1, compile="never", finish_all=True)
         return solution, (solution.start_time_s, time.perf_counter() - began)
     except ImpactPostureError as error:
         return error.what, (0.0, 0.0)
