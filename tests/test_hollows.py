@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
@@ -16,6 +18,7 @@ from impact_posture.arrays import Array
 from impact_posture.collision.geometry import load_geometry
 from impact_posture.collision.hollows import open_hollows
 from impact_posture.collision.hull_fit import fit_hull
+from impact_posture.collision.joint_planes import JointPlanes, joint_planes
 from impact_posture.collision.mesh_check import mesh_collisions
 from impact_posture.collision.pairs import Hindrance, hindered, random_postures, touch_of
 from impact_posture.collision.parts import divide, triangles_of
@@ -23,6 +26,9 @@ from impact_posture.collision.shape_points import shape_points
 from impact_posture.collision.shapes import RobotShapes, load_shapes
 from impact_posture.collision.swept_hull import SweptHull, separation
 from impact_posture.collision.urdf_shapes import read_urdf_shapes
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import Tree
+from impact_posture.posture.nested_links import NestedLinks
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from tests.test_bad_shapes import link, mesh, stl
@@ -201,3 +207,68 @@ def test_pelvis_and_hip_are_kept_apart() -> None:
         free, allowed = free + (not touching), allowed + apart
     # The hulls of the whole bodies allow less than half of them.
     assert free > 200 and allowed > 0.7 * free
+
+
+# ---- bounds on the joints between two bodies ----------------------------------------------------------------------
+
+WAIST = ("waist_roll_joint", "waist_pitch_joint")
+
+
+def planes_where(touches: Callable[[Array], bool], first: str = "waist_yaw_joint") -> JointPlanes | None:
+    """Planes for bodies of g1 that touch where a function of the positions of the waist says so."""
+    robot = load_robot("g1")
+    last = robot.joint_id(WAIST[-1])
+
+    def touch(data: pin.Data) -> bool:
+        # Rotations about x, then y.
+        R = (data.oMi[robot.joint_id("waist_yaw_joint")].inverse() * data.oMi[last]).rotation
+        return touches(np.array([np.arctan2(R[2, 1], R[1, 1]), np.arctan2(R[0, 2], R[0, 0])]))
+
+    return joint_planes(robot, ("a", "b"), (robot.joint_id(first), last), touch)
+
+
+@given(st.lists(st.tuples(st.sampled_from([-0.52, 0.52]), st.sampled_from([-0.52, 0.52]), st.floats(0.05, 0.35)),
+                min_size=1, max_size=3))  # fmt: skip
+@settings(max_examples=10, deadline=None)
+def test_planes_cut_off_where_shapes_touch(corners: list[tuple[float, float, float]]) -> None:
+    def touches(x: Array) -> bool:
+        return any(np.hypot(*(x - corner[:2])) <= corner[2] for corner in corners)
+
+    planes = planes_where(touches)
+    assert planes is not None and planes.joints == WAIST
+    random = np.random.default_rng(0).uniform(-0.52, 0.52, (2000, 2))
+    inside = (random @ planes.normals.T <= planes.bounds).all(axis=1)
+    assert not any(touches(x) for x in random[inside])
+    assert (planes.bounds > 0).all() and inside.mean() > 0.5
+
+
+@pytest.mark.parametrize("case", ["nowhere", "everywhere", "at the start", "far joints"])
+def test_no_planes_where_none_help(case: str) -> None:
+    regions = {
+        "nowhere": lambda x: False,
+        "everywhere": lambda x: True,
+        "at the start": lambda x: bool(np.hypot(*x) < 0.1),
+        "far joints": lambda x: bool(x[0] > 0.4),
+    }
+    first = "left_knee_joint" if case == "far joints" else "waist_yaw_joint"
+    assert planes_where(regions[case], first) is None
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_within_the_planes_the_waist_of_g1_does_not_touch(seed: int) -> None:
+    robot = load_robot("g1")
+    (planes,) = load_shapes(robot).joint_planes
+    constraint, numeric = NestedLinks(robot, planes), Numeric(robot.model)
+    assert planes.joints == WAIST and set(planes.bodies) == {"waist_yaw_link", "torso_link"}
+    q = robot.posture()
+    at = [robot.model.idx_qs[robot.joint_id(name)] for name in WAIST]
+    q[at] = np.random.default_rng(seed).uniform(-0.52, 0.52, 2)
+    value, jacobian = constraint.evaluate(numeric.at(q))
+    touching = set(planes.bodies) in [set(pair) for pair in mesh_collisions(robot, load_shapes(robot), q)]
+    assert not (touching and (value <= constraint.upper).all())
+    v = np.random.default_rng(seed).normal(size=robot.nv)
+    ahead, behind = (constraint.evaluate(numeric.at(pin.integrate(robot.model, q, h * v)))[0] for h in (1e-6, -1e-6))
+    np.testing.assert_allclose(jacobian @ v, (ahead - behind) / 2e-6, atol=1e-7)
+    tree_q = ca.SX.sym("q", robot.nq)
+    symbolic = ca.Function("c", [tree_q], [constraint.symbolic(Tree(robot.model, tree_q), ca.SX(0, 1))])
+    np.testing.assert_allclose(np.array(symbolic(q)).ravel(), value, atol=1e-12)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import product
 
 import coal
@@ -14,6 +14,7 @@ from impact_posture.collision.bodies import Body, merged_bodies
 from impact_posture.collision.geometry import Geometry, geometry_key, load_geometry
 from impact_posture.collision.hollows import open_hollows
 from impact_posture.collision.hull_fit import Fit, fit_hull
+from impact_posture.collision.joint_planes import JointPlanes, joint_planes
 from impact_posture.collision.pairs import Pair, hindered, mostly_touching, pairs_of, touch_of
 from impact_posture.collision.parts import triangles_of
 from impact_posture.collision.swept_hull import SweptHull
@@ -35,7 +36,8 @@ class FittedShapes:
         always_touching: Names of shapes that touch at the default posture and at most others, so that they overlap by
             design and need not keep apart.
         hulls_touching: Names of bodies whose hulls touch at most of the postures at which their shapes do not, even
-            if they are cut.  They are in no pair, and only the check on the shapes finds their collisions.
+            if they are cut.  They are in no pair.  The check on the shapes finds their collisions.
+        joint_planes: What keeps the shapes of such bodies apart, where few joints lie between them.
         warnings: Shapes that are left out, and what a robot without shapes means; one line each.
     """
 
@@ -43,6 +45,7 @@ class FittedShapes:
     pairs: StoredArray
     always_touching: tuple[tuple[str, str], ...]
     hulls_touching: tuple[tuple[str, str], ...]
+    joint_planes: tuple[JointPlanes, ...]
     warnings: tuple[str, ...]
 
 
@@ -115,6 +118,11 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
 
     hollows = hindered(robot, hulls, pairs, bodies_touch)
     opened = open_hollows(hulls, hollows, lambda k: triangles_of(shapes[n] for n in merged[k].shapes))
+    planes = (
+        joint_planes(robot, (a.name, b.name), (a.joint, b.joint), partial(bodies_touch, pair))
+        for pair in sorted(opened.hindered)
+        for a, b in [[hulls[k] for k in pair]]
+    )
     bodies = [hull for parts in opened.parts for hull in parts]
     index = {hull: k for k, hull in enumerate(bodies)}
     kept = [pair for pair in pairs if pair not in opened.hindered]
@@ -124,6 +132,7 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
         pairs=np.array(apart_bodies, dtype=int).reshape(-1, 2),
         always_touching=tuple((shapes[i].name, shapes[j].name) for i, j in touching),
         hulls_touching=tuple((hulls[i].name, hulls[j].name) for i, j in sorted(opened.hindered)),
+        joint_planes=tuple(one for one in planes if one is not None),
         warnings=loaded.warnings,
     )
 

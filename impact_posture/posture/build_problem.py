@@ -83,7 +83,7 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
     clear, around = [], None
     if requirements.collision:
         around = _surroundings(objective, numeric, requirements, list(struck.values()))
-        clear, notes = around.constraints, [*notes, *around.notes]
+        clear, notes = [*around.nested, *around.constraints], [*notes, *around.notes]
     problem = PostureProblem(
         robot, objective, requirements, given, (*constraints, *more, *clear, *loads), lower, upper,
         notes=(*decided, *notes), surroundings=around,

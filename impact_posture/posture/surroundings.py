@@ -19,6 +19,7 @@ from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.posture.clearance import Clearance
+from impact_posture.posture.nested_links import NestedLinks
 from impact_posture.posture.separator import Body, Separator
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import PATCH, Obstacle
@@ -137,6 +138,11 @@ class Surroundings:
         return self._depths.get(contact, 0.0)
 
     # ---- what follows -----------------------------------------------------------------------------------------
+
+    @cached_property
+    def nested(self) -> list[NestedLinks]:
+        """Return the constraints of links in each other's hollows."""
+        return [NestedLinks(self.robot, planes) for planes in self.shapes.joint_planes]
 
     @cached_property
     def constraints(self) -> list[Clearance]:
