@@ -421,6 +421,6 @@ class ProblemSettings(ImpactSettings):
     ] = "multistart"  # fmt: skip
     starts: Annotated[int, Setting("Number of starting points of the search.", OUTPUT, **demand.ONE_OR_MORE)] = 16
     finish_all: Annotated[
-        bool, Setting("Also finish starts that can no longer become the best, and list all their optima.", OUTPUT)
+        bool, Setting("Finish starts of large programs that can no longer be the best: lists all optima.", OUTPUT)
     ] = False
     seed: Annotated[int, Setting("Seed of the random starts.", OUTPUT, **demand.ZERO_OR_MORE)] = 0

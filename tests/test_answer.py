@@ -203,18 +203,27 @@ def test_starts_that_share_a_run_end_where_their_own_runs_would(
 
 
 @pytest.mark.parametrize(
-    "robot, normal", [("solo8", (0.0, 0.0, 1.0)), ("tiago", (-1.0, 0.0, 0.0)), ("g1", (-1.0, 0.0, 0.0))]
+    "robot, normal, starts",
+    [("solo8", (0.0, 0.0, 1.0), 28), ("tiago", (-1.0, 0.0, 0.0), 70), ("g1", (-1.0, 0.0, 0.0), 12)],
 )
-def test_a_start_that_is_left_would_not_have_been_the_best(robot: str, normal: tuple[float, float, float]) -> None:
+def test_a_start_that_is_left_would_not_have_been_the_best(
+    robot: str, normal: tuple[float, float, float], starts: int
+) -> None:
     problem = prepare(ProblemSettings(robot=robot, normal=normal)).problem
     few, all_ = (
-        solve(problem, starts=12, jobs=2, compile="never", finish_all=finish_all) for finish_all in (False, True)
+        solve(problem, starts=starts, jobs=2, compile="never", finish_all=finish_all) for finish_all in (False, True)
     )
     assert all_.dominated_starts == 0 < few.dominated_starts
     assert few.certified_starts + few.dominated_starts + few.colliding_starts <= few.starts
     best = [one.problem.objective.value(one.q) for one in (few, all_)]
     assert best[0] == pytest.approx(best[1], rel=1e-5)
     assert few.optima[0].hits <= all_.optima[0].hits
+
+
+@pytest.mark.parametrize("robot", ["solo8", "tilthex_arm"])
+def test_a_small_program_finishes_every_start(robot: str) -> None:
+    solution = solve(prepare(ProblemSettings(robot=robot, normal=(0.0, 0.0, 1.0))).problem, compile="never")
+    assert solution.dominated_starts == 0 and solution.certified_starts == solution.starts == 16
 
 
 @pytest.mark.parametrize("robot", ["xarm7", "anymal_c"])

@@ -24,6 +24,8 @@ Progress = Callable[[int, int], None]
 
 # Starts that run before the others, and most runs from one start, each with a program that has grown.
 _FIRST, _ROUNDS = 2, 8
+# Unknowns of all starts together up to which every start is finished, because that takes no longer.
+_SMALL = 1000
 # Where only the best counts: unknowns of the starts that go on together, which takes longer than to build a program,
 # and the share above the best from which a bound dominates.  A run that ended in a trap may end below its bound.
 _BATCH, _FAR = 1500, 0.05
@@ -102,7 +104,7 @@ class Search:
         starts: Number of starts.
         seed: Seed of the starts that are not known.
         compile: Whether to compile the program.
-        finish_all: Whether starts go on that cannot become the best.
+        finish_all: Whether starts go on that cannot become the best; in small programs they always do.
     """
 
     def __init__(
@@ -117,8 +119,8 @@ class Search:
         finish_all: bool,
     ) -> None:
         self.problem, self._known, self._scale, self._seed, self._compile = problem, known, scale, seed, compile
-        self._starts, self._finish_all = starts, finish_all
         self.nlp = build_nlp(problem, compile=compile, starts=starts)
+        self._starts, self._finish_all = starts, finish_all or starts * self._unknowns <= _SMALL
         self.build_time_s = self.nlp.build_time_s
         # A run goes on from where it ended without what the program lacked.
         self._ends: dict[int, Array] = {}
@@ -165,6 +167,10 @@ class Search:
                 self.build_time_s += self.nlp.build_time_s
         return [runs[index] for index in range(starts)]
 
+    @property
+    def _unknowns(self) -> int:
+        return int(self.nlp.solver.size1_in("x0"))
+
     def _next(self, waiting: list[int], runs: dict[int, Run]) -> list[int]:
         """Return the starts to run next."""
         if not runs and self.problem.grows:
@@ -172,7 +178,7 @@ class Search:
             return waiting[:_FIRST]
         if self._finish_all or not all(k in runs for k in waiting):
             return waiting
-        count = max(_BATCH // int(self.nlp.solver.size1_in("x0")), 1)
+        count = max(_BATCH // self._unknowns, 1)
         return sorted(sorted(waiting, key=lambda k: runs[k].minimized)[:count])
 
     def _clear(self, run: Run) -> bool:
@@ -190,10 +196,8 @@ class Search:
         return groups
 
     def _round(self, waiting: list[int], jobs: int, last: set[int]) -> Iterator[tuple[int, Run]]:
-        unknowns = len(waiting) * int(self.nlp.solver.size1_in("x0"))
-        with fork_map(
-            lambda k: self._timed(waiting[k], last=waiting[k] in last), len(waiting), jobs if unknowns > _FORK else 1
-        ) as results:
+        jobs = jobs if len(waiting) * self._unknowns > _FORK else 1
+        with fork_map(lambda k: self._timed(waiting[k], last=waiting[k] in last), len(waiting), jobs) as results:
             if around := self.problem.surroundings:
                 # The last word needs the shapes themselves, and this process would only wait.
                 _ = around.shapes.geometry
