@@ -34,5 +34,5 @@ RECOMMENDED: dict[str, str] = {
     "aerial-vertical": "robust-flow",
     "aerial-lateral": "robust-flow",
     "solo8-push": "stiff",
-    "talos-push": "posture",
+    "talos-push": "robust-flow",
 }
