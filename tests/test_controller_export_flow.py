@@ -33,7 +33,7 @@ IMPACTS = {"tilthex_arm": ("ee", (0.0, 0.0, 1.0)), "panda": ("panda_hand_tcp", (
 # The arm of panda turns about the line from shoulder to wrist.
 ELBOW = (0.3, -0.7, 0.3, -2.3, 0.1, 1.6, 0.9, 0.035, 0.035)
 # A pitch of solo8 and joints that differ from leg to leg.
-LEANING = np.array([0, 0, 0, 0, 0.2, 0, 0.3, -0.15, -0.3, 0.1, 0.15, 0.3, -0.06, 0.12])
+LEANING = np.array([0, 0, 0, 0, 0.05, 0, 0.3, -0.15, -0.3, 0.1, 0.15, 0.3, -0.06, 0.12])
 DT = 2e-3
 
 
@@ -59,7 +59,7 @@ def both(name: str, path: tuple[float, ...] = ()) -> tuple[Controller, Reference
 
 @pytest.mark.parametrize(
     ("name", "path", "tilt", "ticks"),
-    [("tilthex_arm", (), 0.8, 300), ("solo8", (), 0.8, 300), ("solo8", (), 0.01, 800), ("panda", ELBOW, 0.8, 300)],
+    [("tilthex_arm", (), 0.8, 300), ("solo8", (), 0.8, 300), ("solo8", (), 0.053, 600), ("panda", ELBOW, 0.8, 300)],
 )
 def test_the_reference_goes_as_in_python(name: str, path: tuple[float, ...], tilt: float, ticks: int) -> None:
     """Each controller moves a robot of its own, through all phases."""
@@ -68,11 +68,11 @@ def test_the_reference_goes_as_in_python(name: str, path: tuple[float, ...], til
     posture.options = replace(posture.options, tilt=tilt)
     theirs.parameters["flow_tilt"][:] = tilt
     # From its own posture, level as it is, solo8 tilts no way.
-    start = np.array(pin.integrate(r.model, r.posture(), LEANING)) if tilt < 0.1 else r.posture()
+    start = np.array(pin.integrate(r.model, r.posture(), LEANING)) if tilt < 0.5 else r.posture()
     for controller in (ours, theirs):
         controller.reset(start, np.zeros(r.nv))
     states = [(start, np.zeros(r.nv)) for _ in range(2)]
-    first = posture.value
+    first, most = posture.value, 0.0
     for k in range(ticks):
         for phase, at in (("brace", 0), ("contact", ticks // 2), ("brace", ticks // 2 + 20), ("release", ticks - 10)):
             if k == at:
@@ -86,13 +86,14 @@ def test_the_reference_goes_as_in_python(name: str, path: tuple[float, ...], til
             v = v + DT * command.acceleration
             states[i] = np.asarray(pin.integrate(r.model, q, DT * v)), v
         np.testing.assert_allclose(theirs.target, posture.target, rtol=0, atol=1e-9)
+        if r.floating:
+            most = max(most, float(np.arccos(pin.Quaternion(theirs.target[3:7]).matrix()[2, 2])))
         report = theirs.report()
         assert report.level == posture.level and report.objective == pytest.approx(posture.value, rel=1e-7)
     away = np.abs(pin.difference(r.model, start, theirs.target)).max()
     assert away > 0.02 and theirs.flow_failures == 0
-    if tilt < 0.1:
-        before, after = (pin.Quaternion(q[3:7]).matrix()[2] for q in (start, theirs.target))
-        assert 0.5 * tilt < np.arccos(before @ after) < tilt
+    # Without the bound it comes to 0.06.
+    assert tilt > 0.5 or 0.0515 < most < tilt
     assert path or posture.value < 0.95 * first
     assert np.abs(posture.flow.velocity).max() < 0.02
 

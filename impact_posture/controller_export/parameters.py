@@ -110,7 +110,7 @@ def _fields(s: Structure, period: float) -> Iterator[Field]:
             ("epsilon", "amount", "predicted decrease of H/H0 below which the flow rests"),
             ("joint_margin", "nonnegative", "distance from the joint limits, rad or m"),
             ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
-            ("tilt", "amount", "largest angle by which the base tilts from where it started, rad"),
+            ("tilt", "amount", "largest tilt of the base from the default posture, rad"),
             ("share", "share", "share of the limits of the actuators that rest may take"),
             ("haste", "share", "share of what is left of them that accelerating may take"),
             ("tracking", "amount", "error of the joints at which the flow waits, rad or m"),

@@ -6,8 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 
 from impact_posture.arrays import Array
+from impact_posture.robot.robot import Robot
 from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.qp import QP
 from impact_posture.tsid.ranges import JointRanges
@@ -78,26 +80,25 @@ class FlowDirection:
     """
 
     def __init__(
-        self, state: State, edges: Array, controls: int, *, rho: float, mu: float, margin: float, tilt: float
+        self, robot: Robot, edges: Array, controls: int, *, rho: float, mu: float, margin: float, tilt: float
     ) -> None:
         """Size the buffers.
 
         Args:
-            state: The state where the flow starts.
+            robot: The robot.
             edges: Normals of the support polygon, shape (k, 2).
             controls: Number of static controls with limits.
             rho: ρ, per rad².
             mu: μ, per rad².
             margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
-            tilt: Largest angle between the vertical and the base's direction that is vertical at the start, rad.
+            tilt: Largest angle between the vertical and :func:`upright`, rad.
         """
-        robot = state.robot
         nv, ranges = robot.nv, JointRanges(robot)
         self._joints = np.flatnonzero(np.isfinite(ranges.lower) & np.isfinite(ranges.upper))
         width = (ranges.upper - ranges.lower)[self._joints]
         self._margin = np.minimum(margin, width / 8)
         self._edges, self._mu, self._tilt = edges, mu, tilt
-        self._up = state.base_rotation[2].copy() if robot.floating else None
+        self._up = upright(robot)
         # The pull towards the start acts on joints.  Others lead the base.
         self._pull = np.full(nv, rho)
         self._pull[: 6 if robot.floating else 0] = 0.0
@@ -213,6 +214,11 @@ class FlowDirection:
         y = solved.z[:r]
         self.gain = -float(slope @ y + y @ y / 2)
         return np.asarray(way @ y)
+
+
+def upright(robot: Robot) -> Array | None:
+    """Return the direction in a floating base that is vertical in the default posture, shape (3,)."""
+    return pin.Quaternion(robot.posture()[3:7]).matrix()[2].copy() if robot.floating else None
 
 
 def limited(vector: Array, largest: float) -> Array:

@@ -54,7 +54,7 @@ class FlowOptions:
         epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.
         joint_margin: Distance from the joint limits, rad (m).
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
-        tilt: Largest angle by which a floating base tilts from where it started, rad.
+        tilt: Largest angle between a floating base and its upright in the default posture, rad.
         share: Share of the actuators' limits that holding ``q_r`` may take.
         haste: Share that accelerating may take of what is then left of the actuators' limits.
         tracking: Error of the joints at which the flow waits for the robot, rad (m).
@@ -164,7 +164,7 @@ class ReferenceFlow:
         self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
         self._edges, self._offsets = support_edges(state, self._contacts)
         self.direction = FlowDirection(
-            state, self._edges, self._static.limited.size,
+            self.robot, self._edges, self._static.limited.size,
             rho=options.rho, mu=options.mu, margin=options.joint_margin, tilt=options.tilt,
         )  # fmt: skip
         self.start = 1.0

@@ -15,18 +15,18 @@ static double ip_flow_along(const ip_flow *f, int r, const double *way)
 }
 
 #if IP_BASE
-/* Angle between the vertical and the base's direction that was vertical at the start, rad, and its slope. */
+/* Angle between the vertical and the direction that is upright in the base, rad, and its slope. */
 static double ip_flow_tilt(const ip_flow *f, double *row)
 {
   const double *vertical = f->m.base + 6;
   double axis[3], sine;
   int i;
-  ip_cross(vertical, f->up, axis);
+  ip_cross(vertical, ip_upright, axis);
   sine = sqrt(ip_dot(axis, axis, 3));
   for (i = 0; i < 3; ++i) {
     row[3 + i] = sine > IP_LEVEL ? axis[i] / sine : 0.0;
   }
-  return atan2(sine, ip_dot(vertical, f->up, 3));
+  return atan2(sine, ip_dot(vertical, ip_upright, 3));
 }
 #endif
 

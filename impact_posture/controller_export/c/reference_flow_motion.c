@@ -158,9 +158,6 @@ static int ip_flow_begin(ip_context *c)
   memcpy(f->q, c->q, sizeof f->q);
   memcpy(f->first, c->q, sizeof f->first);
   memcpy(f->here, c->q, sizeof f->here);
-#if IP_BASE
-  memcpy(f->up, c->m.base + 6, sizeof f->up);
-#endif
   f->deadline = INFINITY;
   ip_dynamics_constants(&f->m);
   ip_dynamics_constants(&f->ahead);
