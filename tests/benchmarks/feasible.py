@@ -83,7 +83,9 @@ def _row(robot: str, name: str, request: Request, ends: list[int], left: list[in
             quick, less = _solve(asked | demands, finish_all=False)
             assert isinstance(quick, PostureSolution)
             above = quick.optima[0].objective / found.optima[0].objective - 1
-            cells += [f"{quick.dominated_starts}", f"{100 * above:.1f} %", f"{100 * less[1] / took[1]:.0f} %"]
+            left = quick.dominated_starts
+            share = f"{100 * less[1] / took[1]:.0f} %"
+            cells += [f"{left}", f"{100 * above:.1f} %", share] if left else ["0", "", ""]
     return [*cells, conflict]
 
 
