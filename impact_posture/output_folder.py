@@ -84,6 +84,9 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
                 _replace(beside, out, force, kind)
     except OSError as error:
         words = error.strerror or str(error)
+        if isinstance(error, FileNotFoundError) and error.filename:
+            # What is missing may be another file than those of the folder.
+            words = f"{words}: {error.filename}"
         raise OutputError(
             f"cannot be written ({words})", where=str(out), hint="free space or choose another --out"
         ) from error
