@@ -139,7 +139,7 @@ class Search:
         while waiting:
             batch = self._next(waiting, runs)
             shared = self._shared(batch)
-            last = {k for k in shared if counts[k] == _ROUNDS - 1}
+            last = {k for own in shared.values() if max(counts[j] for j in own) >= _ROUNDS - 1 for k in own}
             for leader, run in self._round(list(shared), jobs, last):
                 own = run.time_s / len(shared[leader])
                 for k in shared[leader]:
@@ -152,12 +152,12 @@ class Search:
             lacking = {k: r.q for k in batch if (r := runs[k].record) is not None and runs[k].lacks and k not in last}
             # A run without all rows goes through bodies and may end between them.  With the rows and a higher price
             # it keeps what its start satisfies.
-            trapped = {k for k in batch if runs[k].trapped and counts[k] < _ROUNDS}
+            trapped = {k for k in batch if runs[k].trapped and k not in last}
             self._trapped.update(trapped)
             self._ends = {k: q for k, q in (self._ends | lacking).items() if k not in trapped}
             waiting = sorted({*waiting} - {*batch} | {*lacking, *trapped})
             if not self._finish_all:
-                dominated = {k for k in waiting if k in runs and runs[k].minimized > best * (1 + _FAR)}
+                dominated = {k for k in waiting if k in runs and runs[k].minimized > best + _FAR * abs(best)}
                 runs |= {k: replace(runs[k], dominated=True) for k in dominated}
                 waiting = [k for k in waiting if k not in dominated]
                 lacking = {k: q for k, q in lacking.items() if k not in dominated}
