@@ -15,6 +15,8 @@ _TOLERANCE = 0.004
 # Corners are chosen among so many points at most; the sweep radius is that of all points.
 _MOST_CANDIDATES = 4000
 _CHUNK = 20_000
+# Points that are not worth a hull of their own.
+_FEW = 50
 # Error (m) of a distance by coal.
 _ROUNDING = 1e-9
 
@@ -51,7 +53,18 @@ def fit_hull(points: Array, tolerance: float = _TOLERANCE) -> Fit:
         if len(chosen) >= min(MOST_VERTICES, len(candidates)) or -queue[0][0] <= tolerance:
             break
         chosen.append(queue[0][1])
-    return Fit(vertices, max((distance_from_hull(p, hull) for p in _outside(points, hull)), default=0.0) + _ROUNDING)
+    outside = _extreme(_outside(points, hull))
+    return Fit(vertices, max((distance_from_hull(p, hull) for p in outside), default=0.0) + _ROUNDING)
+
+
+def _extreme(points: Array) -> Array:
+    """Return the corners of the hull of points: a distance from a convex set is convex, so the largest is at one."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return np.asarray(points[ConvexHull(points).vertices]) if len(points) > _FEW else points
+    except QhullError:
+        return points
 
 
 def _outside(points: Array, hull: SweptHull) -> Array:
