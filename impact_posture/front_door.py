@@ -138,7 +138,8 @@ class PostureResult:
     def path(self, *, seed: int = 0) -> PostureResult:
         """Return the same result with a path from the start to the optimum, timed within the robot's limits.
 
-        See :func:`~impact_posture.path.posture_path.posture_path`.
+        See :func:`~impact_posture.path.posture_path.posture_path`.  Where it does not reach the optimum, it tries the
+        others, of which a large program has all only if the search was to ``finish_all``.
 
         Args:
             seed: Seed of the sampling planner.

@@ -324,7 +324,7 @@ def test_a_gradient_that_fails_stops_the_flow_until_it_is_back() -> None:
     assert not posture.flow.failed and np.abs(posture.flow.velocity).max() > 0.01
 
 
-@pytest.mark.parametrize("case", ["options", "share", "time", "before", "flat", "nan"])
+@pytest.mark.parametrize("case", ["options", "share", "number", "time", "before", "flat", "nan"])
 def test_what_cannot_flow_is_refused(case: str) -> None:
     r = robot("tilthex_arm")
     with pytest.raises((InputError, MetricError)) as caught:
@@ -332,6 +332,8 @@ def test_what_cannot_flow_is_refused(case: str) -> None:
             FlowOptions(speed=0.0)
         elif case == "share":
             FlowOptions(share=1.2)
+        elif case == "number":
+            FlowOptions(tilt=float("nan"))
         elif case == "time":
             flying(arm_well())[1].brace(float("nan"))
         elif case == "before":

@@ -209,10 +209,11 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
         page.line(f"no collision; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
     optima = ", ".join(f"{number(o.objective)} ({o.hits}×)" for o in solution.optima[:5])
     more = f" and {len(solution.optima) - 5} more" if len(solution.optima) > 5 else ""
-    left = f"; {solution.dominated_starts} left, which could not become the best" if solution.dominated_starts else ""
+    left = solution.dominated_starts
     page.line(
-        f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s{left}; "
-        f"optima: {optima}{more}"
+        f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
+        + (f"{left} could not become the best (--finish-all); " if left else "")
+        + f"optima: {optima}{more}"
     )
     if "global" in document:
         page.line(document["global"]["line"])

@@ -74,9 +74,10 @@ class FlowOptions:
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
-        numbers = asdict(self)
-        least = min(numbers.pop(name) for name in ("rho", "joint_margin", "com_margin"))
-        if not (min(numbers.values()) > 0 and least >= 0 and max(self.share, self.haste) <= 1):
+        may_vanish = ("rho", "joint_margin", "com_margin")
+        # Comparisons one by one refuse what is not a number, too.
+        good = all(x > 0 or (x == 0 and name in may_vanish) for name, x in asdict(self).items())
+        if not (good and max(self.share, self.haste) <= 1):
             raise InputError("a number is out of range", where="flow options", hint="see the docstring")
 
 
