@@ -222,7 +222,7 @@ def _drawings(
     from impact_posture.report.page import figures
 
     def draw(name: str) -> list[tuple[str, str]]:
-        draw_all(view, folder, formats, [name])
-        return figures(folder, f"{name}.*") if report else []
+        drawn = draw_all(view, folder, formats, [name])
+        return figures(folder, drawn) if report else []
 
     return [partial(draw, name) for name in drawable(view)]

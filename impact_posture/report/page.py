@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import groupby
@@ -104,9 +104,15 @@ def render(content: Content, scene: Scene, pictures: Sequence[tuple[str, str]]) 
     return text
 
 
-def figures(folder: Path, pattern: str = "*") -> list[tuple[str, str]]:
-    """Return name and address of each figure in a folder and below: SVG if there is one, else PNG in fewer colors."""
-    found = sorted(p for p in folder.rglob(pattern) if p.suffix in _TYPES and p.is_file())
+def figures(folder: Path, paths: Iterable[Path] | None = None) -> list[tuple[str, str]]:
+    """Return name and address of figures in a folder: SVG if there is one, else PNG in fewer colors.
+
+    Args:
+        folder: The folder.
+        paths: Files in it; all that it holds and that are below it by default.  While others write there, it cannot
+            be searched, because their temporary folders vanish.
+    """
+    found = sorted(p for p in (folder.rglob("*") if paths is None else paths) if p.suffix in _TYPES and p.is_file())
     # An SVG comes behind the PNG of the same name and takes its place.
     each = {str(path.relative_to(folder).with_suffix("")): path for path in found}
     return [(name, _address(path)) for name, path in each.items()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -10,6 +11,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from impact_posture import result_folder
 from impact_posture.errors import InputError, OutputError
 from impact_posture.plot import FIGURES, FORMATS, FigureNotFound, ResultView, draw_all, postures_figure
 from impact_posture.plot.classical_figure import classical_figure
@@ -173,3 +175,17 @@ def test_bad_input(pendulum: ResultView, panda: ResultView, tmp_path: Path) -> N
     with pytest.raises(OutputError, match="cannot be written"):
         draw_all(pendulum, tmp_path / "file", ("png",), only=["jump"])
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_figure_is_drawn_while_the_temporary_folders_of_others_vanish(
+    tmp_path: Path, tilthex: ResultView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process had just removed its folder when this one came to search in it."""
+
+    def vanished(folder: Path, pattern: str) -> Iterator[Path]:
+        raise FileNotFoundError(folder / f".impact-posture-gone/{pattern}")
+
+    monkeypatch.setattr(Path, "rglob", vanished)
+    drawings = result_folder._drawings(tilthex, tmp_path, ("png",), True)
+    ((name, address),) = drawings[-1]()
+    assert (tmp_path / f"{name}.png").is_file() and address.startswith("data:image/png;base64,")
