@@ -99,7 +99,9 @@ def test_pairs_leave_out_neighbors_and_what_the_srdf_allows(name: str) -> None:
     # A pair of bodies for every pair of shapes that has to keep apart, and none for others.
     joints = {(shapes.bodies[i].joint, shapes.bodies[j].joint) for i, j in shapes.pairs}
     named = {body.name: body.joint for body in shapes.bodies}
-    joints |= {(named[a], named[b]) for a, b in shapes.hulls_touching}
+    joints |= {
+        (named[a], named[b]) for a, b in (*shapes.hulls_touching, *(one.bodies for one in shapes.joint_planes))
+    }
     objects = shapes.geometry.geometryObjects
     of_shapes = {
         (objects[p.first].parentJoint, objects[p.second].parentJoint) for p in shapes.geometry.collisionPairs
@@ -235,4 +237,5 @@ def test_overlaps_by_design_are_reported_by_name() -> None:
     # The shapes of hulls in each other's hollows are checked all the same.
     objects = shapes.geometry.geometryObjects
     checked = {(objects[p.first].name, objects[p.second].name) for p in shapes.geometry.collisionPairs}
-    assert set(shapes.hulls_touching) <= checked and not set(shapes.always_touching) & checked
+    nested = {planes.bodies for planes in shapes.joint_planes}
+    assert nested and nested <= checked and not set(shapes.always_touching) & checked and not nested & pairs

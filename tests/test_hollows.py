@@ -1,9 +1,8 @@
-"""Bodies in each other's hollows: cuts that lose nothing, and parts that leave the hollows free."""
+"""Bodies in each other's hollows: planes in the joints between them keep their shapes apart."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import product
 from pathlib import Path
 
 import casadi as ca
@@ -12,59 +11,24 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import ConvexHull
 
 from impact_posture.arrays import Array
-from impact_posture.collision.geometry import load_geometry
-from impact_posture.collision.hollows import open_hollows
-from impact_posture.collision.hull_fit import fit_hull
 from impact_posture.collision.joint_planes import JointPlanes, joint_planes
 from impact_posture.collision.mesh_check import mesh_collisions
-from impact_posture.collision.pairs import Hindrance, hindered, random_postures, touch_of
-from impact_posture.collision.parts import divide, triangles_of
-from impact_posture.collision.shape_points import shape_points
+from impact_posture.collision.pairs import random_postures
 from impact_posture.collision.shapes import RobotShapes, load_shapes
-from impact_posture.collision.swept_hull import SweptHull, separation
-from impact_posture.collision.urdf_shapes import read_urdf_shapes
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.nested_links import NestedLinks
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from tests.test_bad_shapes import link, mesh, stl
-from tests.test_collision_shapes import outside, surface
 
 CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 FACES = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
 # Inner half width of a channel, thickness of its walls, half width of the rod in it, m.
 INNER, WALL, ROD = 0.1, 0.02, 0.02
-
-
-def area(triangles: Array) -> Array:
-    return np.asarray(np.linalg.norm(np.cross(*np.diff(triangles, axis=1).transpose(1, 0, 2)), axis=1) / 2)
-
-
-@given(seed=st.integers(0, 2**32 - 1), height=st.floats(-1.5, 1.5), upright=st.booleans())
-def test_a_cut_loses_no_point(seed: int, height: float, upright: bool) -> None:
-    random = np.random.default_rng(seed)
-    # Corners on a grid, so that some of them lie in an upright plane.
-    triangles = random.integers(-4, 5, (60, 3, 3)) / 3
-    height = round(3 * height) / 3 if upright else height
-    axis = np.eye(3)[seed % 3] if upright else random.normal(size=3)
-    axis /= np.linalg.norm(axis)
-    below, above = divide(triangles, axis, height)
-    assert (below @ axis).max(initial=-9) <= height + 1e-12
-    assert (above @ axis).min(initial=9) >= height - 1e-12
-    assert area(below).sum() + area(above).sum() == pytest.approx(area(triangles).sum(), abs=1e-12)
-    # A random point of each triangle is a sum of the corners of a triangle of its side.
-    shares = random.dirichlet(np.ones(3), len(triangles))
-    for point in np.einsum("nk,nkj->nj", shares, triangles):
-        side = below if point @ axis <= height else above
-        rows = np.concatenate([side.transpose(0, 2, 1), np.ones((len(side), 1, 3))], axis=1)
-        found = np.linalg.pinv(rows) @ np.r_[point, 1]
-        apart = np.linalg.norm(np.einsum("nij,nj->ni", rows, found) - np.r_[point, 1], axis=1)
-        assert (apart[found.min(axis=1) > -1e-9] < 1e-9).any()
 
 
 # ---- a rod in a channel -------------------------------------------------------------------------------------------
@@ -102,12 +66,10 @@ def rod_in_channel(folder: Path, turn: Array) -> tuple[Robot, RobotShapes]:
     return robot, load_shapes(robot)
 
 
-def closest(robot: Robot, shapes: RobotShapes, q: Array) -> float:
-    """Least distance of two hulls that have to keep apart, m."""
-    data = robot.model.createData()
-    pin.forwardKinematics(robot.model, data, q)
-    pairs = ((shapes.bodies[i], shapes.bodies[j]) for i, j in shapes.pairs)
-    return min(separation(a, data.oMi[a.joint], b, data.oMi[b.joint]).distance for a, b in pairs)
+def within(robot: Robot, planes: JointPlanes, q: Array) -> bool:
+    """Tell whether a posture is within the planes of two bodies."""
+    at = [robot.model.idx_qs[robot.joint_id(name)] for name in planes.joints]
+    return bool((planes.normals @ q[at] <= planes.bounds).all())
 
 
 @pytest.mark.parametrize("turn", [np.eye(3), pin.rpy.rpyToMatrix(0.3, 0.2, 0.7)], ids=["upright", "turned"])
@@ -116,97 +78,50 @@ def test_a_rod_may_be_in_a_channel_and_not_in_its_walls(
 ) -> None:
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
     robot, shapes = rod_in_channel(tmp_path, turn)
-    assert shapes.hulls_touching == () and not shapes.warnings
-    assert {body.link for body in shapes.bodies} == {"frame", "rod"} and len(shapes.bodies) > 2
-    assert all(body.name.startswith(f"{body.link}/") for body in shapes.bodies if body.link == "frame")
+    assert shapes.hulls_touching == () and not shapes.warnings and not len(shapes.pairs)
+    (planes,) = shapes.joint_planes
+    assert set(planes.bodies) == {"frame", "rod"} and planes.joints == ("y", "z")
     free, allowed = 0, 0
     for q in random_postures(robot, 200):
         gap = float(min(INNER - ROD - abs(q[0]), 0.15 + q[1] - ROD))
-        distance = closest(robot, shapes, q)
-        # The hulls hold the shapes, so they are never farther apart.
-        assert distance <= max(gap, 0) + 1e-6
         assert bool(mesh_collisions(robot, shapes, q)) is (gap < 0)
-        if np.array_equal(turn, np.eye(3)):
-            # Parts are cut beside the walls, and take in so much of the channel.
-            assert distance > gap - 0.03 or gap < 0
-        free, allowed = free + (gap > 0), allowed + (distance > 0)
+        assert gap > 0 or not within(robot, planes, q)
+        free, allowed = free + (gap > 0), allowed + within(robot, planes, q)
     assert 100 < free < 190
     assert allowed > 0.7 * free
-
-
-def test_a_rod_that_fills_its_bore_stays_out_of_the_pairs(tmp_path: Path) -> None:
-    """A cube inside another: no cut of either frees the inner one, and neither is cut in the end."""
-    triangles = CUBE[FACES]
-    cubes = [SweptHull(name, name, 0, *fit_hull(scale * CUBE)) for name, scale in (("outer", 1.0), ("inner", 0.9))]
-    hollow = {(0, 1): Hindrance([pin.SE3.Identity()] * 5, 5)}
-    opened = open_hollows(cubes, hollow, lambda k: (1.0, 0.9)[k] * triangles)
-    assert opened.parts == [[cubes[0]], [cubes[1]]]
-    assert opened.hindered == {(0, 1)}
 
 
 # ---- robots -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["hyq", "hextilt"])
+@pytest.mark.parametrize("name", ["hextilt", "icub"])
 def test_bodies_of_robots_have_no_hollows_left(name: str) -> None:
-    shapes = load_shapes(load_robot(name))
-    assert shapes.hulls_touching == ()
-    parts = [body for body in shapes.bodies if "/" in body.name]
-    assert parts and len({body.name for body in shapes.bodies}) == len(shapes.bodies)
-    # Each part has its link's name, and no more parts than allowed.
-    for link_name in {body.link for body in parts}:
-        assert len([body for body in parts if body.link == link_name]) <= 8
+    """One of two, and one of three joints between bodies."""
+    robot = load_robot(name)
+    shapes = load_shapes(robot)
+    assert shapes.hulls_touching == () and shapes.joint_planes
+    for planes in shapes.joint_planes:
+        one, other = ({k for k, body in enumerate(shapes.bodies) if body.name == end} for end in planes.bodies)
+        assert one and other and not [pair for pair in shapes.pairs if set(pair) == one | other]
+        assert within(robot, planes, robot.posture())
+    touching = [frozenset(planes.bodies) for planes in shapes.joint_planes]
+    kept = np.zeros(len(touching), dtype=int)
+    for q in random_postures(robot, 200):
+        inside = np.array([within(robot, planes, q) for planes in shapes.joint_planes])
+        kept += inside
+        hit = {frozenset(pair) for pair in mesh_collisions(robot, shapes, q)}
+        assert not [pair for pair, free in zip(touching, inside, strict=True) if free and pair in hit]
+    assert (kept > 0).all()
 
 
-@pytest.mark.parametrize("name", ["hyq", "hextilt"])
-def test_parts_hold_their_shapes(name: str) -> None:
-    shapes, random = load_shapes(load_robot(name)), np.random.default_rng(0)
-    cut = {body.link for body in shapes.bodies if "/" in body.name}
-    frames = shapes.robot.model.frames
-    for shape in shapes.geometry.geometryObjects:
-        if frames[shape.parentFrame].name not in cut:
-            continue
-        points = surface(shape, random, 200)
-        for body in shapes.bodies:
-            if body.joint == shape.parentJoint and len(points):
-                points = points[_far(body, points)]
-        assert not len(points), shape.name
-
-
-def _far(body: SweptHull, points: Array) -> Array:
-    """Tell which points are not in a swept hull."""
-    planes = ConvexHull(body.vertices).equations
-    near = np.max(points @ planes[:, :3].T + planes[:, 3], axis=1) <= 0
-    near[~near] = outside(body, points[~near]) < 1e-6
-    return np.asarray(~near)
-
-
-def test_pelvis_and_hip_are_kept_apart() -> None:
-    """The two bodies of g1 that collide at many of its optima, alone, because its other bodies take long."""
-    robot = load_robot("g1")
-    described = [shape for shape in read_urdf_shapes(robot)[0] if shape.link in ("pelvis", "right_hip_roll_link")]
-    shapes = list(load_geometry(robot, described).model.geometryObjects)
-    hulls = []
-    for shape in shapes:
-        points = shape_points(shape.geometry) @ shape.placement.rotation.T + shape.placement.translation
-        hulls.append(SweptHull(shape.name, shape.name, shape.parentJoint, *fit_hull(points)))
-    touch = touch_of(shapes)
-    hollows = hindered(robot, hulls, [(0, 1)], touch)
-    assert set(hollows) == {(0, 1)}
-    opened = open_hollows(hulls, hollows, lambda k: triangles_of([shapes[k]]))
-    assert opened.hindered == set() and sum(map(len, opened.parts)) > 2
-    data = robot.model.createData()
-    allowed = free = 0
-    for q in random_postures(robot, 300):
-        pin.forwardKinematics(robot.model, data, q)
-        apart = all(
-            separation(a, data.oMi[a.joint], b, data.oMi[b.joint]).distance > 0 for a, b in product(*opened.parts)
-        )
-        touching = touch((0, 1), data)
-        assert not (apart and touching)
-        free, allowed = free + (not touching), allowed + apart
-    # The hulls of the whole bodies allow less than half of them.
-    assert free > 200 and allowed > 0.7 * free
+def test_bodies_that_nest_and_never_touch_are_free() -> None:
+    """The upper legs of HyQ turn in its body's hull, and touch its shapes at no position of the hips."""
+    shapes = load_shapes(load_robot("hyq"))
+    assert shapes.hulls_touching == () and [len(planes.bounds) for planes in shapes.joint_planes] == [0] * 4
+    names = [body.name for body in shapes.bodies]
+    apart = {frozenset((names[i], names[j])) for i, j in shapes.pairs}
+    assert frozenset(("base_link", "lf_upperleg")) not in apart
+    assert frozenset(("base_link", "lf_lowerleg")) in apart
 
 
 # ---- bounds on the joints between two bodies ----------------------------------------------------------------------
@@ -242,10 +157,9 @@ def test_planes_cut_off_where_shapes_touch(corners: list[tuple[float, float, flo
     assert (planes.bounds > 0).all() and inside.mean() > 0.5
 
 
-@pytest.mark.parametrize("case", ["nowhere", "everywhere", "at the start", "far joints"])
+@pytest.mark.parametrize("case", ["everywhere", "at the start", "far joints"])
 def test_no_planes_where_none_help(case: str) -> None:
     regions = {
-        "nowhere": lambda x: False,
         "everywhere": lambda x: True,
         "at the start": lambda x: bool(np.hypot(*x) < 0.1),
         "far joints": lambda x: bool(x[0] > 0.4),
@@ -254,12 +168,17 @@ def test_no_planes_where_none_help(case: str) -> None:
     assert planes_where(regions[case], first) is None
 
 
+def test_shapes_that_touch_nowhere_need_no_plane() -> None:
+    planes = planes_where(lambda x: False)
+    assert planes is not None and planes.normals.shape == (0, 2) and planes.bounds.shape == (0,)
+
+
 @given(seed=st.integers(0, 2**32 - 1))
 def test_within_the_planes_the_waist_of_g1_does_not_touch(seed: int) -> None:
     robot = load_robot("g1")
-    (planes,) = load_shapes(robot).joint_planes
+    (planes,) = (one for one in load_shapes(robot).joint_planes if one.joints == WAIST)
     constraint, numeric = NestedLinks(robot, planes), Numeric(robot.model)
-    assert planes.joints == WAIST and set(planes.bodies) == {"waist_yaw_link", "torso_link"}
+    assert set(planes.bodies) == {"waist_yaw_link", "torso_link"}
     q = robot.posture()
     at = [robot.model.idx_qs[robot.joint_id(name)] for name in WAIST]
     q[at] = np.random.default_rng(seed).uniform(-0.52, 0.52, 2)

@@ -8,25 +8,28 @@ from itertools import product
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.robot.robot import Robot
 from impact_posture.stored_text import StoredArray
 
 # Positions of each joint at which shapes are tried.  More joints than this between two bodies are too many.
-_TRIED, _MOST_JOINTS = 25, 2
+_TRIED, _MOST_JOINTS = 25, 3
 # Most planes of a pair, and the least share of the free positions that they leave.
-_MOST_PLANES, _LEFT = 8, 0.5
+_MOST_PLANES, _LEFT = 12, 1 / 3
+# A plane that cuts off less is not worth a row, even if it costs no free position: share of the free positions.
+_WORTH = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class JointPlanes:
-    """Planes ``normals θ ≤ bounds`` for the joints between two bodies; beyond them their shapes may touch.
+    """Planes ``normals θ ≤ bounds`` for the joints between two bodies; within them their shapes do not touch.
 
     Attributes:
         bodies: Names of the bodies.
-        joints: Names of the joints between them, m of one or two.
-        normals: Shape (k, m), per rad (m).
+        joints: Names of the joints between them, m of one to three.
+        normals: Shape (k, m), per rad (m); no rows if the shapes touch nowhere.
         bounds: Shape (k,).
     """
 
@@ -39,11 +42,11 @@ class JointPlanes:
 def joint_planes(
     robot: Robot, names: tuple[str, str], ends: tuple[int, int], touch: Callable[[pin.Data], bool]
 ) -> JointPlanes | None:
-    """Return planes that keep the shapes of two bodies apart; ``None`` if they touch nowhere, or no planes are found.
+    """Return planes that keep the shapes of two bodies apart; ``None`` if none are found.
 
-    The shapes are tried on a grid over the ranges of the joints.  Each plane cuts off the nearest position at which
-    they touch, one step of the grid before it, at right angles to the line from the default posture (in shares of
-    the ranges), until it cuts off all of them.
+    The shapes are tried on a grid over the ranges of the joints.  Planes cut off the positions at which they touch,
+    with the cells of the grid around them: each time the one that cuts off most of them for the free positions that
+    it costs.
 
     Args:
         robot: The robot.
@@ -66,23 +69,45 @@ def joint_planes(
         pin.forwardKinematics(model, data, q)
         return touch(data)
 
-    shares = (grid - start[at]) / half
     hit = np.array([touches(theta) for theta in grid])
-    free, left = shares[~hit], shares[hit]
-    step, count = 2 / (_TRIED - 1), len(free)
-    normals, bounds = list[Array](), list[float]()
-    while len(left):
-        size = np.linalg.norm(left, axis=1)
-        nearest = int(size.argmin())
-        if size[nearest] <= step or len(normals) == _MOST_PLANES:
-            return None
-        normals.append(left[nearest] / size[nearest])
-        bounds.append(float(size[nearest]) - step)
-        free, left = (points[points @ normals[-1] <= bounds[-1]] for points in (free, left))
-    if not normals or len(free) < _LEFT * count:
+    found = _cut_off(hit, (grid - start[at]) / half, 2 / (_TRIED - 1))
+    if found is None:
         return None
-    rows = np.array(normals) / half
-    return JointPlanes(names, tuple(str(model.names[k]) for k in between), rows, bounds + rows @ start[at])
+    rows = found[0] / half
+    return JointPlanes(names, tuple(str(model.names[k]) for k in between), rows, found[1] + rows @ start[at])
+
+
+def _cut_off(hit: NDArray[np.bool_], shares: Array, step: float) -> tuple[Array, Array] | None:
+    """Return normals, shape (k, m), and bounds of planes that cut off the positions hit, but not the origin.
+
+    Args:
+        hit: Whether the shapes touch at each position.
+        shares: Positions, measured from the default posture in shares of half the ranges, shape (n, m).
+        step: Step of the grid.
+    """
+    free, left = shares[~hit], shares[hit]
+    count = max(1, len(free))
+    # Along each axis, and between axes.
+    signs = np.array([signs for signs in product((-1, 0, 1), repeat=shares.shape[1]) if any(signs)], dtype=float)
+    directions = signs / np.linalg.norm(signs, axis=1, keepdims=True)
+    # The cells around a position reach so far along each direction.
+    cells = step * np.abs(directions).sum(axis=1)
+    normals, bounds = [np.zeros((0, shares.shape[1]))], [np.zeros(0)]
+    while len(left):
+        heights = (left @ directions.T - cells).round(9)
+        planes = [(k, bound) for k, along in enumerate(heights.T) for bound in np.unique(along) if bound > 0]
+        if not planes or len(bounds) > _MOST_PLANES:
+            return None
+        costs = [np.sum(free @ directions[k] > bound) for k, bound in planes]
+        worth = [
+            np.sum(heights[:, k] >= bound) / (cost + _WORTH * count)
+            for (k, bound), cost in zip(planes, costs, strict=True)
+        ]
+        k, bound = planes[int(np.argmax(worth))]
+        normals.append(directions[[k]])
+        bounds.append(np.array([bound]))
+        free, left = free[free @ directions[k] <= bound], left[heights[:, k] < bound]
+    return (np.vstack(normals), np.hstack(bounds)) if len(free) >= _LEFT * count else None
 
 
 def _between(model: pin.Model, first: int, second: int) -> list[int]:

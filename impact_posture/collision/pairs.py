@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 import coal
 import numpy as np
@@ -20,22 +19,6 @@ _COUNTED = 100
 _SEED = 0
 
 Pair = tuple[int, int]
-
-
-class Hindrance(NamedTuple):
-    """Postures that the hulls of two bodies forbid, and their shapes do not.
-
-    Attributes:
-        placements: Placement of the second body in the axes of the first at each of them.
-        free: Number of sampled postures that the shapes allow.
-    """
-
-    placements: list[pin.SE3]
-    free: int
-
-    def by(self, count: int) -> bool:
-        """Tell whether hulls hinder the bodies that touch at so many of the placements."""
-        return 2 * count >= self.free
 
 
 def pairs_apart(
@@ -83,7 +66,7 @@ def hindered(
     bodies: Sequence[SweptHull],
     pairs: list[Pair],
     touch: Callable[[Pair, pin.Data], bool],
-) -> dict[Pair, Hindrance]:
+) -> list[Pair]:
     """Return the pairs of bodies whose hulls touch at most of the postures at which their shapes do not.
 
     Such bodies lie in each other's hollows, as a shaft in its fork.  To keep their hulls apart would forbid most of
@@ -96,8 +79,7 @@ def hindered(
         touch: Whether shapes of two bodies touch at the placements in the data.
     """
     data = robot.model.createData()
-    apart = np.zeros(len(pairs), dtype=int)
-    placements: list[list[pin.SE3]] = [[] for _ in pairs]
+    apart, forbidden = np.zeros((2, len(pairs)), dtype=int)
     first, second = np.array(pairs, dtype=int).reshape(-1, 2).T
     reach = np.array([body.reach for body in bodies])
     for q in [robot.posture(), *random_postures(robot, _COUNTED)]:
@@ -110,11 +92,8 @@ def hindered(
             if separation(a, data.oMi[a.joint], b, data.oMi[b.joint]).distance > 0:
                 apart[k] += 1
             elif not touch(pairs[k], data):
-                placements[k].append(data.oMi[a.joint].actInv(data.oMi[b.joint]))
-    found = {
-        pair: Hindrance(at, len(at) + int(count)) for pair, at, count in zip(pairs, placements, apart, strict=True)
-    }
-    return {pair: one for pair, one in found.items() if one.by(len(one.placements))}
+                forbidden[k] += 1
+    return [pair for pair, more, less in zip(pairs, forbidden, apart, strict=True) if more >= less]
 
 
 def touch_of(shapes: Sequence[pin.GeometryObject]) -> Callable[[Pair, pin.Data], bool]:

@@ -1,4 +1,4 @@
-"""Points whose convex hull holds a shape of coal."""
+"""Points whose convex hull holds a shape of coal, and its surface."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import coal
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.collision.mesh_triangles import mesh_points
+from impact_posture.collision.mesh_triangles import Triangles, hull_surface, mesh_points, mesh_triangles
 
 # Corners of the polygon around a circle: it is 0.5 % larger.
 _SIDES = 32
@@ -34,6 +34,15 @@ def shape_points(shape: Any) -> Array:
             return _ends(_ball() * float(shape.radius), shape.halfLength)
         case _:
             return mesh_points(shape)
+
+
+def surface_of(shape: Any) -> tuple[Array, Triangles]:
+    """Return the corners of a shape in its own axes, shape (k, 3), m, and its triangles as indices, shape (n, 3).
+
+    They are those of a mesh, or of the hull around a primitive shape.
+    """
+    points = shape_points(shape)
+    return (points, mesh_triangles(shape)) if isinstance(shape, coal.BVHModelBase) else hull_surface(points)
 
 
 def _ends(points: Array, half_length: float) -> Array:

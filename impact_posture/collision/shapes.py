@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
-from itertools import product
 
 import coal
 import numpy as np
@@ -12,11 +11,9 @@ import pinocchio as pin
 
 from impact_posture.collision.bodies import Body, merged_bodies
 from impact_posture.collision.geometry import Geometry, geometry_key, load_geometry
-from impact_posture.collision.hollows import open_hollows
 from impact_posture.collision.hull_fit import Fit, fit_hull
 from impact_posture.collision.joint_planes import JointPlanes, joint_planes
 from impact_posture.collision.pairs import Pair, hindered, mostly_touching, pairs_of, touch_of
-from impact_posture.collision.parts import triangles_of
 from impact_posture.collision.swept_hull import SweptHull
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.progress import tell
@@ -35,17 +32,18 @@ class FittedShapes:
         pairs: Bodies that have to keep apart, as indices into ``bodies``, shape (k, 2).
         always_touching: Names of shapes that touch at the default posture and at most others, so that they overlap by
             design and need not keep apart.
-        hulls_touching: Names of bodies whose hulls touch at most of the postures at which their shapes do not, even
-            if they are cut.  They are in no pair.  The check on the shapes finds their collisions.
-        joint_planes: What keeps the shapes of such bodies apart, where few joints lie between them.
+        joint_planes: What keeps bodies apart whose hulls touch at most of the postures at which their shapes do not.
+            They are in no pair.  Where their shapes touch nowhere, it has no rows.
+        hulls_touching: Names of such bodies for which no planes are found.  Only the check on the shapes finds their
+            collisions.
         warnings: Shapes that are left out, and what a robot without shapes means; one line each.
     """
 
     bodies: tuple[SweptHull, ...]
     pairs: StoredArray
     always_touching: tuple[tuple[str, str], ...]
-    hulls_touching: tuple[tuple[str, str], ...]
     joint_planes: tuple[JointPlanes, ...]
+    hulls_touching: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
 
 
@@ -98,7 +96,7 @@ def _shapes(source: _Source) -> RobotShapes:
 
 
 def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
-    """Load the shapes, fit their hulls, find the pairs, and cut bodies in each other's hollows into parts."""
+    """Load the shapes, fit their hulls, and find the pairs; bodies in each other's hollows get bounds on joints."""
     tell("fitting collision shapes")
     loaded = load_geometry(robot, described)
     shapes, apart = loaded.model.geometryObjects, loaded.apart
@@ -116,23 +114,18 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
         a, b = (merged[k].shapes for k in pair)
         return any(touch((i, j), data) for i in a for j in b)
 
-    hollows = hindered(robot, hulls, pairs, bodies_touch)
-    opened = open_hollows(hulls, hollows, lambda k: triangles_of(shapes[n] for n in merged[k].shapes))
-    planes = (
-        joint_planes(robot, (a.name, b.name), (a.joint, b.joint), partial(bodies_touch, pair))
-        for pair in sorted(opened.hindered)
-        for a, b in [[hulls[k] for k in pair]]
-    )
-    bodies = [hull for parts in opened.parts for hull in parts]
-    index = {hull: k for k, hull in enumerate(bodies)}
-    kept = [pair for pair in pairs if pair not in opened.hindered]
-    apart_bodies = [(index[a], index[b]) for i, j in kept for a, b in product(opened.parts[i], opened.parts[j])]
+    nested = hindered(robot, hulls, pairs, bodies_touch)
+    named = {pair: (hulls[pair[0]].name, hulls[pair[1]].name) for pair in nested}
+    planes = {
+        pair: joint_planes(robot, names, (hulls[pair[0]].joint, hulls[pair[1]].joint), partial(bodies_touch, pair))
+        for pair, names in named.items()
+    }
     return FittedShapes(
-        bodies=tuple(replace(hull, known_faces=hull.faces) for hull in bodies),
-        pairs=np.array(apart_bodies, dtype=int).reshape(-1, 2),
+        bodies=tuple(replace(hull, known_faces=hull.faces) for hull in hulls),
+        pairs=np.array([pair for pair in pairs if pair not in named], dtype=int).reshape(-1, 2),
         always_touching=tuple((shapes[i].name, shapes[j].name) for i, j in touching),
-        hulls_touching=tuple((hulls[i].name, hulls[j].name) for i, j in sorted(opened.hindered)),
-        joint_planes=tuple(one for one in planes if one is not None),
+        hulls_touching=tuple(names for pair, names in named.items() if planes[pair] is None),
+        joint_planes=tuple(one for one in planes.values() if one is not None),
         warnings=loaded.warnings,
     )
 

@@ -142,7 +142,7 @@ class Surroundings:
     @cached_property
     def nested(self) -> list[NestedLinks]:
         """Return the constraints of links in each other's hollows."""
-        return [NestedLinks(self.robot, planes) for planes in self.shapes.joint_planes]
+        return [NestedLinks(self.robot, planes) for planes in self.shapes.joint_planes if len(planes.bounds)]
 
     @cached_property
     def constraints(self) -> list[Clearance]:

@@ -13,8 +13,7 @@ import pinocchio as pin
 from impact_posture.arrays import Array
 from impact_posture.collision.geometry import geometry_key, load_geometry
 from impact_posture.collision.mesh_triangles import Triangles, hull_surface
-from impact_posture.collision.parts import surface_of
-from impact_posture.collision.shape_points import shape_points
+from impact_posture.collision.shape_points import shape_points, surface_of
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.libraries import source_key
 from impact_posture.report.mesh_license import MeshLicense, license_of
