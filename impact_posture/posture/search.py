@@ -23,7 +23,7 @@ from impact_posture.processes import fork_map
 Progress = Callable[[int, int], None]
 
 # Starts that run before the others, and most runs from one start, each with a program that has grown.
-_FIRST, _ROUNDS = 2, 8
+_FIRST, _ROUNDS = 2, 10
 # Unknowns of all starts together up to which every start is finished, because that takes no longer.
 _SMALL = 1000
 # Where only the best counts: unknowns of the starts that go on together, which takes longer than to build a program,
@@ -34,7 +34,7 @@ _FORK = 200
 # Starts that go on from postures this close (rad, m) share one run, which would end at the same posture.
 _SAME = 1e-6
 # Price of a meter of slack for runs that ended in a trap, and how often they begin anew.
-HIGH_PRICE, _ANEW = 20 * SLACK_PRICE, 2
+HIGH_PRICE, _ANEW = 20 * SLACK_PRICE, 4
 
 
 @dataclass(frozen=True)
