@@ -193,8 +193,8 @@ def test_surface_and_locking_are_warned_about(tmp_path: Path) -> None:
 
 def test_knees_below_the_ground_and_a_growing_jump_are_said(tmp_path: Path) -> None:
     """The best posture of this quadruped folds two knees under its feet, and V rises while H falls."""
-    command = ("optimize", "anymal_c", "--normal", 0, 1, 0, "--json", "--no-codegen", "--format", "png")
-    done = run(*command, "--out", "clear", cwd=tmp_path)
+    command = ("optimize", "anymal_c", "--normal", 0, 1, 0, "--json", "--no-codegen", "--no-report")
+    done = run(*command, "--starts", 6, "--out", "clear", cwd=tmp_path)
     clear = json.loads(done.stdout)
     assert not any("below the lowest foot" in warning for warning in clear["warnings"])
     assert clear["collision"]["optimal"]["distance"] > 0.0009

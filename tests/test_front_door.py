@@ -205,7 +205,7 @@ def test_friction_is_that_of_the_contact_and_is_saved(tmp_path: Path) -> None:
     robot = ip.load_robot("tilthex_arm")
     objective = ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1), friction=0.3), kind="coulomb")
     problem = ip.PostureProblem(objective, base="level")
-    ip.optimize(problem, starts=1).save(tmp_path / "out", codegen=False)
+    ip.optimize(problem, starts=1).save(tmp_path / "out", codegen=False, formats=("png",), report=False)
     assert "friction = 0.3" in (tmp_path / "out" / "problem.toml").read_text()
     assert problem.problem.requirements.friction == 0.3
 

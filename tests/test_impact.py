@@ -151,8 +151,9 @@ def test_oracle_by_its_definition(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_lifted_form(name: str) -> None:
     """At the guess the equations hold and the value is the oracle's; the equations fix the unknowns."""
-    for found, contact, metric, supports in combinations(name):
-        for kind in KINDS:
+    for k, (found, contact, metric, supports) in enumerate(combinations(name)):
+        # A robot that goes through all combinations goes through them with each kind, every other with three kinds.
+        for kind in KINDS if name in WHOLE else [KINDS[(NAMES.index(name) + k) % len(KINDS)]]:
             objective = ImpactObjective(found, contact, metric, kind, supports)
             q, n = ca.SX.sym("q", found.nq), ca.SX.sym("n", 3)
             lifted = objective.lift(Tree(found.model, q), n, ca.SX(1))
