@@ -18,7 +18,7 @@ from impact_posture.stored_text import StoredArray
 _TRIED, _MOST_JOINTS = 25, 3
 # Most planes of a pair, and the least share of the free positions that they leave.
 _MOST_PLANES, _LEFT = 12, 1 / 3
-# A plane that cuts off less is not worth a row, even if it costs no free position: share of the free positions.
+# A plane costs the free positions that it cuts off, and this share of all free positions for itself.
 _WORTH = 0.05
 
 
