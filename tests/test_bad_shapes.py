@@ -20,6 +20,7 @@ from impact_posture.collision import shapes as collision_shapes
 from impact_posture.collision.mesh_check import mesh_collisions
 from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import NO_SHAPES, RobotShapes, load_shapes
+from impact_posture.collision.swept_hull import distance_from_hull
 from impact_posture.errors import InputError, SpecError, UrdfError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
@@ -174,6 +175,19 @@ def test_an_open_mesh_is_closed_by_its_hull(tmp_path: Path) -> None:
     body = next(body for body in shapes.bodies if body.link == "middle")
     assert not shapes.warnings
     assert {tuple(np.round(v, 6).tolist()) for v in body.vertices} == {tuple(v) for v in TETRAHEDRON.tolist()}
+
+
+def test_a_corner_with_hundreds_of_edges(tmp_path: Path) -> None:
+    """A fine cone beside a box: coal takes 255 edges at a corner, and the tip has 400."""
+    angles = np.linspace(0, 2 * np.pi, 401)
+    rim = 0.08 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    tip = np.broadcast_to([0.0, 0.0, 0.2], (400, 3))
+    stl(tmp_path / "cone.stl", np.stack([rim[:-1], rim[1:], tip], axis=1))
+    shapes = arm(tmp_path, mesh("cone.stl"), BOX)
+    assert not shapes.warnings
+    cone = [body for body in shapes.bodies if body.link == "middle" and body.vertices[:, 2].max() > 0.15]
+    assert len(cone) == 1 and len(cone[0].vertices) <= 40
+    assert all(distance_from_hull(point, cone[0]) < 1e-9 for point in (*rim, tip[0]))
 
 
 def test_millimeters_with_a_scale_and_mirrored_meshes_are_fine(tmp_path: Path) -> None:
