@@ -20,10 +20,10 @@ from impact_posture.posture.solve import distinct
 from impact_posture.posture.starts import FEASIBLE, Projector, random_posture
 from impact_posture.settings import ProblemSettings
 
-# Most rounds in which the program of a point grows.
-_ROUNDS = 8
-# Postures from which the constraints are relaxed, and random starts where a neighbor is infeasible already.
-_TRIES, _FEW = 4, 3
+# Most rounds in which the program of a point grows, and most of them before anything says that the point is feasible.
+_ROUNDS, _UNSURE = 8, 3
+# Postures from which the constraints are relaxed.
+_TRIES = 4
 # Postures whose joints differ by more than this (rad, m) may be of different optima.
 SWITCH = 0.2
 # An optimum is better than another if its objective is lower by this share.
@@ -86,21 +86,21 @@ class Walk:
         return found
 
 
-def search(walk: Walk, place: Place, guesses: Sequence[Array], *, few: bool = False) -> PointResult:
+def search(walk: Walk, place: Place, guesses: Sequence[Array], *, beside: bool = False) -> PointResult:
     """Solve one point: from the guesses and the given posture, and from many starts where they disagree.
 
     Args:
         walk: Problem and program as the points before have left them.
         place: Target position and orientation.
         guesses: Optima of neighbors.
-        few: Whether few starts are enough, because a neighbor is infeasible and none has an optimum.
+        beside: Whether a neighbor is infeasible and none has an optimum, so that this point is likely infeasible too.
     """
-    attempt = _Attempt(walk, place, _FEW if few else walk.settings.starts - 1)
+    attempt = _Attempt(walk, place, walk.settings.starts - 1)
     try:
-        if (found := attempt.certified(guesses)) is not None:
+        if not beside and (found := attempt.certified(guesses, rounds=_UNSURE)) is not None:
             return found
         # Either this finds the constraints that conflict, or a posture to start from.
-        relaxed = walk.relax(place, 1 if few else _TRIES)
+        relaxed = walk.relax(place, 1 if beside else _TRIES)
         if relaxed.conflicts:
             return attempt.without("infeasible", Infeasible(relaxed.conflicts).what)
         if (found := attempt.certified([relaxed.q])) is not None:
@@ -145,15 +145,18 @@ class _Attempt:
         self.problem, self.runs, self.fault = walk.at(walk.problem, place), 0, "no run converged"
         self._walk, self._others = walk, others
 
-    def certified(self, guesses: Sequence[Array], *, alone: bool = False) -> PointResult | None:
+    def certified(
+        self, guesses: Sequence[Array], *, alone: bool = False, rounds: int = _ROUNDS
+    ) -> PointResult | None:
         """Return the best certified posture, with parts added to the program as its ends need them.
 
         Args:
             guesses: Where the runs start, besides the given posture and the random ones.
             alone: Whether nothing else is started from.
+            rounds: Most rounds in which the program grows.
         """
         price = SLACK_PRICE
-        for _ in range(_ROUNDS):
+        for _ in range(rounds):
             problem = self.problem
             nlp = self._walk.nlp.at(problem)
             scale = problem.objective.value(guesses[0] if len(guesses) else problem.given)
