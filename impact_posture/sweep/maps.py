@@ -30,7 +30,8 @@ from impact_posture.sweep.shard import STATUS
 from impact_posture.tables import validate
 
 # The best posture switches between neighbors that differ (tangent norm, without the place of the base) by more than
-# SWITCH, and by more than this many times what neighbors usually differ by.
+# SWITCH, and by more than this many times what the closest quarter of all neighbors differ by at most: half of them
+# may be on both sides of a switch.
 _UNUSUAL = 4.0
 # From this ratio of the largest to the least objective on, colors follow its logarithm.
 _WIDE = 20.0
@@ -177,7 +178,7 @@ def _switches(postures: Sequence[Sequence[Array | None]], problem: PostureProble
                     if next_to is not None:
                         size = float(np.linalg.norm(wrapped_difference(problem, q, next_to)[own]))
                         steps.append((size, (row, column), other))
-    usual = float(np.median([size for size, _, _ in steps])) if steps else 0.0
+    usual = float(np.quantile([size for size, _, _ in steps], 0.25)) if steps else 0.0
     return [(one, other) for size, one, other in steps if size > max(SWITCH, _UNUSUAL * usual)]
 
 
