@@ -94,9 +94,9 @@ def test_a_rod_may_be_in_a_channel_and_not_in_its_walls(
 # ---- robots -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["hextilt", "icub"])
-def test_bodies_of_robots_have_no_hollows_left(name: str) -> None:
-    """One of two, and one of three joints between bodies."""
+@pytest.mark.parametrize("name", ["hextilt", "g1", "icub"])
+def test_nested_bodies_keep_apart_and_most_of_their_free_positions(name: str) -> None:
+    """Two joints between them, such as pelvis and hip of g1, and three at the hips of iCub."""
     robot = load_robot(name)
     shapes = load_shapes(robot)
     assert shapes.hulls_touching == () and shapes.joint_planes
@@ -104,14 +104,16 @@ def test_bodies_of_robots_have_no_hollows_left(name: str) -> None:
         one, other = ({k for k, body in enumerate(shapes.bodies) if body.name == end} for end in planes.bodies)
         assert one and other and not [pair for pair in shapes.pairs if set(pair) == one | other]
         assert within(robot, planes, robot.posture())
-    touching = [frozenset(planes.bodies) for planes in shapes.joint_planes]
-    kept = np.zeros(len(touching), dtype=int)
+    free, kept = np.zeros((2, len(shapes.joint_planes)), dtype=int)
     for q in random_postures(robot, 200):
-        inside = np.array([within(robot, planes, q) for planes in shapes.joint_planes])
-        kept += inside
         hit = {frozenset(pair) for pair in mesh_collisions(robot, shapes, q)}
-        assert not [pair for pair, free in zip(touching, inside, strict=True) if free and pair in hit]
-    assert (kept > 0).all()
+        apart = np.array([frozenset(planes.bodies) not in hit for planes in shapes.joint_planes])
+        inside = np.array([within(robot, planes, q) for planes in shapes.joint_planes])
+        assert not (inside & ~apart).any()
+        free, kept = free + apart, kept + inside
+    # Most postures collide at the hips of iCub, and what is left is far from convex.
+    least = [0.7 if len(planes.joints) == 2 else 0.1 for planes in shapes.joint_planes]
+    assert (kept > least * free).all()
 
 
 def test_bodies_that_nest_and_never_touch_are_free() -> None:
