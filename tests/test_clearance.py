@@ -299,7 +299,7 @@ def test_derivatives_of_a_program_that_grew_are_those_of_casadi(name: str) -> No
     first = nlp = build_nlp(problem, compile="never")
     for _ in range(3):
         # Postures anywhere bring in pairs and corners, as the ends of runs do.
-        ends = [random_posture(problem, projector.chart, rng, near=False) for _ in range(3)]
+        ends = [random_posture(problem, projector.chart, rng) for _ in range(3)]
         problem = problem.grown(ends)
         nlp = nlp.grown(problem, compile="never")
     assert nlp.solver.size1_in("lbg") > first.solver.size1_in("lbg") + 50
@@ -311,3 +311,10 @@ def test_derivatives_of_a_program_that_grew_are_those_of_casadi(name: str) -> No
         pairs = zip(ours, theirs, strict=True) if count == 2 else [(ours, theirs)]
         for one, other in pairs:
             np.testing.assert_allclose(ca.DM(one).full(), ca.DM(other).full(), rtol=1e-9, atol=1e-9)
+
+
+def test_starts_lie_near_a_posture_that_is_clear() -> None:
+    # The given posture reaches far through the wall, and most starts near it end between bodies.
+    posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0), holdable=False)).problem
+    found = solve(posed, starts=16, jobs=1, compile="never", finish_all=True)
+    assert found.certified_starts == 16

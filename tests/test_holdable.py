@@ -53,7 +53,7 @@ def cases(name: str, **more: object) -> tuple[LoadCase, ...]:
 
 
 def posture(posed: PostureProblem, seed: int, *, near: bool = True) -> Vector:
-    return random_posture(posed, Chart(posed.robot.model), np.random.default_rng(seed), near=near)
+    return random_posture(posed, Chart(posed.robot.model), np.random.default_rng(seed), posed.given if near else None)
 
 
 def statics(posed: PostureProblem, case: LoadCase, q: Vector, z: Vector) -> Vector:

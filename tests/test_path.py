@@ -301,7 +301,7 @@ def test_random_postures_of_robots_are_reached_on_the_constraints(name: str) -> 
     assert start is not None
     generator = rng("reach", name)
     for _ in range(2):
-        end = space.projector.project(random_posture(problem, space.projector.chart, generator, near=True)).q
+        end = space.projector.project(random_posture(problem, space.projector.chart, generator, problem.given)).q
         if not space.valid(end):
             continue
         way = space.walk(start, end)

@@ -45,7 +45,7 @@ def catalogue(robot: str, **more: object) -> PostureProblem:
 
 def drawn(manifold: ConstraintManifold, count: int, seed: int) -> Vector:
     rng = np.random.default_rng(seed)
-    found = [random_posture(manifold.problem, manifold.chart, rng, near=False) for _ in range(count)]
+    found = [random_posture(manifold.problem, manifold.chart, rng) for _ in range(count)]
     return np.array([manifold.chart.to_x(q) for q in found])
 
 
@@ -163,7 +163,7 @@ def test_arms_of_the_catalogue_have_all_their_components_and_no_random_posture_i
 def test_a_batch_has_the_numbers_of_pinocchio(robot):
     problem = catalogue(robot)
     manifold, rng = ConstraintManifold(problem), np.random.default_rng(3)
-    q = [random_posture(problem, manifold.chart, rng, near=True) for _ in range(4)]
+    q = [random_posture(problem, manifold.chart, rng, problem.given) for _ in range(4)]
     x = manifold.project(np.array([manifold.chart.to_x(one) for one in q])).x
     values, gradients = manifold.objective(x)
     numeric = Numeric(problem.robot.model)

@@ -86,8 +86,8 @@ def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, effort
     ours, theirs = _Tree(space, start), _Tree(space, target)
     growing, other, attempt, begun = ours, theirs, 0, space.pulls
     while space.pulls - begun <= effort:
-        near = attempt % 4 < 2
-        aim = random_posture(space.problem, chart, rng, near=near) if attempt else target
+        near = space.problem.given if attempt % 4 < 2 else None
+        aim = random_posture(space.problem, chart, rng, near) if attempt else target
         end = growing.extend(aim)
         meeting = growing.postures[end]
         last = 0 if meeting is target else other.extend(meeting)

@@ -61,7 +61,8 @@ def elastic(
     program = program or ElasticProgram(problem)
     best: ElasticAnswer | None = None
     for attempt in range(tries):
-        start = problem.given if attempt == 0 else random_posture(problem, chart, rng, near=attempt % 2 == 1)
+        near = problem.given if attempt % 2 else None
+        start = random_posture(problem, chart, rng, near) if attempt else problem.given
         for _ in range(_ROUNDS):
             found = _relax(problem, chart, program, start)
             if found.problem is problem:

@@ -227,7 +227,7 @@ def _improved(
 def _redrawn(projector: Projector, q: Array, rng: np.random.Generator) -> Array | None:
     """Return the posture with some joints drawn anew, pulled onto the constraints; ``None`` if it does not reach."""
     chart = projector.chart
-    x, other = chart.to_x(q), chart.to_x(random_posture(projector.problem, chart, rng, near=False))
+    x, other = chart.to_x(q), chart.to_x(random_posture(projector.problem, chart, rng))
     share = rng.choice(_REDRAWN)
     for slot in chart.slots:
         if slot.kind.family != "free-flyer" and rng.random() < share:

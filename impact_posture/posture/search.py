@@ -218,7 +218,9 @@ class Search:
         elif start is None:
             # What is not clear of other bodies may not get out from between them.
             other = index + max(trapped - 1, 0) * self._starts
-            start = feasible_start(problem, other, self._seed, ATTEMPTS if trapped else CANDIDATES)
+            count = ATTEMPTS if trapped else CANDIDATES
+            # Near the first start, because the given posture may be far from all that satisfies the constraints.
+            start = feasible_start(problem, other, self._seed, count, self._known[0])
         if start is None:
             return Run()
         price = HIGH_PRICE if trapped else SLACK_PRICE

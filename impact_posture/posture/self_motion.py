@@ -120,7 +120,8 @@ def component_through(manifold: ConstraintManifold, x: Array) -> SelfMotion:
 
 def _random(manifold: ConstraintManifold, rng: np.random.Generator) -> Array:
     """Return random postures on the manifold within the limits; inequalities need not hold."""
-    drawn = [random_posture(manifold.problem, manifold.chart, rng, near=k % 4 == 0) for k in range(_BATCH)]
+    problem = manifold.problem
+    drawn = [random_posture(problem, manifold.chart, rng, None if k % 4 else problem.given) for k in range(_BATCH)]
     found = manifold.project(np.array([manifold.chart.to_x(q) for q in drawn]), within=True)
     return found.x[found.converged]
 

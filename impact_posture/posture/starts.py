@@ -115,23 +115,25 @@ class Projector:
         return blocked
 
 
-def feasible_start(problem: PostureProblem, index: int, seed: int, candidates: int = CANDIDATES) -> Array | None:
+def feasible_start(
+    problem: PostureProblem, index: int, seed: int, candidates: int = CANDIDATES, around: Array | None = None
+) -> Array | None:
     """Return the ``index``-th feasible start of a seed; ``None`` if no attempt reached the constraints.
 
-    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near it, even starts anywhere within
-    the limits.  Near starts reach the constraints more often, far starts find other optima.  Of ``candidates``
-    postures that reach them, the first counts that satisfies the constraints without projection too, else the one
-    that violates them least.
+    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near ``around``, by default the given
+    posture, and even starts anywhere within the limits.  Near starts reach the constraints more often, far starts
+    find other optima.  Of ``candidates`` postures that reach them, the first counts that satisfies the constraints
+    without projection too, else the one that violates them least.
     """
-    projector = Projector(problem)
+    projector, around = Projector(problem), problem.given if around is None else around
     if index == 0:
         found = projector.project(problem.given)
         return found.q if found.violation <= FEASIBLE else None
     rng = np.random.default_rng([seed, index])
     best, least, tried = None, np.inf, 0
     for attempt in range(ATTEMPTS):
-        near = (index + attempt) % 2 == 1
-        found = projector.project(random_posture(problem, projector.chart, rng, near=near))
+        near = around if (index + attempt) % 2 else None
+        found = projector.project(random_posture(problem, projector.chart, rng, near))
         if found.violation <= FEASIBLE:
             outside, tried = projector.outside(found.q), tried + 1
             if outside < least:
@@ -141,14 +143,16 @@ def feasible_start(problem: PostureProblem, index: int, seed: int, candidates: i
     return best
 
 
-def random_posture(problem: PostureProblem, chart: Chart, rng: np.random.Generator, *, near: bool) -> Array:
-    """Return a random posture within the bounds, not yet on the constraints."""
+def random_posture(
+    problem: PostureProblem, chart: Chart, rng: np.random.Generator, near: Array | None = None
+) -> Array:
+    """Return a random posture near a given one, or anywhere within the bounds, not yet on the constraints."""
     model = problem.robot.model
     base = 6 if problem.robot.floating else 0
-    if near:
+    if near is not None:
         step = rng.normal(size=model.nv) * rng.uniform(0.1, 0.8)
         step[:base] *= 0.2
-        return np.asarray(pin.integrate(model, problem.given, step))
+        return np.asarray(pin.integrate(model, near, step))
     x = chart.to_x(problem.given)
     for slot in chart.slots:
         low, high = problem.lower[slot.x], problem.upper[slot.x]

@@ -188,7 +188,8 @@ class _Attempt:
         projector = Projector(self.problem)
         for k in range(1, self._others + 1):
             rng = np.random.default_rng([self._walk.settings.seed, k])
-            found = projector.project(random_posture(self.problem, projector.chart, rng, near=k % 2 == 1))
+            near = self.problem.given if k % 2 else None
+            found = projector.project(random_posture(self.problem, projector.chart, rng, near))
             if found.violation <= FEASIBLE:
                 yield found.q
 
