@@ -108,21 +108,21 @@ def between(low: float, high: float, unit: str, names: Sequence[str] = ()) -> di
     }
 
 
-def tilt_of(pose: str) -> float | None:
-    """Return DEG of the contact pose ``aligned:DEG``, or ``None`` for any other pose."""
-    kind, colon, degrees = pose.partition(":")
+def tilt_of(value: str) -> float | None:
+    """Return DEG of a contact pose ``aligned:DEG`` or a base ``level:DEG``, or ``None`` for any other value."""
+    kind, colon, degrees = value.partition(":")
     try:
-        return float(degrees) if kind == "aligned" and colon else None
+        return float(degrees) if kind in ("aligned", "level") and colon else None
     except ValueError:
         return None
 
 
-def pose_of(kinds: Sequence[str]) -> dict[str, Any]:
-    """Return the demand for a contact pose of these kinds, or ``aligned:DEG``; a misspelt one gets a suggestion."""
+def kind_or_tilt(kinds: Sequence[str], tilted: str) -> dict[str, Any]:
+    """Return the demand for one of these kinds, or ``tilted:DEG``; a misspelt one gets a suggestion."""
 
     def holds(value: str) -> bool:
-        if value in kinds or value.startswith("aligned:"):
+        if value in kinds or value.startswith(f"{tilted}:"):
             return value in kinds or 0 < (tilt_of(value) or 0.0) < 90
-        raise ValueError("; ".join(not_one_of(value, (*kinds, "aligned:DEG"))))
+        raise ValueError("; ".join(not_one_of(value, (*kinds, f"{tilted}:DEG"))))
 
-    return {"holds": holds, "demand": "give aligned:DEG with degrees above 0 and below 90"}
+    return {"holds": holds, "demand": f"give {tilted}:DEG with degrees above 0 and below 90"}

@@ -286,7 +286,7 @@ class ProblemSettings(ImpactSettings):
         Setting(
             "Constraint on the contact frame: full, position, aligned (spin free), aligned:DEG (and tilted by up to "
             "DEG), free or box.",
-            TASK, "KIND", "robot.toml's, else full", **demand.pose_of(get_args(ContactPose)),
+            TASK, "KIND", "robot.toml's, else full", **demand.kind_or_tilt(get_args(ContactPose), "aligned"),
         ),
     ] = None  # fmt: skip
     box: Annotated[Vector3, Setting("Half extents of --contact-pose box, m.", TASK, "X Y Z", **demand.LENGTHS)] = (
@@ -302,9 +302,11 @@ class ProblemSettings(ImpactSettings):
         Setting("Keep a joint at its value; repeatable.", TASK, "JOINT", "robot.toml's", repeatable=True),
     ] = None
     base: Annotated[
-        BaseMode | None,
+        str | None,
         Setting(
-            "Constraint on a floating base: free, level, fixed or box.", TASK, "KIND", "robot.toml's, else free"
+            "Constraint on a floating base: free, level (yaw free), level:DEG (and tilted by up to DEG), fixed or "
+            "box.",
+            TASK, "KIND", "robot.toml's, else free", **demand.kind_or_tilt(get_args(BaseMode), "level"),
         ),
     ] = None  # fmt: skip
     base_box: Annotated[Vector3, Setting("Half extents of --base box, m.", TASK, "X Y Z", **demand.LENGTHS)] = (

@@ -196,17 +196,20 @@ def _value_at(constraint: AxisInCone, numeric: Numeric, q: NDArray[np.float64]) 
     return constraint.evaluate(numeric.at(q))[0]
 
 
-def test_a_tool_that_may_tilt_does_at_least_as_well() -> None:
-    asked = {"robot": "panda", "normal": (0.0, 0.0, 1.0), "starts": 4}
+@pytest.mark.parametrize(
+    ("name", "key", "kind"), [("panda", "contact_pose", "aligned"), ("tilthex_arm", "base", "level")]
+)
+def test_what_may_tilt_does_at_least_as_well(name: str, key: str, kind: str) -> None:
+    asked = {"robot": name, "normal": (0.0, 0.0, 1.0), "starts": 4}
     values = []
-    for pose in ("aligned", "aligned:10", "aligned:30"):
-        prepared = prepare(make_settings({**asked, "contact_pose": pose}))
+    for tilted in (kind, f"{kind}:10", f"{kind}:30"):
+        prepared = prepare(make_settings({**asked, key: tilted}))
         found = solve(prepared.problem, starts=4, compile="never")
         assert found.certificate.holds()
         values.append(prepared.problem.objective.value(found.q))
         for constraint in prepared.problem.constraints:
             if isinstance(constraint, AxisInCone):
-                degrees = float(pose.partition(":")[2])
+                degrees = float(tilted.partition(":")[2])
                 numeric = Numeric(prepared.problem.robot.model)
                 assert -constraint.evaluate(numeric.at(found.q))[0][0] >= np.cos(np.deg2rad(degrees)) - 1e-9
                 jacobian = constraint.evaluate(numeric.at(found.q))[1]
@@ -254,6 +257,8 @@ def test_the_front_of_jump_and_force_is_that_of_searches_with_a_bound(name: str)
         ({"contact_duration": 0.0}, SpecError, "1e-07 to 100 s"),
         ({"contact_pose": "aligned:90"}, SpecError, "aligned:DEG"),
         ({"contact_pose": "aligned:nan"}, SpecError, "aligned:DEG"),
+        ({"base": "level:90"}, SpecError, "level:DEG"),
+        ({"base": "aligned:20"}, SpecError, "level:DEG"),
         ({"max_force": 1.0, "contact_stiffness": "steel"}, Infeasible, "bounds on the impact"),
     ],
 )

@@ -115,7 +115,7 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
     parts = [_run_document(factory, one, measured) for one, measured in zip(found, metrics, strict=True)]
     status = gravest(part["status"] for part in parts)
     completed = status == "completed"
-    goes_to = job.controller.removesuffix("-stiff")
+    offline = factory.offline(job.controller)
     document = {
         "schema": SCHEMA,
         "scenario": scenario.name,
@@ -132,8 +132,8 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         "windows": [{**window, "sign": part["sign"]} for part in parts for window in part["windows"]],
         "prediction": _mean_prediction([p for part in parts for p in part["prediction"]]) if completed else None,
         "runs": parts,
-        "offline": factory.offline.to_dict() if goes_to in ("posture", "path") else None,
-        "path": factory.path.to_dict() if goes_to == "path" else None,
+        "offline": None if offline is None else offline.to_dict(),
+        "path": factory.path.to_dict() if job.controller.removesuffix("-stiff") == "path" else None,
         "warnings": factory.warnings,
         "model_sha256": factory.setup.robot.model_sha256,
         "versions": versions() | {"mujoco": metadata.version("mujoco")},

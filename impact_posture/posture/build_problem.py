@@ -229,10 +229,11 @@ def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements
     if not robot.floating:
         return []
     base = base_point()
-    placement = numeric.placement(base)
+    placement, upright = numeric.placement(base), np.array([0.0, 0.0, 1.0])
     if requirements.base == "level":
-        upright = np.array([0.0, 0.0, 1.0])
         return [HeldOrientation("level base", base, np.eye(3), upright)]
+    if (degrees := tilt_of(requirements.base)) is not None:
+        return [AxisInCone("tilt of the base", base, upright, upright, degrees)]
     if requirements.base == "fixed":
         return [HeldPose("base", base, placement)]
     if requirements.base == "box":

@@ -16,7 +16,7 @@ from impact_posture.impact.objective import ImpactObjective, Objective
 from impact_posture.posture.constraint import Constraint
 from impact_posture.posture.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
-from impact_posture.settings import CLEARANCE, BaseMode, Obstacle, Vector3
+from impact_posture.settings import CLEARANCE, Obstacle, Vector3
 
 # A direction of the tangent space is held if a unit step along it moves a constraint by more than this.
 RANK_TOLERANCE = 1e-7
@@ -32,7 +32,8 @@ class Requirements:
         target_position: Position of the contact frame, world, meters; ``None`` for its initial position.
         target_quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
         box: Half extents of the box of ``contact_pose = box``, meters.
-        base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``fixed`` or ``box``.
+        base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt at most
+            DEG degrees, yaw free), ``fixed`` or ``box``.
         base_box: Half extents of the box of ``base = box``, meters.
         keep: Frames whose pose is held.
         hold: Joints kept at their initial value.
@@ -59,7 +60,7 @@ class Requirements:
     target_position: Vector3 | None = None
     target_quaternion: tuple[float, float, float, float] | None = None
     box: Vector3 = (0.05, 0.05, 0.05)
-    base: BaseMode = "free"
+    base: str = "free"
     base_box: Vector3 = (0.2, 0.2, 0.2)
     keep: tuple[str, ...] = ()
     hold: tuple[str, ...] = ()

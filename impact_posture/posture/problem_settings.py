@@ -19,7 +19,7 @@ from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.robot.model_variant import ModelVariant
 from impact_posture.robot.robot_loader import from_folder, names_a_path
 from impact_posture.robot.urdf import EXAMPLE_PREFIX
-from impact_posture.settings import BaseMode, ProblemSettings
+from impact_posture.settings import ProblemSettings
 from impact_posture.tables import read_toml, validate
 
 _FILES = ("srdf", "config")
@@ -103,7 +103,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     robot, spec = objective.robot, objective.robot.spec.constraints
     poses = [settings.contact_pose or robot.contact_pose(contact.frame) for contact in objective.contacts]
     free = tuple(j for j in spec.hold if j not in robot.locked)
-    base: BaseMode = "level" if spec.level_base and robot.floating else "free"
+    base = "level" if spec.level_base and robot.floating else "free"
     com = spec.com_over_feet and bool(objective.supports) if settings.com is None else settings.com
     if settings.obstacles and not settings.collision:
         raise InputError("do nothing without `collision`", where="obstacles", hint="leave one of them out")

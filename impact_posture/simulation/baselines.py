@@ -7,7 +7,7 @@ import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.driver import Driver, RobustDriver
+from impact_posture.simulation.driver import MOVE, Driver, RobustDriver
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient
@@ -15,6 +15,7 @@ from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.activation import Phase
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.impact_robust import ImpactRobustPosture, curvature, curvature_scale
+from impact_posture.tsid.smooth_step import smooth
 from impact_posture.tsid.state import State
 
 
@@ -42,26 +43,31 @@ def spring_of_term(robot: Robot, gradient: Gradient, q: Array, strength: float) 
     return np.asarray(spring + spring.T) / 2
 
 
-def resting_posture(driver: Driver, seconds: float, quiet: float = 1e-3) -> Array:
+def resting_posture(driver: Driver, seconds: float, quiet: float = 1e-3, ahead: float = 0.0) -> Array:
     """Return the posture that a driver braces to, shape (nq,).
 
     The robot executes the planned acceleration exactly, without physics engine, sensors and motors.
 
     Args:
         driver: The driver, which is reset.
-        seconds: Longest time, s.
+        seconds: Longest time to come to rest, s.
         quiet: ``‖ν‖`` below which the robot rests, once the driver is at its full level.
+        ahead: Way that the end effector then goes on towards the surface, m.
     """
     setup, period = driver.setup, driver.controller.period
-    q, v, rest = setup.q.copy(), np.zeros(setup.robot.nv), 0
+    q, v, t = setup.q.copy(), np.zeros(setup.robot.nv), 0.0
     driver.reset(q)
     driver.brace()
-    for k in range(round(seconds / period)):
-        v = v + period * driver.tick(Reading(k * period, q, v, None)).acceleration
-        q = np.asarray(pin.integrate(setup.robot.model, q, period * v))
-        rest = rest + 1 if driver.level == 1 and float(np.linalg.norm(v)) < quiet else 0
-        if rest * period > 0.2:
-            break
+    for way in (0.0, ahead)[: 2 if ahead else 1]:
+        began, rest = t, 0
+        if way:
+            driver.expect(t + MOVE)
+        while t < began + seconds and rest * period <= 0.2:
+            gone = ReferencePoint(way * smooth(min((t - began) / MOVE, 1.0)), 0.0, 0.0)
+            v = v + period * driver.tick(Reading(t, q, v, None), gone if way else None).acceleration
+            q = np.asarray(pin.integrate(setup.robot.model, q, period * v))
+            t += period
+            rest = rest + 1 if driver.level == 1 and float(np.linalg.norm(v)) < quiet else 0
     return q
 
 

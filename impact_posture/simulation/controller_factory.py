@@ -50,6 +50,7 @@ MEANING: dict[str, str] = {
     "robust-flow": "the posture flows to lower H before the impact, without a gain",
     "robust-flow-sticking": "the same to lower S, for impacts at a given speed",
     "posture": "the offline optimum as posture, no gradient",
+    "posture-sticking": "the offline optimum of S as posture, for impacts at a given speed",
     "path": "the offline optimum, along a timed path without collisions",
     "stiff": "the start posture, as stiff as the term is where robust rests",
     "posture-stiff": "the offline optimum, as stiff as the term is there",
@@ -73,7 +74,10 @@ _KINDS: dict[str, ObjectiveKind] = {
     "robust-speed": "speed",
     "robust-sticking": "sticking",
     "robust-flow-sticking": "sticking",
+    "posture-sticking": "sticking",
 }
+# Controllers that go to a posture found offline.
+_OFFLINE = ("posture", "posture-sticking", "path")
 # Entry points by which other installed packages add controllers.
 GROUP = "impact_posture.controllers"
 
@@ -87,6 +91,7 @@ class ControllerFactory:
         free: Whether gradients and the offline optimum ignore the feet.
         gradient_of: Makes the gradient of an objective, compiled or interpreted.
         compile: Whether controllers run as machine code: ``auto`` where they can, always, or never.
+        starts: Number of starts of the optimizer for offline postures.
         in_c: Whether the last driver does.
         warnings: What of the last driver is not compiled although it should have been, and why.
     """
@@ -95,11 +100,13 @@ class ControllerFactory:
     free: bool = False
     gradient_of: Callable[[ImpactObjective], Gradient] = compiled
     compile: CompileMode = "never"
+    starts: int = 8
     in_c: bool = False
     warnings: list[str] = field(default_factory=list)
     _fault: str = ""
     _objectives: dict[ObjectiveKind, ImpactObjective] = field(default_factory=dict)
     _gradients: dict[ObjectiveKind, tuple[Gradient, tuple[str, ...]]] = field(default_factory=dict)
+    _offline: dict[tuple[ObjectiveKind, bool], OfflinePosture] = field(default_factory=dict)
 
     def objective(self, kind: ObjectiveKind = "impulse") -> ImpactObjective:
         """Return an objective for the impact of the scenario."""
@@ -127,16 +134,25 @@ class ControllerFactory:
         function, normal = self.objective().value_fun(), np.array(self.objective().contact.normal, dtype=float)
         return lambda q: float(function(q, normal))
 
-    @cached_property
-    def offline(self) -> OfflinePosture:
-        """The posture of the controllers ``posture`` and ``path``."""
-        return offline_posture(self.setup, self.objective())
+    def offline(self, name: str = "posture") -> OfflinePosture | None:
+        """Return the offline posture of a controller, or ``None`` for one that goes to none."""
+        name = name.removesuffix(_STIFF)
+        return self._optimum(name) if name in _OFFLINE else None
+
+    def _optimum(self, name: str) -> OfflinePosture:
+        # A path begins where the robot starts, so its end holds the end effector there.
+        kind, at_contact = _KINDS.get(name, "impulse"), name != "path"
+        if (kind, at_contact) not in self._offline:
+            self._offline[kind, at_contact] = offline_posture(
+                self.setup, self.objective(kind), starts=self.starts, at_contact=at_contact
+            )
+        return self._offline[kind, at_contact]
 
     @cached_property
     def path(self) -> PosturePath:
         """The path of the ``path`` controller."""
         check_package()
-        solution = self.offline.solution
+        solution = self._optimum("path").solution
         tell("looking for a path to the offline posture")
         return posture_path(solution)
 
@@ -178,8 +194,8 @@ class ControllerFactory:
             return self._stiffened("nominal", "robust", gain)
         if name.endswith(_STIFF):
             return self._stiffened(name.removesuffix(_STIFF), name.removesuffix(_STIFF), gain)
-        if name == "posture":
-            return PostureDriver(setup, nominal_posture(setup), self.offline.q)
+        if name in ("posture", "posture-sticking"):
+            return PostureDriver(setup, nominal_posture(setup), self._optimum(name).q)
         if name == "path":
             return PathDriver(setup, nominal_posture(setup), self.path)
         if name in _PLAIN:
@@ -193,7 +209,7 @@ class ControllerFactory:
             released = ImpactRobustPosture(
                 robot, gradient, K=K, fade=term.fade, activation=once, spring="release", **options
             )
-            return ReleaseDriver(setup, released, gradient, self.offline.q)
+            return ReleaseDriver(setup, released, gradient, self._optimum(name).q)
         activation = Activation(ramp=term.ramp, live=mode == "live")
         driver, task = (WalkerDriver, FlowPosture) if name == "walker" else (RobustDriver, ImpactRobustPosture)
         return driver(setup, task(robot, gradient, K=K, fade=term.fade, activation=activation, **options))

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SolverFailed
+from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.posture_distance import distance
@@ -16,6 +20,7 @@ from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.progress import tell
 from impact_posture.settings import FRICTION, ProblemSettings
 from impact_posture.simulation.scenario import Setup
+from impact_posture.tsid.reference_flow import FlowOptions
 
 # Share of the limits that holding a posture may take.
 SHARE = 0.8
@@ -36,7 +41,7 @@ class OfflinePosture:
         solution: What the optimizer found.
         objective: Objective at the posture.
         initial: Objective at the start posture of the scenario, after it was put on the constraints.
-        distance: Distance from that start posture, rad (m).
+        distance: Distance from the posture there, rad (m).
         note: What could not be demanded of the posture, and why.
     """
 
@@ -57,25 +62,28 @@ class OfflinePosture:
         return {"q": self.q.tolist(), **numbers}
 
 
-def offline_posture(setup: Setup, objective: ImpactObjective, *, starts: int = 8) -> OfflinePosture:
+def offline_posture(
+    setup: Setup, objective: ImpactObjective, *, starts: int = 8, at_contact: bool = True
+) -> OfflinePosture:
     """Optimize the posture for the impact of a scenario.
 
     The constraints are those of ``impact-posture optimize``: no collision with itself, the surface or the ground, and
-    at most :data:`SHARE` of the limits of motors and rotors to hold the posture.  The end effector stays where it
-    starts, as far as its task holds it.  The base of a robot that flies stays level.  The feet of a robot that stands
-    stay where they are, with the center of mass above them.  Where no posture is free of collisions, the best one
-    with them is taken, and a note says so.
+    at most :data:`SHARE` of the limits of motors and rotors to hold the posture.  The end effector is where it meets
+    the surface, as far as its task holds it.  The base of a robot that flies stays level.  The feet of a robot that
+    stands stay where they are, with the center of mass above them, and its base tilts as far as the reference flow
+    may tilt it.  Where no posture is free of collisions, the best one with them is taken, and a note says so.
 
     Args:
         setup: The experiment.
         objective: The objective.
         starts: Number of starts of the optimizer.
+        at_contact: Whether the end effector is where it meets the surface, else where it starts.
 
     Raises:
         Infeasible, SolverFailed: As :func:`impact_posture.posture.solve.solve`.
     """
     tell("looking for the offline posture")
-    wanted, note = scenario_requirements(setup, objective), ""
+    wanted, note = scenario_requirements(setup, objective, at_contact=at_contact), ""
     # Margins of the center of mass are none for a robot that does not stand.
     margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
     tries = [(collision, *each) for collision in (True, False) for each in margins]
@@ -96,15 +104,22 @@ def offline_posture(setup: Setup, objective: ImpactObjective, *, starts: int = 8
     raise AssertionError("the last attempt returns or raises")
 
 
-def scenario_requirements(setup: Setup, objective: ImpactObjective) -> Requirements:
-    """Return what a scenario demands of a posture, without margins."""
-    control, contact = setup.scenario.control, objective.contact
+def scenario_requirements(setup: Setup, objective: ImpactObjective, *, at_contact: bool = True) -> Requirements:
+    """Return what a scenario demands of a posture, without margins; arguments as of :func:`offline_posture`."""
+    control, contact, base, target = setup.scenario.control, objective.contact, "free", None
+    if setup.robot.floating:
+        base = "level" if control.tilt is not None else f"level:{np.rad2deg(FlowOptions().tilt)}"
+    if at_contact and control.end_effector is not None and setup.scenario.contacts:
+        place = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, contact.frame))
+        x, y, z = (place.translation - setup.gap * setup.scenario.normal).tolist()
+        target = (x, y, z)
     settings = ProblemSettings(
         robot=setup.scenario.robot,
         frame=contact.frame,
         normal=contact.normal,
         contact_pose="free" if control.end_effector is None else control.end_effector.pose,
-        base="level" if control.tilt is not None and setup.robot.floating else "free",
+        target_position=target,
+        base=base,
         regularization=_NEARNESS,
         friction=FRICTION if control.footing is None else control.footing.friction,
     )

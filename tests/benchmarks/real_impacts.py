@@ -1,7 +1,8 @@
 """Impacts of robots that stand, reach and fly: what the rigid model predicts of each controller, then its run.
 
-The prediction needs no run.  The controller braces in a robot that does exactly what it plans, and the rigid model
-takes the posture that is reached and the speed of the scenario.  Runs that are done are kept in build/real-impacts.
+The prediction needs no run.  The controller braces in a robot that does exactly what it plans, and takes the end
+effector to the surface.  The rigid model takes the posture that is reached and the speed of the scenario.  Runs that
+are done are kept in build/real-impacts.
 """
 
 from __future__ import annotations
@@ -29,7 +30,16 @@ SCENARIOS = (
     "talos-throw", "solo8-throw", "talos-strike", "talos-strike 0.5", "talos-strike 1.5", "g1-strike",
     "g1-strike 0.5", "g1-strike 1.5", "solo12-landing", "panda-tap", "hextilt-poke"
 )  # fmt: skip
-COMPARED = ("nominal", "robust", "robust-sticking", "robust-flow", "robust-flow-sticking", "posture", "stiff")
+COMPARED = (
+    "nominal",
+    "robust",
+    "robust-sticking",
+    "robust-flow",
+    "robust-flow-sticking",
+    "posture",
+    "posture-sticking",
+    "stiff",
+)
 HEAD = (
     "controller", "predicted: H", "√S jump", "Coulomb jump", "of nominal", "measured jump", "of nominal",
     "motion in the window", "over the second", "peak force, N", "saturated in / out, s", "status",
@@ -52,10 +62,10 @@ def scenario_of(name: str) -> Scenario:
 
 
 def predicted(factory: ControllerFactory, name: str) -> dict[str, float | None]:
-    """H, the sticking and the Coulomb jump in the posture that a controller braces to, before any run."""
+    """H, the sticking and the Coulomb jump in the posture that a controller meets the impact in, before any run."""
     setup = factory.setup
     task, oracle = setup.scenario.task, factory.objective().oracle
-    q = resting_posture(factory.driver(name), task.settle)
+    q = resting_posture(factory.driver(name), task.settle, ahead=setup.gap if setup.scenario.contacts else 0.0)
     found = oracle.quantities(q)
     if isinstance(task, Throw):
         _, sticking, coulomb = thrown_jumps(oracle, q, task, task.speed)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from impact_posture.simulation.controller_factory import ControllerFactory, Mode
-from impact_posture.simulation.offline import offline_posture
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import Setup, set_up
@@ -62,9 +61,8 @@ def factory(name: str, settle: float | None = None) -> ControllerFactory:
 
 def driven(made: ControllerFactory, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
     """A run with the push forward alone."""
-    if controller.startswith(("posture", "path")) and "offline" not in vars(made):
-        # Few starts: what is tested is the driver.
-        made.offline = offline_posture(made.setup, made.objective(), starts=1)
+    # What is tested is the driver.
+    made.starts = 1
     return run(made, controller, mode=mode, seed=seed, only=1)[0]
 
 

@@ -13,9 +13,9 @@ from impact_posture.simulation.baselines import ReleaseDriver, WalkerDriver, res
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.driver import RobustDriver
 from impact_posture.simulation.impact_baselines import InvariantDriver
-from impact_posture.simulation.offline import offline_posture
 from impact_posture.simulation.reference import Reference
-from impact_posture.simulation.scenario import RepeatedContacts
+from impact_posture.simulation.scenario import RepeatedContacts, set_up
+from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.task import Task
 from tests.helpers import Vector, central_gradient, frame_jacobian, mass_matrix, rng
@@ -70,20 +70,37 @@ def test_stiff_has_the_spring_that_robust_is_where_it_rests(name: str) -> None:
     np.testing.assert_allclose(posture.damping @ posture.damping / 4, posture.stiffness, rtol=1e-9, atol=1e-9)
 
 
+# ---- posture-sticking ------------------------------------------------------------------------------------------
+
+
+def test_the_offline_posture_of_S_is_met_at_the_surface() -> None:
+    setup = set_up(read_scenario("solo12-landing"))
+    made = ControllerFactory(setup, starts=1)
+    optimum, sticking = made.offline("posture-sticking"), made.objective("sticking").value
+    assert optimum is not None and made.offline("nominal") is None
+    there = resting_posture(made.driver("posture-sticking"), 3.0, ahead=setup.gap)
+    # Where the foot starts, the robot cannot be in that posture.
+    here = resting_posture(made.driver("posture-sticking"), 3.0)
+    away = [np.linalg.norm(pin.difference(setup.robot.model, q, optimum.q)) for q in (there, here)]
+    assert away[0] < 0.01 < away[1]
+    assert sticking(there) == pytest.approx(optimum.objective, rel=0.01)
+    assert sticking(there) < 0.6 * sticking(resting_posture(made.driver("nominal"), 3.0, ahead=setup.gap))
+
+
 # ---- robust-release -----------------------------------------------------------------------------------------------
 
 
 def test_without_the_spring_the_posture_goes_further_and_is_held_there(monkeypatch: pytest.MonkeyPatch) -> None:
     made = factory("aerial-vertical")
     value, setup = made.objective().value, made.setup
-    monkeypatch.setitem(vars(made), "offline", offline_posture(setup, made.objective(), starts=1))
+    monkeypatch.setattr(made, "starts", 1)
     driver = made.driver("robust-release")
     assert isinstance(driver, ReleaseDriver)
     reached = resting_posture(driver, 6.0)
     assert driver.level == 0
     assert not driver.posture.activation.live
     assert value(reached) < 0.5 * value(resting_posture(made.driver("robust"), 3.0))
-    assert value(reached) < 1.05 * value(made.offline.q)
+    assert value(reached) < 1.05 * value(made.offline().q)
     # What is held is the posture, as the term left it.
     away = pin.difference(setup.robot.model, reached, driver.posture.target)[6:]
     assert np.abs(away).max() < 0.02

@@ -17,6 +17,7 @@ from impact_posture.simulation.offline import SHARE, offline_posture, scenario_r
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
+from impact_posture.tsid.reference_flow import FlowOptions
 from tests.benchmarks.robustness.outcomes import is_held
 from tests.simulation.factories import needs_mujoco
 
@@ -73,7 +74,7 @@ def test_a_note_says_where_collisions_cannot_be_demanded(monkeypatch: pytest.Mon
     objective = scenario_objective(setup)
     # No posture keeps all links a meter apart.
     demands = replace(scenario_requirements(setup, objective), clearance=1.0)
-    monkeypatch.setattr(offline, "scenario_requirements", lambda *_: demands)
+    monkeypatch.setattr(offline, "scenario_requirements", lambda *_, **__: demands)
     monkeypatch.setattr(offline, "_MARGINS", offline._MARGINS[-1:])
     found = offline_posture(setup, objective, starts=1)
     assert found.note.startswith("links may touch in the offline posture, because none without collisions was found")
@@ -85,3 +86,22 @@ def test_without_the_feet_nothing_is_demanded_of_them() -> None:
     objective = scenario_objective(setup, free=True)
     assert not scenario_requirements(setup, objective).com_over_feet
     assert offline_posture(setup, objective, starts=1).objective < objective.value(setup.q)
+
+
+def test_it_is_the_posture_in_which_the_surface_is_met() -> None:
+    setup = set_up(read_scenario("solo12-landing"))
+    objective = scenario_objective(setup, "sticking")
+    model, data = setup.robot.model, setup.robot.model.createData()
+    frame = model.getFrameId(objective.contact.frame)
+
+    def place(q: np.ndarray) -> np.ndarray:
+        pin.framesForwardKinematics(model, data, q)
+        return np.array(data.oMf[frame].translation)
+
+    there, here = (offline_posture(setup, objective, starts=2, at_contact=met).q for met in (True, False))
+    start = place(setup.q)
+    np.testing.assert_allclose(place(there), start - setup.gap * setup.scenario.normal, atol=1e-8)
+    np.testing.assert_allclose(place(here), start, atol=1e-8)
+    # The robot stands, and its base tilts as far as the flow may tilt it.
+    for q in (there, here):
+        assert pin.Quaternion(q[3:7]).matrix()[2, 2] >= np.cos(FlowOptions().tilt) - 1e-9
