@@ -80,18 +80,20 @@ def simulate(
     quiet: options.Quiet = False,
 ) -> None:
     """Run ``impact-posture simulate``."""
+    from impact_posture.simulation.scenario_file import read_scenario
+
+    # A name that is none is refused before all that takes long to import.
+    name = read_scenario(scenario).name
     from impact_posture.escape import file_name
     from impact_posture.experiment.folders import FORMATS, Output, write_simulation
     from impact_posture.experiment.jobs import Job, execute, worth_compiling
     from impact_posture.experiment.statistics import fate
     from impact_posture.output_folder import check_output
     from impact_posture.posture.nlp import one_blas_thread
-    from impact_posture.simulation.scenario_file import read_scenario
 
     if export_world is not None:
         _export_world(Page(quiet=quiet or json), scenario, Path(export_world), force)
         return
-    name = read_scenario(scenario).name
     only, code = None if sign is None else int(sign), worth_compiling(compile, 1)
     job = Job(scenario, controller, seed, mode, free, gain, only, code)
     folder = Path(out) if out else Path(file_name(f"{name}-{job.label.replace(':', '-')}"))
