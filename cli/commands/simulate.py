@@ -22,8 +22,8 @@ Controller = Annotated[
     typer.Option(
         "--controller", rich_help_panel=RUN,
         help="nominal, robust, robust-speed, robust-sticking, robust-release, robust-flow, robust-flow-sticking, "
-        "posture, posture-sticking, path, stiff, posture-stiff, invariant, walker, reference-spreading, impact-aware, "
-        "or the name that an installed package has registered.",
+        "posture, posture-sticking, path, stiff, posture-stiff, invariant, walker, reference-spreading, "
+        "impact-aware, or the name that an installed package has registered.",
     ),
 ]  # fmt: skip
 RunSeed = Annotated[int, typer.Option("--seed", min=0, rich_help_panel=RUN, help="Seed of the sensors' noise.")]
