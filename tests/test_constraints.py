@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -12,9 +13,12 @@ import pytest
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
-from impact_posture.impact.contact import point_on
+from impact_posture.impact.contact import ImpactContact, point_on
+from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.constraint import ExpressionConstraint
 from impact_posture.posture.pose_constraints import (
+    AxisInCone,
     CenterOfMassOverFeet,
     HeldOrientation,
     HeldPose,
@@ -22,6 +26,7 @@ from impact_posture.posture.pose_constraints import (
     HeldTurn,
     PositionBox,
 )
+from impact_posture.posture.problem import Requirements
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 
@@ -103,3 +108,20 @@ def test_level_base_leaves_yaw_free_and_nothing_else() -> None:
     for tilt in ([0.1, 0, 0], [0, -0.2, 0], [np.pi, 0, 0]):
         q[3:7] = pin.Quaternion(pin.exp3(np.array(tilt))).coeffs()
         assert np.abs(level.evaluate(Numeric(robot.model).at(q))[0]).max() > 0.05
+
+
+def test_a_base_tilts_from_its_default_posture() -> None:
+    robot = load_robot("solo8")
+    q = robot.posture()
+    # A base link whose axes lie on their side.
+    q[3:7] = pin.Quaternion(pin.exp3(np.array([np.pi / 2, 0.0, 0.3]))).coeffs()
+    lying = replace(robot, postures={**robot.postures, robot.default_posture: q})
+    objective = ImpactObjective(lying, ImpactContact("base_link", (1.0, 0.0, 0.0)))
+    problem = build_problem(lying, objective, q, Requirements(contact_pose="free", base="level:20"))
+    tilt = next(c for c in problem.constraints if isinstance(c, AxisInCone))
+    at, upright = Numeric(robot.model), pin.Quaternion(q[3:7]).matrix()
+    for degrees, fits in ((0.0, True), (19.9, True), (20.1, False)):
+        q[3:7] = pin.Quaternion(pin.exp3(np.deg2rad(degrees) * np.array([0.6, 0.8, 0.0])) @ upright).coeffs()
+        value = tilt.evaluate(at.at(q))[0]
+        assert value == pytest.approx(-np.cos(np.deg2rad(degrees)))
+        assert (tilt.excess(value) == 0).all() == fits

@@ -16,7 +16,6 @@ from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
-from impact_posture.tsid.flow_direction import upright
 from impact_posture.tsid.frame_tasks import FrameAligned, FramePose, FramePosition, FrameTask
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.points import Point
@@ -163,7 +162,7 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
         "task_axis": [_axes(t) for t in tasks],
     }
     if sizes["FLOW"] and robot.floating:
-        doubles["upright"] = upright(robot)
+        doubles["upright"] = robot.upright
     found: dict[str, NDArray[Any]] = {name: np.array(v, dtype=np.int64) for name, v in tables.items()}
     found |= {name: np.array(values, dtype=float).ravel() for name, values in doubles.items()}
     # Bounds on joints are simple ones, which come first, or the last rows.

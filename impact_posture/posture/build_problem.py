@@ -229,11 +229,12 @@ def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements
     if not robot.floating:
         return []
     base = base_point()
-    placement, upright = numeric.placement(base), np.array([0.0, 0.0, 1.0])
+    placement, vertical = numeric.placement(base), np.array([0.0, 0.0, 1.0])
     if requirements.base == "level":
-        return [HeldOrientation("level base", base, np.eye(3), upright)]
+        return [HeldOrientation("level base", base, np.eye(3), vertical)]
     if (degrees := tilt_of(requirements.base)) is not None:
-        return [AxisInCone("tilt of the base", base, upright, upright, degrees)]
+        assert robot.upright is not None  # noqa: S101 (narrows a type)
+        return [AxisInCone("tilt of the base", base, robot.upright, vertical, degrees)]
     if requirements.base == "fixed":
         return [HeldPose("base", base, placement)]
     if requirements.base == "box":

@@ -32,8 +32,8 @@ class Requirements:
         target_position: Position of the contact frame, world, meters; ``None`` for its initial position.
         target_quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
         box: Half extents of the box of ``contact_pose = box``, meters.
-        base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt at most
-            DEG degrees, yaw free), ``fixed`` or ``box``.
+        base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt from
+            its default posture at most DEG degrees, yaw free), ``fixed`` or ``box``.
         base_box: Half extents of the box of ``base = box``, meters.
         keep: Frames whose pose is held.
         hold: Joints kept at their initial value.

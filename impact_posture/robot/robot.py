@@ -175,6 +175,11 @@ class Robot:
             raise PostureNotFound(name, self.postures, where=self.name)
         return np.array(self.postures[name], dtype=float)
 
+    @property
+    def upright(self) -> Array | None:
+        """Direction in a floating base that is vertical in the default posture, shape (3,), or ``None``."""
+        return pin.Quaternion(self.posture()[3:7]).matrix()[2].copy() if self.floating else None
+
     def check_posture(self, q: Array, *, where: str = "posture", limits: bool = True) -> Array:
         """Check length, finiteness, quaternion and limits of ``q``; return it with unit quaternions.
 

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.robot.robot import Robot
@@ -91,14 +90,14 @@ class FlowDirection:
             rho: ρ, per rad².
             mu: μ, per rad².
             margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
-            tilt: Largest angle between the vertical and :func:`upright`, rad.
+            tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
         """
         nv, ranges = robot.nv, JointRanges(robot)
         self._joints = np.flatnonzero(np.isfinite(ranges.lower) & np.isfinite(ranges.upper))
         width = (ranges.upper - ranges.lower)[self._joints]
         self._margin = np.minimum(margin, width / 8)
         self._edges, self._mu, self._tilt = edges, mu, tilt
-        self._up = upright(robot)
+        self._up = robot.upright
         # The pull towards the start acts on joints.  Others lead the base.
         self._pull = np.full(nv, rho)
         self._pull[: 6 if robot.floating else 0] = 0.0
@@ -214,11 +213,6 @@ class FlowDirection:
         y = solved.z[:r]
         self.gain = -float(slope @ y + y @ y / 2)
         return np.asarray(way @ y)
-
-
-def upright(robot: Robot) -> Array | None:
-    """Return the direction in a floating base that is vertical in the default posture, shape (3,)."""
-    return pin.Quaternion(robot.posture()[3:7]).matrix()[2].copy() if robot.floating else None
 
 
 def limited(vector: Array, largest: float) -> Array:
