@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import casadi as ca
 import numpy as np
@@ -16,14 +18,14 @@ from impact_posture.posture.nlp import IPOPT_OPTIONS, run_solver
 from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.program_rows import Derivatives, ProgramRows, joined
-from impact_posture.posture.starts import random_posture
+from impact_posture.posture.starts import FEASIBLE, Projector, random_posture
 
 # A constraint with a violation below this (m, rad) is satisfied.
 _KEPT = 1e-6
 # Price of a meter of slack beside that of a violated row: where bodies are in the way of a pose, they are the reason.
 _SLACK_PRICE = 0.03
 # Most postures to begin from.  In xarm7 before a wall, the 14th was the first that led to a posture free of it.
-_TRIES = 24
+TRIES = 24
 # Most times that the program grows for one start.
 _ROUNDS = 20
 
@@ -46,7 +48,7 @@ class ElasticAnswer:
 
 
 def elastic(
-    problem: PostureProblem, seed: int = 0, tries: int = _TRIES, program: ElasticProgram | None = None
+    problem: PostureProblem, seed: int = 0, tries: int = TRIES, program: ElasticProgram | None = None
 ) -> ElasticAnswer:
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures.
 
@@ -57,12 +59,9 @@ def elastic(
         program: The program of the same problem with another target, or of one that grew into it.
     """
     chart = Chart.of(problem.robot.model)
-    rng = np.random.default_rng(seed)
     program = program or ElasticProgram(problem)
     best: ElasticAnswer | None = None
-    for attempt in range(tries):
-        near = problem.given if attempt % 2 else None
-        start = random_posture(problem, chart, rng, near) if attempt else problem.given
+    for start in islice(_starts(problem, chart, seed), tries):
         for _ in range(_ROUNDS):
             found = _relax(problem, chart, program, start)
             if found.problem is problem:
@@ -74,6 +73,16 @@ def elastic(
             break
     assert best is not None  # noqa: S101 (narrows a type)
     return best
+
+
+def _starts(problem: PostureProblem, chart: Chart, seed: int) -> Iterator[Array]:
+    """Yield the given posture, then random ones on the projected constraints, those nearest to the others first."""
+    yield problem.given
+    rng, projector = np.random.default_rng(seed), Projector(problem)
+    near = [problem.given if k % 2 else None for k in range(1, TRIES)]
+    found = [projector.project(random_posture(problem, chart, rng, posture)) for posture in near]
+    order = [(each.violation > FEASIBLE, projector.outside(each.q)) for each in found]
+    yield from (found[k].q for k in sorted(range(len(found)), key=order.__getitem__))
 
 
 def _relax(problem: PostureProblem, chart: Chart, program: ElasticProgram, start: Array) -> ElasticAnswer:

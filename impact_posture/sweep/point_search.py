@@ -12,7 +12,7 @@ from impact_posture.arrays import Array
 from impact_posture.errors import ImpactPostureError, Infeasible
 from impact_posture.posture.build_problem import retarget
 from impact_posture.posture.certificate import Certificate, certify
-from impact_posture.posture.elastic import ElasticAnswer, ElasticProgram, elastic
+from impact_posture.posture.elastic import TRIES, ElasticAnswer, ElasticProgram, elastic
 from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.search import HIGH_PRICE
@@ -22,8 +22,8 @@ from impact_posture.settings import ProblemSettings
 
 # Most rounds in which the program of a point grows, and most of them before anything says that the point is feasible.
 _ROUNDS, _UNSURE = 8, 3
-# Postures from which the constraints are relaxed.
-_TRIES = 4
+# Postures from which the constraints of a point beside an infeasible one are relaxed.
+_FEW = 8
 # Postures whose joints differ by more than this (rad, m) may be of different optima.
 SWITCH = 0.2
 # An optimum is better than another if its objective is lower by this share.
@@ -77,7 +77,7 @@ class Walk:
         """Return a problem with its target at a place."""
         return retarget(problem, *place, self.nlp.program.numeric)
 
-    def relax(self, place: Place, tries: int) -> ElasticAnswer:
+    def relax(self, place: Place, tries: int = TRIES) -> ElasticAnswer:
         """Relax the constraints at a place, with the parts that the places before needed for it."""
         program = self._relaxed = self._relaxed or ElasticProgram(self.problem)
         before = program.time_s
@@ -100,7 +100,10 @@ def search(walk: Walk, place: Place, guesses: Sequence[Array], *, beside: bool =
         if not beside and (found := attempt.certified(guesses, rounds=_UNSURE)) is not None:
             return found
         # Either this finds the constraints that conflict, or a posture to start from.
-        relaxed = walk.relax(place, 1 if beside else _TRIES)
+        relaxed = walk.relax(place, 1) if beside else walk.relax(place)
+        if beside and any(" / " in name for name in relaxed.conflicts):
+            # A pose out of reach is so from every posture, but there may be another way past a body.
+            relaxed = walk.relax(place, _FEW)
         if relaxed.conflicts:
             return attempt.without("infeasible", Infeasible(relaxed.conflicts).what)
         if (found := attempt.certified([relaxed.q])) is not None:
