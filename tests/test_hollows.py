@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -131,9 +132,18 @@ def test_bodies_that_nest_and_never_touch_are_free() -> None:
 WAIST = ("waist_roll_joint", "waist_pitch_joint")
 
 
-def planes_where(touches: Callable[[Array], bool], first: str = "waist_yaw_joint") -> JointPlanes | None:
+def planes_where(
+    touches: Callable[[Array], bool],
+    first: str = "waist_yaw_joint",
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+) -> JointPlanes | None:
     """Planes for bodies of g1 that touch where a function of the positions of the waist says so."""
     robot = load_robot("g1")
+    model = robot.model.copy()
+    for name, limits in (ranges or {}).items():
+        at = model.idx_qs[robot.joint_id(name)]
+        model.lowerPositionLimit[at], model.upperPositionLimit[at] = limits
+    robot = replace(robot, model=model)
     last = robot.joint_id(WAIST[-1])
 
     def touch(data: pin.Data) -> bool:
@@ -168,6 +178,16 @@ def test_no_planes_where_none_help(case: str) -> None:
     }
     first = "left_knee_joint" if case == "far joints" else "waist_yaw_joint"
     assert planes_where(regions[case], first) is None
+
+
+def test_a_joint_without_a_range_stays_where_it_is() -> None:
+    def touches(x: Array) -> bool:
+        return bool(x[1] > 0.3)
+
+    planes = planes_where(touches, ranges={WAIST[0]: (0.0, 0.0)})
+    assert planes is not None and planes.joints == WAIST[1:]
+    # Neighbors on a grid over many turns are no neighbors.
+    assert planes_where(touches, ranges={WAIST[0]: (-75.4, 75.4)}) is None
 
 
 def test_shapes_that_touch_nowhere_need_no_plane() -> None:

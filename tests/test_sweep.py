@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from impact_posture.errors import ImpactPostureError, InputError, OutputError, S
 from impact_posture.posture.build_problem import build_problem, retarget
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.settings import ProblemSettings
+from impact_posture.sweep.atlas import sweep_key
 from impact_posture.sweep.executors import SlurmJobs, dask_cluster, parse_options, process_pool
 from impact_posture.sweep.grid import Axis, Grid
 from impact_posture.sweep.maps import draw_maps
@@ -210,6 +212,29 @@ def test_a_sweep_goes_on_with_what_is_missing_or_damaged(aerial: Path, tmp_path:
     assert shards(folder) == shards(aerial)
     assert (folder / "notes.txt").read_text() == "mine" and not left.exists()
     assert solve(AERIAL, tmp_path).shards == 0
+
+
+def test_a_folder_never_mixes_what_files_say(pendulum: str, tmp_path: Path) -> None:
+    """Neither limits nor a posture file are part of the dynamics."""
+    urdf, posture = Path(pendulum), tmp_path / "posture.json"
+    text = f'[problem]\nrobot = {json.dumps(pendulum)}\nframe = "tip"\nnormal = [0, 1, 0]\nposture = "posture.json"\n'
+    (tmp_path / "sweep.toml").write_text(text + '[grid]\nobjective = ["impulse"]\n', encoding="utf-8")
+    keys = []
+    for upper, angle in (("3", 0.1), ("3", 0.1), ("2.5", 0.1), ("2.5", 0.2)):
+        urdf.write_text(urdf.read_text(encoding="utf-8").replace('upper="3"', f'upper="{upper}"'), encoding="utf-8")
+        posture.write_text(json.dumps({"joints": {"swing": angle}}), encoding="utf-8")
+        keys.append(sweep_key(read_sweep(tmp_path / "sweep.toml")))
+    assert keys[0] == keys[1] and len(set(keys)) == 3
+
+
+def test_a_run_that_was_killed_before_its_manifest_goes_on(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    solve(AERIAL, tmp_path)
+    wanted = shards(folder)
+    (folder / "manifest.json").unlink()
+    shutil.rmtree(folder / "data")
+    solve(AERIAL, tmp_path)
+    assert shards(folder) == wanted
 
 
 def test_a_folder_never_mixes(aerial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

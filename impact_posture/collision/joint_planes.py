@@ -16,6 +16,8 @@ from impact_posture.stored_text import StoredArray
 
 # Positions of each joint at which shapes are tried.  More joints than this between two bodies are too many.
 _TRIED, _MOST_JOINTS = 25, 3
+# Half of the largest range of a joint, rad (m), so that neighbors on the grid are half a radian apart at most.
+_MOST_HALF = 6.5
 # Most planes of a pair, and the least share of the free positions that they leave.
 _MOST_PLANES, _LEFT = 12, 1 / 3
 # A plane costs the free positions that it cuts off, and this share of all free positions for itself.
@@ -55,11 +57,15 @@ def joint_planes(
         touch: Whether the shapes touch at the placements in the data.
     """
     model, start = robot.model, robot.posture()
-    between = _between(model, *ends)
+    lowest, highest = model.lowerPositionLimit, model.upperPositionLimit
+    # A joint without a range stays where it starts.
+    between = [
+        k for k in _between(model, *ends) if model.nqs[k] != 1 or lowest[model.idx_qs[k]] < highest[model.idx_qs[k]]
+    ]
     at = [model.idx_qs[k] for k in between]
-    low, high = (np.asarray(limits)[at] for limits in (model.lowerPositionLimit, model.upperPositionLimit))
+    low, high = lowest[at], highest[at]
     half, single = (high - low) / 2, all(model.nqs[k] == 1 for k in between)
-    if not (0 < len(between) <= _MOST_JOINTS and single and np.isfinite(half).all() and (half > 0).all()):
+    if not (0 < len(between) <= _MOST_JOINTS and single and (half > 0).all() and (half <= _MOST_HALF).all()):
         return None
     data, q = model.createData(), start.copy()
     grid = np.array(list(product(*np.linspace(low, high, _TRIED).T)))

@@ -28,8 +28,10 @@ Progress = Callable[[int, int], None]
 _PARTS = (
     "robot",
     "dynamics",
+    "collision",
     "impact",
     "posture",
+    "path",
     "codegen",
     "tsid",
     "controller_export",
@@ -126,9 +128,9 @@ def _source() -> str:
 
 @cache
 def _scenario(scenario: str) -> str:
-    """Return the text of the file, and the hash of its robot."""
-    model = controller_factory(scenario, False).setup.robot.model_sha256
-    return f"{scenario_path(scenario).read_text(encoding='utf-8')}\0{model}"
+    """Return the text of the file, and what its robot's files say."""
+    robot = controller_factory(scenario, False).setup.robot.data_sha256
+    return f"{scenario_path(scenario).read_text(encoding='utf-8')}\0{robot}"
 
 
 def run_batch(

@@ -123,6 +123,16 @@ class Robot:
         """The same hash with the armature that the joint model leaves to an impact."""
         return self._hash(np.asarray(self.model.armature))
 
+    @cached_property
+    def data_sha256(self) -> str:
+        """Hash of all data but shapes: dynamics, limits, frames, postures and what ``robot.toml`` says."""
+        model = self.model
+        limits = (model.lowerPositionLimit, model.upperPositionLimit, model.effortLimit, model.velocityLimit)
+        arrays = [_rounded(values) for values in (*limits, *self.postures.values())]
+        frames = [(f.name, int(f.parentJoint), _rounded(f.placement.homogeneous)) for f in model.frames]
+        content = self.model_sha256, repr(self.spec), self.default_posture, arrays, frames
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
     def _hash(self, armature: Array) -> str:
         model, joints = self.model, []
         for i in range(1, model.njoints):

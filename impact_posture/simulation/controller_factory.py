@@ -124,7 +124,7 @@ class ControllerFactory:
                 warning = f"the gradient is interpreted, not compiled, which is slower: {error.line}"
                 self._gradients[kind] = interpreted(self.objective(kind)), (warning,)
         found, warnings = self._gradients[kind]
-        self.warnings += warnings
+        self.warnings += [warning for warning in warnings if warning not in self.warnings]
         return found
 
     @cached_property

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from impact_posture.errors import InputError, OutputError, SpecError
 from impact_posture.libraries import source_key
-from impact_posture.output_folder import check_output, write_record, write_whole
+from impact_posture.output_folder import check_output, is_ours, write_record, write_whole
 from impact_posture.posture.problem_settings import dump_settings
 from impact_posture.sweep.case_solver import CaseSolver
 from impact_posture.sweep.sweep_file import Sweep
@@ -37,7 +37,7 @@ def sweep_key(sweep: Sweep) -> str:
     for case in sweep.cases:
         solver = CaseSolver(case)
         solver.check(sweep.grid)
-        content += [dump_settings(case.settings), solver.robot.model_sha256]
+        content += [dump_settings(case.settings), solver.content]
     return source_key(content, *_PACKAGES)
 
 
@@ -62,7 +62,9 @@ class Atlas:
         """
         manifest = self.folder / MANIFEST
         if not manifest.is_file():
-            check_output(self.folder, force=False, kind="sweep")
+            # A run that was killed before it wrote the manifest left the record alone.
+            if not is_ours(self.folder, "sweep"):
+                check_output(self.folder, force=False, kind="sweep")
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)
                 write_record(self.folder, "sweep")

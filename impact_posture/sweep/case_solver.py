@@ -54,6 +54,14 @@ class CaseSolver:
         self._known: OrderedDict[tuple[Any, ...], Prepared] = OrderedDict()
         self.robot = self.template(*self.normal_and_speed({})).impact.robot
 
+    @property
+    def content(self) -> str:
+        """All that files say of the robot and the problem, as text."""
+        found = self.template(*self.normal_and_speed({}))
+        around, weights = found.problem.surroundings, found.impact.objective.metric.weights
+        bodies = [] if around is None else [(b.name, b.radius, b.vertices.tolist()) for b in around.shapes.bodies]
+        return repr((self.robot.data_sha256, found.impact.q.tolist(), weights, bodies))
+
     def normal_and_speed(self, values: Mapping[str, Any]) -> tuple[Any, float]:
         """Return the normal and the speed at values of the grid, which choose the template."""
         settings = self._case.settings

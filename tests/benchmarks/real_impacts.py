@@ -7,7 +7,6 @@ are done are kept in build/real-impacts.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from impact_posture.errors import ImpactPostureError, MetricError
+from impact_posture.experiment.batch import key_of
 from impact_posture.experiment.jobs import Job, execute
 from impact_posture.impact.coulomb import coulomb_impact
 from impact_posture.simulation.baselines import resting_posture
 from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory
 from impact_posture.simulation.scenario import RepeatedContacts, Scenario, set_up
-from impact_posture.simulation.scenario_file import read_scenario, scenario_path
+from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.throw import Throw, thrown_jumps
 from tests.benchmarks.core import ROOT, Request, collected, table
 
@@ -80,9 +80,9 @@ def predicted(factory: ControllerFactory, name: str) -> dict[str, float | None]:
 
 
 def result(scenario: str, name: str) -> dict[str, Any]:
-    """The prediction and the run of one controller, kept by the content of the scenario."""
+    """The prediction and the run of one controller, kept by scenario, robot and code."""
     shipped = scenario.split()[0]
-    key = hashlib.sha256(scenario_path(shipped).read_bytes()).hexdigest()[:12]
+    key = key_of(Job(shipped, name, 0, compile="auto"))[:12]
     kept = FOLDER / f"{scenario.replace(' ', '-')}-{name}-{key}.json"
     if kept.is_file():
         return dict(json.loads(kept.read_text(encoding="utf-8")))
@@ -122,9 +122,9 @@ def lines(request: Request) -> Iterator[str]:
 
 
 def _row(name: str, row: dict[str, Any], nominal: dict[str, Any]) -> list[str]:
-    before, base = row["predicted"] or {}, nominal["predicted"]
+    before, base = row["predicted"] or {}, nominal["predicted"] or {}
     jumps = [before.get(key) for key in ("sticking", "coulomb")]
-    cells = [f"`{name}`", _number(before.get("H")), *map(_number, jumps), _ratio(jumps[1], base["coulomb"])]
+    cells = [f"`{name}`", _number(before.get("H")), *map(_number, jumps), _ratio(jumps[1], base.get("coulomb"))]
     found, other = row["metrics"], nominal["metrics"]
     if found is None:
         return [*cells, "–", "–", "–", "–", "–", "–", row["status"]]
