@@ -11,6 +11,8 @@ from impact_posture.parsing import parse_contact
 
 CONTACT, METRIC, ROBOT, TASK, OUTPUT = "Contact", "Measure", "Robot", "Task", "Output"
 _LARGEST = float("inf")
+# Degrees below which the cosine of a tilt says nothing at the precision that certifies.
+_LEAST_TILT = 0.1
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ def kind_or_tilt(kinds: Sequence[str], tilted: str) -> dict[str, Any]:
 
     def holds(value: str) -> bool:
         if value in kinds or value.startswith(f"{tilted}:"):
-            return value in kinds or 0 < (tilt_of(value) or 0.0) < 90
+            return value in kinds or _LEAST_TILT <= (tilt_of(value) or 0.0) < 90
         raise ValueError("; ".join(not_one_of(value, (*kinds, f"{tilted}:DEG"))))
 
-    return {"holds": holds, "demand": f"give {tilted}:DEG with degrees above 0 and below 90"}
+    return {"holds": holds, "demand": f"give {tilted}:DEG with {_LEAST_TILT:g} degrees or more, below 90"}

@@ -191,6 +191,15 @@ def test_a_chain_of_massless_links_is_named_whole(load: Load) -> None:
         load(*elements)
 
 
+def test_a_base_that_the_urdf_itself_lets_float(load: Load) -> None:
+    elements = (link("world", None), link("a", OFF_AXIS), link("b", OFF_AXIS))
+    joints = (joint("world", "a", kind="floating"), joint("a", "b", "0 1 0"))
+    for root in (None, "fixed", "free-flyer"):
+        with pytest.raises(UrdfError) as caught:
+            load(*elements, *joints, root=root)
+        one_line(caught.value, "'world_a', is floating", "root='free-flyer'")
+
+
 def test_a_massless_floating_base(load: Load) -> None:
     elements = (link("a", None), link("b", OFF_AXIS), joint("a", "b", "0 1 0"))
     with pytest.raises(InertiaError) as caught:

@@ -258,6 +258,7 @@ def test_the_front_of_jump_and_force_is_that_of_searches_with_a_bound(name: str)
         ({"contact_pose": "aligned:90"}, SpecError, "aligned:DEG"),
         ({"contact_pose": "aligned:nan"}, SpecError, "aligned:DEG"),
         ({"base": "level:90"}, SpecError, "level:DEG"),
+        ({"base": "level:0.01"}, SpecError, "0.1 degrees or more"),
         ({"base": "aligned:20"}, SpecError, "level:DEG"),
         ({"max_force": 1.0, "contact_stiffness": "steel"}, Infeasible, "bounds on the impact"),
     ],
