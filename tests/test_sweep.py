@@ -227,6 +227,14 @@ def test_a_folder_never_mixes_what_files_say(pendulum: str, tmp_path: Path) -> N
     assert keys[0] == keys[1] and len(set(keys)) == 3
 
 
+def test_a_point_beside_one_out_of_reach_is_searched(tmp_path: Path) -> None:
+    """Most postures with this pose have a link in the wall, so a few tries find no way past it."""
+    text = '[problem]\nrobot = "xarm7"\nnormal = [-1, 0, 0]\nholdable = false\nstarts = 4\n[grid]\nx = [2.0, 0.0]'
+    solve(text, tmp_path)
+    rows = ip.sweep.open(tmp_path / "out").to_table().sort_by("point").to_pylist()
+    assert [row["status"] for row in rows] == ["infeasible", "certified"]
+
+
 def test_a_run_that_was_killed_before_its_manifest_goes_on(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     solve(AERIAL, tmp_path)

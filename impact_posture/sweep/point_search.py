@@ -22,8 +22,10 @@ from impact_posture.settings import ProblemSettings
 
 # Most rounds in which the program of a point grows, and most of them before anything says that the point is feasible.
 _ROUNDS, _UNSURE = 8, 3
-# Postures from which the constraints of a point beside an infeasible one are relaxed.
+# Postures from which the constraints of a point with neighbors are relaxed.
 _FEW = 8
+# What stands between two bodies in the name of a conflict.
+_BODIES = " / "
 # Postures whose joints differ by more than this (rad, m) may be of different optima.
 SWITCH = 0.2
 # An optimum is better than another if its objective is lower by this share.
@@ -86,23 +88,24 @@ class Walk:
         return found
 
 
-def search(walk: Walk, place: Place, guesses: Sequence[Array], *, beside: bool = False) -> PointResult:
+def search(walk: Walk, place: Place, guesses: Sequence[Array], *, beside: str = "") -> PointResult:
     """Solve one point: from the guesses and the given posture, and from many starts where they disagree.
 
     Args:
         walk: Problem and program as the points before have left them.
         place: Target position and orientation.
         guesses: Optima of neighbors.
-        beside: Whether a neighbor is infeasible and none has an optimum, so that this point is likely infeasible too.
+        beside: Why a neighbor is infeasible if none has an optimum.  This point is likely infeasible too.
     """
     attempt = _Attempt(walk, place, walk.settings.starts - 1)
     try:
         if not beside and (found := attempt.certified(guesses, rounds=_UNSURE)) is not None:
             return found
         # Either this finds the constraints that conflict, or a posture to start from.
-        relaxed = walk.relax(place, 1) if beside else walk.relax(place)
-        if beside and any(" / " in name for name in relaxed.conflicts):
-            # A pose out of reach is so from every posture, but there may be another way past a body.
+        relaxed = walk.relax(place, 1 if beside else _FEW if guesses else TRIES)
+        reached = all(_BODIES in part for part in beside.split("), "))
+        if beside and not reached and any(_BODIES in name for name in relaxed.conflicts):
+            # The pose of the neighbor is out of reach from every posture, but here may be a way past a body.
             relaxed = walk.relax(place, _FEW)
         if relaxed.conflicts:
             return attempt.without("infeasible", Infeasible(relaxed.conflicts).what)
