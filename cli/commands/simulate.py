@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -13,6 +13,9 @@ from impact_posture_cli.experiments import RUN, Compile, Mode, ScenarioName
 from impact_posture_cli.output import Page, complain, number, print_json
 from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import positive
+
+if TYPE_CHECKING:
+    from impact_posture.simulation.scenario import Scenario
 
 # Exit code of a run that did not complete.
 _FAILED = 4
@@ -83,7 +86,7 @@ def simulate(
     from impact_posture.simulation.scenario_file import read_scenario
 
     # A name that is none is refused before all that takes long to import.
-    name = read_scenario(scenario).name
+    given = read_scenario(scenario)
     from impact_posture.escape import file_name
     from impact_posture.experiment.folders import FORMATS, Output, write_simulation
     from impact_posture.experiment.jobs import Job, execute, worth_compiling
@@ -92,11 +95,11 @@ def simulate(
     from impact_posture.posture.nlp import one_blas_thread
 
     if export_world is not None:
-        _export_world(Page(quiet=quiet or json), scenario, Path(export_world), force)
+        _export_world(Page(quiet=quiet or json), given, Path(export_world), force)
         return
     only, code = None if sign is None else int(sign), worth_compiling(compile, 1)
     job = Job(scenario, controller, seed, mode, free, gain, only, code)
-    folder = Path(out) if out else Path(file_name(f"{name}-{job.label.replace(':', '-')}"))
+    folder = Path(out) if out else Path(file_name(f"{given.name}-{job.label.replace(':', '-')}"))
     check_output(folder, force=force, kind="run")
     with progress("running", shown=not (quiet or json)):
         with one_blas_thread():
@@ -111,19 +114,17 @@ def simulate(
         _show(Page(quiet=quiet), document, job.label, folder)
     if document["status"] != "completed":
         sys.stdout.flush()
-        complain(f"error: {name}, {job.label}: {fate(document)}; its numbers are no result")
+        complain(f"error: {given.name}, {job.label}: {fate(document)}; its numbers are no result")
         raise typer.Exit(_FAILED)
 
 
-def _export_world(page: Page, scenario: str, out: Path, force: bool) -> None:
+def _export_world(page: Page, scenario: Scenario, out: Path, force: bool) -> None:
     from impact_posture.output_folder import check_output
     from impact_posture.simulation.scenario import set_up
-    from impact_posture.simulation.scenario_file import read_scenario
     from impact_posture.simulation.world_export import export_world
 
-    given = read_scenario(scenario)
     check_output(out, force=force, kind="world")
-    export_world(set_up(given), out, force=force)
+    export_world(set_up(scenario), out, force=force)
     page.line(f"written: {out}; its sensors have no noise")
 
 

@@ -110,17 +110,11 @@ def _gaps(model: pin.Model, objects: list[pin.GeometryObject]) -> float:
 
 def geometry_key(robot: Robot, described: list[UrdfShape]) -> str:
     """Return a hash of everything that shapes the swept hulls of a robot and their pairs."""
-    model = robot.model
-    content = [coal.__version__]
+    content = [coal.__version__, robot.kinematics_sha256]
     for shape in described:
         content.append(repr((shape.name, shape.link, shape.kind, shape.sizes, shape.placement.homogeneous.tolist())))
         if shape.mesh is not None:
             with shape.mesh.open("rb") as file:
                 content.append(hashlib.file_digest(file, "sha256").hexdigest())
     content += sorted(" ".join(sorted(pair)) for pair in disabled_links(robot))
-    content += [f"{f.name} {f.parentJoint} {f.placement.homogeneous.tolist()}" for f in model.frames]
-    for joint, parent, placement in zip(model.joints, model.parents, model.jointPlacements, strict=True):
-        content.append(f"{joint.shortname()} {parent} {placement.homogeneous.tolist()}")
-    limits = (model.lowerPositionLimit, model.upperPositionLimit)
-    content += [repr([v.tolist() for v in (*limits, *robot.postures.values())]), robot.default_posture]
     return source_key(content, "collision")

@@ -124,13 +124,22 @@ class Robot:
         return self._hash(np.asarray(self.model.armature))
 
     @cached_property
-    def data_sha256(self) -> str:
-        """Hash of all data but shapes: dynamics, limits, frames, postures and what ``robot.toml`` says."""
+    def kinematics_sha256(self) -> str:
+        """Hash of joints, frames, limits of positions, and postures."""
         model = self.model
-        limits = (model.lowerPositionLimit, model.upperPositionLimit, model.effortLimit, model.velocityLimit)
-        arrays = [_rounded(values) for values in (*limits, *self.postures.values())]
-        frames = [(f.name, int(f.parentJoint), _rounded(f.placement.homogeneous)) for f in model.frames]
-        content = self.model_sha256, repr(self.spec), self.default_posture, arrays, frames
+        placed = [(f.name, int(f.parentJoint), _rounded(f.placement.homogeneous)) for f in model.frames]
+        for k in range(1, model.njoints):
+            joint, numbers = model.joints[k], model.jointPlacements[k].homogeneous
+            placed.append((joint.shortname(), int(model.parents[k]), _rounded([*numbers.flat, *_axis(joint)])))
+        arrays = model.lowerPositionLimit, model.upperPositionLimit, *self.postures.values()
+        content = placed, [_rounded(values) for values in arrays], self.default_posture
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+    @cached_property
+    def data_sha256(self) -> str:
+        """Hash of all data but shapes: dynamics, kinematics, limits, and what ``robot.toml`` says."""
+        efforts, rates = _rounded(self.model.effortLimit), _rounded(self.model.velocityLimit)
+        content = self.model_sha256, self.kinematics_sha256, efforts, rates, repr(self.spec)
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
     def _hash(self, armature: Array) -> str:

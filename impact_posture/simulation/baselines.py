@@ -58,7 +58,7 @@ def resting_posture(driver: Driver, seconds: float, quiet: float = 1e-3, ahead: 
     q, v, t = setup.q.copy(), np.zeros(setup.robot.nv), 0.0
     driver.reset(q)
     driver.brace()
-    for way in (0.0, ahead)[: 2 if ahead else 1]:
+    for way in (0.0, ahead) if ahead else (0.0,):
         began, rest = t, 0
         if way:
             driver.expect(t + MOVE)

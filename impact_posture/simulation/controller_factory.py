@@ -194,10 +194,10 @@ class ControllerFactory:
             return self._stiffened("nominal", "robust", gain)
         if name.endswith(_STIFF):
             return self._stiffened(name.removesuffix(_STIFF), name.removesuffix(_STIFF), gain)
-        if name in ("posture", "posture-sticking"):
-            return PostureDriver(setup, nominal_posture(setup), self._optimum(name).q)
         if name == "path":
             return PathDriver(setup, nominal_posture(setup), self.path)
+        if name in _OFFLINE:
+            return PostureDriver(setup, nominal_posture(setup), self._optimum(name).q)
         if name in _PLAIN:
             return _PLAIN[name](setup, nominal_posture(setup))
         term, gradient = setup.scenario.control.robust, self.gradient(_KINDS.get(name, "impulse"))

@@ -62,8 +62,8 @@ class Atlas:
         """
         manifest = self.folder / MANIFEST
         if not manifest.is_file():
-            # A run that was killed before it wrote the manifest left the record alone.
-            if not is_ours(self.folder, "sweep"):
+            # A run that was killed before it wrote the manifest left a record, and no results that could be lost.
+            if not is_ours(self.folder, "sweep") or (self.folder / _DATA).exists():
                 check_output(self.folder, force=False, kind="sweep")
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)

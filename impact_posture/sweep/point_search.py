@@ -24,8 +24,6 @@ from impact_posture.settings import ProblemSettings
 _ROUNDS, _UNSURE = 8, 3
 # Postures from which the constraints of a point with neighbors are relaxed.
 _FEW = 8
-# What stands between two bodies in the name of a conflict.
-_BODIES = " / "
 # Postures whose joints differ by more than this (rad, m) may be of different optima.
 SWITCH = 0.2
 # An optimum is better than another if its objective is lower by this share.
@@ -36,10 +34,17 @@ Place = tuple[Any, Any]
 
 
 class PointResult(NamedTuple):
-    """The answer to one problem: its columns in the table, and its posture, shape (nq,), if there is one."""
+    """The answer to one problem.
+
+    Attributes:
+        row: Its columns in the table.
+        q: Its posture, shape (nq,), if there is one.
+        conflicts: Names of the constraints that conflict, if it is infeasible.
+    """
 
     row: dict[str, Any]
     q: Array | None = None
+    conflicts: tuple[str, ...] = ()
 
 
 @dataclass
@@ -88,14 +93,14 @@ class Walk:
         return found
 
 
-def search(walk: Walk, place: Place, guesses: Sequence[Array], *, beside: str = "") -> PointResult:
+def search(walk: Walk, place: Place, guesses: Sequence[Array], beside: Sequence[str] = ()) -> PointResult:
     """Solve one point: from the guesses and the given posture, and from many starts where they disagree.
 
     Args:
         walk: Problem and program as the points before have left them.
         place: Target position and orientation.
         guesses: Optima of neighbors.
-        beside: Why a neighbor is infeasible if none has an optimum.  This point is likely infeasible too.
+        beside: What conflicts at infeasible neighbors if none has an optimum.  This point is likely infeasible too.
     """
     attempt = _Attempt(walk, place, walk.settings.starts - 1)
     try:
@@ -103,17 +108,21 @@ def search(walk: Walk, place: Place, guesses: Sequence[Array], *, beside: str = 
             return found
         # Either this finds the constraints that conflict, or a posture to start from.
         relaxed = walk.relax(place, 1 if beside else _FEW if guesses else TRIES)
-        reached = all(_BODIES in part for part in beside.split("), "))
-        if beside and not reached and any(_BODIES in name for name in relaxed.conflicts):
+        if not all(map(_of_bodies, beside)) and any(map(_of_bodies, relaxed.conflicts)):
             # The pose of the neighbor is out of reach from every posture, but here may be a way past a body.
             relaxed = walk.relax(place, _FEW)
         if relaxed.conflicts:
-            return attempt.without("infeasible", Infeasible(relaxed.conflicts).what)
+            return attempt.without("infeasible", Infeasible(relaxed.conflicts).what, tuple(relaxed.conflicts))
         if (found := attempt.certified([relaxed.q])) is not None:
             return found
         return attempt.without("uncertified", attempt.fault)
     except ImpactPostureError as error:
         return attempt.without("undefined", error.line)
+
+
+def _of_bodies(conflict: str) -> bool:
+    """Tell whether two bodies are in each other's way, by the name of a conflict."""
+    return " / " in conflict
 
 
 def improve(walk: Walk, place: Place, known: PointResult, guess: Array) -> PointResult:
@@ -224,9 +233,10 @@ class _Attempt:
         }
         return PointResult(row, end.q)
 
-    def without(self, status: str, reason: str) -> PointResult:
+    def without(self, status: str, reason: str, conflicts: tuple[str, ...] = ()) -> PointResult:
         """Return the answer that there is no posture."""
-        return PointResult({"status": status, "reason": reason, "optima": 0, "runs": self.runs})
+        row = {"status": status, "reason": reason, "optima": 0, "runs": self.runs}
+        return PointResult(row, conflicts=conflicts)
 
 
 class _End(NamedTuple):

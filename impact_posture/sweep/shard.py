@@ -95,9 +95,8 @@ def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
             continue
         before = [results[k - points.start] for k in sweep.grid.neighbors(point, points.start)]
         guesses = [one.q for one in before if one.q is not None]
-        reasons = [str(one.row["reason"]) for one in before if one.row["status"] == "infeasible"]
-        beside = "" if guesses else "; ".join(reasons)
-        results.append(search(walk, target, guesses, beside=beside))
+        beside = () if guesses else tuple(name for one in before for name in one.conflicts)
+        results.append(search(walk, target, guesses, beside))
         last = walk, target
     # An optimum that appears on the way may have been the better one already before.
     for point in reversed(points):
