@@ -30,6 +30,7 @@ from matplotlib.figure import Figure
 import impact_posture.codegen.export
 import impact_posture.experiment.figures
 import impact_posture.experiment.folders
+import impact_posture.experiment.jobs
 import impact_posture.experiment.reproduction
 import impact_posture.impact.evaluation
 import impact_posture.plot.snapshots
@@ -157,6 +158,8 @@ def _command(
     """Become what a shell would have started: streams, folder, signals and warnings are those of a new program."""
     # The test's objects are left alone: a page that is looked at is a page that is copied.
     gc.freeze()
+    # A new program has made no controllers, nor compiled anything for them.
+    impact_posture.experiment.jobs.controller_factory.cache_clear()
     os.dup2(out, 1)
     os.dup2(errors, 2)
     sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
@@ -176,7 +179,7 @@ def _command(
         if words[0] != "report":
             # A page without figures is made where it is what a test is about.
             impact_posture.report.result_report.write_result_report = lambda *arguments, **options: None
-            impact_posture.report.shapes.draw_robot = lambda *arguments: None
+            impact_posture.report.result_report.result_scene = lambda *arguments: None
             impact_posture.experiment.folders.try_report = lambda *arguments, **options: ""
     if prepare is not None:
         prepare()

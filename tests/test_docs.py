@@ -86,9 +86,7 @@ def run_page(page: Path, folder: Path) -> Iterator[Ran]:
     for file in dict.fromkeys(example_files(page)):
         shutil.copy(file, folder / file.name)
     for shown in shown_commands(page):
-        # One cache, because shapes take seconds to fit.
-        environment = {"COLUMNS": "300", "IMPACT_POSTURE_CACHE": str(ROOT / "build" / "cache")}
-        done = run(*shown.arguments, cwd=folder, env=environment)
+        done = run(*shown.arguments, cwd=folder, env={"COLUMNS": "300"})
         yield Ran(shown, done.returncode, done.stdout, done.stderr)
 
 

@@ -40,7 +40,7 @@ def shortened(source: str | Path, **changes: Any) -> Setup:
 
 def controller_factory(setup: Setup, free: bool = False) -> ControllerFactory:
     """Gradients at once, and an offline optimum from few starts."""
-    return ControllerFactory(setup, free=free, gradient_of=interpreted)
+    return ControllerFactory(setup, free=free, gradient_of=interpreted, starts=2)
 
 
 def near(name: str, **changes: Any) -> Setup:

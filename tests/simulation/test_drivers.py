@@ -106,7 +106,7 @@ def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.Monke
     for name in ("aerial-lateral", "talos-push"):
         made = factory(name)
         # Formulations do not depend on where posture and path end.
-        monkeypatch.setitem(vars(made), "offline", SimpleNamespace(q=made.setup.q))
+        monkeypatch.setitem(vars(made), "_optimum", lambda name, q=made.setup.q: SimpleNamespace(q=q))
         monkeypatch.setitem(vars(made), "path", SimpleNamespace(duration=0.0))
         nominal = made.driver("nominal").controller.formulation
         for controller in CONTROLLERS:

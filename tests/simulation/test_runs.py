@@ -39,7 +39,7 @@ APPROACH = ("reference-spreading", "impact-aware")
 ALL = [(name, c, "live") for name in SHIPPED for c in CONTROLLERS if name not in PUSHES or c not in APPROACH]
 ALL = [case for case in ALL if case[1] != "path" and case[:2] != ("talos-push", "robust-release")]
 # They differ from others in the metric or after they have arrived: one flight and one robot on feet will do.
-ALIKE = ("robust-speed", "robust-sticking", "robust-flow-sticking", "posture-stiff")
+ALIKE = ("robust-speed", "robust-sticking", "robust-flow-sticking", "posture-sticking", "posture-stiff")
 ALL = [case for case in ALL if case[0] not in ("aerial-lateral", "talos-push") or case[1] not in ALIKE]
 # Its approach to the wall lasts longer than the shortened wait there.
 ALL.remove(("aerial-lateral", "impact-aware", "live"))
