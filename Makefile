@@ -114,6 +114,7 @@ study-controller: $(VENV)/.installed-test
 
 study-sweep: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks.sweep
+	$(BIN)/python -m tests.benchmarks.sweep_verdicts
 
 reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks reproduction --write

@@ -227,12 +227,13 @@ def test_a_folder_never_mixes_what_files_say(pendulum: str, tmp_path: Path) -> N
     assert keys[0] == keys[1] and len(set(keys)) == 3
 
 
-def test_a_point_beside_one_out_of_reach_is_searched(tmp_path: Path) -> None:
-    """Most postures with this pose have a link in the wall, so a few tries find no way past it."""
-    text = '[problem]\nrobot = "xarm7"\nnormal = [-1, 0, 0]\nholdable = false\nstarts = 4\n[grid]\nx = [2.0, 0.0]'
-    solve(text, tmp_path)
+@pytest.mark.parametrize("y", [[0.1], [0.0, 0.1]], ids=["alone", "beside optima"])
+def test_a_point_is_infeasible_where_no_posture_gets_past_a_body(tmp_path: Path, y: list[float]) -> None:
+    """Most postures with this pose have a link in the wall, or lead into it; the first point is out of reach."""
+    problem = '[problem]\nrobot = "xarm7"\nnormal = [-1, 0, 0]\nholdable = false\nstarts = 4\n'
+    solve(f"{problem}[grid]\nx = [2.0, 0.0]\ny = {y}", tmp_path)
     rows = ip.sweep.open(tmp_path / "out").to_table().sort_by("point").to_pylist()
-    assert [row["status"] for row in rows] == ["infeasible", "certified"]
+    assert [row["status"] for row in rows] == ["infeasible"] * len(y) + ["certified"] * len(y)
 
 
 def test_a_run_that_was_killed_before_its_manifest_goes_on(tmp_path: Path) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 
 import casadi as ca
 import numpy as np
@@ -48,7 +48,11 @@ class ElasticAnswer:
 
 
 def elastic(
-    problem: PostureProblem, seed: int = 0, tries: int = TRIES, program: ElasticProgram | None = None
+    problem: PostureProblem,
+    seed: int = 0,
+    tries: int = TRIES,
+    program: ElasticProgram | None = None,
+    guesses: Sequence[Array] = (),
 ) -> ElasticAnswer:
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures.
 
@@ -57,11 +61,12 @@ def elastic(
         seed: Seed of the postures.
         tries: Most postures to begin from.
         program: The program of the same problem with another target, or of one that grew into it.
+        guesses: Postures to begin from before all others.
     """
     chart = Chart.of(problem.robot.model)
     program = program or ElasticProgram(problem)
     best: ElasticAnswer | None = None
-    for start in islice(_starts(problem, chart, seed), tries):
+    for start in islice(chain(guesses, _starts(problem, chart, seed)), tries):
         for _ in range(_ROUNDS):
             found = _relax(problem, chart, program, start)
             if found.problem is problem:

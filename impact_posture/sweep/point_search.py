@@ -9,21 +9,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.errors import ImpactPostureError, Infeasible
+from impact_posture.errors import ImpactPostureError, Infeasible, SolverFailed
 from impact_posture.posture.build_problem import retarget
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.elastic import TRIES, ElasticAnswer, ElasticProgram, elastic
 from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.search import HIGH_PRICE
-from impact_posture.posture.solve import distinct
+from impact_posture.posture.solve import distinct, solve
 from impact_posture.posture.starts import FEASIBLE, Projector, random_posture
 from impact_posture.settings import ProblemSettings
 
 # Most rounds in which the program of a point grows, and most of them before anything says that the point is feasible.
 _ROUNDS, _UNSURE = 8, 3
-# Postures from which the constraints of a point with neighbors are relaxed.
-_FEW = 8
+# Postures from which the constraints of a point beside infeasible ones are relaxed.
+_BESIDE = 4
 # Postures whose joints differ by more than this (rad, m) may be of different optima.
 SWITCH = 0.2
 # An optimum is better than another if its objective is lower by this share.
@@ -39,12 +39,12 @@ class PointResult(NamedTuple):
     Attributes:
         row: Its columns in the table.
         q: Its posture, shape (nq,), if there is one.
-        conflicts: Names of the constraints that conflict, if it is infeasible.
+        violation: Least violation of the constraints that could be found, summed, if it is infeasible.
     """
 
     row: dict[str, Any]
     q: Array | None = None
-    conflicts: tuple[str, ...] = ()
+    violation: float = 0.0
 
 
 @dataclass
@@ -84,45 +84,43 @@ class Walk:
         """Return a problem with its target at a place."""
         return retarget(problem, *place, self.nlp.program.numeric)
 
-    def relax(self, place: Place, tries: int = TRIES) -> ElasticAnswer:
+    def relax(self, place: Place, tries: int = TRIES, guesses: Sequence[Array] = ()) -> ElasticAnswer:
         """Relax the constraints at a place, with the parts that the places before needed for it."""
         program = self._relaxed = self._relaxed or ElasticProgram(self.problem)
         before = program.time_s
-        found = elastic(self.at(program.problem, place), self.settings.seed, tries, program)
+        found = elastic(self.at(program.problem, place), self.settings.seed, tries, program, guesses)
         self.timer.solver_s += program.time_s - before
         return found
 
 
-def search(walk: Walk, place: Place, guesses: Sequence[Array], beside: Sequence[str] = ()) -> PointResult:
+def search(walk: Walk, place: Place, guesses: Sequence[Array], beside: float = 0.0) -> PointResult:
     """Solve one point: from the guesses and the given posture, and from many starts where they disagree.
 
     Args:
         walk: Problem and program as the points before have left them.
         place: Target position and orientation.
         guesses: Optima of neighbors.
-        beside: What conflicts at infeasible neighbors if none has an optimum.  This point is likely infeasible too.
+        beside: Least violation at infeasible neighbors if none has an optimum.  This point is likely infeasible too.
     """
     attempt = _Attempt(walk, place, walk.settings.starts - 1)
     try:
         if not beside and (found := attempt.certified(guesses, rounds=_UNSURE)) is not None:
             return found
         # Either this finds the constraints that conflict, or a posture to start from.
-        relaxed = walk.relax(place, 1 if beside else _FEW if guesses else TRIES)
-        if not all(map(_of_bodies, beside)) and any(map(_of_bodies, relaxed.conflicts)):
-            # The pose of the neighbor is out of reach from every posture, but here may be a way past a body.
-            relaxed = walk.relax(place, _FEW)
+        relaxed = walk.relax(place, _BESIDE if beside else TRIES, guesses)
+        if 0 < _violation(relaxed) < beside / 2:
+            # On the way from the neighbors the constraints come within reach, perhaps here.
+            relaxed = walk.relax(place)
         if relaxed.conflicts:
-            return attempt.without("infeasible", Infeasible(relaxed.conflicts).what, tuple(relaxed.conflicts))
-        if (found := attempt.certified([relaxed.q])) is not None:
-            return found
-        return attempt.without("uncertified", attempt.fault)
+            return attempt.without("infeasible", Infeasible(relaxed.conflicts).what, _violation(relaxed))
+        found = attempt.certified([relaxed.q]) or attempt.searched(relaxed.q)
+        return found or attempt.without("uncertified", attempt.fault)
     except ImpactPostureError as error:
         return attempt.without("undefined", error.line)
 
 
-def _of_bodies(conflict: str) -> bool:
-    """Tell whether two bodies are in each other's way, by the name of a conflict."""
-    return " / " in conflict
+def _violation(relaxed: ElasticAnswer) -> float:
+    return sum(relaxed.conflicts.values())
 
 
 def improve(walk: Walk, place: Place, known: PointResult, guess: Array) -> PointResult:
@@ -183,7 +181,7 @@ class _Attempt:
             for end in found:
                 certificate = certify(problem, end.q, scale, end.auxiliaries, nlp.program.numeric)
                 if certificate.holds() and self._is_clear(end.q):
-                    return self._answer(end, certificate, len(found))
+                    return self._answer(end.q, certificate, len(found))
                 self.fault = f"stationarity {certificate.stationarity:.1e}, violation {certificate.primal:.1e}"
             if not found:
                 return None
@@ -197,6 +195,19 @@ class _Attempt:
             else:
                 return None
         return None
+
+    def searched(self, guess: Array) -> PointResult | None:
+        """Return what ``optimize`` finds, which starts anew where a run ends between bodies."""
+        settings = self._walk.settings
+        try:
+            found = solve(
+                self.problem, starts=settings.starts, seed=settings.seed, jobs=1, compile="never", guesses=[guess]
+            )
+        except SolverFailed as error:
+            self.fault = error.what
+            return None
+        self.runs += found.feasible_starts
+        return self._answer(found.q, found.certificate, len(found.optima))
 
     def _random_starts(self) -> Iterator[Array]:
         """Yield random postures that one projection takes to the constraints."""
@@ -219,24 +230,24 @@ class _Attempt:
         around = self.problem.surroundings
         return self.problem.objective.movable(q) and not (around and around.collisions(q))
 
-    def _answer(self, end: _End, certificate: Certificate, optima: int) -> PointResult:
-        found = self.problem.impact.oracle.quantities(end.q)
+    def _answer(self, q: Array, certificate: Certificate, optima: int) -> PointResult:
+        found = self.problem.impact.oracle.quantities(q)
         row = {
             "status": "certified",
-            "q": end.q.tolist(),
-            "value": self.problem.objective.value(end.q),
+            "q": q.tolist(),
+            "value": self.problem.objective.value(q),
             **{key: getattr(found, key) for key in "HGVSE"},
             "stationarity": certificate.stationarity,
             "violation": certificate.primal,
             "optima": optima,
             "runs": self.runs,
         }
-        return PointResult(row, end.q)
+        return PointResult(row, q)
 
-    def without(self, status: str, reason: str, conflicts: tuple[str, ...] = ()) -> PointResult:
+    def without(self, status: str, reason: str, violation: float = 0.0) -> PointResult:
         """Return the answer that there is no posture."""
         row = {"status": status, "reason": reason, "optima": 0, "runs": self.runs}
-        return PointResult(row, conflicts=conflicts)
+        return PointResult(row, violation=violation)
 
 
 class _End(NamedTuple):

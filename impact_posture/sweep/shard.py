@@ -95,7 +95,7 @@ def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
             continue
         before = [results[k - points.start] for k in sweep.grid.neighbors(point, points.start)]
         guesses = [one.q for one in before if one.q is not None]
-        beside = () if guesses else tuple(name for one in before for name in one.conflicts)
+        beside = 0.0 if guesses else min((one.violation for one in before if one.violation), default=0.0)
         results.append(search(walk, target, guesses, beside))
         last = walk, target
     # An optimum that appears on the way may have been the better one already before.
