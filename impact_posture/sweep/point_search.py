@@ -203,7 +203,7 @@ class _Attempt:
             found = solve(
                 self.problem, starts=settings.starts, seed=settings.seed, jobs=1, compile="never", guesses=[guess]
             )
-        except SolverFailed as error:
+        except (Infeasible, SolverFailed) as error:
             self.fault = error.what
             return None
         self.runs += found.feasible_starts
