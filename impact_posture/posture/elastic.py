@@ -25,7 +25,9 @@ _KEPT = 1e-6
 # Price of a meter of slack beside that of a violated row: where bodies are in the way of a pose, they are the reason.
 _SLACK_PRICE = 0.03
 # Most postures to begin from.  In xarm7 before a wall, the 14th was the first that led to a posture free of it.
-TRIES = 24
+_TRIES = 24
+# Postures that confirm what conflicts nearby.  In panda before a wall two find the way past a body, if there is one.
+_CONFIRMING = 4
 # Most times that the program grows for one start.
 _ROUNDS = 20
 
@@ -46,35 +48,41 @@ class ElasticAnswer:
     conflicts: dict[str, float]
     at_limits: tuple[str, ...]
 
+    @property
+    def violation(self) -> float:
+        """Sum of what all constraints are violated by."""
+        return sum(self.conflicts.values())
+
 
 def elastic(
     problem: PostureProblem,
     seed: int = 0,
-    tries: int = TRIES,
     program: ElasticProgram | None = None,
     guesses: Sequence[Array] = (),
+    beside: float = 0.0,
 ) -> ElasticAnswer:
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures.
 
     Args:
         problem: The posture problem.
         seed: Seed of the postures.
-        tries: Most postures to begin from.
         program: The program of the same problem with another target, or of one that grew into it.
         guesses: Postures to begin from before all others.
+        beside: Least violation known of a target nearby, which few postures confirm.  All are tried where these leave
+            less than half of it.
     """
     chart = Chart.of(problem.robot.model)
     program = program or ElasticProgram(problem)
     best: ElasticAnswer | None = None
-    for start in islice(chain(guesses, _starts(problem, chart, seed)), tries):
+    for count, start in enumerate(islice(chain(guesses, _starts(problem, chart, seed)), _TRIES), 1):
         for _ in range(_ROUNDS):
             found = _relax(problem, chart, program, start)
             if found.problem is problem:
                 break
             problem = found.problem
-        if best is None or sum(found.conflicts.values()) < sum(best.conflicts.values()):
+        if best is None or found.violation < best.violation:
             best = found
-        if not best.conflicts:
+        if not best.conflicts or (count == _CONFIRMING and 2 * best.violation >= beside > 0):
             break
     assert best is not None  # noqa: S101 (narrows a type)
     return best
@@ -84,7 +92,7 @@ def _starts(problem: PostureProblem, chart: Chart, seed: int) -> Iterator[Array]
     """Yield the given posture, then random ones on the projected constraints, those nearest to the others first."""
     yield problem.given
     rng, projector = np.random.default_rng(seed), Projector(problem)
-    near = [problem.given if k % 2 else None for k in range(1, TRIES)]
+    near = [problem.given if k % 2 else None for k in range(1, _TRIES)]
     found = [projector.project(random_posture(problem, chart, rng, posture)) for posture in near]
     order = [(each.violation > FEASIBLE, projector.outside(each.q)) for each in found]
     yield from (found[k].q for k in sorted(range(len(found)), key=order.__getitem__))

@@ -12,7 +12,7 @@ from impact_posture.arrays import Array
 from impact_posture.errors import ImpactPostureError, Infeasible, SolverFailed
 from impact_posture.posture.build_problem import retarget
 from impact_posture.posture.certificate import Certificate, certify
-from impact_posture.posture.elastic import TRIES, ElasticAnswer, ElasticProgram, elastic
+from impact_posture.posture.elastic import ElasticAnswer, ElasticProgram, elastic
 from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.search import HIGH_PRICE
@@ -22,8 +22,6 @@ from impact_posture.settings import ProblemSettings
 
 # Most rounds in which the program of a point grows, and most of them before anything says that the point is feasible.
 _ROUNDS, _UNSURE = 8, 3
-# Postures from which the constraints of a point beside infeasible ones are relaxed.
-_BESIDE = 4
 # Postures whose joints differ by more than this (rad, m) may be of different optima.
 SWITCH = 0.2
 # An optimum is better than another if its objective is lower by this share.
@@ -84,11 +82,11 @@ class Walk:
         """Return a problem with its target at a place."""
         return retarget(problem, *place, self.nlp.program.numeric)
 
-    def relax(self, place: Place, tries: int = TRIES, guesses: Sequence[Array] = ()) -> ElasticAnswer:
+    def relax(self, place: Place, guesses: Sequence[Array] = (), beside: float = 0.0) -> ElasticAnswer:
         """Relax the constraints at a place, with the parts that the places before needed for it."""
         program = self._relaxed = self._relaxed or ElasticProgram(self.problem)
         before = program.time_s
-        found = elastic(self.at(program.problem, place), self.settings.seed, tries, program, guesses)
+        found = elastic(self.at(program.problem, place), self.settings.seed, program, guesses, beside)
         self.timer.solver_s += program.time_s - before
         return found
 
@@ -107,20 +105,13 @@ def search(walk: Walk, place: Place, guesses: Sequence[Array], beside: float = 0
         if not beside and (found := attempt.certified(guesses, rounds=_UNSURE)) is not None:
             return found
         # Either this finds the constraints that conflict, or a posture to start from.
-        relaxed = walk.relax(place, _BESIDE if beside else TRIES, guesses)
-        if 0 < _violation(relaxed) < beside / 2:
-            # On the way from the neighbors the constraints come within reach, perhaps here.
-            relaxed = walk.relax(place)
+        relaxed = walk.relax(place, guesses, beside)
         if relaxed.conflicts:
-            return attempt.without("infeasible", Infeasible(relaxed.conflicts).what, _violation(relaxed))
+            return attempt.without("infeasible", Infeasible(relaxed.conflicts).what, relaxed.violation)
         found = attempt.certified([relaxed.q]) or attempt.searched(relaxed.q)
         return found or attempt.without("uncertified", attempt.fault)
     except ImpactPostureError as error:
         return attempt.without("undefined", error.line)
-
-
-def _violation(relaxed: ElasticAnswer) -> float:
-    return sum(relaxed.conflicts.values())
 
 
 def improve(walk: Walk, place: Place, known: PointResult, guess: Array) -> PointResult:
