@@ -336,6 +336,10 @@ class ProblemSettings(ImpactSettings):
             TASK, option="--holdable/--no-holdable",
         ),
     ] = True  # fmt: skip
+    approach: Annotated[
+        bool,
+        Setting("The joints can bring the contact to the surface at --speed within their velocity limits.", TASK),
+    ] = False
     hold_force: Annotated[
         float,
         Setting(

@@ -190,6 +190,9 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     page.gap()
     worst_lines(page, frames, blocks)
     _holding(page, initial["holding"], optimal["holding"])
+    if optimal["attainable_speed"] is not None:
+        speeds = " to ".join(f"{block['attainable_speed']:.3g}" for block in (initial, optimal))
+        page.line(f"fastest approach within the joints' velocity limits: {speeds} m/s")
     page.line(f"reduction {percent(solution.reduction)}; {_redundancy(solution.redundancy)} left by the constraints")
     if "robustness" in document:
         page.line(document["robustness"]["line"])

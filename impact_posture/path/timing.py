@@ -46,12 +46,6 @@ class TimedCurve:
     notes: tuple[str, ...] = ()
 
 
-def velocity_limits(space: PathSpace) -> Array:
-    """Return the velocity limits, shape (nv,), infinite where the model has none."""
-    limits = np.array(space.model.velocityLimit)
-    return np.where(np.isfinite(limits) & (limits > 0) & (limits < 1e10), limits, np.inf)
-
-
 def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve | None:
     """Return the fastest motion within velocities and torques (TOPP-RA, Pham and Pham 2018), ``None`` if none exists.
 
@@ -61,7 +55,7 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
     from toppra.algorithm import TOPPRA
     from toppra.constraint import DiscretizationType, JointTorqueConstraint, JointVelocityConstraint
 
-    speed = velocity_limits(space)
+    speed = space.problem.robot.velocity_limits
     # Joints without a limit get a bound that nothing reaches; the solver takes no infinities.
     bound = np.where(np.isfinite(speed), speed, 1e6)
 
@@ -101,7 +95,7 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     """
     notes, tau = [], np.linspace(0.0, 1.0, INSTANTS)
     rates = [_rates(curve, float(x)) for x in tau]
-    speed, known = velocity_limits(space), not limits.missing
+    speed, known = space.problem.robot.velocity_limits, not limits.missing
     if known:
         zero = np.zeros(space.model.nv)
         rests = [(q, limits.load(q, zero, zero)) for q, _, _ in rates]
@@ -116,7 +110,7 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
         notes.append(f"{why}: timed by velocities alone")
         least = [0.0]
         speed = np.where(np.isfinite(speed), speed, _DEFAULT_SPEED)
-        if not np.isfinite(velocity_limits(space)).all():
+        if not np.isfinite(space.problem.robot.velocity_limits).all():
             notes.append(f"where no velocity limit is known, {_DEFAULT_SPEED:g} rad/s or m/s counts")
     duration = max(*least, *(float((np.abs(v) / speed).max()) for _, v, _ in rates), SAMPLE_TIME)
     t = _times(duration)
@@ -184,7 +178,7 @@ def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: Act
     for row, k in enumerate([] if limits.missing else every):
         found = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
         shares[row] = np.nan if found is None else found
-    groups = {"velocity": (np.abs(motion.v[every]) / velocity_limits(space), robot.tangent_names)}
+    groups = {"velocity": (np.abs(motion.v[every]) / space.problem.robot.velocity_limits, robot.tangent_names)}
     for kind in ("torque", "thrust"):
         own = [k for k, other in enumerate(limits.kinds) if other == kind]
         groups[kind] = np.abs(shares[:, own]), tuple(limits.names[k] for k in own)

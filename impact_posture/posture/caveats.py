@@ -11,6 +11,8 @@ from impact_posture.posture.problem_settings import Prepared
 
 # A contact counts as locked if its 1/mass falls below this share of the initial value.
 _LOCKED = 0.05
+# Share of the approach speed that rounding may cost.
+_REACHED = 1e-6
 # A joint further than this behind a surface gets a warning, meters.
 _BEHIND = 0.01
 
@@ -41,18 +43,26 @@ def notes_on_impacts(objective: Objective, initial: Array, q: Array) -> list[str
     return notes
 
 
-def caveats(prepared: Prepared, initial: Array, q: Array, holding: Holding | None) -> list[str]:
-    """Return warnings about holding, the surface and the ground, for the initial and the optimal posture.
+def caveats(
+    prepared: Prepared, initial: Array, q: Array, holding: Holding | None, attainable: float | None
+) -> list[str]:
+    """Return warnings about holding, approach, surface and ground, for the initial and the optimal posture.
 
     Args:
         prepared: The problem.
         initial: Initial posture, shape (nq,).
         q: Optimal posture, shape (nq,).
         holding: What holds the optimal posture, if it is known.
+        attainable: Speed at which the joints can arrive in it, m/s, if it is bounded.
     """
     verb = "hold" if prepared.impact.robot.spec.propulsion is None else "hover in"
     loads = holding.violations() if holding else []
     held = [f"the robot cannot {verb} the optimal posture: {violation}" for violation in loads]
+    if attainable is not None and attainable < (1 - _REACHED) * prepared.impact.speed:
+        held.append(
+            f"the joints can bring the contact to the surface at no more than {attainable:.2g} m/s in the optimal "
+            f"posture, not at {prepared.impact.speed:g} m/s: add `approach=True`, or give the `speed` that is meant"
+        )
     around = prepared.problem.surroundings
     if around is not None and around.shapes.bodies:
         return held

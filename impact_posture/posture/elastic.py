@@ -41,17 +41,14 @@ class ElasticAnswer:
         problem: The problem with all parts that its program needed.
         conflicts: Violated constraints and their violation; empty if all are satisfied.
         at_limits: Joints on a limit at ``q``.
+        violation: Sum of the violations at the price of each constraint.
     """
 
     q: Array
     problem: PostureProblem
     conflicts: dict[str, float]
     at_limits: tuple[str, ...]
-
-    @property
-    def violation(self) -> float:
-        """Sum of what all constraints are violated by."""
-        return sum(self.conflicts.values())
+    violation: float
 
 
 def elastic(
@@ -181,10 +178,12 @@ def _widened(hessian: ca.SX, before: int, width: int, after: int) -> ca.SX:
 def _judge(problem: PostureProblem, chart: Chart, q: Array) -> ElasticAnswer:
     numeric = Numeric(problem.robot.model).at(q)
     conflicts: dict[str, float] = {}
+    total = 0.0
     for constraint, excess in zip(problem.constraints, problem.violations(numeric), strict=True):
         for name, violation in constraint.conflicts(excess).items():
             if violation > _KEPT:
                 conflicts[name] = conflicts.get(name, 0.0) + violation
+                total += constraint.price * violation
     x = chart.to_x(q)
     limits = []
     for slot in chart.slots:
@@ -194,4 +193,4 @@ def _judge(problem: PostureProblem, chart: Chart, q: Array) -> ElasticAnswer:
             limits.append(f"'{slot.name}' at its lower limit")
         elif problem.upper[slot.x] - x[slot.x] < 1e-4:
             limits.append(f"'{slot.name}' at its upper limit")
-    return ElasticAnswer(q, problem, conflicts, tuple(limits))
+    return ElasticAnswer(q, problem, conflicts, tuple(limits), total)

@@ -47,6 +47,7 @@ class Requirements:
         hold_force: Force that each contact pushes back with after the impact, N, which has to be held as well.
         least_mobility: Least G of each contact, 1/kg, for the bound on the peak force; 0 for none.
         largest_jump: Largest jump of a joint per approach speed; infinite for no bound.
+        approach_speed: Speed at which the joints have to bring the contact to the surface, m/s; 0 for no demand.
         collision: Keep the links clear of each other, the surface, the ground and the obstacles.
         clearance: Least distance of all of these, m.
         surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` to decide by the robot.
@@ -74,6 +75,7 @@ class Requirements:
     hold_force: float = 0.0
     least_mobility: float = 0.0
     largest_jump: float = float("inf")
+    approach_speed: float = 0.0
     collision: bool = False
     clearance: float = CLEARANCE
     surface: str | float | None = None

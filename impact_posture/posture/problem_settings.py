@@ -113,7 +113,10 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
         )
     if settings.keep_contacts and not objective.supports:
         raise InputError("there are no feet to keep", where="keep_contacts", hint="add `support` or leave it out")
+    if settings.approach and settings.speed == 0:
+        raise InputError("needs an approach speed", where="approach", hint="give `speed` above zero")
     return Requirements(
+        approach_speed=settings.speed if settings.approach else 0.0,
         contact_pose=poses[0] if poses else "free",
         other_poses=tuple(poses[1:]),
         base=settings.base or base,

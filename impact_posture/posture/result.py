@@ -12,6 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.impact.evaluation import Evaluation
+from impact_posture.posture.approach_speed import AttainableSpeed
 from impact_posture.posture.caveats import caveats
 from impact_posture.posture.global_search import GlobalSearch, SelfMotionMap
 from impact_posture.posture.load_cases import load_cases
@@ -52,8 +53,10 @@ def result_document(
     impact, around = prepared.impact, prepared.problem.surroundings
     loads = load_cases(impact.objective, solution.initial, prepared.problem.requirements)
     before, after = (loads.holding(q) for q in (solution.initial, solution.q))
+    approach = AttainableSpeed(impact.robot, impact.objective, prepared.problem.requirements)
+    attainable = [approach.reached(q) for q in (solution.initial, solution.q)]
     fault = [solution.compiler_fault] if solution.compiler_fault else []
-    found = caveats(prepared, solution.initial, solution.q, after)
+    found = caveats(prepared, solution.initial, solution.q, after, attainable[1])
     warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *found)
     curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list(), "tradeoff_against": tradeoff.against}
     return {
@@ -66,8 +69,13 @@ def result_document(
             "moved": solution.moved,
             **initial.to_dict(),
             "holding": before and before.to_dict(),
+            "attainable_speed": attainable[0],
         },
-        "optimal": {**optimal.to_dict(), "holding": after and after.to_dict()},
+        "optimal": {
+            **optimal.to_dict(),
+            "holding": after and after.to_dict(),
+            "attainable_speed": attainable[1],
+        },
         "reduction": solution.reduction,
         **({} if robustness is None else {"robustness": robustness.to_dict()}),
         "redundancy": solution.redundancy,

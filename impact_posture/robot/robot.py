@@ -103,6 +103,13 @@ class Robot:
         """Armature of each velocity entry as stated, shape (nv,), kg·m² (kg for prismatic joints)."""
         return np.array(self.model.armature if self.stated_armature is None else self.stated_armature, dtype=float)
 
+    @property
+    def velocity_limits(self) -> Array:
+        """Velocity limit of each velocity entry, rad/s or m/s, infinite where the model states none, shape (nv,)."""
+        limits = np.array(self.model.velocityLimit)
+        limits[: 6 if self.floating else 0] = np.inf
+        return np.where((limits > 0) & (limits < 1e10), limits, np.inf)
+
     @cached_property
     def mass(self) -> float:
         """Total moving mass, kg."""

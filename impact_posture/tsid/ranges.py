@@ -20,12 +20,10 @@ class JointRanges:
     def __init__(self, robot: Robot) -> None:
         model = robot.model
         self.lower, self.upper = np.full(robot.nv, -np.inf), np.full(robot.nv, np.inf)
-        self.velocity, self.index = np.full(robot.nv, np.inf), np.zeros(robot.nv, dtype=np.intp)
+        self.velocity, self.index = robot.velocity_limits, np.zeros(robot.nv, dtype=np.intp)
         for name in robot.joint_names:
             joint = model.getJointId(name)
             v = slice(model.idx_vs[joint], model.idx_vs[joint] + model.nvs[joint])
-            speed = np.asarray(model.velocityLimit)[v]
-            self.velocity[v] = np.where(speed > 0, speed, np.inf)
             if model.nqs[joint] == model.nvs[joint]:
                 q = np.arange(model.idx_qs[joint], model.idx_qs[joint] + model.nqs[joint])
                 self.index[v] = q
