@@ -28,6 +28,8 @@ _SLACK_PRICE = 0.03
 _TRIES = 24
 # Postures that confirm what conflicts nearby.  In panda before a wall two find the way past a body, if there is one.
 _CONFIRMING = 4
+# Postures that are drawn at once: mostly few are needed, and to draw all takes longer than to relax a small robot.
+_DRAW = 8
 # Most times that the program grows for one start.
 _ROUNDS = 20
 
@@ -86,13 +88,14 @@ def elastic(
 
 
 def _starts(problem: PostureProblem, chart: Chart, seed: int) -> Iterator[Array]:
-    """Yield the given posture, then random ones on the projected constraints, those nearest to the others first."""
+    """Yield the given posture, then random ones on the projected constraints, of each draw the clearest first."""
     yield problem.given
     rng, projector = np.random.default_rng(seed), Projector(problem)
     near = [problem.given if k % 2 else None for k in range(1, _TRIES)]
-    found = [projector.project(random_posture(problem, chart, rng, posture)) for posture in near]
-    order = [(each.violation > FEASIBLE, projector.outside(each.q)) for each in found]
-    yield from (found[k].q for k in sorted(range(len(found)), key=order.__getitem__))
+    for some in near[:_DRAW], near[_DRAW:]:
+        found = [projector.project(random_posture(problem, chart, rng, posture)) for posture in some]
+        order = [(each.violation > FEASIBLE, projector.outside(each.q)) for each in found]
+        yield from (found[k].q for k in sorted(range(len(found)), key=order.__getitem__))
 
 
 def _relax(problem: PostureProblem, chart: Chart, program: ElasticProgram, start: Array) -> ElasticAnswer:
