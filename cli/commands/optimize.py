@@ -193,7 +193,8 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     if optimal["attainable_speed"] is not None:
         speeds = " to ".join(f"{block['attainable_speed']:.3g}" for block in (initial, optimal))
         page.line(f"fastest approach within the joints' velocity limits: {speeds} m/s")
-    page.line(f"reduction {percent(solution.reduction)}; {_redundancy(solution.redundancy)} left by the constraints")
+    free = f"{solution.redundancy} degree{'' if solution.redundancy == 1 else 's'} of freedom"
+    page.line(f"reduction {percent(solution.reduction)}; {free} left by the constraints")
     if "robustness" in document:
         page.line(document["robustness"]["line"])
     for note in solution.notes[len(prepared.problem.notes) :]:
@@ -262,8 +263,7 @@ def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
         rows.append(
             (f"  {point['within']:.{digits}f}", gain, *(number(point[key]) for key in keys), ", ".join(marks))
         )
-    head = ("  within", "gain", "objective", "H", "G", "V", "S", "")
-    page.table(head, rows, right=range(7))
+    page.table(("  within", "gain", "objective", "H", "G", "V", "S", ""), rows, right=range(7))
     for note in notes:
         page.line(note)
 
@@ -283,10 +283,6 @@ def _path(page: Page, path: dict[str, Any]) -> None:
         page.line("path: the start is the optimum" if path["found"] else "path: none leads away from the start")
     if path["reason"]:
         page.line(f"  {path['reason']}")
-
-
-def _redundancy(count: int) -> str:
-    return "1 degree of freedom" if count == 1 else f"{count} degrees of freedom"
 
 
 def _active(entry: dict[str, Any]) -> str:
