@@ -103,6 +103,9 @@ class AttainableSpeed:
         robot: The robot, with the velocity limits of its URDF.
         objective: Its contacts and supports.
         requirements: What of the base, of the contact's pose and of other frames is held.
+
+    Attributes:
+        bounded: Whether velocity limits bound the speed, at least at some postures.
     """
 
     def __init__(self, robot: Robot, objective: Objective, requirements: Requirements) -> None:
@@ -114,13 +117,15 @@ class AttainableSpeed:
                 start = robot.model.idx_vs[joint]
                 free[start : start + robot.model.nvs[joint]] = True
         free &= ~held_rows(robot, requirements.hold).any(axis=0)
-        if robot.floating and (objective.supports or requirements.base == "fixed"):
+        flies = robot.floating and not objective.supports and requirements.base != "fixed"
+        if robot.floating and not flies:
             free[:6] = False
         self.free = np.flatnonzero(free)
         bounded = np.isfinite(limit[self.free])
         self.scale = np.where(bounded, limit[self.free], 1.0)
         self.upper = np.where(bounded, 1.0, np.inf)
         self.names = [robot.tangent_names[k] for k in self.free]
+        self.bounded = bool(self.points) and not flies and bool(bounded.any() or not bounded.size)
 
     @property
     def arrives(self) -> Array:
@@ -161,7 +166,7 @@ class AttainableSpeed:
 
     def reached(self, q: Array) -> float | None:
         """Return the speed at ``q``, shape (nq,), in m/s; ``None`` where nothing bounds it."""
-        speed = self.at(Numeric(self._model).at(q)).speed if self.points else float("inf")
+        speed = self.at(Numeric(self._model).at(q)).speed if self.bounded else float("inf")
         return speed if np.isfinite(speed) else None
 
 

@@ -78,10 +78,10 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
         constraints += in_every_variant(objective, numeric, requirements.friction, bounds, constraints)
     if requirements.approach_speed > 0:
         attainable = AttainableSpeed(robot, objective, requirements)
-        if attainable.reached(numeric.q) is None:
-            decided.append("nothing bounds the speed of the approach: no joint velocity with a limit decides it")
-        else:
+        if attainable.bounded:
             constraints.append(ApproachSpeed(attainable, requirements.approach_speed))
+        else:
+            decided.append("nothing bounds the speed of the approach: no joint velocity with a limit decides it")
     lower, upper = _bounds(robot, chart, given, requirements)
     held_up = load_cases(objective, given, requirements) if requirements.holdable else LoadCases()
     decided += held_up.notes
