@@ -125,7 +125,7 @@ class AttainableSpeed:
         self.scale = np.where(bounded, limit[self.free], 1.0)
         self.upper = np.where(bounded, 1.0, np.inf)
         self.names = [robot.tangent_names[k] for k in self.free]
-        self.bounded = bool(self.points) and not flies and bool(bounded.any() or not bounded.size)
+        self.bounded = bool(self.points) and not flies and bool(bounded.any())
 
     @property
     def arrives(self) -> Array:
