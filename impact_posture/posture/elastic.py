@@ -101,17 +101,17 @@ def _starts(problem: PostureProblem, chart: Chart, seed: int) -> Iterator[Array]
 def _relax(problem: PostureProblem, chart: Chart, program: ElasticProgram, start: Array) -> ElasticAnswer:
     """Minimize the slack from one posture; the answer's problem has grown if the program lacked parts."""
     lower_rows, upper_rows = problem.row_bounds
-    rows = len(lower_rows)
     norms = np.zeros(len(chart.quaternion_slices()))
     x = np.clip(chart.to_x(start), problem.lower, problem.upper)
     guess = problem.guess(Numeric(problem.robot.model).at(chart.to_q(x)))
     solver, began = program.solver(problem), time.perf_counter()
+    slacks = int(solver.size1_in("x0")) - chart.nx - len(guess.values)
     answer = run_solver(
         solver,
-        x0=np.concatenate([x, np.full(2 * rows, 0.1), guess.values]),
+        x0=np.concatenate([x, np.full(slacks, 0.1), guess.values]),
         p=np.concatenate([chart.to_x(problem.given), *[c.parameters for c in problem.constraints]]),
-        lbx=np.concatenate([problem.lower, np.zeros(2 * rows), guess.lower]),
-        ubx=np.concatenate([problem.upper, np.full(2 * rows, np.inf), guess.above]),
+        lbx=np.concatenate([problem.lower, np.zeros(slacks), guess.lower]),
+        ubx=np.concatenate([problem.upper, np.full(slacks, np.inf), guess.above]),
         lbg=np.concatenate([norms, lower_rows]),
         ubg=np.concatenate([norms, upper_rows]),
     )
@@ -150,14 +150,20 @@ class ElasticProgram:
 
     def _solver(self, problem: PostureProblem) -> ca.Function:
         lifted = self._rows.lift(problem)
-        k, z, nx = lifted.rows.numel(), lifted.variables.numel(), self._x.numel()
+        z, nx = lifted.variables.numel(), self._x.numel()
+        # Rows with a slack of their own, which is cheaper, need no other.
+        free = [0.0 if piece.slack.nnz() else 1.0 for piece in lifted.pieces]
+        price = np.concatenate(
+            [np.full(len(problem.carried(i)), free[i] * c.price) for i, c in enumerate(problem.constraints)]
+        )
+        relaxed_rows = np.flatnonzero(price).tolist()
+        k, place = len(relaxed_rows), ca.SX.eye(len(price))[:, relaxed_rows]
         up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
-        price = np.concatenate([np.full(len(problem.carried(i)), c.price) for i, c in enumerate(problem.constraints)])
         x, p = ca.vertcat(self._x, up, down, lifted.variables), ca.vertcat(self._reference, *self._rows.parameters)
-        g = ca.vertcat(self._norms, lifted.rows + up - down)
-        f = ca.dot(price, up + down) + _SLACK_PRICE * lifted.slack + self._away
+        g = ca.vertcat(self._norms, lifted.rows + place @ (up - down))
+        f = ca.dot(price[relaxed_rows], up + down) + _SLACK_PRICE * lifted.slack + self._away
         known = self._rows.derivatives(lifted)
-        slacks = ca.horzcat(ca.SX.eye(k), -ca.SX.eye(k))
+        slacks = ca.horzcat(place, -place)
         relaxed = Derivatives(
             known.multipliers,
             ca.horzcat(known.jacobian[:, :nx], slacks, known.jacobian[:, nx:]),

@@ -108,6 +108,14 @@ def slurm_jobs(sweep: Sweep, folder: Path) -> None:
         run_sweep(sweep, folder, executor, in_hand=4)
 
 
+def slurm_cluster(file: Path, folder: Path) -> None:
+    """Job arrays of a Slurm cluster that this machine belongs to."""
+    if shutil.which("sbatch") is None:
+        raise FileNotFoundError("no sbatch")
+    words = command("sweep", file, "--slurm", "timeout_min=30", "--out", folder)
+    subprocess.run(words, check=True, capture_output=True, timeout=900)
+
+
 def killed_parent(file: Path, folder: Path, seed: int) -> int:
     """Kill a run at random times after its first shard, until it was killed often enough; return the kills."""
     rng, kills = random.Random(seed), 0
@@ -141,6 +149,7 @@ def robustness(folder: Path, only: str = "") -> None:
         "Dask, 4 workers, one killed": lambda out: killed_dask_worker(sweep, out),
         "MPI, 3 ranks": lambda out: mpi_ranks(file, out),
         "submitit, local jobs": lambda out: slurm_jobs(sweep, out),
+        "submitit, job arrays of Slurm": lambda out: slurm_cluster(file, out),
         f"parent killed {KILLS} times": lambda out: killed_parent(file, out, 1),
     }
     for k, (name, way) in enumerate(ways.items()):
@@ -266,12 +275,11 @@ if __name__ == "__main__":
         atlas(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))
         sys.exit()
     with tempfile.TemporaryDirectory() as place:
-        parts = sys.argv[1:] or ["robustness", "speed", "overhead"]
-        if "parent" in parts:
-            robustness(Path(place), "parent")
-        if "robustness" in parts:
-            robustness(Path(place))
-        if "speed" in parts:
-            speed(Path(place), 2000)
-        if "overhead" in parts:
-            task_overhead()
+        for part in sys.argv[1:] or ["robustness", "speed", "overhead"]:
+            if part == "speed":
+                speed(Path(place), 2000)
+            elif part == "overhead":
+                task_overhead()
+            else:
+                # One of the ways by a word of its name, such as MPI.
+                robustness(Path(place), "" if part == "robustness" else part)
