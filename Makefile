@@ -21,7 +21,7 @@ help:
 	@echo "make study-elastic  which inertia arms with elastic joints meet a contact with, against MuJoCo"
 	@echo "make study-global   how complete the search global is, and basin hopping beside multi-start"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
-	@echo "make study-feasible  what it costs to be clear of collisions and held by the motors, over the catalogue"
+	@echo "make study-feasible  what it costs to be clear of collisions, held by the motors and reached at speed"
 	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts (ten minutes)"
 	@echo "make study-real-impacts  balls, strikes, taps: what the rigid model predicts, and what MuJoCo finds (some minutes)"
 	@echo "make study-robustness  where each controller helps, and which targets it keeps: variations of each experiment (some hours; goes on where it was)"
@@ -105,6 +105,7 @@ study-global: $(VENV)/.installed-test
 
 study-feasible: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks feasible --write
+	$(BIN)/python -m tests.benchmarks approach --write
 
 study-flow: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks flow --jobs $(JOBS) --write
