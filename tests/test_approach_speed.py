@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import casadi as ca
@@ -17,8 +18,9 @@ from scipy.optimize import linprog
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.errors import Infeasible
-from impact_posture.posture.approach_speed import ApproachSpeed, AttainableSpeed
+from impact_posture.errors import Infeasible, InputError
+from impact_posture.posture.approach_speed import ApproachSpeed
+from impact_posture.posture.attainable_speed import AttainableSpeed
 from impact_posture.posture.problem_settings import Prepared, prepare
 from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
@@ -120,8 +122,8 @@ def test_reduced_form_has_the_gradient_of_the_manifold(name: str, seed: int) -> 
     gradient, slope = constraint.evaluate(numeric.at(q))[1][0], rng(seed, 1).normal(size=model.nv)
     sides = [side * (value(pin.integrate(model, q, side * 1e-6 * slope)) - value(q)) / 1e-6 for side in (1, -1)]
     # The speed has a kink where another joint comes to its limit.
-    if sides[0] == pytest.approx(sides[1], rel=1e-3, abs=1e-4):
-        assert gradient @ slope == pytest.approx(np.mean(sides), rel=1e-3, abs=1e-4)
+    margin = 1e-4 + 1e-3 * np.abs(sides).max()
+    assert min(sides) - margin <= gradient @ slope <= max(sides) + margin
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -168,11 +170,77 @@ def test_what_the_joints_cannot_do_is_infeasible_and_named() -> None:
         solve(made.problem, starts=2, jobs=1)
 
 
-def test_a_base_that_flies_and_a_push_have_no_bound() -> None:
-    for robot, more in (("tilthex_arm", {}), ("solo12", {"frame": "base_link", "contact_pose": "free"})):
-        made = prepare(make_settings({"robot": robot, "normal": (0, 0, 1), "approach": True, **more}))
-        assert not any(isinstance(c, ApproachSpeed) for c in made.problem.constraints)
-        assert any("bounds the speed of the approach" in note for note in made.problem.notes)
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"robot": "tilthex_arm"}, "nothing bounds it"),
+        ({"robot": "solo12", "frame": "base_link", "contact_pose": "free"}, "nothing bounds it"),
+        ({"robot": "talos", "frame": "base_link", "contact_pose": "position"}, "the legs move the contact"),
+        ({"robot": "solo12", "frame": "FL_LOWER_LEG", "contact_pose": "position"}, "the legs move the contact"),
+    ],
+)
+def test_where_joints_with_limits_do_not_bring_the_contact_nothing_is_demanded(
+    more: dict[str, object], words: str
+) -> None:
+    made = prepare(make_settings({"normal": (0, 0, 1), "approach": True, **more}))
+    assert not any(isinstance(c, ApproachSpeed) for c in made.problem.constraints)
+    assert any("speed of the approach is not demanded" in note and words in note for note in made.problem.notes)
+    assert AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements).unknown
+
+
+def chain(path: Path, axes: str, limits: Sequence[float]) -> str:
+    """An arm of links along z; a limit of zero is none."""
+    turns = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+    parts = ['<robot name="chain"><link name="ground"/>']
+    for k, (axis, limit) in enumerate(zip(axes, limits, strict=True)):
+        parent = f"l{k - 1}" if k else "ground"
+        parts.append(
+            f'<link name="l{k}"><inertial><origin xyz="0 0 0.15"/><mass value="2"/>'
+            '<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial></link>'
+            f'<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>'
+            f'<origin xyz="0 0 {0.3 if k else 0}"/><axis xyz="{turns[axis]}"/>'
+            f'<limit lower="-2.5" upper="2.5" effort="200" velocity="{limit}"/></joint>'
+        )
+    parts.append(
+        f'<link name="tip"/><joint name="end" type="fixed"><parent link="l{len(axes) - 1}"/><child link="tip"/>'
+        '<origin xyz="0 0 0.3"/></joint></robot>'
+    )
+    path.write_text("".join(parts))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("axes", "limits", "pose"),
+    [
+        # Rows out of the plane are zero.
+        ("yyyy", [2, 2, 2, 2], "full"),
+        # Limits that stand for none.
+        ("zyzyzyz", [2, 2, 2, 2, 2, 2, 1e6], "full"),
+        ("zyzyzyz", [5e9, 5e9, 5e9, 5e9, 5e9, 5e9, 2], "full"),
+        # Only the first joint has a limit, so nothing bounds the speed at most postures.
+        ("zyzyzyz", [2, 0, 0, 0, 0, 0, 0], "full"),
+        # Five joints cannot hold the turn of the tip, which then turns.
+        ("zyyyz", [2, 2, 2, 2, 2], "position"),
+    ],
+)
+def test_unusual_arms_certify(tmp_path: Path, axes: str, limits: list[float], pose: str) -> None:
+    path = chain(tmp_path / "chain.urdf", axes, limits)
+    q = tuple([0.3, 0.6, 0.5, 0.4, 0.3, 0.4, 0.2][: len(axes)])
+    values = {"robot": path, "frame": "tip", "normal": (-1, 0, 0), "q": q, "contact_pose": pose}
+    made = prepare(make_settings({**values, "speed": 0.2, "approach": True}))
+    found = solve(made.problem, starts=3, jobs=1)
+    assert found.certificate.holds() and found.certified_starts == 3
+    attainable = AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements)
+    assert 0.2 - 1e-8 <= (attainable.reached(found.q) or np.inf)
+
+
+def test_joints_that_are_too_few_are_refused(tmp_path: Path) -> None:
+    held = {"hold": tuple(f"joint{k}" for k in range(1, 8)), "robot": "xarm7", "normal": (0, 0, 1)}
+    with pytest.raises(InputError, match="cannot move"):
+        prepare(make_settings({**held, "approach": True}))
+    made = prepare(make_settings(held))
+    attainable = AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements)
+    assert attainable.reached(made.problem.given) == 0.0
 
 
 def test_the_command(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,12 @@ from impact_posture.errors import ImpactPostureError, InputError, OutputError, S
 from impact_posture.posture.build_problem import build_problem, retarget
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.settings import ProblemSettings
+from impact_posture.sweep import shard
 from impact_posture.sweep.atlas import sweep_key
 from impact_posture.sweep.executors import SlurmJobs, dask_cluster, parse_options, process_pool
 from impact_posture.sweep.grid import Axis, Grid
 from impact_posture.sweep.maps import draw_maps
+from impact_posture.sweep.point_search import PointResult
 from impact_posture.sweep.run import SweepRun, run_sweep
 from impact_posture.sweep.shard import solve_shard
 from impact_posture.sweep.sweep_file import read_sweep
@@ -269,6 +272,29 @@ def test_a_folder_never_mixes(aerial: Path, tmp_path: Path, monkeypatch: pytest.
     assert os.listdir(tmp_path / "mine") == ["thesis.tex"]
 
 
+def test_speeds_that_are_the_same_problem_have_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The better optimum appears at the last point, and its neighbors along y are those of the first speed alone."""
+    values = {(0, 0): 9.0, (0, 1): 9.0, (1, 0): 9.0, (1, 1): 1.0}
+    template = SimpleNamespace(problem=object())
+    solver: Any = SimpleNamespace(
+        normal_and_speed=lambda values: (None, values["speed"]),
+        template=lambda normal, speed: template,
+        target=lambda values: (values["y"], values["x"]),
+        walk=lambda problem: "walk",
+    )
+
+    def search(walk: str, place: Any, guesses: Any, beside: float) -> PointResult:
+        return PointResult({"value": values[place]}, np.array([values[place]]))
+
+    def improve(walk: str, place: Any, known: PointResult, guess: Any) -> PointResult:
+        return PointResult({"value": guess[0]}, guess) if guess[0] < known.row["value"] else known
+
+    monkeypatch.setattr(shard, "search", search)
+    monkeypatch.setattr(shard, "improve", improve)
+    sweep: Any = SimpleNamespace(grid=Grid((Axis("y", (0, 1)), Axis("x", (0, 1)), Axis("speed", (1.0, 2.0)))))
+    assert [one.row["value"] for one in shard._walk(sweep, solver, range(8))] == [1.0] * 8
+
+
 # ---- what is refused -----------------------------------------------------------------------------------------------
 
 PROBLEM = '[problem]\nrobot = "tilthex_arm"\nnormal = [0, 0, 1]\n'
@@ -291,6 +317,7 @@ PROBLEM = '[problem]\nrobot = "tilthex_arm"\nnormal = [0, 0, 1]\n'
         (PROBLEM + "[grid]\nx = [0, 0.0]", "has a value twice"),
         (PROBLEM + "[grid]\nspeeds = [1]", "did you mean speed"),
         (PROBLEM + "[grid]\nspeed = [1, -1]", "grid.speed[1]"),
+        (PROBLEM + "approach = true\n[grid]\nspeed = [1, 0]", "needs an approach speed"),
         (PROBLEM + "[grid]\nnormal = [[0, 0, 0]]", "not all zero"),
         (PROBLEM + '[grid]\nobjective = ["impulse", "sped"]', "did you mean speed"),
         (PROBLEM + "[grid]\nseed = [1]", "'seed' cannot vary"),

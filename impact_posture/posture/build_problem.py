@@ -14,7 +14,8 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.impact.objective import ImpactObjective, Objective
-from impact_posture.posture.approach_speed import ApproachSpeed, AttainableSpeed
+from impact_posture.posture.approach_speed import ApproachSpeed
+from impact_posture.posture.attainable_speed import AttainableSpeed
 from impact_posture.posture.constraint import Constraint
 from impact_posture.posture.impact_constraints import in_every_variant, kept_feet, limits
 from impact_posture.posture.load_cases import LoadCases, load_cases
@@ -78,10 +79,10 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
         constraints += in_every_variant(objective, numeric, requirements.friction, bounds, constraints)
     if requirements.approach_speed > 0:
         attainable = AttainableSpeed(robot, objective, requirements)
-        if attainable.bounded:
-            constraints.append(ApproachSpeed(attainable, requirements.approach_speed))
+        if attainable.unknown:
+            decided.append(f"the speed of the approach is not demanded: {attainable.unknown}")
         else:
-            decided.append("nothing bounds the speed of the approach: no joint velocity with a limit decides it")
+            constraints.append(ApproachSpeed(attainable, requirements.approach_speed))
     lower, upper = _bounds(robot, chart, given, requirements)
     held_up = load_cases(objective, given, requirements) if requirements.holdable else LoadCases()
     decided += held_up.notes

@@ -11,8 +11,8 @@ from impact_posture.posture.problem_settings import Prepared
 
 # A contact counts as locked if its 1/mass falls below this share of the initial value.
 _LOCKED = 0.05
-# Share of the approach speed that rounding may cost.
-_REACHED = 1e-6
+# Share of the approach speed that three digits do not show.
+_REACHED = 5e-3
 # A joint further than this behind a surface gets a warning, meters.
 _BEHIND = 0.01
 
@@ -58,9 +58,10 @@ def caveats(
     verb = "hold" if prepared.impact.robot.spec.propulsion is None else "hover in"
     loads = holding.violations() if holding else []
     held = [f"the robot cannot {verb} the optimal posture: {violation}" for violation in loads]
-    if attainable is not None and attainable < (1 - _REACHED) * prepared.impact.speed:
+    demanded = prepared.problem.requirements.approach_speed > 0
+    if attainable is not None and attainable < (1 - _REACHED) * prepared.impact.speed and not demanded:
         held.append(
-            f"the joints can bring the contact to the surface at no more than {attainable:.2g} m/s in the optimal "
+            f"the joints can bring the contact to the surface at no more than {attainable:.3g} m/s in the optimal "
             f"posture, not at {prepared.impact.speed:g} m/s: add `approach=True`, or give the `speed` that is meant"
         )
     around = prepared.problem.surroundings

@@ -13,6 +13,7 @@ from impact_posture.escape import toml
 from impact_posture.impact.contact_compression import ContactStiffness
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, resolve
+from impact_posture.posture.attainable_speed import FASTEST
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.pose_constraints import CenterOfMassOverFeet
 from impact_posture.posture.problem import PostureProblem, Requirements
@@ -113,8 +114,8 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
         )
     if settings.keep_contacts and not objective.supports:
         raise InputError("there are no feet to keep", where="keep_contacts", hint="add `support` or leave it out")
-    if settings.approach and settings.speed == 0:
-        raise InputError("needs an approach speed", where="approach", hint="give `speed` above zero")
+    if settings.approach and not 0 < settings.speed <= FASTEST:
+        raise InputError("needs an approach speed", where="approach", hint=f"give `speed` from 0 to {FASTEST:g} m/s")
     return Requirements(
         approach_speed=settings.speed if settings.approach else 0.0,
         contact_pose=poses[0] if poses else "free",

@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.impact.evaluation import Evaluation
-from impact_posture.posture.approach_speed import AttainableSpeed
+from impact_posture.posture.attainable_speed import AttainableSpeed
 from impact_posture.posture.caveats import caveats
 from impact_posture.posture.global_search import GlobalSearch, SelfMotionMap
 from impact_posture.posture.load_cases import load_cases

@@ -92,13 +92,13 @@ class CaseSolver:
         return np.array(Numeric(self.robot.model).at(impact.q).placement(frame).translation)
 
     def check(self, grid: Grid) -> None:
-        """Check that the targets of the grid fit the problem.
+        """Check that the targets and speeds of the grid fit the problem.
 
         Raises:
-            InputError: The contact takes no target, or a quaternion has no unit length.
+            InputError: The contact takes no target, a quaternion has no unit length, or a demand needs another speed.
         """
         for axis in grid.axes:
-            for value in axis.values if axis.name.startswith("target") else axis.values[:1]:
+            for value in axis.values if axis.name.startswith(("target", "speed")) else axis.values[:1]:
                 prepared = self.template(*self.normal_and_speed({axis.name: value}))
                 retarget(prepared.problem, *self.target({axis.name: value}))
 

@@ -79,6 +79,8 @@ def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
     """Solve the points of a shard, each from the neighbors before it, then look back from the neighbors after it."""
     results: list[PointResult] = []
     walks: OrderedDict[int, Walk] = OrderedDict()
+    # Points that are the same problem as the one before them, and have its answer.
+    alike: list[int] = []
 
     def at(point: int) -> tuple[Walk, Any]:
         values = sweep.grid.values(point)
@@ -92,6 +94,7 @@ def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
         if last is not None and last[0] is walk and last[1] == target:
             # Only the speed differs, and the problem does not see it.
             results.append(results[-1])
+            alike.append(point)
             continue
         before = [results[k - points.start] for k in sweep.grid.neighbors(point, points.start)]
         guesses = [one.q for one in before if one.q is not None]
@@ -105,6 +108,9 @@ def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
             for other in sweep.grid.neighbors(point, points.start):
                 known = results[other - points.start]
                 results[other - points.start] = improve(*at(other), known, posture)
+    # The first speed has the most neighbors of its own.
+    for point in alike:
+        results[point - points.start] = results[point - points.start - 1]
     return results
 
 

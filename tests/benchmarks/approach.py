@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from impact_posture.errors import ImpactPostureError
-from impact_posture.posture.approach_speed import AttainableSpeed
+from impact_posture.posture.attainable_speed import AttainableSpeed
 from impact_posture.posture.problem_settings import Prepared, prepare
 from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.robot.robot_loader import known_robots
@@ -34,7 +34,7 @@ def _row(robot: str, normal: tuple[float, float, float], seed: int) -> list[str]
     asked = {"robot": robot, "normal": normal, "collision": True, "holdable": True}
     made = prepare(make_settings(asked))
     attainable = AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements)
-    if not attainable.bounded:
+    if attainable.unknown:
         return []
     try:
         found = _solve(made, seed)
