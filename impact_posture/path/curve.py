@@ -13,8 +13,8 @@ from impact_posture.path.search import even
 
 # The curve leaves the constraints by no more than this tangent length; its samples are pulled onto them.
 DEVIATION = 1e-5
-# How often the number of knots is doubled to get there.
-_DOUBLINGS = 4
+# How often the number of knots is doubled to get there.  A path along bodies has corners, at which it halves the rest.
+_DOUBLINGS = 7
 # Step of central differences along the curve, whose length is 1.
 _STEP = 1e-5
 
@@ -75,7 +75,8 @@ class PathCurve:
         worst, before, parts = (
             0.0,
             self.at(self.z[0]),
-            max(1, self._space.checks(np.abs(np.diff(self.z, axis=0)).max(axis=0))),
+            # The knots themselves are on the constraints.
+            max(2, self._space.checks(np.abs(np.diff(self.z, axis=0)).max(axis=0))),
         )
         for s in np.linspace(0.0, 1.0, parts * (len(self.s) - 1) + 1):
             off = self.posture(float(s))
