@@ -170,13 +170,10 @@ class AttainableSpeed:
         """Return the tangent gradient of the rows summed with ``weights``, one array for each point, shape (nv,)."""
         v = np.zeros(model.model.nv)
         v[self.free] = self.scale * velocities
-        return np.sum(
-            [
-                model.coupling_gradient(moved.point, moved.wrench(own), v, in_frame=moved.in_frame)
-                for moved, own in zip(self.points, weights, strict=True)
-            ],
-            axis=0,
-        )
+        gradient = np.zeros(len(v))
+        for moved, own in zip(self.points, weights, strict=True):
+            gradient += model.coupling_gradient(moved.point, moved.wrench(own), v, in_frame=moved.in_frame)
+        return gradient
 
     def at(self, model: Numeric) -> Attained:
         """Return the fastest approach at ``model.q``."""
