@@ -13,7 +13,7 @@ from impact_posture.path.search import even
 
 # The curve leaves the constraints by no more than this tangent length; its samples are pulled onto them.
 DEVIATION = 1e-5
-# How often the number of knots is doubled to get there.  A path along bodies has corners, at which it halves the rest.
+# How often the number of knots is doubled to get there; at the corners of a path along bodies that halves the rest.
 _DOUBLINGS = 7
 # Step of central differences along the curve, whose length is 1.
 _STEP = 1e-5
