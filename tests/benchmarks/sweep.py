@@ -99,7 +99,9 @@ def mpi_ranks(file: Path, folder: Path) -> None:
         raise FileNotFoundError("no mpiexec")
     words = command("sweep", file, "--mpi", "--out", folder)
     launched = [mpiexec, "-n", "3", sys.executable, "-m", "mpi4py.futures", *words[1:]]
-    subprocess.run(launched, check=True, capture_output=True, timeout=900)
+    # Open MPI counts cores, and there may be two.
+    environment = os.environ | {"OMPI_MCA_rmaps_base_oversubscribe": "1"}
+    subprocess.run(launched, check=True, capture_output=True, timeout=900, env=environment)
 
 
 def slurm_jobs(sweep: Sweep, folder: Path) -> None:
