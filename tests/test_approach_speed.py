@@ -188,6 +188,15 @@ def test_where_joints_with_limits_do_not_bring_the_contact_nothing_is_demanded(
     assert AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements).unknown
 
 
+def test_a_kept_foot_is_no_leg_that_moves_the_hand() -> None:
+    made = prepared("talos", keep=("right_sole_link",))
+    constraint = constraint_of(made)
+    at = Numeric(made.problem.robot.model).at(made.problem.given)
+    assert constraint.evaluate(at)[0][0] == pytest.approx(
+        constraint_of(prepared("talos", keep=())).evaluate(at)[0][0]
+    )
+
+
 def chain(path: Path, axes: str, limits: Sequence[float]) -> str:
     """An arm of links along z; a limit of zero is none."""
     turns = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}

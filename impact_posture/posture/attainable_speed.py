@@ -112,18 +112,19 @@ class AttainableSpeed:
     def __init__(self, robot: Robot, objective: Objective, requirements: Requirements) -> None:
         self._model = robot.model
         self.points = _moving_points(robot, objective, requirements)
-        moving = self._chain([moved.point for moved in self.points])
-        standing = self._chain([point_on(robot, support.frame) for support in objective.supports])
         flies = robot.floating and not objective.supports and requirements.base != "fixed"
-        joints = moving & (np.arange(robot.nv) >= (0 if flies or not robot.floating else 6))
-        free = joints & ~held_rows(robot, requirements.hold).any(axis=0)
+        joints = np.arange(robot.nv) >= (0 if flies or not robot.floating else 6)
+        bringing = joints & self._chain([moved.point for moved in self.points if moved.comes])
+        standing = self._chain([point_on(robot, support.frame) for support in objective.supports])
+        free = joints & self._chain([moved.point for moved in self.points])
+        free &= ~held_rows(robot, requirements.hold).any(axis=0)
         self.free = np.flatnonzero(free)
         limit = robot.velocity_limits[self.free]
         stated = limit < FASTEST
         self.scale, self.upper = np.where(stated, limit, 1.0), np.where(stated, 1.0, np.inf)
         self.names = [robot.tangent_names[k] for k in self.free]
         self.unknown = ""
-        if robot.floating and not flies and self.points and ((joints & standing).any() or not joints.any()):
+        if robot.floating and not flies and self.points and ((bringing & standing).any() or not bringing.any()):
             self.unknown = "the legs move the contact, and how fast they do is not computed"
         elif not self.points or flies or (free.any() and not stated.any()):
             self.unknown = "nothing bounds it: no joint velocity with a limit decides it"
