@@ -25,7 +25,7 @@ from impact_posture.sweep.sweep_file import OFFSETS, Case
 
 # Problems and programs that a process keeps, and most problems if the speed varies.  Each takes about a MB, and all
 # but the speeds of one normal are done for good.
-_KEPT, _MOST_SPEEDS = 4, 16
+_KEPT, _MOST_SPEEDS = 4, 64
 
 _Value = TypeVar("_Value")
 
