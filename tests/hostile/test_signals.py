@@ -53,7 +53,8 @@ def session(leader: int) -> list[str]:
             fields = (entry / "stat").read_text().rpartition(")")[2].split()
             if int(entry.name) and int(fields[3]) == leader and fields[0] not in "ZX":
                 found.append((entry / "cmdline").read_text().replace("\0", " "))
-    return found
+    # One that has given its memory back is about to end.
+    return [words for words in found if words]
 
 
 def times(count: int) -> list[tuple[str, int, signal.Signals]]:
