@@ -1,4 +1,4 @@
-"""The type of the arrays of numbers in signatures, and a null space."""
+"""The type of the arrays of numbers in signatures, and linear algebra that SciPy takes long to import."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,3 +17,22 @@ def null_space(rows: Array, tolerance: float) -> Array:
     """
     _, values, axes = np.linalg.svd(rows)
     return np.asarray(axes[int((values > tolerance * values.max(initial=0.0)).sum()) :].T)
+
+
+def independent_rows(rows: Array, tolerance: float) -> list[int]:
+    """Return the indices of rows that span all of them; the next is always the one with most left without the others.
+
+    Args:
+        rows: Shape (k, n).
+        tolerance: A row of which no more than this is left is no row of its own.
+    """
+    left, found = np.array(rows, dtype=float), list[int]()
+    for _ in range(len(left)):
+        sizes = np.linalg.norm(left, axis=1)
+        k = int(sizes.argmax())
+        if sizes[k] <= tolerance:
+            break
+        left -= np.outer(left @ left[k], left[k]) / sizes[k] ** 2
+        left[k] = 0.0
+        found.append(k)
+    return sorted(found)

@@ -9,7 +9,10 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from impact_posture.arrays import independent_rows
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
@@ -125,3 +128,12 @@ def test_a_base_tilts_from_its_default_posture() -> None:
         value = tilt.evaluate(at.at(q))[0]
         assert value == pytest.approx(-np.cos(np.deg2rad(degrees)))
         assert (tilt.excess(value) == 0).all() == fits
+
+
+@given(st.integers(0, 2**20), st.integers(1, 7), st.integers(1, 9), st.integers(0, 6))
+def test_independent_rows_span_all_of_them(seed: int, count: int, width: int, repeats: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(count, width)) * rng.choice([1e-3, 1.0, 1e2], (count, 1))
+    rows = rng.permutation(np.vstack([rows, rng.normal(size=(repeats, count)) @ rows, np.zeros((1, width))]))
+    found = independent_rows(rows, 1e-9)
+    assert len(found) == np.linalg.matrix_rank(rows) == np.linalg.matrix_rank(rows[found])

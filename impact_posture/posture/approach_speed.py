@@ -105,13 +105,9 @@ class ApproachSpeed(Constraint):
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
         """See :class:`Constraint`; the limits of the joints are rows as well."""
-        own, names, by_posture = self._attainable, [], []
-        for index, moved in enumerate(own.points):
-            for row in range(len(moved.rows)):
-                weights = [np.zeros(len(point.rows)) for point in own.points]
-                weights[index][row] = 1.0
-                by_posture.append(own.by_posture(model, auxiliaries, weights))
-                names.append(f"motion of {moved.name} in the {self.name}")
+        own = self._attainable
+        names = [f"motion of {moved.name} in the {self.name}" for moved in own.points for _ in moved.rows]
+        by_posture = [own.by_posture(model, auxiliaries, row) for row in np.eye(len(names))]
         A, limited = own.jacobian(model), np.flatnonzero(np.isfinite(own.upper))
         bounds, zero = own.upper[limited], np.zeros(len(A))
         return Linearization(

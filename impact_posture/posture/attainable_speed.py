@@ -14,19 +14,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.arrays import Array
+from impact_posture.arrays import Array, independent_rows
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import Objective
 from impact_posture.posture.linear_program import solve_linear
-from impact_posture.posture.problem import Requirements, held_rows
+from impact_posture.posture.problem import RANK_TOLERANCE, Requirements, held_rows
 from impact_posture.robot.robot import Robot
 
 # A speed that no contact has, m/s, and a limit that no joint has, rad/s or m/s: what reaches them is not bounded.
 FASTEST = 1e3
-# A row is the sum of others if no more of it than this is left without them.
-_DEPENDENT = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,14 +146,7 @@ class AttainableSpeed:
         for _ in range(2):
             q = pin.integrate(self._model, pin.neutral(self._model), rng.normal(size=self._model.nv))
             blocks.append(self.jacobian(model.at(q)) / self.scale)
-        rows = np.column_stack([*blocks, self.arrives])
-        basis, found = np.zeros((0, rows.shape[1])), list[int]()
-        for index, row in enumerate(rows):
-            for _ in range(2):
-                row = row - basis.T @ (basis @ row)
-            if (size := float(np.linalg.norm(row))) > _DEPENDENT:
-                basis, found = np.vstack([basis, row / size]), [*found, index]
-        return found
+        return independent_rows(np.column_stack([*blocks, self.arrives]), RANK_TOLERANCE)
 
     @property
     def arrives(self) -> Array:
@@ -167,12 +158,13 @@ class AttainableSpeed:
         whole = np.vstack([point.jacobian(model) for point in self.points])
         return np.asarray(whole[:, self.free] * self.scale)
 
-    def by_posture(self, model: Numeric, velocities: Array, weights: Sequence[Array]) -> Array:
-        """Return the tangent gradient of the rows summed with ``weights``, one array for each point, shape (nv,)."""
+    def by_posture(self, model: Numeric, velocities: Array, weights: Array) -> Array:
+        """Return the tangent gradient of the rows summed with ``weights``, shape (m,), as shape (nv,)."""
         v = np.zeros(model.model.nv)
         v[self.free] = self.scale * velocities
         gradient = np.zeros(len(v))
-        for moved, own in zip(self.points, weights, strict=True):
+        ends = np.cumsum([len(moved.rows) for moved in self.points])[:-1]
+        for moved, own in zip(self.points, np.split(weights, ends), strict=True):
             gradient += model.coupling_gradient(moved.point, moved.wrench(own), v, in_frame=moved.in_frame)
         return gradient
 
@@ -187,8 +179,7 @@ class AttainableSpeed:
             return Attained(0.0, np.zeros(len(self.free)), np.zeros(model.model.nv))
         if -found.value > (1 - 1e-9) * FASTEST:
             return Attained(float("inf"), found.x[:-1], np.zeros(model.model.nv))
-        ends = np.cumsum([len(point.rows) for point in self.points])[:-1]
-        gradient = -self.by_posture(model, found.x[:-1], np.split(found.multipliers, ends))
+        gradient = -self.by_posture(model, found.x[:-1], found.multipliers)
         return Attained(max(0.0, -found.value), found.x[:-1], gradient)
 
     def reached(self, q: Array) -> float | None:

@@ -152,16 +152,14 @@ class ElasticProgram:
         lifted = self._rows.lift(problem)
         z, nx = lifted.variables.numel(), self._x.numel()
         # Rows with a slack of their own, which is cheaper, need no other.
-        free = [0.0 if piece.slack.nnz() else 1.0 for piece in lifted.pieces]
-        price = np.concatenate(
-            [np.full(len(problem.carried(i)), free[i] * c.price) for i, c in enumerate(problem.constraints)]
-        )
-        relaxed_rows = np.flatnonzero(price).tolist()
-        k, place = len(relaxed_rows), ca.SX.eye(len(price))[:, relaxed_rows]
+        counts = [len(problem.carried(i)) for i in range(len(problem.constraints))]
+        rigid = np.repeat(np.array([not piece.slack.nnz() for piece in lifted.pieces], dtype=bool), counts)
+        price = np.repeat([c.price for c in problem.constraints], counts)[rigid]
+        k, place = len(price), ca.SX.eye(len(rigid))[:, np.flatnonzero(rigid).tolist()]
         up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
         x, p = ca.vertcat(self._x, up, down, lifted.variables), ca.vertcat(self._reference, *self._rows.parameters)
         g = ca.vertcat(self._norms, lifted.rows + place @ (up - down))
-        f = ca.dot(price[relaxed_rows], up + down) + _SLACK_PRICE * lifted.slack + self._away
+        f = ca.dot(price, up + down) + _SLACK_PRICE * lifted.slack + self._away
         known = self._rows.derivatives(lifted)
         slacks = ca.horzcat(place, -place)
         relaxed = Derivatives(

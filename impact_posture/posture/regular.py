@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array, null_space
+from impact_posture.arrays import Array, independent_rows, null_space
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.objective import Objective
 from impact_posture.posture.constraint import Constraint
@@ -144,12 +144,7 @@ def _independent_rows(problem: PostureProblem, numeric: Numeric) -> tuple[tuple[
     # Of rows that repeat each other, those of the cheaper constraint are left out.
     stacked = np.vstack([c.price * c.evaluate(numeric)[1] for _, c in equalities])
     stacked[:, held] = 0.0
-    # SciPy takes long to import, and few problems come here.
-    from scipy.linalg import qr
-
-    _, triangle, order = qr(stacked.T, mode="economic", pivoting=True)
-    count = int((np.abs(np.diag(triangle)) > RANK_TOLERANCE).sum())
-    chosen = {labels[k] for k in order[:count]}
+    chosen = {labels[k] for k in independent_rows(stacked, RANK_TOLERANCE)}
     return tuple(
         tuple(row for row in range(len(c.lifted_bounds[0])) if not c.equality or (index, row) in chosen)
         for index, c in enumerate(problem.constraints)

@@ -37,7 +37,7 @@ class PointResult(NamedTuple):
     Attributes:
         row: Its columns in the table.
         q: Its posture, shape (nq,), if there is one.
-        violation: Least violation of the constraints that could be found, summed, if it is infeasible.
+        violation: Least violation that could be found, at the prices of the constraints, if it is infeasible.
     """
 
     row: dict[str, Any]

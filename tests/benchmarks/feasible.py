@@ -17,13 +17,13 @@ from tests.settings import make_settings
 _HEAD = ("robot", "normal", "free: objective", "certified", "collide", "ms", "clear: loss", "certified", "a start",
          "search", "all: loss", "certified", "left out", "a start", "search", "left", "above", "time")  # fmt: skip
 _NORMALS = {"down": DOWN, "ahead": BACK}
-_STARTS = 16
+STARTS = 16
 
 
 def lines(request: Request) -> Iterator[str]:
     """A row for each robot and normal."""
     yield "Each robot of the catalogue at its own contact frame, striking a floor (*down*) and a wall (*ahead*),"
-    yield f"from {_STARTS} starts: *free* of demands, *clear* of collisions, and with *all*, also held by the motors."
+    yield f"from {STARTS} starts: *free* of demands, *clear* of collisions, and with *all*, also held by the motors."
     yield "*collide*: of the distinct optima of the free problem, those at which shapes touch each other, the surface"
     yield "or the ground. *loss*: how much the objective of the best posture rises. *left out*: certified ends that"
     yield "the check on the original shapes refused. *ms*: median time of a start. *a start*: that median against the"
@@ -46,7 +46,7 @@ def _row(robot: str, name: str, request: Request, ends: list[int], left: list[in
     say(f"{robot} {name}")
     asked = {"robot": robot, "normal": _NORMALS[name], "seed": request.seed}
     clear, everything = {"collision": True}, {"collision": True, "holdable": True}
-    free, apart = _solve(asked)
+    free, apart = solved(asked)
     around = _surroundings(asked | clear)
     if not isinstance(free, PostureSolution):
         return [robot, name, *["–"] * (len(_HEAD) - 2), free]
@@ -64,8 +64,8 @@ def _row(robot: str, name: str, request: Request, ends: list[int], left: list[in
     for demands in (clear, everything):
         if demands is everything:
             # Other work on the machine changes the speed, so each ratio has a free search of its own.
-            apart = _solve(asked)[1]
-        found, took = _solve(asked | demands)
+            apart = solved(asked)[1]
+        found, took = solved(asked | demands)
         if not isinstance(found, PostureSolution):
             cells += ["–"] * (4 if demands is clear else 8)
             conflict = found
@@ -74,28 +74,28 @@ def _row(robot: str, name: str, request: Request, ends: list[int], left: list[in
         if demands is everything:
             cells.append(f"{found.colliding_starts}")
             # Another seed gives more ends for the check on the original shapes.
-            again, _ = _solve(asked | demands | {"seed": request.seed + 1})
+            again, _ = solved(asked | demands | {"seed": request.seed + 1})
             more = [found, *([again] if isinstance(again, PostureSolution) else [])]
             ends += [one.certified_starts + one.colliding_starts for one in more]
             left += [one.colliding_starts for one in more]
         cells += [f"{took[0] / apart[0]:.1f}×", f"{took[1] / apart[1]:.1f}×"]
         if demands is everything:
-            quick, less = _solve(asked | demands, finish_all=False)
+            quick, less = solved(asked | demands, finish_all=False)
             assert isinstance(quick, PostureSolution)
             above = quick.optima[0].objective / found.optima[0].objective - 1
-            left = quick.dominated_starts
+            dominated = quick.dominated_starts
             share = f"{100 * less[1] / took[1]:.0f} %"
-            cells += [f"{left}", f"{100 * above:.1f} %", share] if left else ["0", "", ""]
+            cells += [f"{dominated}", f"{100 * above:.1f} %", share] if dominated else ["0", "", ""]
     return [*cells, conflict]
 
 
-def _solve(asked: dict[str, object], finish_all: bool = True) -> tuple[PostureSolution | str, tuple[float, float]]:
+def solved(asked: dict[str, object], finish_all: bool = True) -> tuple[PostureSolution | str, tuple[float, float]]:
     """The solution, or why there is none, and the median time of a start and the time of the search, s."""
     try:
         problem = prepare(make_settings(asked)).problem
         began = time.perf_counter()
         seed = int(str(asked["seed"]))
-        solution = solve(problem, starts=_STARTS, seed=seed, jobs=1, compile="never", finish_all=finish_all)
+        solution = solve(problem, starts=STARTS, seed=seed, jobs=1, compile="never", finish_all=finish_all)
         return solution, (solution.start_time_s, time.perf_counter() - began)
     except ImpactPostureError as error:
         return error.what, (0.0, 0.0)
