@@ -259,7 +259,7 @@ def test_the_command(tmp_path: Path) -> None:
     document = json.loads((tmp_path / "out" / "result.json").read_text())
     speed = document["optimal"]["attainable_speed"]
     assert speed >= 0.8 * (1 - 1e-6)
-    assert f"{speed:.3g} m/s" in done.stdout
+    assert f"{speed:.4g}  m/s" in done.stdout
     assert "approach at 0.8 m/s within the velocity limits of the joints" in document["constraints"]
     assert run("optimize", tmp_path / "out" / "problem.toml", "--out", "again", cwd=tmp_path).returncode == 0
     still = run("optimize", "ur5", "--normal", 0, 0, 1, "--speed", 0, "--approach", cwd=tmp_path)

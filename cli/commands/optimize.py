@@ -190,10 +190,6 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     page.gap()
     worst_lines(page, frames, blocks)
     _holding(page, initial["holding"], optimal["holding"])
-    speeds = [block["attainable_speed"] for block in (initial, optimal)]
-    if speeds != [None, None]:
-        words = " to ".join("unbounded" if speed is None else f"{speed:.3g}" for speed in speeds)
-        page.line(f"fastest approach within the joints' velocity limits: {words} m/s")
     free = f"{solution.redundancy} degree{'' if solution.redundancy == 1 else 's'} of freedom"
     page.line(f"reduction {percent(solution.reduction)}; {free} left by the constraints")
     if "robustness" in document:

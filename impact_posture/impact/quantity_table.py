@@ -41,7 +41,7 @@ def quantities(metric: Metric) -> list[tuple[str, str, str]]:
 
 
 def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
-    """Return the objective, H to E, the impulse with friction and the peak force without, where they are known.
+    """Return objective, H to E, impulse with friction, peak force without, and fastest approach, where known.
 
     Args:
         impact: The impact.
@@ -59,4 +59,7 @@ def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict
         rows.append(QuantityRow("impulse", first, last, "N·s", f"impulse {at}, friction {impact.contact.friction:g}"))
     if None not in forces:
         rows.append(QuantityRow("force", forces[0], forces[1], "N", f"peak force {at}, no friction"))
+    speeds = [block.get("attainable_speed") for block in (initial, optimal)]
+    if speeds != [None, None]:
+        rows.append(QuantityRow("approach", *speeds, "m/s", "fastest within the joints' velocity limits"))
     return rows

@@ -115,7 +115,8 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     if settings.keep_contacts and not objective.supports:
         raise InputError("there are no feet to keep", where="keep_contacts", hint="add `support` or leave it out")
     if settings.approach and not 0 < settings.speed <= FASTEST:
-        raise InputError("needs an approach speed", where="approach", hint=f"give `speed` from 0 to {FASTEST:g} m/s")
+        what = "needs an approach speed above zero"
+        raise InputError(what, where="approach", hint=f"give `speed`, up to {FASTEST:g} m/s")
     return Requirements(
         approach_speed=settings.speed if settings.approach else 0.0,
         contact_pose=poses[0] if poses else "free",
