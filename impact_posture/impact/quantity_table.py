@@ -61,5 +61,5 @@ def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict
         rows.append(QuantityRow("force", forces[0], forces[1], "N", f"peak force {at}, no friction"))
     speeds = [block.get("attainable_speed") for block in (initial, optimal)]
     if speeds != [None, None]:
-        rows.append(QuantityRow("approach", *speeds, "m/s", "fastest within the joints' velocity limits"))
+        rows.append(QuantityRow("approach", speeds[0], speeds[1], "m/s", "fastest within the joints' velocity limits"))
     return rows
