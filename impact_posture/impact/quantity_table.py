@@ -59,7 +59,7 @@ def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict
         rows.append(QuantityRow("impulse", first, last, "N·s", f"impulse {at}, friction {impact.contact.friction:g}"))
     if None not in forces:
         rows.append(QuantityRow("force", forces[0], forces[1], "N", f"peak force {at}, no friction"))
-    speeds = [block.get("attainable_speed") for block in (initial, optimal)]
-    if speeds != [None, None]:
-        rows.append(QuantityRow("approach", speeds[0], speeds[1], "m/s", "fastest within the joints' velocity limits"))
+    first, last = (block.get("attainable_speed") for block in (initial, optimal))
+    if (first, last) != (None, None):
+        rows.append(QuantityRow("approach", first, last, "m/s", "fastest within the joints' velocity limits"))
     return rows
