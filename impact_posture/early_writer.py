@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -18,6 +21,9 @@ from impact_posture.scratch_folder import scratch_folder
 if TYPE_CHECKING:
     from impact_posture.result_folder import Finish
     from impact_posture.settings import ProblemSettings
+
+# The least priority of a thread.  The solver runs first, and what remains is done when it has ended.
+_LAST = 19
 
 
 @contextmanager
@@ -39,10 +45,27 @@ def early_writer(
         if jobs > 1 and "fork" in multiprocessing.get_all_start_methods():
             try:
                 folder = stack.enter_context(scratch_folder())
-                finish = stack.enter_context(fork_server(partial(load, settings, folder, report, meshes)))
+                load = partial(_load_in_background, settings, folder, report, meshes)
+                finish = stack.enter_context(fork_server(load))
             except (OSError, OutputError):
                 finish = None
         yield finish
+
+
+def _load_in_background(
+    settings: ProblemSettings, folder: Path, report: bool, meshes: bool, requested: Callable[[], bool]
+) -> Finish:
+    """Call :func:`load` with the least priority, in a thread because a process cannot raise its priority again.
+
+    Threads have priorities of their own on Linux.  Elsewhere the priority stays as it is.
+    """
+
+    def last() -> None:
+        with suppress(OSError, AttributeError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LAST)
+
+    with ThreadPoolExecutor(1, initializer=last) as pool:
+        return pool.submit(load, settings, folder, report, meshes, requested).result()
 
 
 def load(

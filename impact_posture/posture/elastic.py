@@ -13,9 +13,7 @@ import numpy as np
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.nlp import IPOPT_OPTIONS, run_solver
-from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.program_rows import Derivatives, ProgramRows, joined
 from impact_posture.posture.starts import FEASIBLE, Projector, random_posture
@@ -24,6 +22,8 @@ from impact_posture.posture.starts import FEASIBLE, Projector, random_posture
 _KEPT = 1e-6
 # Price of a meter of slack beside that of a violated row: where bodies are in the way of a pose, they are the reason.
 _SLACK_PRICE = 0.03
+# Price of the squared distance from the given posture, which makes the answer unique.
+_AWAY_PRICE = 1e-6
 # Most postures to begin from.  In xarm7 before a wall, the 14th was the first that led to a posture free of it.
 _TRIES = 24
 # Postures that confirm what conflicts nearby.  In panda before a wall two find the way past a body, if there is one.
@@ -125,21 +125,19 @@ class ElasticProgram:
 
     Args:
         problem: The problem before it grows.
+        rows: The rows of its constraints, if another program of the problem has them.
 
     Attributes:
         problem: The problem as far as it has grown.
         time_s: Wall time within the solver so far, s.
     """
 
-    def __init__(self, problem: PostureProblem) -> None:
-        self.problem, self.time_s, chart = problem, 0.0, Chart.of(problem.robot.model)
+    def __init__(self, problem: PostureProblem, rows: ProgramRows | None = None) -> None:
+        self.problem, self.time_s = problem, 0.0
         self._latest: tuple[str, ca.Function] | None = None
-        self._x, self._reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
-        tree = Tree(problem.robot.model, chart.configuration(self._x), self._x)
-        self._rows = ProgramRows(self._x, tree, problem)
-        self._away = 1e-6 * distance_squared(chart, tree.q, chart.configuration(self._reference))
-        self._norms = chart.norms(self._x)
-        self._own = Derivatives.of(ca.vertcat(self._away, self._norms), self._x)
+        self._rows = rows = rows or ProgramRows(problem)
+        self._away = _AWAY_PRICE * rows.away
+        self._own = Derivatives.of(ca.vertcat(self._away, rows.norms), rows.x)
 
     def solver(self, problem: PostureProblem) -> ca.Function:
         """Return ``nlpsol`` for the first problem, also with another target, or one that grew out of it."""
@@ -150,15 +148,18 @@ class ElasticProgram:
 
     def _solver(self, problem: PostureProblem) -> ca.Function:
         lifted = self._rows.lift(problem)
-        z, nx = lifted.variables.numel(), self._x.numel()
+        z, nx = lifted.variables.numel(), self._rows.chart.nx
         # Rows with a slack of their own, which is cheaper, need no other.
         counts = [len(problem.carried(i)) for i in range(len(problem.constraints))]
         rigid = np.repeat(np.array([not piece.slack.nnz() for piece in lifted.pieces], dtype=bool), counts)
         price = np.repeat([c.price for c in problem.constraints], counts)[rigid]
         k, place = len(price), ca.SX.eye(len(rigid))[:, np.flatnonzero(rigid).tolist()]
         up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
-        x, p = ca.vertcat(self._x, up, down, lifted.variables), ca.vertcat(self._reference, *self._rows.parameters)
-        g = ca.vertcat(self._norms, lifted.rows + place @ (up - down))
+        x, p = (
+            ca.vertcat(self._rows.x, up, down, lifted.variables),
+            ca.vertcat(self._rows.reference, *self._rows.parameters),
+        )
+        g = ca.vertcat(self._rows.norms, lifted.rows + place @ (up - down))
         f = ca.dot(price, up + down) + _SLACK_PRICE * lifted.slack + self._away
         known = self._rows.derivatives(lifted)
         slacks = ca.horzcat(place, -place)

@@ -25,6 +25,7 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.posture.compiled import CompileMode, compiled_solver
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.program import Program, parameters
+from impact_posture.posture.program_rows import ProgramRows
 
 IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.print_level": 0,
@@ -220,7 +221,12 @@ def _noticing_interrupts() -> Iterator[None]:
 
 
 def build_nlp(
-    problem: PostureProblem, *, compile: CompileMode = "auto", starts: int = 1, program: Program | None = None
+    problem: PostureProblem,
+    *,
+    compile: CompileMode = "auto",
+    starts: int = 1,
+    program: Program | None = None,
+    rows: ProgramRows | None = None,
 ) -> PostureNLP:
     """Build the program; the number of ``starts`` decides whether compiling pays.
 
@@ -229,12 +235,13 @@ def build_nlp(
         compile: Whether to compile.
         starts: Number of runs.
         program: The expressions of a problem that grew into this one.
+        rows: The rows of the constraints of such a problem, if another program has them.
 
     Raises:
         CompilerError, OutputError: As :func:`impact_posture.posture.compiled.compiled_solver`.
     """
     began = time.perf_counter()
-    program = program or Program(problem)
+    program = program or Program(problem, rows)
     symbols, derivatives = program.symbols(problem)
     options = IPOPT_OPTIONS | (_WORST_OPTIONS if problem.objective.attempts > 1 else {})
     # A program that grows is soon another one, so it is not worth compiling.

@@ -21,8 +21,6 @@ import numpy as np
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.dynamics.tree import Tree
-from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.program_rows import Derivatives, ProgramRows, joined
 
@@ -32,42 +30,39 @@ class Program:
 
     Args:
         problem: The problem before it grows.
+        rows: The rows of its constraints, if another program of the problem has them.
 
     Attributes:
+        rows: The rows of the constraints.
         chart: Coordinates of the robot.
         numeric: The model in numbers, made once for all runs.
         bounded: Number of last rows that are inequalities ``≤ 0`` of the objective.
     """
 
-    def __init__(self, problem: PostureProblem) -> None:
-        self.chart = chart = Chart.of(problem.robot.model)
-        self.numeric = Numeric(problem.robot.model)
-        self._x = x = ca.SX.sym("x", chart.nx)
+    def __init__(self, problem: PostureProblem, rows: ProgramRows | None = None) -> None:
+        self.rows = rows = rows or ProgramRows(problem)
+        self.chart, self.numeric = rows.chart, Numeric(problem.robot.model)
         own = ca.SX.sym("own", len(problem.objective.parameters))
         scale, weight, self._price = ca.SX.sym("scale"), ca.SX.sym("weight"), ca.SX.sym("price")
-        reference = ca.SX.sym("reference", chart.nx)
-        tree = Tree(problem.robot.model, chart.configuration(x), x)
-        self._lifted = lifted = problem.objective.lift(tree, own, scale)
+        self._lifted = lifted = problem.objective.lift(rows.tree, own, scale)
         self.bounded = int(lifted.inequalities.numel())
-        self._value = lifted.value / scale + weight * distance_squared(chart, tree.q, chart.configuration(reference))
-        self._norms = chart.norms(x)
-        self._rows = ProgramRows(x, tree, problem)
-        self._p = ca.vertcat(own, scale, weight, self._price, reference, *self._rows.parameters)
+        self._value = lifted.value / scale + weight * rows.away
+        self._p = ca.vertcat(own, scale, weight, self._price, rows.reference, *rows.parameters)
 
     def symbols(self, problem: PostureProblem) -> tuple[dict[str, ca.SX], dict[str, ca.Function]]:
         """Return the expressions of a problem, and the derivatives of one that grows as options of ``nlpsol``.
 
         The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.
         """
-        rows, objective = self._rows.lift(problem), self._lifted
-        x = ca.vertcat(self._x, objective.variables, rows.variables)
-        g = ca.vertcat(self._norms, rows.rows, objective.residual, objective.inequalities)
+        rows, objective = self.rows.lift(problem), self._lifted
+        x = ca.vertcat(self.rows.x, objective.variables, rows.variables)
+        g = ca.vertcat(self.rows.norms, rows.rows, objective.residual, objective.inequalities)
         symbols = {"x": x, "p": self._p, "f": self._value + self._price * rows.slack, "g": g}
         if not problem.grows:
             return symbols, {}
-        found = joined(self._own, self._rows.derivatives(rows), self.chart.nx)
+        found = joined(self._own, self.rows.derivatives(rows), self.chart.nx)
         # Own rows are the value, the norms and the rows of the objective, with the constraints between the latter.
-        norms, count, own = self._norms.numel(), rows.rows.numel(), self._own.multipliers.numel()
+        norms, count, own = self.rows.norms.numel(), rows.rows.numel(), self._own.multipliers.numel()
         order = [*range(1, 1 + norms), *range(own, own + count), *range(1 + norms, own)]
         placed = Derivatives(found.multipliers[order], found.jacobian[order, :], found.hessian)
         return symbols, placed.options(x, self._p, found.multipliers[0], g)
@@ -76,8 +71,8 @@ class Program:
     def _own(self) -> Derivatives:
         """Derivatives of the value and of all rows but those of constraints."""
         objective = self._lifted
-        rows = ca.vertcat(self._value, self._norms, objective.residual, objective.inequalities)
-        return Derivatives.of(rows, ca.vertcat(self._x, objective.variables))
+        rows = ca.vertcat(self._value, self.rows.norms, objective.residual, objective.inequalities)
+        return Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))
 
 
 def parameters(problem: PostureProblem, chart: Chart, scale: float, price: float) -> Array:

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.constraint import LiftedRows
+from impact_posture.posture.posture_distance import distance_squared
 from impact_posture.posture.problem import PostureProblem
 
 
@@ -47,19 +49,27 @@ class Derivatives:
 
 
 class ProgramRows:
-    """Lifts the constraints of a problem, and those of all problems that it grows into.
+    """Lifts the constraints of a problem, and those of all problems that it grows into, for all of its programs.
 
     Args:
-        x: Chart coordinates, shape (nx, 1).
-        tree: The dynamics at ``x``.
         problem: The problem before it grows.
 
     Attributes:
+        chart: Coordinates of the robot.
+        x: Chart coordinates, shape (nx, 1).
+        tree: The dynamics at ``x``.
+        norms: Squared norms of the quaternions less one.
+        reference: Chart coordinates of the given posture, shape (nx, 1).
+        away: Squared distance from the given posture.
         parameters: Symbols of the parameters of each constraint.
     """
 
-    def __init__(self, x: ca.SX, tree: Tree, problem: PostureProblem) -> None:
-        self._x, self._tree = x, tree
+    def __init__(self, problem: PostureProblem) -> None:
+        self.chart = chart = Chart.of(problem.robot.model)
+        self.x, self.reference = ca.SX.sym("x", chart.nx), ca.SX.sym("reference", chart.nx)
+        self.tree = Tree(problem.robot.model, chart.configuration(self.x), self.x)
+        self.norms = chart.norms(self.x)
+        self.away = distance_squared(chart, self.tree.q, chart.configuration(self.reference))
         self.parameters = [ca.SX.sym(f"p{k}", len(c.parameters)) for k, c in enumerate(problem.constraints)]
         self._lifted: dict[tuple[int, str, tuple[int, ...]], LiftedRows] = {}
         self._blocks: list[tuple[Derivatives, list[LiftedRows]]] = []
@@ -72,7 +82,7 @@ class ProgramRows:
             # Constraints with another target have the same expressions.
             key = index, constraint.structure, tuple(carried)
             if key not in self._lifted:
-                lifted = constraint.lift(self._tree, self.parameters[index])
+                lifted = constraint.lift(self.tree, self.parameters[index])
                 if not lifted.pieces:
                     lifted = LiftedRows(lifted.rows[carried], lifted.variables, lifted.slack)
                 self._lifted[key] = lifted
@@ -81,7 +91,7 @@ class ProgramRows:
 
     def derivatives(self, lifted: LiftedRows) -> Derivatives:
         """Return the derivatives of the rows of :meth:`lift` over ``(x, z)``."""
-        nx, row, column = self._x.numel(), 0, 0
+        nx, row, column = self.x.numel(), 0, 0
         rows, sides, columns = dict[int, range](), dict[int, range](), dict[int, range]()
         pieces: dict[int, LiftedRows] = {}
         for whole in lifted.pieces:
@@ -116,7 +126,7 @@ class ProgramRows:
         known = {id(piece.rows) for _, block in self._blocks for piece in block}
         new = [piece for piece in pieces if id(piece.rows) not in known]
         if new:
-            unknowns = ca.vertcat(self._x, *[piece.variables for piece in new])
+            unknowns = ca.vertcat(self.x, *[piece.variables for piece in new])
             self._blocks.append((Derivatives.of(ca.vertcat(*[piece.rows for piece in new]), unknowns), new))
 
 

@@ -17,6 +17,7 @@ from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, SolveRecord, build_nlp, one_blas_thread
 from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import PostureProblem
+from impact_posture.posture.program_rows import ProgramRows
 from impact_posture.posture.starts import ATTEMPTS, CANDIDATES, FEASIBLE, feasible_start
 from impact_posture.processes import fork_map
 
@@ -105,6 +106,7 @@ class Search:
         seed: Seed of the starts that are not known.
         compile: Whether to compile the program.
         finish_all: Whether starts go on that cannot become the best; in small programs they always do.
+        rows: The rows of the constraints, if another program of the problem has them.
     """
 
     def __init__(
@@ -117,9 +119,10 @@ class Search:
         seed: int,
         compile: CompileMode,
         finish_all: bool,
+        rows: ProgramRows | None = None,
     ) -> None:
         self.problem, self._known, self._scale, self._seed, self._compile = problem, known, scale, seed, compile
-        self.nlp = build_nlp(problem, compile=compile, starts=starts)
+        self.nlp = build_nlp(problem, compile=compile, starts=starts, rows=rows)
         self._starts, self._finish_all = starts, finish_all or starts * self._unknowns <= _SMALL
         self.build_time_s = self.nlp.build_time_s
         # A run goes on from where it ended without what the program lacked.

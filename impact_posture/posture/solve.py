@@ -16,9 +16,10 @@ from impact_posture.errors import ContactError, Infeasible, SolverFailed
 from impact_posture.posture.caveats import notes_on_impacts
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.elastic import elastic
+from impact_posture.posture.elastic import ElasticProgram, elastic
 from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
+from impact_posture.posture.program_rows import ProgramRows
 from impact_posture.posture.search import Progress, Run, Search, feasible
 from impact_posture.posture.starts import Projector, feasible_start
 
@@ -118,11 +119,19 @@ def solve(
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
         SolverFailed: No run ended at a certified posture.
     """
-    problem, initial = _initial(problem, seed)
+    rows = ProgramRows(problem)
+    problem, initial = _initial(problem, seed, rows)
     scale = _initial_objective(problem, initial)
     began = time.perf_counter()
     search = Search(
-        problem, (initial, *guesses), scale, starts=starts, seed=seed, compile=compile, finish_all=finish_all
+        problem,
+        (initial, *guesses),
+        scale,
+        starts=starts,
+        seed=seed,
+        compile=compile,
+        finish_all=finish_all,
+        rows=rows,
     )
     runs = search.run(jobs, progress)
     problem, nlp = search.problem, search.nlp
@@ -203,7 +212,7 @@ def _last_word(problem: PostureProblem, runs: list[Run]) -> tuple[list[Run], str
     return good, touching
 
 
-def _initial(problem: PostureProblem, seed: int) -> tuple[PostureProblem, Array]:
+def _initial(problem: PostureProblem, seed: int, rows: ProgramRows) -> tuple[PostureProblem, Array]:
     """The given posture moved onto the constraints, or the first other start that reaches them.
 
     Constraints without projection need the elastic program, and its problem has the parts that it needed.
@@ -212,7 +221,8 @@ def _initial(problem: PostureProblem, seed: int) -> tuple[PostureProblem, Array]
     start = next((q for q in starts if q is not None), None)
     if start is not None and feasible(problem, start):
         return problem, start
-    answer = elastic(problem if start is None else replace(problem, given=start), seed)
+    given, problem = problem.given, problem if start is None else replace(problem, given=start)
+    answer = elastic(problem, seed, ElasticProgram(problem, rows))
     if answer.conflicts:
         limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
         sign = "; check the sign of the normal, which points towards the robot"
@@ -228,7 +238,7 @@ def _initial(problem: PostureProblem, seed: int) -> tuple[PostureProblem, Array]
             where="problem",
             hint="start from a `posture` nearer to the target",
         )
-    return replace(answer.problem, given=problem.given), found.q
+    return replace(answer.problem, given=given), found.q
 
 
 def _initial_objective(problem: PostureProblem, initial: Array) -> float:
