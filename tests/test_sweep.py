@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,16 +21,19 @@ from hypothesis import strategies as st
 import impact_posture as ip
 from impact_posture.errors import ImpactPostureError, InputError, OutputError, SpecError
 from impact_posture.posture.build_problem import build_problem, retarget
+from impact_posture.posture.certificate import certify
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.settings import ProblemSettings
 from impact_posture.sweep import shard
 from impact_posture.sweep.atlas import sweep_key
+from impact_posture.sweep.case_solver import CaseSolver
 from impact_posture.sweep.executors import SlurmJobs, dask_cluster, parse_options, process_pool
 from impact_posture.sweep.grid import Axis, Grid
 from impact_posture.sweep.maps import draw_maps
 from impact_posture.sweep.point_search import PointResult
 from impact_posture.sweep.run import SweepRun, run_sweep
 from impact_posture.sweep.shard import solve_shard
+from impact_posture.sweep.shard_table import read_shard
 from impact_posture.sweep.sweep_file import read_sweep
 from tests.command import refused, run
 
@@ -55,12 +60,30 @@ starts = 4
 x = { from = 0, to = 0.04, count = 3 }
 z = [0, 2]
 """
+# Panda has optima of the same pose that differ by a factor of four.
+SWITCHING = """
+shard = {shard}
+[problem]
+robot = "panda"
+normal = [-1, 0, 0]
+collision = false
+starts = {starts}
+[grid]
+y = {{ from = -0.2, to = 0.2, count = 5 }}
+z = {{ from = -0.2, to = 0.2, count = 5 }}
+"""
+
+
+def write(text: str, folder: Path) -> Path:
+    """Write the text of a sweep."""
+    path = folder / "sweep.toml"
+    path.write_text(text)
+    return path
 
 
 def solve(text: str, folder: Path, executor: Any = None, name: str = "out", **options: Any) -> SweepRun:
     """Run the sweep of a text."""
-    (folder / "sweep.toml").write_text(text)
-    return run_sweep(read_sweep(folder / "sweep.toml"), folder / name, executor, **options)
+    return run_sweep(read_sweep(write(text, folder)), folder / name, executor, **options)
 
 
 def shards(folder: Path) -> dict[str, bytes]:
@@ -95,6 +118,11 @@ def test_points_and_neighbors_of_a_grid(shape: list[int], data: st.DataObject) -
         assert first <= other < point
         steps = np.subtract(grid.place(point), grid.place(other))
         assert sorted(steps) == [0] * (len(shape) - 1) + [1]
+    around = grid.around(point)
+    assert len(around) == sum((k > 0) + (k + 1 < n) for k, n in zip(grid.place(point), shape, strict=True))
+    assert set(grid.neighbors(point, first)) <= set(around)
+    for other in around:
+        assert np.abs(np.subtract(grid.place(point), grid.place(other))).sum() == 1
 
 
 @pytest.mark.parametrize("robot", ["tilthex_arm", "talos", "panda"])
@@ -187,7 +215,7 @@ def test_the_bytes_do_not_depend_on_what_runs_it(aerial: Path, tmp_path: Path) -
     sweep = read_sweep(tmp_path / "sweep.toml")
     key = json.loads((aerial / "manifest.json").read_text())["key"]
     backwards = [solve_shard(sweep, key, shard).content for shard in (2, 1, 0)]
-    assert backwards[::-1] == list(wanted.values())
+    assert backwards[::-1] == [solve_shard(sweep, key, shard).content for shard in range(3)]
 
 
 def test_a_dask_cluster_gives_the_same_bytes(aerial: Path, tmp_path: Path) -> None:
@@ -211,10 +239,51 @@ def test_a_sweep_goes_on_with_what_is_missing_or_damaged(aerial: Path, tmp_path:
     left.write_bytes(b"what a killed run left")
     seen: list[tuple[int, int]] = []
     assert solve(AERIAL, tmp_path, progress=lambda done, all_of: seen.append((done, all_of))).shards == 2
-    assert seen == [(0, 6), (3, 6), (6, 6)]
+    # The second pass of two shards needs the first one of all three.
+    assert seen == [(0, 14), (3, 14), (6, 14), (8, 14), (11, 14), (14, 14)]
     assert shards(folder) == shards(aerial)
     assert (folder / "notes.txt").read_text() == "mine" and not left.exists()
+    assert not (folder / "first-pass").exists()
     assert solve(AERIAL, tmp_path).shards == 0
+
+
+@pytest.mark.parametrize("mine", [False, True])
+def test_a_sweep_that_was_stopped_in_either_pass_goes_on(tmp_path: Path, mine: bool) -> None:
+    """Each run ends after two shards, and what it has written is the table so far."""
+    sweep = SWITCHING.format(starts=1, shard=7)
+    solve(sweep, tmp_path, name="whole")
+    wanted, folder, stops = shards(tmp_path / "whole"), tmp_path / "out", 0
+
+    def stop(done: int, count: int) -> None:
+        if 7 < done < count:
+            raise KeyboardInterrupt
+
+    while shards(folder) != wanted:
+        with contextlib.suppress(KeyboardInterrupt):
+            solve(sweep, tmp_path, progress=stop)
+        assert ip.sweep.open(folder).count_rows() == min(25, 14 * (stops := stops + 1))
+        if mine and (folder / "first-pass").exists():
+            (folder / "first-pass/notes.txt").write_text("mine")
+    assert stops == 4
+    assert [path.name for path in folder.glob("first-pass/**/*")] == ["notes.txt"] * mine
+
+
+def test_neighboring_shards_pass_on_their_optima(tmp_path: Path) -> None:
+    """Each point alone ends in an optimum of its own."""
+    sweep = read_sweep(write(SWITCHING.format(starts=2, shard=1), tmp_path))
+    run_sweep(sweep, tmp_path / "out")
+    rows = ip.sweep.open(tmp_path / "out").to_table().sort_by("point").to_pylist()
+    key = json.loads((tmp_path / "out/manifest.json").read_text())["key"]
+    first = [read_shard(solve_shard(sweep, key, shard).content)[0].row for shard in range(sweep.shards)]
+    before, after = (np.array([row["value"] for row in found]) for found in (first, rows))
+    assert (after <= before).all() and (after < 0.7 * before).sum() >= 3
+    assert {row["status"] for row in rows} == {"certified"}
+    for point in np.flatnonzero(after < before):
+        target = CaseSolver(sweep.cases[0]).target(sweep.grid.values(int(point)))[0]
+        problem = prepare(replace(sweep.cases[0].settings, target_position=target)).problem
+        q = np.array(rows[point]["q"])
+        assert problem.objective.value(q) == pytest.approx(after[point], rel=1e-9)
+        assert certify(problem, q, before[point]).holds()
 
 
 def test_a_folder_never_mixes_what_files_say(pendulum: str, tmp_path: Path) -> None:
@@ -292,7 +361,9 @@ def test_speeds_that_are_the_same_problem_have_the_same_answer(monkeypatch: pyte
     monkeypatch.setattr(shard, "search", search)
     monkeypatch.setattr(shard, "improve", improve)
     sweep: Any = SimpleNamespace(grid=Grid((Axis("y", (0, 1)), Axis("x", (0, 1)), Axis("speed", (1.0, 2.0)))))
-    assert [one.row["value"] for one in shard._walk(sweep, solver, range(8))] == [1.0] * 8
+    found = shard._Shard(sweep, solver, range(8), [])
+    found.solve()
+    assert [one.row["value"] for one in found.results] == [1.0] * 8
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------

@@ -75,7 +75,10 @@ def sweep(
     place = Path(out) if out else Path(file_name(path.stem))
     began = time.perf_counter()
     where = _executor(workers, scheduler, slurm, place, mpi=mpi)
-    with where as executor, progress("solving", "problems", shown=not (quiet or json), first="checking") as advance:
+    with (
+        where as executor,
+        progress("solving", "points in all passes", shown=not (quiet or json), first="checking") as advance,
+    ):
         done = run_sweep(asked, place, executor, progress=advance)
     found: dict[str, Any] = {
         "schema": "impact-posture/sweep-run/1",

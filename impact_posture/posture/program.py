@@ -13,6 +13,7 @@ Every function is then linear or quadratic in the auxiliaries, and the exact Hes
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 
 import casadi as ca
@@ -48,6 +49,12 @@ class Program:
         self.bounded = int(lifted.inequalities.numel())
         self._value = lifted.value / scale + weight * rows.away
         self._p = ca.vertcat(own, scale, weight, self._price, rows.reference, *rows.parameters)
+
+    def branch(self) -> Program:
+        """Return a program that grows on its own from here."""
+        made = copy(self)
+        made.rows = self.rows.branch()
+        return made
 
     def symbols(self, problem: PostureProblem) -> tuple[dict[str, ca.SX], dict[str, ca.Function]]:
         """Return the expressions of a problem, and the derivatives of one that grows as options of ``nlpsol``.

@@ -6,6 +6,7 @@ of its pieces stay as they were, and so do their derivatives.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import casadi as ca
@@ -73,6 +74,12 @@ class ProgramRows:
         self.parameters = [ca.SX.sym(f"p{k}", len(c.parameters)) for k, c in enumerate(problem.constraints)]
         self._lifted: dict[tuple[int, str, tuple[int, ...]], LiftedRows] = {}
         self._blocks: list[tuple[Derivatives, list[LiftedRows]]] = []
+
+    def branch(self) -> ProgramRows:
+        """Return rows that grow on their own from here."""
+        made = copy(self)
+        made._lifted, made._blocks = dict(self._lifted), list(self._blocks)
+        return made
 
     def lift(self, problem: PostureProblem) -> LiftedRows:
         """Return the rows that the program of a problem carries, by constraint."""

@@ -7,6 +7,7 @@ import fcntl
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from impact_posture.libraries import source_key
 from impact_posture.output_folder import check_output, is_ours, write_record, write_whole
 from impact_posture.posture.problem_settings import dump_settings
 from impact_posture.sweep.case_solver import CaseSolver
+from impact_posture.sweep.shard_table import passes_of, read_postures
 from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.version import __version__
 
@@ -23,6 +25,10 @@ if TYPE_CHECKING:
 
 SCHEMA = "impact-posture/sweep-folder/1"
 MANIFEST, _DATA = "manifest.json", "data"
+# Shards after their first pass, which the second one replaces in the table while their neighbors still need them.
+_FIRST_PASS = "first-pass"
+# Shards whose postures are kept in memory; those along an axis are needed one after the other.
+_KEPT = 16
 # Packages whose formulas decide the numbers.
 _PACKAGES = ("robot", "dynamics", "collision", "impact", "posture", "sweep")
 
@@ -52,6 +58,7 @@ class Atlas:
 
     def __init__(self, folder: Path, sweep: Sweep, key: str) -> None:
         self.folder, self._sweep, self._key = folder, sweep, key
+        self._postures = lru_cache(_KEPT)(self._read_postures)
 
     @contextmanager
     def opened(self) -> Iterator[None]:
@@ -88,22 +95,49 @@ class Atlas:
             except OSError:
                 # This file system knows no locks.
                 pass
-            for part in (self.folder / _DATA).glob("case=*/.shard-*.parquet.*.part"):
+            for part in self.folder.glob("*/case=*/.shard-*.parquet.*.part"):
                 with suppress(OSError):
                     part.unlink()
             yield
 
-    def waiting(self) -> list[int]:
-        """Return the shards without a whole file of this sweep."""
-        return [shard for shard in range(self._sweep.shards) if not self._is_done(shard)]
+    def waiting(self) -> tuple[list[int], list[int]]:
+        """Return the shards whose first pass is lacking and needed, and those that lack the second one."""
+        lacking = [shard for shard in range(self._sweep.shards) if not self._is_done(shard)]
+        if self._sweep.passes == 1:
+            return lacking, []
+        needed = {*lacking, *(other for shard in lacking for other in self._sweep.beside(shard))}
+        return [shard for shard in sorted(needed) if self._first(shard) is None], lacking
 
-    def write(self, shard: int, content: bytes) -> None:
+    def solved(self, shard: int) -> tuple[bytes, dict[int, list[float]]]:
+        """Return the file of a shard after its first pass, and the postures next to it in other shards."""
+        beside: dict[int, list[float]] = {}
+        for other, points in self._sweep.beside(shard).items():
+            known = self._postures(other)
+            beside |= {point: posture for point in points if (posture := known[point]) is not None}
+        return self._content(shard), beside
+
+    def write(self, shard: int, content: bytes, passes: int) -> None:
         """Write the file of a shard, whole or not at all.
 
         Raises:
             OutputError: It cannot be written.
         """
-        path = self._path(shard)
+        before = self._passes(self._path(shard), shard)
+        if before == 1 < passes:
+            # Its neighbors still need it.
+            self._write(self._path(shard, _FIRST_PASS), self._content(shard))
+        self._write(self._path(shard, _FIRST_PASS if before > passes else _DATA), content)
+
+    def finish(self) -> None:
+        """Delete the shards after their first pass."""
+        places = [self._path(shard, _FIRST_PASS) for shard in range(self._sweep.shards)]
+        with suppress(OSError):
+            for path in places:
+                path.unlink(missing_ok=True)
+            for folder in (*{path.parent for path in places}, self.folder / _FIRST_PASS):
+                folder.rmdir()
+
+    def _write(self, path: Path, content: bytes) -> None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -111,24 +145,30 @@ class Atlas:
             raise OutputError(words, where=str(path.parent), hint="check the disk and permissions") from None
         write_whole(path, content)
 
-    def _path(self, shard: int) -> Path:
+    def _path(self, shard: int, place: str = _DATA) -> Path:
         case, part = divmod(shard, self._sweep.shards_of_case)
-        return self.folder / _DATA / f"case={case}" / f"shard-{part:06d}.parquet"
+        return self.folder / place / f"case={case}" / f"shard-{part:06d}.parquet"
+
+    def _passes(self, path: Path, shard: int) -> int:
+        return passes_of(path, self._key, len(self._sweep.span(shard)[1]))
 
     def _is_done(self, shard: int) -> bool:
-        from pyarrow import ArrowException, parquet
+        return self._passes(self._path(shard), shard) == self._sweep.passes
 
-        path = self._path(shard)
-        if not path.exists():
-            return False
-        try:
-            found = parquet.read_metadata(path)
-        except (OSError, ArrowException):
-            return False
-        return (
-            found.num_rows == len(self._sweep.span(shard)[1])
-            and (found.metadata or {}).get(b"sweep") == self._key.encode()
-        )
+    def _first(self, shard: int) -> Path | None:
+        """The file of a shard after its first pass."""
+        paths = self._path(shard), self._path(shard, _FIRST_PASS)
+        return next((path for path in paths if self._passes(path, shard) == 1), None)
+
+    def _content(self, shard: int) -> bytes:
+        path = self._first(shard)
+        if path is None:
+            raise OutputError("lost a shard meanwhile", where=str(self.folder), hint="run sweep again, which goes on")
+        return path.read_bytes()
+
+    def _read_postures(self, shard: int) -> dict[int, list[float] | None]:
+        """The postures of a shard after its first pass, by their points."""
+        return dict(zip(self._sweep.span(shard)[1], read_postures(self._content(shard)), strict=True))
 
     def _manifest(self) -> dict[str, Any]:
         sweep = self._sweep

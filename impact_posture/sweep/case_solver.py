@@ -102,18 +102,16 @@ class CaseSolver:
                 prepared = self.template(*self.normal_and_speed({axis.name: value}))
                 retarget(prepared.problem, *self.target({axis.name: value}))
 
-    def program(self, problem: PostureProblem) -> PostureNLP:
-        """Return the program of a problem, built anew only if its expressions are new.
-
-        A program never grows out of another here, so its rounding depends on its problem alone.
-        """
-        key = f"{problem.objective.structure}\n{problem.structure}"
-        made = kept(self._programs, key, lambda: build_nlp(problem, compile="never"), _KEPT)
-        return replace(made, problem=problem)
-
     def walk(self, template: PostureProblem) -> Walk:
-        """Return the way of a template through a shard."""
-        return Walk(template, self._case.settings, self.program, self.timer)
+        """Return the way of a template through a shard.
+
+        Its program is built anew only if its expressions are new.  It grows on its own from here, so its rounding
+        depends on the template and the points of the shard alone.
+        """
+        key = f"{template.objective.structure}\n{template.structure}"
+        made = kept(self._programs, key, lambda: build_nlp(template, compile="never"), _KEPT)
+        nlp = replace(made, problem=template, program=made.program.branch())
+        return Walk(template, self._case.settings, nlp, self.timer)
 
 
 def kept(cache: OrderedDict[Any, _Value], key: Any, make: Callable[[], _Value], most: int) -> _Value:

@@ -68,3 +68,12 @@ class Grid:
                 found.append(point - stride)
             stride *= count
         return found
+
+    def around(self, point: int) -> list[int]:
+        """Return the neighbors of ``point`` along all axes, the one before it and then the one after it."""
+        found: list[int] = []
+        stride = 1
+        for count, k in zip(reversed(self.shape), reversed(self.place(point)), strict=True):
+            found += [point - stride] * (k > 0) + [point + stride] * (k + 1 < count)
+            stride *= count
+        return found

@@ -26,7 +26,7 @@ from impact_posture.settings import ProblemSettings
 from impact_posture.sweep.atlas import open_atlas, read_manifest
 from impact_posture.sweep.grid import Axis, Grid
 from impact_posture.sweep.point_search import SWITCH
-from impact_posture.sweep.shard import STATUS
+from impact_posture.sweep.shard_table import STATUS
 from impact_posture.tables import validate
 
 # The best posture switches between neighbors that differ (tangent norm, without the place of the base) by more than

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -58,7 +58,7 @@ class Walk:
     Args:
         template: The problem with the normal and the speed of some points.
         settings: Number of starts, and their seed.
-        build: Returns the program of a problem.
+        nlp: Its program, which nothing else lets grow.
         timer: Where the time of the solver is added.
     """
 
@@ -66,17 +66,17 @@ class Walk:
         self,
         template: PostureProblem,
         settings: ProblemSettings,
-        build: Callable[[PostureProblem], PostureNLP],
+        nlp: PostureNLP,
         timer: Timer,
     ) -> None:
         # The template is kept, because a shard knows it by its identity.
-        self._template, self._build, self.settings, self.timer = template, build, settings, timer
+        self._template, self.settings, self.timer = template, settings, timer
+        self.problem, self.nlp = template, nlp
         self._relaxed: ElasticProgram | None = None
-        self.grow(template)
 
     def grow(self, problem: PostureProblem) -> None:
         """Go on with the parts that a point needed."""
-        self.problem, self.nlp = problem, self._build(problem)
+        self.problem, self.nlp = problem, self.nlp.grown(problem, compile="never")
 
     def at(self, problem: PostureProblem, place: Place) -> PostureProblem:
         """Return a problem with its target at a place."""
@@ -84,7 +84,7 @@ class Walk:
 
     def relax(self, place: Place, guesses: Sequence[Array] = (), beside: float = 0.0) -> ElasticAnswer:
         """Relax the constraints at a place, with the parts that the places before needed for it."""
-        program = self._relaxed = self._relaxed or ElasticProgram(self.problem)
+        program = self._relaxed = self._relaxed or ElasticProgram(self.problem, self.nlp.program.rows.branch())
         before = program.time_s
         found = elastic(self.at(program.problem, place), self.settings.seed, program, guesses, beside)
         self.timer.solver_s += program.time_s - before

@@ -1,20 +1,20 @@
-"""Solve a shard: what a worker gets, and the Parquet file that it returns."""
+"""Solve a shard in two passes: what a worker gets, and the Parquet file that it returns."""
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from impact_posture.arrays import Array
 from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.sweep.case_solver import CaseSolver, kept
-from impact_posture.sweep.grid import Axis
-from impact_posture.sweep.point_search import PointResult, Walk, improve, search
+from impact_posture.sweep.point_search import Place, PointResult, Walk, improve, search
+from impact_posture.sweep.shard_table import STATUS, read_shard, write_shard
 from impact_posture.sweep.sweep_file import Sweep
 
 # MUMPS, within IPOPT, is not made for threads; a worker with several takes its shards one after the other.
@@ -25,20 +25,17 @@ _KEPT = 4
 _KEPT_WALKS = 64
 _SOLVERS: OrderedDict[tuple[str, int], CaseSolver] = OrderedDict()
 
-STATUS = ("certified", "infeasible", "uncertified", "undefined")
-NUMBERS = ("value", *"HGVSE", "predicted_impulse", "predicted_jump", "stationarity", "violation")
-
 
 @dataclass(frozen=True)
 class ShardResult:
-    """A finished shard.
+    """A shard after a pass.
 
     Attributes:
         index: Index of the shard.
         content: Its Parquet file.
         counts: Number of points of each status.
         solver_s: Wall time within IPOPT and the functions that it calls, s.
-        total_s: Wall time of the shard, s.
+        total_s: Wall time of the pass, s.
     """
 
     index: int
@@ -59,99 +56,133 @@ def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
     Raises:
         ImpactPostureError: A setting is wrong.
     """
+    return _passed(sweep, key, index, 1, [], _Shard.solve)
+
+
+def revise_shard(
+    sweep: Sweep, key: str, index: int, content: bytes, beside: Mapping[int, list[float]]
+) -> ShardResult:
+    """Improve the points of a solved shard by the postures that neighboring shards have next to it.
+
+    Args:
+        sweep: The sweep.
+        key: Hash of the sweep, its robots and this version.
+        index: Index of the shard.
+        content: Its file after the first pass.
+        beside: Postures after the first pass at the points of other shards that are neighbors of this one.
+
+    Raises:
+        ImpactPostureError: A setting is wrong.
+    """
+    return _passed(sweep, key, index, 2, read_shard(content), lambda shard: shard.revise(beside))
+
+
+def _passed(
+    sweep: Sweep, key: str, index: int, passes: int, known: list[PointResult], work: Callable[[_Shard], None]
+) -> ShardResult:
+    """Work on the known answers of a shard."""
     with _ALONE, one_blas_thread():
         began = time.perf_counter()
         case, points = sweep.span(index)
-        solver = _solver(sweep, key, case)
+        speeds = max((len(axis.values) for axis in sweep.grid.axes if axis.name == "speed"), default=1)
+        solver = kept(_SOLVERS, (key, case), lambda: CaseSolver(sweep.cases[case], speeds), _KEPT)
         solver.timer.solver_s = 0.0
-        results = _walk(sweep, solver, points)
-        content = _parquet(sweep, key, case, points, results, solver)
-        counts = {status: sum(one.row["status"] == status for one in results) for status in STATUS}
+        shard = _Shard(sweep, solver, points, known)
+        work(shard)
+        content = write_shard(sweep, key, index, passes, shard.results, shard.predicted)
+        counts = {status: sum(one.row["status"] == status for one in shard.results) for status in STATUS}
         return ShardResult(index, content, counts, solver.timer.solver_s, time.perf_counter() - began)
 
 
-def _solver(sweep: Sweep, key: str, case: int) -> CaseSolver:
-    speeds = max((len(axis.values) for axis in sweep.grid.axes if axis.name == "speed"), default=1)
-    return kept(_SOLVERS, (key, case), lambda: CaseSolver(sweep.cases[case], speeds), _KEPT)
+class _Shard:
+    """The points of a shard and their answers.
 
+    Args:
+        sweep: The sweep.
+        solver: Robot and programs of the case.
+        points: Indices of its points.
+        results: What is known of the first of them.
 
-def _walk(sweep: Sweep, solver: CaseSolver, points: range) -> list[PointResult]:
-    """Solve the points of a shard, each from the neighbors before it, then look back from the neighbors after it."""
-    results: list[PointResult] = []
-    walks: OrderedDict[int, Walk] = OrderedDict()
-    # Points that are the same problem as the one before them, and have its answer.
-    alike: list[int] = []
+    Attributes:
+        results: The answers so far.
+    """
 
-    def at(point: int) -> tuple[Walk, Any]:
-        values = sweep.grid.values(point)
-        prepared = solver.template(*solver.normal_and_speed(values))
-        walk = kept(walks, id(prepared.problem), partial(solver.walk, prepared.problem), _KEPT_WALKS)
-        return walk, solver.target(values)
+    def __init__(self, sweep: Sweep, solver: CaseSolver, points: range, results: list[PointResult]) -> None:
+        self._grid, self._solver, self._points, self.results = sweep.grid, solver, points, results
+        self._walks: OrderedDict[int, Walk] = OrderedDict()
 
-    last: tuple[Walk, Any] | None = None
-    for point in points:
-        walk, target = at(point)
-        if last is not None and last[0] is walk and last[1] == target:
-            # Only the speed differs, and the problem does not see it.
-            results.append(results[-1])
-            alike.append(point)
-            continue
-        before = [results[k - points.start] for k in sweep.grid.neighbors(point, points.start)]
-        guesses = [one.q for one in before if one.q is not None]
-        beside = 0.0 if guesses else min((one.violation for one in before if one.violation), default=0.0)
-        results.append(search(walk, target, guesses, beside))
-        last = walk, target
-    # An optimum that appears on the way may have been the better one already before.
-    for point in reversed(points):
-        posture = results[point - points.start].q
-        if posture is not None:
-            for other in sweep.grid.neighbors(point, points.start):
-                known = results[other - points.start]
-                results[other - points.start] = improve(*at(other), known, posture)
-    # The first speed has the most neighbors of its own.
-    for point in alike:
-        results[point - points.start] = results[point - points.start - 1]
-    return results
+    def solve(self) -> None:
+        """Solve each point from the neighbors before it, then look back from the neighbors after it."""
+        grid, first = self._grid, self._points.start
+        for point, own in self._own_problems():
+            if not own:
+                self.results.append(self.results[-1])
+                continue
+            before = [self.results[k - first] for k in grid.neighbors(point, first)]
+            guesses = [one.q for one in before if one.q is not None]
+            beside = 0.0 if guesses else min((one.violation for one in before if one.violation), default=0.0)
+            self.results.append(search(*self._at(point), guesses, beside))
+        # An optimum that appears on the way may have been the better one already before.
+        for point in reversed(self._points):
+            posture = self.results[point - first].q
+            if posture is not None:
+                for other in grid.neighbors(point, first):
+                    self._improve(other, posture)
+        self._share()
 
+    def revise(self, beside: Mapping[int, list[float]]) -> None:
+        """Improve the points at the border by postures of other shards, and the others by points that improved."""
+        improved = set[int]()
 
-def _parquet(
-    sweep: Sweep, key: str, case: int, points: range, results: Sequence[PointResult], solver: CaseSolver
-) -> bytes:
-    """Return the table of a shard as a Parquet file."""
-    import pyarrow as pa
-    from pyarrow import parquet
+        def look(points: Iterable[int], postures: Callable[[int], Any]) -> None:
+            for point in points:
+                for other in self._grid.around(point):
+                    posture = postures(other)
+                    if posture is not None and self._improve(point, posture):
+                        improved.add(point)
 
-    axes = (*sweep.outer, *sweep.grid.axes)
-    kinds = {axis.name: _kind(axis) for axis in axes}
-    number, text, count = pa.float64(), pa.string(), pa.int32()
-    own = [("status", text), ("reason", text), ("q", pa.list_(number)), *[(name, number) for name in NUMBERS]]
-    columns = [("point", pa.int64()), *kinds.items(), *own, ("optima", count), ("runs", count)]
-    rows = []
-    for point, result in zip(points, results, strict=True):
-        values = {**sweep.grid.values(point), **sweep.cases[case].values}
-        # A value that Arrow has no plain type for is JSON.
-        odd = {name: json.dumps(v) for name, v in values.items() if kinds[name] == text and not isinstance(v, str)}
-        rows.append({"point": case * sweep.grid.size + point, **values, **odd, **result.row})
-        if result.q is not None:
-            impact = solver.template(*solver.normal_and_speed(values)).impact
-            approach = (1 + impact.restitution) * impact.speed
-            rows[-1] |= {
-                "predicted_impulse": approach / result.row["G"],
-                "predicted_jump": approach * result.row["V"] ** 0.5,
-            }
-    table = pa.Table.from_pylist(rows, pa.schema(columns, metadata={"sweep": key}))
-    sink = pa.BufferOutputStream()
-    parquet.write_table(table, sink, compression="zstd")
-    return bytes(sink.getvalue())
+        def here(other: int) -> Array | None:
+            return self.results[other - self._points.start].q if other in improved else None
 
+        own = [point for point, own in self._own_problems() if own]
+        look(own, lambda other: here(other) if other in self._points else beside.get(other))
+        look(reversed(own), here)
+        self._share()
 
-def _kind(axis: Axis) -> Any:
-    """Return the Arrow type of the column of an axis."""
-    import pyarrow as pa
+    def predicted(self, values: Mapping[str, Any], result: PointResult) -> dict[str, float]:
+        """Return the columns that follow from the speed at a point."""
+        impact = self._solver.template(*self._solver.normal_and_speed(values)).impact
+        approach = (1 + impact.restitution) * impact.speed
+        return {"predicted_impulse": approach / result.row["G"], "predicted_jump": approach * result.row["V"] ** 0.5}
 
-    if all(isinstance(value, bool) for value in axis.values):
-        return pa.bool_()
-    if all(isinstance(value, int | float) for value in axis.values):
-        return pa.float64()
-    vectors = all(isinstance(v, list | tuple) and all(isinstance(x, float | int) for x in v) for v in axis.values)
-    return pa.list_(pa.float64()) if vectors else pa.string()
+    def _at(self, point: int) -> tuple[Walk, Place]:
+        values = self._grid.values(point)
+        prepared = self._solver.template(*self._solver.normal_and_speed(values))
+        walk = kept(self._walks, id(prepared.problem), partial(self._solver.walk, prepared.problem), _KEPT_WALKS)
+        return walk, self._solver.target(values)
+
+    def _own_problems(self) -> Iterator[tuple[int, bool]]:
+        """Yield each point, and whether it is another problem than the one before it.
+
+        Where only the speed differs, and the problem does not see it, it is the same.
+        """
+        last: tuple[Walk, Place] | None = None
+        for point in self._points:
+            walk, place = self._at(point)
+            yield point, last is None or last[0] is not walk or last[1] != place
+            last = walk, place
+
+    def _improve(self, point: int, posture: Any) -> bool:
+        """Improve a point from the posture of a neighbor; say whether that did."""
+        index = point - self._points.start
+        known = self.results[index]
+        self.results[index] = improve(*self._at(point), known, posture)
+        return self.results[index] is not known
+
+    def _share(self) -> None:
+        """Give the points that are the same problem as the one before them its answer."""
+        # The first speed has the most neighbors of its own.
+        for point, own in self._own_problems():
+            if not own:
+                index = point - self._points.start
+                self.results[index] = self.results[index - 1]

@@ -90,11 +90,24 @@ class Sweep:
         """Number of shards of each case."""
         return -(-self.grid.size // self.shard)
 
+    @property
+    def passes(self) -> int:
+        """Number of passes over each shard: the second is for what neighboring shards have found."""
+        return 1 if self.shards_of_case == 1 else 2
+
     def span(self, shard: int) -> tuple[int, range]:
         """Return the case of a shard, and its points as indices of the grid."""
         case, part = divmod(shard, self.shards_of_case)
         first = part * self.shard
         return case, range(first, min(first + self.shard, self.grid.size))
+
+    def beside(self, shard: int) -> dict[int, list[int]]:
+        """Return the neighbors of the points of a shard that are in other shards, by their shard."""
+        case, points = self.span(shard)
+        found: dict[int, list[int]] = {}
+        for other in sorted({other for point in points for other in self.grid.around(point)}.difference(points)):
+            found.setdefault(case * self.shards_of_case + other // self.shard, []).append(other)
+        return found
 
 
 def read_sweep(path: Path) -> Sweep:

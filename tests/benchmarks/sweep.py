@@ -230,9 +230,9 @@ def atlas(folder: Path, name: str, points: int) -> None:
 
     def progress(done: int, count: int) -> None:
         nonlocal told
-        if done * 10 // points == told and done < count:
+        if done * 10 // count == told and done < count:
             return
-        told = done * 10 // points
+        told = done * 10 // count
         within, total = np.sum(watched.finished, axis=0) if watched.finished else (0.0, 1.0)
         children = [child.pid for child in multiprocessing.active_children()]
         memory = " ".join(f"{_resident(pid):.1f}" for pid in children if pid)

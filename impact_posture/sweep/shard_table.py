@@ -1,0 +1,106 @@
+"""The table of a shard: a Parquet file with a row for each point."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from impact_posture.sweep.grid import Axis
+from impact_posture.sweep.point_search import PointResult
+from impact_posture.sweep.sweep_file import Sweep
+
+STATUS = ("certified", "infeasible", "uncertified", "undefined")
+PREDICTED = ("predicted_impulse", "predicted_jump")
+NUMBERS = ("value", *"HGVSE", *PREDICTED, "stationarity", "violation")
+
+
+def write_shard(
+    sweep: Sweep,
+    key: str,
+    index: int,
+    passes: int,
+    results: Sequence[PointResult],
+    predicted: Callable[[Mapping[str, Any], PointResult], dict[str, float]],
+) -> bytes:
+    """Return the file of a shard.
+
+    Args:
+        sweep: The sweep.
+        key: Its hash.
+        index: Index of the shard.
+        passes: Number of passes that the shard has had.
+        results: The answers to its points.
+        predicted: Returns the predictions for the values of a point and its posture.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    case, points = sweep.span(index)
+    axes = (*sweep.outer, *sweep.grid.axes)
+    kinds = {axis.name: _kind(axis) for axis in axes}
+    number, text, count = pa.float64(), pa.string(), pa.int32()
+    own = [("status", text), ("reason", text), ("q", pa.list_(number)), *[(name, number) for name in NUMBERS]]
+    columns = [("point", pa.int64()), *kinds.items(), *own, ("optima", count), ("runs", count)]
+    rows = []
+    for point, result in zip(points, results, strict=True):
+        values = {**sweep.grid.values(point), **sweep.cases[case].values}
+        # A value that Arrow has no plain type for is JSON.
+        odd = {name: json.dumps(v) for name, v in values.items() if kinds[name] == text and not isinstance(v, str)}
+        rows.append({"point": case * sweep.grid.size + point, **values, **odd, **result.row})
+        if result.q is not None:
+            rows[-1] |= predicted(values, result)
+    table = pa.Table.from_pylist(rows, pa.schema(columns, metadata={"sweep": key, "passes": str(passes)}))
+    sink = pa.BufferOutputStream()
+    parquet.write_table(table, sink, compression="zstd")
+    return bytes(sink.getvalue())
+
+
+def read_shard(content: bytes) -> list[PointResult]:
+    """Return the answers in the file of a shard."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    columns = ["status", "reason", "q", *(name for name in NUMBERS if name not in PREDICTED), "optima", "runs"]
+    found = []
+    for row in parquet.read_table(pa.BufferReader(content), columns=columns).to_pylist():
+        known = {name: value for name, value in row.items() if value is not None}
+        found.append(PointResult(known, np.array(known["q"]) if "q" in known else None))
+    return found
+
+
+def read_postures(content: bytes) -> list[list[float] | None]:
+    """Return the postures in the file of a shard."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    found: list[list[float] | None] = parquet.read_table(pa.BufferReader(content), columns=["q"])["q"].to_pylist()
+    return found
+
+
+def passes_of(path: Path, key: str, points: int) -> int:
+    """Return how many passes the shard in a file has had; 0 if it is no whole file of the sweep."""
+    from pyarrow import ArrowException, parquet
+
+    try:
+        found = parquet.read_metadata(path)
+        about = found.metadata or {}
+        own = found.num_rows == points and about.get(b"sweep") == key.encode()
+        return int(about[b"passes"]) if own else 0
+    except (OSError, ArrowException, LookupError, ValueError):
+        return 0
+
+
+def _kind(axis: Axis) -> Any:
+    """Return the Arrow type of the column of an axis."""
+    import pyarrow as pa
+
+    if all(isinstance(value, bool) for value in axis.values):
+        return pa.bool_()
+    if all(isinstance(value, int | float) for value in axis.values):
+        return pa.float64()
+    vectors = all(isinstance(v, list | tuple) and all(isinstance(x, float | int) for x in v) for v in axis.values)
+    return pa.list_(pa.float64()) if vectors else pa.string()
