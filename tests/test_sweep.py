@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 import impact_posture as ip
 from impact_posture.errors import ImpactPostureError, InputError, OutputError, SpecError
+from impact_posture.posture.attainable_speed import AttainableSpeed
 from impact_posture.posture.build_problem import build_problem, retarget
 from impact_posture.posture.certificate import certify
 from impact_posture.posture.problem_settings import prepare
@@ -162,6 +163,16 @@ def test_every_point_has_its_row_and_a_certificate_that_holds(aerial: Path) -> N
         assert [row[key] for key in "HGVSE"] == pytest.approx([getattr(found, key) for key in "HGVSE"])
         assert row["predicted_jump"] == pytest.approx(row["speed"] * found.V**0.5)
         assert row["predicted_impulse"] == pytest.approx(row["speed"] / found.G)
+
+
+def test_each_posture_has_its_fastest_approach(aerial: Path, arm: Path) -> None:
+    """That of a base that flies is not bounded."""
+    assert ip.sweep.open(aerial).to_table()["attainable_speed"].to_pylist() == [None] * 8
+    prepared = prepare(ProblemSettings(robot="panda", normal=(0.0, 0.0, 1.0), collision=False))
+    approach = AttainableSpeed(prepared.impact.robot, prepared.impact.objective, prepared.problem.requirements)
+    rows = [row for row in ip.sweep.open(arm).to_table().to_pylist() if row["q"]]
+    found = [row["attainable_speed"] for row in rows]
+    assert rows and found == pytest.approx([approach.reached(np.array(row["q"])) for row in rows])
 
 
 def test_a_point_is_what_optimize_finds(aerial: Path) -> None:

@@ -14,6 +14,7 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.resolved_impact import resolve
+from impact_posture.posture.attainable_speed import AttainableSpeed
 from impact_posture.posture.build_problem import retarget
 from impact_posture.posture.nlp import PostureNLP, build_nlp
 from impact_posture.posture.problem import PostureProblem
@@ -50,6 +51,7 @@ class CaseSolver:
         self._loaded = load_robot(case.settings.robot, case.settings)
         self._templates = min(max(_KEPT, speeds), _MOST_SPEEDS)
         self.template = lru_cache(self._templates)(self._template)
+        self.attainable = lru_cache(self._templates)(self._attainable)
         self._programs: OrderedDict[str, PostureNLP] = OrderedDict()
         self._known: OrderedDict[tuple[Any, ...], Prepared] = OrderedDict()
         self.robot = self.template(*self.normal_and_speed({})).impact.robot
@@ -75,6 +77,11 @@ class CaseSolver:
         objective = made.impact.objective
         key = objective.structure, tuple(objective.parameters), made.problem.requirements
         return replace(kept(self._known, key, lambda: made, self._templates), impact=made.impact)
+
+    def _attainable(self, normal: Any, speed: float) -> AttainableSpeed:
+        """Return the fastest approach of the problem with a normal and a speed."""
+        made = self.template(normal, speed)
+        return AttainableSpeed(self.robot, made.impact.objective, made.problem.requirements)
 
     def target(self, values: Mapping[str, Any]) -> Place:
         """Return the position and orientation of the contact frame at values of the grid."""

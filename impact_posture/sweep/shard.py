@@ -149,11 +149,16 @@ class _Shard:
         look(reversed(own), here)
         self._share()
 
-    def predicted(self, values: Mapping[str, Any], result: PointResult) -> dict[str, float]:
-        """Return the columns that follow from the speed at a point."""
-        impact = self._solver.template(*self._solver.normal_and_speed(values)).impact
+    def predicted(self, values: Mapping[str, Any], q: Array, row: Mapping[str, Any]) -> dict[str, float | None]:
+        """Return the columns that depend on the posture and on the normal or the speed at a point."""
+        chosen = self._solver.normal_and_speed(values)
+        impact = self._solver.template(*chosen).impact
         approach = (1 + impact.restitution) * impact.speed
-        return {"predicted_impulse": approach / result.row["G"], "predicted_jump": approach * result.row["V"] ** 0.5}
+        return {
+            "predicted_impulse": approach / row["G"],
+            "predicted_jump": approach * row["V"] ** 0.5,
+            "attainable_speed": self._solver.attainable(*chosen).reached(q),
+        }
 
     def _at(self, point: int) -> tuple[Walk, Place]:
         values = self._grid.values(point)

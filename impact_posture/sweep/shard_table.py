@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from impact_posture.arrays import Array
 from impact_posture.sweep.grid import Axis
 from impact_posture.sweep.point_search import PointResult
 from impact_posture.sweep.sweep_file import Sweep
 
 STATUS = ("certified", "infeasible", "uncertified", "undefined")
-PREDICTED = ("predicted_impulse", "predicted_jump")
+PREDICTED = ("predicted_impulse", "predicted_jump", "attainable_speed")
 NUMBERS = ("value", *"HGVSE", *PREDICTED, "stationarity", "violation")
 
 
@@ -24,7 +25,7 @@ def write_shard(
     index: int,
     passes: int,
     results: Sequence[PointResult],
-    predicted: Callable[[Mapping[str, Any], PointResult], dict[str, float]],
+    predicted: Callable[[Mapping[str, Any], Array, Mapping[str, Any]], dict[str, float | None]],
 ) -> bytes:
     """Return the file of a shard.
 
@@ -34,7 +35,7 @@ def write_shard(
         index: Index of the shard.
         passes: Number of passes that the shard has had.
         results: The answers to its points.
-        predicted: Returns the predictions for the values of a point and its posture.
+        predicted: Returns the columns that follow from the values of a point, its posture and its other columns.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -52,7 +53,7 @@ def write_shard(
         odd = {name: json.dumps(v) for name, v in values.items() if kinds[name] == text and not isinstance(v, str)}
         rows.append({"point": case * sweep.grid.size + point, **values, **odd, **result.row})
         if result.q is not None:
-            rows[-1] |= predicted(values, result)
+            rows[-1] |= predicted(values, result.q, result.row)
     table = pa.Table.from_pylist(rows, pa.schema(columns, metadata={"sweep": key, "passes": str(passes)}))
     sink = pa.BufferOutputStream()
     parquet.write_table(table, sink, compression="zstd")
