@@ -59,7 +59,9 @@ demo: $(VENV)/.installed
 	@echo
 	@echo "Open demo/report.html in a browser, or: $(BIN)/impact-posture view demo"
 
+# Tests run some hundred commands.  Where Python may not write bytecode, each of them would compile the package again.
 test: $(VENV)/.installed-test
+	$(BIN)/python -m compileall -q impact_posture cli robots
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -q
 
 wheel: $(VENV)/.installed-test

@@ -58,12 +58,21 @@ def _rows(request: Request, programs: dict[str, str]) -> Iterator[list[str]]:
 
 
 def timed(command: list[str]) -> Run:
-    """Run a command in a terminal of its own, in a folder that is removed."""
+    """Run a command in a terminal of its own, in a folder that is removed.
+
+    Bytecode is a cache like the others, so the command may write it.
+    """
     ours, theirs = pty.openpty()
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     with tempfile.TemporaryDirectory() as folder:
         before, began = os.times(), time.perf_counter()
         process = subprocess.Popen(
-            [*command, "--out", f"{folder}/result"], stdin=theirs, stdout=theirs, stderr=theirs, close_fds=True
+            [*command, "--out", f"{folder}/result"],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            close_fds=True,
+            env=environment,
         )
         os.close(theirs)
         text, answer = b"", 0.0
