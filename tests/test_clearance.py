@@ -242,6 +242,21 @@ def test_what_is_impossible_is_named() -> None:
 
 
 @pytest.mark.parametrize(
+    ("pose", "position"), [("full", None), ("full", (3.0, 0.0, 0.0)), ("position", (3.0, 0.0, 0.0))]
+)
+def test_a_turn_that_solves_a_conflict_is_the_hint(pose: str, position: tuple[float, ...] | None) -> None:
+    """The wrist of z1 is in a floor that its hand faces, and nothing helps a hand that is out of reach."""
+    settings = {"robot": "z1", "normal": (0.0, 0.0, 1.0), "contact_pose": pose, "target_position": position}
+    problem = prepare(validate(ProblemSettings, settings, "options")).problem
+    with pytest.raises(Infeasible) as caught:
+        solve(problem, jobs=1)
+    assert ("contact_pose='position'" in caught.value.hint) == (position is None)
+    if position is None:
+        turned = prepare(validate(ProblemSettings, settings | {"contact_pose": "position"}, "options")).problem
+        assert solve(turned, starts=2, jobs=1).certificate.holds()
+
+
+@pytest.mark.parametrize(
     ("name", "normal"), [("z1", (-1.0, 0.0, 0.0)), ("panda", (1.0, 0.0, 0.0)), ("kinova", (0.0, 1.0, 0.0))]
 )
 def test_a_surface_lies_where_the_link_of_the_contact_reaches(name: str, normal: tuple[float, float, float]) -> None:

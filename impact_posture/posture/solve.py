@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -12,16 +12,15 @@ import pinocchio as pin
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.errors import ContactError, Infeasible, SolverFailed
+from impact_posture.errors import SolverFailed
 from impact_posture.posture.caveats import notes_on_impacts
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.elastic import ElasticProgram, elastic
+from impact_posture.posture.initial_posture import initial_objective, initial_posture
 from impact_posture.posture.nlp import one_blas_thread
 from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
 from impact_posture.posture.program_rows import ProgramRows
-from impact_posture.posture.search import Progress, Run, Search, feasible
-from impact_posture.posture.starts import Projector, feasible_start
+from impact_posture.posture.search import Progress, Run, Search
 
 # Optima closer than this in posture (tangent norm) and in objective (relative) are the same optimum.
 SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
@@ -120,8 +119,8 @@ def solve(
         SolverFailed: No run ended at a certified posture.
     """
     rows = ProgramRows(problem)
-    problem, initial = _initial(problem, seed, rows)
-    scale = _initial_objective(problem, initial)
+    problem, initial = initial_posture(problem, seed, rows)
+    scale = initial_objective(problem, initial)
     began = time.perf_counter()
     search = Search(
         problem,
@@ -210,54 +209,6 @@ def _last_word(problem: PostureProblem, runs: list[Run]) -> tuple[list[Run], str
         else:
             good.append(run)
     return good, touching
-
-
-def _initial(problem: PostureProblem, seed: int, rows: ProgramRows) -> tuple[PostureProblem, Array]:
-    """The given posture moved onto the constraints, or the first other start that reaches them.
-
-    Constraints without projection need the elastic program, and its problem has the parts that it needed.
-    """
-    starts = (feasible_start(problem, index, seed) for index in range(5))
-    start = next((q for q in starts if q is not None), None)
-    if start is not None and feasible(problem, start):
-        return problem, start
-    given, problem = problem.given, problem if start is None else replace(problem, given=start)
-    answer = elastic(problem, seed, ElasticProgram(problem, rows))
-    if answer.conflicts:
-        limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
-        sign = "; check the sign of the normal, which points towards the robot"
-        struck = sign if any(" / surface at " in name for name in answer.conflicts) else ""
-        raise Infeasible(
-            answer.conflicts,
-            hint=f"relax one of them, move the target, or start from another `posture`{struck}{limits}",
-        )
-    found = Projector(problem).project(answer.q)
-    if found.violation > 1e-8:
-        raise SolverFailed(
-            f"a posture within {found.violation:.1e} of the constraints was found, but none on them",
-            where="problem",
-            hint="start from a `posture` nearer to the target",
-        )
-    return replace(answer.problem, given=given), found.q
-
-
-def _initial_objective(problem: PostureProblem, initial: Array) -> float:
-    """The objective at the start, which scales the program and so must exist.
-
-    Raises:
-        ContactError: The contact point cannot move along the normal there.
-    """
-    objective = problem.objective
-    # The value is rounding if nothing can move along the normal.
-    value = objective.value(initial) if objective.movable(initial) else 0.0
-    if not (np.isfinite(value) and value > 0):
-        frames = ", ".join(f"'{contact.frame}'" for contact in objective.contacts)
-        raise ContactError(
-            f"the contact point at {frames} cannot move along the normal",
-            where="normal",
-            hint="choose another frame, normal or posture: an impact along it moves nothing",
-        )
-    return value
 
 
 def distinct(problem: PostureProblem, ends: list[tuple[Array, float]]) -> tuple[Optimum, ...]:
