@@ -19,6 +19,7 @@ from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.problem_settings import Prepared, prepare
 from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
+from impact_posture.settings import ProblemSettings
 from impact_posture.toolchain import run_compilers
 from tests.plot.views import PENDULUM
 from tests.settings import make_settings
@@ -56,6 +57,21 @@ def test_the_same_answer_from_machine_code(
         record = nlp.solve(problem.given)
         assert record.converged and record.iterations == interpreted.iterations
         np.testing.assert_allclose(record.q, interpreted.q, atol=1e-9)
+
+
+def test_the_same_answer_from_machine_code_of_a_program_that_grows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The problem of the command line, clear of collisions, whose derivatives are put together by pieces."""
+    need_compiler()
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
+    problem = prepare(ProblemSettings(robot="tilthex_arm", normal=(-1.0, 0.0, 0.0))).problem
+    assert problem.grows
+    interpreted = solve(problem, starts=2, jobs=1, compile="never")
+    assert interpreted.problem is not problem
+    found = solve(problem, starts=2, jobs=1, compile="always")
+    assert found.compiled and found.iterations == interpreted.iterations
+    np.testing.assert_allclose(found.q, interpreted.q, atol=1e-9)
 
 
 def test_a_broken_library_is_not_used(

@@ -42,10 +42,17 @@ class Derivatives:
         )
 
     def options(self, x: ca.SX, p: ca.SX, price: ca.SX, g: ca.SX) -> dict[str, ca.Function]:
-        """Return the options of ``nlpsol`` for ``g`` with these derivatives; ``price`` is the multiplier of f."""
+        """Return the options of ``nlpsol`` for ``g`` with these derivatives; ``price`` is the multiplier of f.
+
+        CasADi looks for them in a library by the names of functions, inputs and outputs.
+        """
+        jacobian, lagrangian = [x, p], [x, p, price, self.multipliers]
+        hessian = [ca.triu(self.hessian)]
         return {
-            "jac_g": ca.Function("nlp_jac_g", [x, p], [g, self.jacobian]),
-            "hess_lag": ca.Function("nlp_hess_l", [x, p, price, self.multipliers], [ca.triu(self.hessian)]),
+            "jac_g": ca.Function("nlp_jac_g", jacobian, [g, self.jacobian], ["x", "p"], ["g", "jac_g_x"]),
+            "hess_lag": ca.Function(
+                "nlp_hess_l", lagrangian, hessian, ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
+            ),
         }
 
 
