@@ -14,7 +14,8 @@ import threadpoolctl
 from impact_posture import libraries
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.posture import compiled
-from impact_posture.posture.nlp import build_nlp, one_blas_thread
+from impact_posture.posture.ipopt import one_blas_thread
+from impact_posture.posture.nlp import build_nlp
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.problem_settings import Prepared, prepare
 from impact_posture.posture.result import result_document

@@ -31,7 +31,7 @@ from impact_posture.sweep.case_solver import CaseSolver
 from impact_posture.sweep.executors import SlurmJobs, dask_cluster, parse_options, process_pool
 from impact_posture.sweep.grid import Axis, Grid
 from impact_posture.sweep.maps import draw_maps
-from impact_posture.sweep.point_search import PointResult
+from impact_posture.sweep.point_search import PointResult, Start
 from impact_posture.sweep.run import SweepRun, run_sweep
 from impact_posture.sweep.shard import solve_shard
 from impact_posture.sweep.shard_table import read_shard
@@ -364,10 +364,10 @@ def test_speeds_that_are_the_same_problem_have_the_same_answer(monkeypatch: pyte
     )
 
     def search(walk: str, place: Any, guesses: Any, beside: float) -> PointResult:
-        return PointResult({"value": values[place]}, np.array([values[place]]))
+        return PointResult({"value": values[place]}, Start(np.array([values[place]])))
 
-    def improve(walk: str, place: Any, known: PointResult, guess: Any) -> PointResult:
-        return PointResult({"value": guess[0]}, guess) if guess[0] < known.row["value"] else known
+    def improve(walk: str, place: Any, known: PointResult, guess: Start) -> PointResult:
+        return PointResult({"value": guess.q[0]}, guess) if guess.q[0] < known.row["value"] else known
 
     monkeypatch.setattr(shard, "search", search)
     monkeypatch.setattr(shard, "improve", improve)

@@ -92,7 +92,7 @@ def simulate(
     from impact_posture.experiment.jobs import Job, execute, worth_compiling
     from impact_posture.experiment.statistics import fate
     from impact_posture.output_folder import check_output
-    from impact_posture.posture.nlp import one_blas_thread
+    from impact_posture.posture.ipopt import one_blas_thread
 
     if export_world is not None:
         _export_world(Page(quiet=quiet or json), given, Path(export_world), force)

@@ -16,7 +16,7 @@ from impact_posture.errors import ImpactPostureError, InputError, MetricError, O
 from impact_posture.experiment.jobs import Job, controller_factory, execute, lost
 from impact_posture.libraries import source_key
 from impact_posture.output_folder import is_ours, write_record, write_whole
-from impact_posture.posture.nlp import one_blas_thread
+from impact_posture.posture.ipopt import one_blas_thread
 from impact_posture.processes import fork_map
 from impact_posture.simulation.controller_factory import CONTROLLERS
 from impact_posture.simulation.scenario_file import scenario_path

@@ -13,7 +13,7 @@ import numpy as np
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.posture.nlp import IPOPT_OPTIONS, run_solver
+from impact_posture.posture.ipopt import IPOPT_OPTIONS, run_solver
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.program_rows import Derivatives, ProgramRows, joined
 from impact_posture.posture.starts import FEASIBLE, Projector, random_posture

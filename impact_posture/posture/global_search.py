@@ -20,7 +20,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, SolverFailed
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.constraint_manifold import ConstraintManifold
-from impact_posture.posture.nlp import one_blas_thread
+from impact_posture.posture.ipopt import one_blas_thread
 from impact_posture.posture.optimality_bound import OptimalityBound, bound_objective
 from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
 from impact_posture.posture.search import Progress

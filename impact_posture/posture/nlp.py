@@ -1,59 +1,51 @@
-"""The nonlinear program, which is built once and solved for many starts, normals and targets.
-
-NumPy, SciPy and CasADi (for MUMPS, within IPOPT) each bring a BLAS that uses all cores.  The systems here have about
-a hundred unknowns, so these threads only wait for each other and block the cores of parallel starts.
-:func:`one_blas_thread` stops that.
-"""
+"""The nonlinear program, which is built once and solved for many starts, normals and targets."""
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import count
 from typing import Any
 
 import casadi as ca
 import numpy as np
-import threadpoolctl
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.posture.compiled import CompileMode, compiled_solver
+from impact_posture.posture.ipopt import CONVERGED, IPOPT_OPTIONS, WARM_OPTIONS, WORST_OPTIONS, run_solver
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.program import Program, parameters
 from impact_posture.posture.program_rows import ProgramRows
 
-IPOPT_OPTIONS: dict[str, Any] = {
-    "ipopt.print_level": 0,
-    "ipopt.sb": "yes",
-    "ipopt.tol": 1e-9,
-    "ipopt.constr_viol_tol": 1e-10,
-    "ipopt.dual_inf_tol": 1e-7,
-    "ipopt.compl_inf_tol": 1e-9,
-    # Bounds are limits of the robot, which the solver must not relax.
-    "ipopt.bound_relax_factor": 0.0,
-    "ipopt.honor_original_bounds": "yes",
-    "ipopt.mu_strategy": "adaptive",
-    # The rows of a program are of like size.  To scale and permute each matrix takes MUMPS longer than it saves.
-    "ipopt.mumps_scaling": 0,
-    "ipopt.mumps_permuting_scaling": 0,
-    "ipopt.max_iter": 300,
-    "print_time": False,
-    "calc_lam_p": False,
-    # Nothing uses sensitivities.
-    "no_nlp_grad": True,
-    "error_on_fail": False,
-}
-# The equations of the dual of a cone are quadratic, and violated equations let the bound ``t`` fall.  A step that
-# violates them strongly to lower the objective never comes back.
-_WORST_OPTIONS = {"ipopt.theta_max_fact": 1.0}
 # Price of a meter of slack in units of the scale.  It has to exceed what a meter of freedom is worth, and 2 did not.
 SLACK_PRICE = 50.0
-CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+# Numbers of the programs of this process.
+_NUMBERS = count()
+
+
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """End of a run, from which a run of the same program with another target goes on.
+
+    Attributes:
+        program: Number of the program.
+        x: All unknowns, shape (n,).
+        lower: Their lower bounds, shape (n,).
+        upper: Their upper bounds, shape (n,).
+        of_bounds: Multipliers of these bounds, shape (n,).
+        of_rows: Multipliers of the rows, shape (m,).
+        scale: Divisor of the objective, to which the multipliers belong.
+    """
+
+    program: int
+    x: Array
+    lower: Array
+    upper: Array
+    of_bounds: Array
+    of_rows: Array
+    scale: float
 
 
 @dataclass(frozen=True)
@@ -67,6 +59,7 @@ class SolveRecord:
         time_s: Wall time of the call.
         auxiliaries: Final auxiliaries of the constraints, shape (k,).
         minimized: Value that the solver minimized, in units of the scale.
+        end: The end, to go on from.
     """
 
     q: Array
@@ -75,6 +68,7 @@ class SolveRecord:
     time_s: float
     auxiliaries: Array
     minimized: float
+    end: WarmStart
 
     @property
     def converged(self) -> bool:
@@ -93,6 +87,7 @@ class PostureNLP:
         build_time_s: Time to build and compile the program.
         compiled: Whether its functions run as machine code.
         compiler_fault: Reason why a compilation failed; empty else.
+        number: Number of the program, the same with another target.
     """
 
     problem: PostureProblem
@@ -101,6 +96,7 @@ class PostureNLP:
     build_time_s: float
     compiled: bool
     compiler_fault: str = ""
+    number: int = field(default_factory=_NUMBERS.__next__)
 
     @property
     def chart(self) -> Chart:
@@ -110,7 +106,7 @@ class PostureNLP:
     def at(self, problem: PostureProblem) -> PostureNLP:
         """Return the program with another target, whose expressions and bounds of rows are the same."""
         found = replace(self, problem=problem)
-        vars(found)["_row_bounds"] = self._row_bounds
+        vars(found).update(_row_bounds=self._row_bounds, _warm_solver=self._warm_solver)
         return found
 
     def grown(self, problem: PostureProblem, *, compile: CompileMode = "auto") -> PostureNLP:
@@ -118,7 +114,13 @@ class PostureNLP:
         return build_nlp(problem, compile=compile, program=self.program)
 
     def solve(
-        self, start: Array, *, scale: float | None = None, attempt: int = 0, price: float = SLACK_PRICE
+        self,
+        start: Array,
+        *,
+        scale: float | None = None,
+        attempt: int = 0,
+        price: float = SLACK_PRICE,
+        warm: WarmStart | None = None,
     ) -> SolveRecord:
         """Solve from ``start``.
 
@@ -127,32 +129,64 @@ class PostureNLP:
             scale: Divisor of the objective; by default its value at ``start``.
             attempt: Index of the guess of the objective.
             price: Price of a meter of slack.
+            warm: End at ``start`` of a run with another target, of which only an end of the same program is used.
         """
-        problem, nx = self.problem, self.chart.nx
-        given = self.chart.to_x(start)
+        scale = scale or self.problem.objective.value(start)
+        if warm is None or warm.program != self.number:
+            return self._run(self.solver, self._cold(start, scale, attempt), price)
+        ratio = warm.scale / scale
+        warm = replace(warm, scale=scale, of_bounds=ratio * warm.of_bounds, of_rows=ratio * warm.of_rows)
+        found = self._run(self._warm_solver, warm, price)
+        if found.converged:
+            return found
+        again = self._run(self.solver, self._cold(start, scale, attempt), price)
+        return replace(again, iterations=found.iterations + again.iterations, time_s=found.time_s + again.time_s)
+
+    def _cold(self, start: Array, scale: float, attempt: int) -> WarmStart:
+        """Return the start of a run without multipliers."""
+        problem, given = self.problem, self.chart.to_x(start)
         x = np.clip(given, problem.lower, problem.upper)
         # The quantities at a posture within its limits are known as a rule.
         q = start if np.array_equal(x, given) else self.chart.to_q(x)
-        scale = scale or problem.objective.value(q)
         guess = problem.objective.guess(q, scale, attempt)
         own = problem.guess(self.program.numeric.at(q))
-        lower = np.concatenate([problem.lower, guess.lower, own.lower])
-        upper = np.concatenate([problem.upper, guess.above, own.above])
-        p = parameters(problem, self.chart, scale, price)
-        x0 = np.concatenate([x, guess.values, own.values])
+        return WarmStart(
+            program=self.number,
+            x=np.concatenate([x, guess.values, own.values]),
+            lower=np.concatenate([problem.lower, guess.lower, own.lower]),
+            upper=np.concatenate([problem.upper, guess.above, own.above]),
+            of_bounds=np.zeros(0),
+            of_rows=np.zeros(0),
+            scale=scale,
+        )
+
+    def _run(self, solver: ca.Function, start: WarmStart, price: float) -> SolveRecord:
+        p = parameters(self.problem, self.chart, start.scale, price)
+        multipliers = {"lam_x0": start.of_bounds, "lam_g0": start.of_rows} if start.of_rows.size else {}
         began = time.perf_counter()
-        answer = run_solver(self.solver, x0=x0, lbx=lower, ubx=upper, p=p, **self._row_bounds)
-        stats = self.solver.stats()
+        answer = run_solver(
+            solver, x0=start.x, lbx=start.lower, ubx=start.upper, p=p, **self._row_bounds, **multipliers
+        )
+        stats = solver.stats()
         elapsed = time.perf_counter() - began
-        found = np.array(answer["x"].nonzeros())
+        x, of_bounds, of_rows = (np.array(answer[key].nonzeros()) for key in ("x", "lam_x", "lam_g"))
         return SolveRecord(
-            q=self.chart.to_q(found[:nx]),
+            q=self.chart.to_q(x[: self.chart.nx]),
             status=str(stats["return_status"]),
             iterations=int(stats["iter_count"]),
             time_s=elapsed,
-            auxiliaries=found[nx + guess.values.size :],
+            auxiliaries=x[x.size - sum(c.unknowns for c in self.problem.constraints) :],
             minimized=float(answer["f"]),
+            end=replace(start, x=x, of_bounds=of_bounds, of_rows=of_rows),
         )
+
+    @cached_property
+    def _warm_solver(self) -> ca.Function:
+        """The solver that goes on from unknowns and multipliers."""
+        names = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l"}
+        known = {option: self.solver.get_function(name) for option, name in names.items()}
+        options = _options(self.problem) | WARM_OPTIONS | known
+        return ca.nlpsol("warm", "ipopt", self.solver.oracle(), options)
 
     @cached_property
     def _row_bounds(self) -> dict[str, Array]:
@@ -163,61 +197,6 @@ class PostureNLP:
         below = lifted.copy()
         below[lifted.size - self.program.bounded :] = -np.inf
         return {"lbg": np.concatenate([lower, below]), "ubg": np.concatenate([upper, lifted])}
-
-
-class _CasadiOpenBLAS(threadpoolctl.OpenBLASController):  # type: ignore[misc]
-    """The OpenBLAS of the CasADi wheels, under its name there."""
-
-    internal_api = "casadi_openblas"
-    filename_prefixes = ("libcasadi-tp-openblas",)
-
-
-threadpoolctl.register(_CasadiOpenBLAS)
-
-
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Limit every BLAS of this process, and of processes forked within, to one thread."""
-    with _libraries().limit(limits=1):
-        yield
-
-
-@cache
-def _libraries() -> threadpoolctl.ThreadpoolController:
-    ca.has_nlpsol("ipopt")  # This loads IPOPT and its BLAS, because the controller finds loaded libraries only.
-    return threadpoolctl.ThreadpoolController()
-
-
-def run_solver(solver: ca.Function, **arguments: Array) -> dict[str, ca.DM]:
-    """Call an ``nlpsol``, and raise the Ctrl-C that IPOPT may catch."""
-    with _noticing_interrupts():
-        answer: dict[str, ca.DM] = solver(**arguments)
-    return answer
-
-
-@contextmanager
-def _noticing_interrupts() -> Iterator[None]:
-    """Raise a Ctrl-C after the solver, because the solver may take it for a failed evaluation and go on."""
-    in_charge = (
-        threading.current_thread() is threading.main_thread()
-        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    )
-    if not in_charge:
-        yield
-        return
-    seen: list[int] = []
-
-    def note(number: int, frame: object) -> None:
-        seen.append(number)
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if seen:
-        raise KeyboardInterrupt
 
 
 def build_nlp(
@@ -243,8 +222,11 @@ def build_nlp(
     began = time.perf_counter()
     program = program or Program(problem, rows)
     symbols, derivatives = program.symbols(problem)
-    options = IPOPT_OPTIONS | (_WORST_OPTIONS if problem.objective.attempts > 1 else {})
     # A program that grows is soon another one, so it is not worth compiling.
-    built = compiled_solver(problem, symbols, options, compile, 1 if problem.grows else starts, derivatives)
+    built = compiled_solver(problem, symbols, _options(problem), compile, 1 if problem.grows else starts, derivatives)
     took = time.perf_counter() - began
     return PostureNLP(problem, program, built.solver, took, built.compiled, built.fault)
+
+
+def _options(problem: PostureProblem) -> dict[str, Any]:
+    return IPOPT_OPTIONS | (WORST_OPTIONS if problem.objective.attempts > 1 else {})

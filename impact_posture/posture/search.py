@@ -14,7 +14,8 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import MetricError
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, SolveRecord, build_nlp, one_blas_thread
+from impact_posture.posture.ipopt import one_blas_thread
+from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, SolveRecord, build_nlp
 from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.program_rows import ProgramRows

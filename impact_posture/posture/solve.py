@@ -17,7 +17,7 @@ from impact_posture.posture.caveats import notes_on_impacts
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.initial_posture import initial_objective, initial_posture
-from impact_posture.posture.nlp import one_blas_thread
+from impact_posture.posture.ipopt import one_blas_thread
 from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
 from impact_posture.posture.program_rows import ProgramRows
 from impact_posture.posture.search import Progress, Run, Search

@@ -13,7 +13,7 @@ from impact_posture.errors import ImpactPostureError, Infeasible, SolverFailed
 from impact_posture.posture.build_problem import retarget
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.elastic import ElasticAnswer, ElasticProgram, elastic
-from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP
+from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, WarmStart
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.search import HIGH_PRICE
 from impact_posture.posture.solve import distinct, solve
@@ -31,18 +31,30 @@ _BETTER = 1e-4
 Place = tuple[Any, Any]
 
 
+class Start(NamedTuple):
+    """A posture to start from, shape (nq,), with the end of the run that led to it if that is known."""
+
+    q: Array
+    end: WarmStart | None = None
+
+
 class PointResult(NamedTuple):
     """The answer to one problem.
 
     Attributes:
         row: Its columns in the table.
-        q: Its posture, shape (nq,), if there is one.
+        start: Its posture, if there is one, as a start for other points.
         violation: Least violation that could be found, at the prices of the constraints, if it is infeasible.
     """
 
     row: dict[str, Any]
-    q: Array | None = None
+    start: Start | None = None
     violation: float = 0.0
+
+    @property
+    def q(self) -> Array | None:
+        """Its posture, shape (nq,), if there is one."""
+        return self.start and self.start.q
 
 
 @dataclass
@@ -91,7 +103,7 @@ class Walk:
         return found
 
 
-def search(walk: Walk, place: Place, guesses: Sequence[Array], beside: float = 0.0) -> PointResult:
+def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0.0) -> PointResult:
     """Solve one point: from the guesses and the given posture, and from many starts where they disagree.
 
     Args:
@@ -105,20 +117,20 @@ def search(walk: Walk, place: Place, guesses: Sequence[Array], beside: float = 0
         if not beside and (found := attempt.certified(guesses, rounds=_UNSURE)) is not None:
             return found
         # Either this finds the constraints that conflict, or a posture to start from.
-        relaxed = walk.relax(place, guesses, beside)
+        relaxed = walk.relax(place, [guess.q for guess in guesses], beside)
         if relaxed.conflicts:
             return attempt.without("infeasible", Infeasible(relaxed.conflicts).what, relaxed.violation)
-        found = attempt.certified([relaxed.q]) or attempt.searched(relaxed.q)
+        found = attempt.certified([Start(relaxed.q)]) or attempt.searched(relaxed.q)
         return found or attempt.without("uncertified", attempt.fault)
     except ImpactPostureError as error:
         return attempt.without("undefined", error.line)
 
 
-def improve(walk: Walk, place: Place, known: PointResult, guess: Array) -> PointResult:
+def improve(walk: Walk, place: Place, known: PointResult, guess: Start) -> PointResult:
     """Return the better of a known answer and of the optimum that the posture of a later neighbor leads to."""
     # The base of a robot that floats follows the target, which is no other optimum.
     own = slice(3 if walk.problem.robot.floating else 0, None)
-    if known.q is not None and np.abs(known.q - guess)[own].max() < SWITCH:
+    if known.q is not None and np.abs(known.q - guess.q)[own].max() < SWITCH:
         return known
     attempt = _Attempt(walk, place, 0)
     try:
@@ -128,7 +140,7 @@ def improve(walk: Walk, place: Place, known: PointResult, guess: Array) -> Point
     if found is None or (known.q is not None and found.row["value"] > (1 - _BETTER) * known.row["value"]):
         return known
     counts = {key: known.row[key] + found.row[key] for key in ("optima", "runs")}
-    return PointResult({**found.row, **counts}, found.q)
+    return PointResult({**found.row, **counts}, found.start)
 
 
 class _Attempt:
@@ -150,7 +162,7 @@ class _Attempt:
         self._walk, self._others = walk, others
 
     def certified(
-        self, guesses: Sequence[Array], *, alone: bool = False, rounds: int = _ROUNDS
+        self, guesses: Sequence[Start], *, alone: bool = False, rounds: int = _ROUNDS
     ) -> PointResult | None:
         """Return the best certified posture, with parts added to the program as its ends need them.
 
@@ -163,21 +175,21 @@ class _Attempt:
         for _ in range(rounds):
             problem = self.problem
             nlp = self._walk.nlp.at(problem)
-            scale = problem.objective.value(guesses[0] if len(guesses) else problem.given)
-            home = [] if alone else [problem.given]
-            ends = [self._run(nlp, start, scale, price) for start in [*guesses, *home]]
+            home = Start(problem.given)
+            scale = problem.objective.value((guesses[0] if guesses else home).q)
+            ends = [self._run(nlp, start, scale, price) for start in (guesses if alone else [*guesses, home])]
             if not alone and not _agree(problem, ends[:-1], ends[-1]):
                 ends += [self._run(nlp, start, scale, price) for start in self._random_starts()]
             found = _optima(problem, ends)
             for end in found:
                 certificate = certify(problem, end.q, scale, end.auxiliaries, nlp.program.numeric)
                 if certificate.holds() and self._is_clear(end.q):
-                    return self._answer(end.q, certificate, len(found))
+                    return self._answer(Start(end.q, end.end), certificate, len(found))
                 self.fault = f"stationarity {certificate.stationarity:.1e}, violation {certificate.primal:.1e}"
             if not found:
                 return None
-            guesses = [end.q for end in found]
-            self.problem = problem.grown(guesses, nlp.program.numeric)
+            guesses = [Start(end.q) for end in found]
+            self.problem = problem.grown([end.q for end in found], nlp.program.numeric)
             if self.problem is not problem:
                 self._walk.grow(self.problem)
             elif price == SLACK_PRICE:
@@ -198,9 +210,9 @@ class _Attempt:
             self.fault = error.what
             return None
         self.runs += found.feasible_starts
-        return self._answer(found.q, found.certificate, len(found.optima))
+        return self._answer(Start(found.q), found.certificate, len(found.optima))
 
-    def _random_starts(self) -> Iterator[Array]:
+    def _random_starts(self) -> Iterator[Start]:
         """Yield random postures that one projection takes to the constraints."""
         projector = Projector(self.problem)
         for k in range(1, self._others + 1):
@@ -208,20 +220,21 @@ class _Attempt:
             near = self.problem.given if k % 2 else None
             found = projector.project(random_posture(self.problem, projector.chart, rng, near))
             if found.violation <= FEASIBLE:
-                yield found.q
+                yield Start(found.q)
 
-    def _run(self, nlp: PostureNLP, start: Array, scale: float, price: float) -> _End:
-        record = nlp.solve(start, scale=scale, price=price)
+    def _run(self, nlp: PostureNLP, start: Start, scale: float, price: float) -> _End:
+        record = nlp.solve(start.q, scale=scale, price=price, warm=start.end)
         self.runs += 1
         self._walk.timer.solver_s += record.time_s
         value = scale * record.minimized if record.converged else np.inf
-        return _End(record.q, value, record.auxiliaries)
+        return _End(record.q, value, record.auxiliaries, record.end)
 
     def _is_clear(self, q: Array) -> bool:
         around = self.problem.surroundings
         return self.problem.objective.movable(q) and not (around and around.collisions(q))
 
-    def _answer(self, q: Array, certificate: Certificate, optima: int) -> PointResult:
+    def _answer(self, start: Start, certificate: Certificate, optima: int) -> PointResult:
+        q = start.q
         found = self.problem.impact.oracle.quantities(q)
         row = {
             "status": "certified",
@@ -233,7 +246,7 @@ class _Attempt:
             "optima": optima,
             "runs": self.runs,
         }
-        return PointResult(row, q)
+        return PointResult(row, start)
 
     def without(self, status: str, reason: str, violation: float = 0.0) -> PointResult:
         """Return the answer that there is no posture."""
@@ -247,6 +260,7 @@ class _End(NamedTuple):
     q: Array
     value: float
     auxiliaries: Array
+    end: WarmStart
 
 
 def _optima(problem: PostureProblem, ends: Sequence[_End]) -> list[_End]:

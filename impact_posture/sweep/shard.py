@@ -10,10 +10,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from impact_posture.arrays import Array
-from impact_posture.posture.nlp import one_blas_thread
+from impact_posture.posture.ipopt import one_blas_thread
 from impact_posture.sweep.case_solver import CaseSolver, kept
-from impact_posture.sweep.point_search import Place, PointResult, Walk, improve, search
+from impact_posture.sweep.point_search import Place, PointResult, Start, Walk, improve, search
 from impact_posture.sweep.shard_table import STATUS, read_shard, write_shard
 from impact_posture.sweep.sweep_file import Sweep
 
@@ -119,33 +121,38 @@ class _Shard:
                 self.results.append(self.results[-1])
                 continue
             before = [self.results[k - first] for k in grid.neighbors(point, first)]
-            guesses = [one.q for one in before if one.q is not None]
+            guesses = [one.start for one in before if one.start is not None]
             beside = 0.0 if guesses else min((one.violation for one in before if one.violation), default=0.0)
             self.results.append(search(*self._at(point), guesses, beside))
         # An optimum that appears on the way may have been the better one already before.
         for point in reversed(self._points):
-            posture = self.results[point - first].q
-            if posture is not None:
+            start = self.results[point - first].start
+            if start is not None:
                 for other in grid.neighbors(point, first):
-                    self._improve(other, posture)
+                    self._improve(other, start)
         self._share()
 
     def revise(self, beside: Mapping[int, list[float]]) -> None:
         """Improve the points at the border by postures of other shards, and the others by points that improved."""
         improved = set[int]()
 
-        def look(points: Iterable[int], postures: Callable[[int], Any]) -> None:
+        def look(points: Iterable[int], starts: Callable[[int], Start | None]) -> None:
             for point in points:
                 for other in self._grid.around(point):
-                    posture = postures(other)
-                    if posture is not None and self._improve(point, posture):
+                    start = starts(other)
+                    if start is not None and self._improve(point, start):
                         improved.add(point)
 
-        def here(other: int) -> Array | None:
-            return self.results[other - self._points.start].q if other in improved else None
+        def here(other: int) -> Start | None:
+            return self.results[other - self._points.start].start if other in improved else None
+
+        def anywhere(other: int) -> Start | None:
+            if other in self._points:
+                return here(other)
+            return Start(np.array(beside[other])) if other in beside else None
 
         own = [point for point, own in self._own_problems() if own]
-        look(own, lambda other: here(other) if other in self._points else beside.get(other))
+        look(own, anywhere)
         look(reversed(own), here)
         self._share()
 
@@ -177,11 +184,11 @@ class _Shard:
             yield point, last is None or last[0] is not walk or last[1] != place
             last = walk, place
 
-    def _improve(self, point: int, posture: Any) -> bool:
+    def _improve(self, point: int, start: Start) -> bool:
         """Improve a point from the posture of a neighbor; say whether that did."""
         index = point - self._points.start
         known = self.results[index]
-        self.results[index] = improve(*self._at(point), known, posture)
+        self.results[index] = improve(*self._at(point), known, start)
         return self.results[index] is not known
 
     def _share(self) -> None:

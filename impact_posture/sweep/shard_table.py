@@ -11,7 +11,7 @@ import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.sweep.grid import Axis
-from impact_posture.sweep.point_search import PointResult
+from impact_posture.sweep.point_search import PointResult, Start
 from impact_posture.sweep.sweep_file import Sweep
 
 STATUS = ("certified", "infeasible", "uncertified", "undefined")
@@ -69,7 +69,7 @@ def read_shard(content: bytes) -> list[PointResult]:
     found = []
     for row in parquet.read_table(pa.BufferReader(content), columns=columns).to_pylist():
         known = {name: value for name, value in row.items() if value is not None}
-        found.append(PointResult(known, np.array(known["q"]) if "q" in known else None))
+        found.append(PointResult(known, Start(np.array(known["q"])) if "q" in known else None))
     return found
 
 

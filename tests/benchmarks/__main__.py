@@ -13,7 +13,7 @@ import argparse
 import sys
 
 from impact_posture.errors import ImpactPostureError
-from impact_posture.posture.nlp import one_blas_thread
+from impact_posture.posture.ipopt import one_blas_thread
 from tests.benchmarks.core import STUDIES, Request, Study, page_of
 
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.kernel import ImpactKernel
-from impact_posture.posture.nlp import IPOPT_OPTIONS, PostureNLP, build_nlp
+from impact_posture.posture.ipopt import IPOPT_OPTIONS
+from impact_posture.posture.nlp import PostureNLP, build_nlp
 from impact_posture.posture.search import run_start
 from tests.benchmarks.cases import CASES
 from tests.benchmarks.core import Request, Vector, feasible_starts, machine, table

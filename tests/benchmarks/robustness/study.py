@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from impact_posture.dynamics.mjcf import import_mujoco
-from impact_posture.posture.nlp import one_blas_thread
+from impact_posture.posture.ipopt import one_blas_thread
 from impact_posture.processes import fork_map
 from tests.benchmarks.core import ROOT, Request, machine, say
 from tests.benchmarks.robustness import envelope, page
