@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike
 
 from impact_posture.errors import InputError, not_one_of
 from impact_posture.impact import objective as core
-from impact_posture.impact.contact import ImpactContact
+from impact_posture.impact.contact import ImpactContact, check_compliance
 from impact_posture.impact.contact_compression import ContactStiffness
 from impact_posture.impact.evaluation import Evaluation, evaluate
-from impact_posture.impact.metric import Metric, build_metric
+from impact_posture.impact.metric import Metric, build_metric, check_weights
 from impact_posture.impact.resolved_impact import ResolvedImpact, missing_support
 from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
 from impact_posture.posture.build_problem import build_problem
@@ -101,6 +101,9 @@ class ImpactObjective(core.ImpactObjective):
         if not isinstance(metric, Metric):
             values = weights if weights is None or isinstance(weights, str) else tuple(weights)
             metric = build_metric(robot, metric, values)
+        check_weights(robot, metric.weights)
+        if compliance:
+            check_compliance(robot, compliance)
         loads = [Payload(*payload) for payload in payloads]
         variants = tuple(model_variants) or build_model_variants(robot, armature_range, loads)
         super().__init__(

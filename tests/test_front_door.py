@@ -225,6 +225,43 @@ def test_what_the_objective_holds_is_said_there(arguments: dict[str, Any], task:
         ip.PostureProblem(ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1)), **arguments), **task)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        # An unknown metric was taken as euclidean, without a word.
+        ({"metric": "Kinetic"}, "'Kinetic' is none of euclidean.*did you mean kinetic"),
+        ({"metric": None}, "None.*is none of"),
+        ({"metric": "foo", "weights": (1.0,) * 9}, "'foo' is none of"),
+        ({"compliance": -1.0}, "compliance is -1"),
+        ({"compliance": float("nan")}, "compliance is nan"),
+        ({"metric": ip.Metric("weighted", (1.0, 2.0))}, "weights: has 2 entries; give 9"),
+    ],
+)
+def test_arguments_of_an_objective_that_do_not_fit(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        arm(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("foo",), "'foo' is none of"),
+        (("weighted",), "needs weights"),
+        (("kinetic", (1.0,) * 9), "takes no weights"),
+        (("weighted", (1.0, -1.0)), "a weight is -1"),
+        (("weighted", (1.0, float("nan"))), "a weight is nan"),
+    ],
+)
+def test_a_metric_that_is_none(arguments: tuple[Any, ...], words: str) -> None:
+    with pytest.raises(MetricError, match=words):
+        ip.Metric(*arguments)
+
+
+def test_a_normal_frame_that_is_none() -> None:
+    with pytest.raises(ContactError, match="'body' is none of world, contact"):
+        ip.ImpactContact("ee", (0, 0, 1), normal_frame="body")  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("friction", ["0.3", None, -1.0, float("nan")])
 def test_a_friction_that_is_none(friction: Any) -> None:
     with pytest.raises(ip.ImpactPostureError, match="friction"):

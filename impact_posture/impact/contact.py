@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.errors import ContactError
+from impact_posture.errors import ContactError, InputError, not_one_of
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import Support as Support
 from impact_posture.settings import FRICTION, NormalFrame, Vector3
@@ -38,7 +39,8 @@ class ImpactContact:
         friction: Coulomb coefficient μ.
 
     Raises:
-        ContactError: The normal is zero, a number is not finite, or the friction is negative.
+        ContactError: The normal is zero, a number is not finite, the friction is negative, or there is no such
+            ``normal_frame``.
     """
 
     frame: str
@@ -49,6 +51,9 @@ class ImpactContact:
     friction: float = FRICTION
 
     def __post_init__(self) -> None:
+        if self.normal_frame not in get_args(NormalFrame):
+            what, hint = not_one_of(self.normal_frame, get_args(NormalFrame))
+            raise ContactError(what, where="normal_frame", hint=hint)
         n = np.array(self.normal, dtype=float)
         if n.shape != (3,) or not np.isfinite(n).all() or np.abs(n).max() < _DUST:
             raise ContactError(
@@ -119,6 +124,21 @@ def least_compliance(robot: Robot) -> float:
     digits as ``ε`` has zeros; about eight digits are left at this limit.
     """
     return _LEAST_COMPLIANCE / robot.mass
+
+
+def check_compliance(robot: Robot, compliance: float) -> None:
+    """Refuse a support compliance ε, 1/kg, that is below :func:`least_compliance` or not finite.
+
+    Raises:
+        InputError: The compliance is too small, negative or not finite.
+    """
+    least = least_compliance(robot)
+    if not (np.isfinite(compliance) and compliance >= least):
+        raise InputError(
+            f"the compliance is {compliance:g} 1/kg",
+            where="support_compliance",
+            hint=f"give at least {least:.3g}, 1e-6 over the mass, because rounding outweighs stiffer feet below it",
+        )
 
 
 def heavy_feet_rounding(robot: Robot, compliance: float) -> float:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
-from impact_posture.errors import MetricError
+from impact_posture.errors import MetricError, not_one_of
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import MetricKind
@@ -22,11 +24,27 @@ class Metric:
         kind: ``euclidean`` (W = I), ``kinetic`` (W = M) or ``weighted`` (diagonal).
         weights: Diagonal of the weighted metric, shape (nv,); else ``None``.
         source: Origin of the weights.
+
+    Raises:
+        MetricError: There is no such kind, or the weights do not belong to it or are not all above zero.
     """
 
     kind: MetricKind = "euclidean"
     weights: tuple[float, ...] | None = None
     source: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(MetricKind):
+            what, hint = not_one_of(self.kind, get_args(MetricKind))
+            raise MetricError(what, where="metric", hint=hint)
+        if (self.kind == "weighted") != (self.weights is not None):
+            what = "needs weights" if self.weights is None else "takes no weights"
+            raise MetricError(f"the {self.kind} metric {what}", where="metric", hint="see build_metric")
+        for value in self.weights or ():
+            if not (np.isfinite(value) and value > 0):
+                raise MetricError(
+                    f"a weight is {value:g}", where=self.source or "weights", hint="every weight must be above zero"
+                )
 
     def diagonal(self, nv: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
         """Return the diagonal of ``W`` of a constant metric, shape (nv,)."""
@@ -46,7 +64,7 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
         MetricError: Weights are missing, zero or negative.
     """
     if kind != "weighted":
-        if weights is not None:
+        if weights is not None and kind in get_args(MetricKind):
             raise MetricError(
                 f"are given, but the metric is {kind}", where="weights", hint="remove them or add `metric='weighted'`"
             )
@@ -59,10 +77,8 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
         )
     source = weights if isinstance(weights, str) else "numbers"
     if not isinstance(weights, str):
+        check_weights(robot, weights)
         values = np.array(weights, dtype=float)
-        if values.shape != (robot.nv,):
-            hint = f"give {robot.nv} numbers above zero"
-            raise MetricError(f"has {values.size} entries", where="weights", hint=hint)
     elif weights == "velocity-limits":
         values = _from_limits(robot)
     else:
@@ -73,6 +89,17 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
                 f"the weight of '{name}' is {value:g}", where=source, hint="every weight must be above zero"
             )
     return Metric("weighted", tuple(float(v) for v in values), source)
+
+
+def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
+    """Refuse weights that are not one number for each of the nv velocities.
+
+    Raises:
+        MetricError: The number of weights differs from nv.
+    """
+    if weights is not None and np.shape(weights) != (robot.nv,):
+        hint = f"give {robot.nv} numbers above zero"
+        raise MetricError(f"has {np.size(weights)} entries", where="weights", hint=hint)
 
 
 def _from_limits(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
