@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,8 @@ CONTACT, METRIC, ROBOT, TASK, OUTPUT = "Contact", "Measure", "Robot", "Task", "O
 _LARGEST = float("inf")
 # Degrees below which the cosine of a tilt says nothing at the precision that certifies.
 _LEAST_TILT = 0.1
+# Largest distance of the norm of a given quaternion from 1.
+_UNIT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,14 @@ def _direction(value: tuple[float, ...]) -> bool:
     return _finite(value) and max(abs(v) for v in value) >= 1e-9
 
 
+def _unit(value: tuple[float, ...]) -> bool:
+    """Tell whether a quaternion has unit length."""
+    norm = math.hypot(*value)
+    if not abs(norm - 1) < _UNIT:
+        raise ValueError(f"has norm {norm:.4g}; give a unit quaternion x y z w")
+    return True
+
+
 def _positive(value: Any) -> bool:
     return _finite(value) and min(value if isinstance(value, tuple) else (value,)) > 0
 
@@ -89,6 +100,7 @@ ONE_OR_MORE = {"holds": _positive, "demand": "give 1 or more"}
 ZERO_OR_MORE = {"holds": lambda value: 0 <= value < _LARGEST, "demand": "give a number, zero or more"}
 SHARE = {"holds": lambda value: 0 <= value <= 1, "demand": "give a number from 0 to 1"}
 HALF_ANGLE = {"holds": lambda value: 0 <= value < 90, "demand": "give degrees from 0 to below 90"}
+UNIT = {"holds": _unit}
 DIRECTION = {"holds": _direction, "demand": "give three finite numbers, not all zero"}
 CONTACTS = {"holds": _contacts}
 FACTORS = {

@@ -279,7 +279,7 @@ class ProblemSettings(ImpactSettings):
     ] = None
     target_quaternion: Annotated[
         tuple[float, float, float, float] | None,
-        Setting("Contact frame's orientation, scalar last.", TASK, "X Y Z W", "as it is", **demand.NUMBERS),
+        Setting("Contact frame's orientation, scalar last.", TASK, "X Y Z W", "as it is", **demand.UNIT),
     ] = None
     contact_pose: Annotated[
         str | None,

@@ -204,6 +204,8 @@ USAGE = [
     ((*PUSH, "--impulse", "0"), "--impulse"),
     ((*PUSH, "--offset", "0", "inf", "0"), "--offset"),
     ((*PUSH, "--metric", "manhattan"), "euclidean"),
+    (("optimize", *PUSH[1:], "--target-quaternion", "0", "0", "0", "0"), "norm 0"),
+    (("optimize", *PUSH[1:], "--target-quaternion", "0", "nan", "0", "1"), "norm nan"),
     (("evalute",), "evalute"),
 ]
 
