@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -221,6 +222,17 @@ def test_degenerate_combinations_are_named() -> None:
     assert "opposite" in said["speed"][0]
     assert "effective mass" in said["impulse"][0]
     assert ImpactObjective(found, contact, Metric(), "speed").warnings == ()
+
+
+def test_degenerate_combinations_are_named_with_supports() -> None:
+    found = robot("solo8")
+    contact, feet = ImpactContact("base_link", (1.0, 0.0, 0.2)), resolve_supports(found, None)
+    impulse = ImpactObjective(found, contact, Metric("kinetic"), "impulse", feet)
+    at = impulse.oracle.quantities(found.posture())
+    assert abs(at.H - at.G) / at.G < 1e-4
+    speed = replace(impulse, kind="speed")
+    assert "effective mass" in impulse.warnings[0] and "opposite" in speed.warnings[0]
+    assert replace(impulse, kind="sticking").warnings == ()
 
 
 def test_velocity_limit_weights_are_inverse_squares() -> None:

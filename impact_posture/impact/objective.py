@@ -152,11 +152,15 @@ class ImpactObjective:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Messages about degenerate combinations."""
-        if self.metric.kind == "kinetic" and self.kind == "speed" and not self.supports:
-            return ("with the kinetic metric 'speed' is 1/G, the exact opposite of 'impulse' (G) and twice 'energy'",)
-        if self.metric.kind == "kinetic" and self.kind == "impulse" and not self.supports:
-            return ("with the kinetic metric 'impulse' is G = 1/m_eff: it only maximizes the effective mass",)
-        return ()
+        if self.metric.kind != "kinetic":
+            return ()
+        # With supports aᵀMa = G − ε‖f‖², with the impulse f of the feet.
+        rest = ", up to the compliance of the feet" if self.supports else ""
+        said = {
+            "speed": f"is 1/G{rest}: the exact opposite of 'impulse' (G) and twice 'energy'",
+            "impulse": f"is G = 1/m_eff{rest}: it only maximizes the effective mass",
+        }
+        return (f"with the kinetic metric '{self.kind}' {said[self.kind]}",) if self.kind in said else ()
 
     @property
     def contacts(self) -> tuple[ImpactContact, ...]:
