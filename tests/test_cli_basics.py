@@ -210,6 +210,11 @@ USAGE = [
 ]
 
 
+def test_codegen_of_a_folder_without_a_result_says_so(tmp_path: Path) -> None:
+    done = start("codegen", str(tmp_path), "--json")
+    assert done.returncode == 1 and json.loads(done.stdout)["error"]["what"] == "holds no result.json"
+
+
 @pytest.mark.parametrize(("arguments", "words"), USAGE, ids=[" ".join(a) for a, _ in USAGE])
 def test_a_wrong_command_line_is_exit_2(arguments: tuple[str, ...], words: str) -> None:
     done = start(*arguments, "--json")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,7 +50,7 @@ def codegen(
     if flow or scenario is not None or daqp is not None:
         raise UsageError("--flow, --scenario and --daqp belong to --controller: give aerial, legged or arm.")
     if not from_result:
-        given.check_contact()
+        _check_problem(given, robot)
     from impact_posture.codegen.export import write_export
 
     posture = squeezed = None
@@ -99,3 +100,14 @@ def codegen(
         ]
     )
     page.line(written.verdict)
+
+
+def _check_problem(given: Given, robot: str) -> None:
+    """Check that there is a contact. Without one, a folder or a path to one is meant as a result folder."""
+    if not {"contact", "normal"} & given.values.keys() and (Path(robot).is_dir() or robot.endswith(os.sep)):
+        from impact_posture.result_view import load_view
+        from impact_posture.robot.robot_loader import known_robots
+
+        if robot not in known_robots():
+            load_view(Path(robot))
+    given.check_contact()
