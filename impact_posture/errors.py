@@ -109,6 +109,15 @@ class JointNotFound(NameNotFound):
     kind = "joint"
 
 
+class JointLocked(JointNotFound):
+    """The joint is rigid, so that it has no entry in ``q``."""
+
+    def __init__(self, name: str, *, where: str = "") -> None:
+        self.name, self.nearest = name, []
+        named = printable(name, longest=_LONGEST_NAME)
+        InputError.__init__(self, f"joint '{named}' is locked", where=where, hint="leave it out, or do not `lock` it")
+
+
 class PostureNotFound(NameNotFound):
     """The robot has no posture of this name, and no file has it either."""
 

@@ -11,6 +11,7 @@ import pytest
 from impact_posture.errors import (
     FrameNotFound,
     InputError,
+    JointLocked,
     JointNotFound,
     NameNotFound,
     PackageNotFound,
@@ -215,6 +216,12 @@ def test_wrong_names_inside_a_robot() -> None:
         found.frame_id("universe")
     with pytest.raises(JointNotFound):
         robot("solo8").joint_id("root_joint")
+
+
+def test_a_locked_joint_is_said_to_be_locked() -> None:
+    found = load_robot("panda", LoadOptions(lock=("panda_joint1",)))
+    with pytest.raises(JointLocked, match="joint 'panda_joint1' is locked"):
+        found.joint_id("panda_joint1")
 
 
 def test_wrong_paths_get_the_nearest(arm: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from impact_posture.errors import (
     ImpactPostureError,
+    JointLocked,
     JointNotFound,
     NotWithinLimits,
     PostureError,
@@ -111,6 +112,13 @@ def test_a_message_may_name_locked_joints(tmp_path: Path) -> None:
     q = read_posture(loaded, save(tmp_path / "s.yaml", text))
     assert q.shape == (9,)
     assert q[8] == 0.3
+
+
+def test_a_posture_in_order_may_not_name_locked_joints(tmp_path: Path) -> None:
+    (tmp_path / "q.json").write_text(json.dumps(write_posture(load_robot("ur5"), load_robot("ur5").posture())))
+    locked = load_robot("ur5", LoadOptions(lock=("elbow_joint",)))
+    with pytest.raises(JointLocked, match="joint 'elbow_joint' is locked"):
+        read_posture(locked, str(tmp_path / "q.json"))
 
 
 HOME = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]

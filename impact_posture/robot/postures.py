@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.errors import JointNotFound, PostureError, PostureNotFound, nearest
+from impact_posture.errors import JointLocked, JointNotFound, PostureError, PostureNotFound, nearest
 from impact_posture.robot.model_joints import q_slice, scalar_entries
 from impact_posture.robot.robot import Robot
 
@@ -121,6 +121,8 @@ def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Array:
     if "joint_names" in data:
         names = _names(data["joint_names"], "joint_names", where)
         for name in names:
+            if name in robot.locked:
+                raise JointLocked(name, where=where)
             if name not in robot.joint_names:
                 raise JointNotFound(name, robot.joint_names, where=where)
         if tuple(names) != robot.joint_names:

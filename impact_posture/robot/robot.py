@@ -12,7 +12,14 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.errors import FrameNotFound, JointNotFound, NotWithinLimits, PostureError, PostureNotFound
+from impact_posture.errors import (
+    FrameNotFound,
+    JointLocked,
+    JointNotFound,
+    NotWithinLimits,
+    PostureError,
+    PostureNotFound,
+)
 from impact_posture.robot.model_joints import joint_range, q_slice
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.settings import ContactPose, JointModel, RobotSettings, Root
@@ -180,7 +187,10 @@ class Robot:
 
         Raises:
             JointNotFound: There is no such joint; carries the nearest names.
+            JointLocked: The joint is rigid.
         """
+        if name in self.locked:
+            raise JointLocked(name, where=self.name)
         if name not in self.joint_names:
             raise JointNotFound(name, self.joint_names, where=self.name)
         return int(self.model.getJointId(name))
