@@ -72,7 +72,7 @@ def _unit(value: tuple[float, ...]) -> bool:
     """Tell whether a quaternion has unit length."""
     norm = math.hypot(*value)
     if not abs(norm - 1) < _UNIT:
-        raise ValueError(f"has norm {norm:.4g}; give a unit quaternion x y z w")
+        raise ValueError(f"has norm {norm:.4g}; {UNIT['demand']}")
     return True
 
 
@@ -100,7 +100,7 @@ ONE_OR_MORE = {"holds": _positive, "demand": "give 1 or more"}
 ZERO_OR_MORE = {"holds": lambda value: 0 <= value < _LARGEST, "demand": "give a number, zero or more"}
 SHARE = {"holds": lambda value: 0 <= value <= 1, "demand": "give a number from 0 to 1"}
 HALF_ANGLE = {"holds": lambda value: 0 <= value < 90, "demand": "give degrees from 0 to below 90"}
-UNIT = {"holds": _unit}
+UNIT = {"holds": _unit, "demand": "give a unit quaternion x y z w"}
 DIRECTION = {"holds": _direction, "demand": "give three finite numbers, not all zero"}
 CONTACTS = {"holds": _contacts}
 FACTORS = {

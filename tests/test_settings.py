@@ -43,6 +43,7 @@ WRONG: list[tuple[str, object, str]] = [
     ("normal", (0.0, float("inf"), 0.0), "not all zero"),
     ("offset", (0.0, float("nan"), 0.0), "finite"),
     ("normal_cone", 90.0, "below 90"),
+    ("target_quaternion", (0.0, 0.0, 0.0, 2.0), "norm 2; give a unit quaternion"),
     ("armature_range", (2.0, 0.5), "the lower first"),
     ("box", (0.1, 0.0, 0.1), "above zero"),
     ("friction", -0.1, "zero or more"),
