@@ -6,6 +6,7 @@ The command line prints ``what``, ``where`` and ``hint`` as one line and exits w
 from __future__ import annotations
 
 import difflib
+import reprlib
 from collections.abc import Iterable
 from typing import ClassVar
 
@@ -13,6 +14,8 @@ from impact_posture.escape import printable
 
 # Longest name in a message.  A longer name loses its middle.
 _LONGEST_NAME = 200
+# Longest part of a message: it lists the 200 joints that a robot may have.
+_LONGEST_PART = 10_000
 
 
 def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:
@@ -25,18 +28,31 @@ def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:
 
 
 def one_line(text: str) -> str:
-    """Return a message on one line, without characters that control a terminal."""
-    return printable(" ".join(text.split()))
+    """Return a message on one line, of limited length, without characters that control a terminal."""
+    return printable(" ".join(text.split()), longest=_LONGEST_PART)
+
+
+def shown(value: object) -> str:
+    """Return a value of a file or of a caller for a message, with the middle of a long one left out.
+
+    The aliases of a YAML file make a few lines into a list of lists that would fill the memory as text.
+    """
+    if isinstance(value, str):
+        return printable(value, longest=_LONGEST_NAME)
+    try:
+        return printable(reprlib.repr(value), longest=_LONGEST_NAME)
+    except Exception:  # Python converts no integer of more than 4300 digits, and a caller's object may do anything.
+        return type(value).__name__
 
 
 def not_one_of(value: object, choices: Iterable[str]) -> tuple[str, str]:
     """Return the fault and the hint for a value that is none of the choices."""
     names = list(choices)
     folded = {name.casefold(): name for name in names}
-    text = str(value).casefold()
+    text = shown(value).casefold()
     begun = [name for name in folded if text and name.startswith(text)]
     close = begun or difflib.get_close_matches(text, folded, n=1, cutoff=0.5)
-    what = f"'{value}' is none of {', '.join(names)}"
+    what = f"'{shown(value)}' is none of {', '.join(names)}"
     return what, f"did you mean {folded[close[0]]}?" if close else "choose one of them"
 
 
@@ -75,6 +91,18 @@ def _rebuild(cls: type[ImpactPostureError], state: dict[str, object], line: str)
 
 class InputError(ImpactPostureError):
     """A value given by the user is wrong."""
+
+
+def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
+    """Refuse a value that is none of the choices.
+
+    Raises:
+        InputError: With the choices, or the nearest of them.
+    """
+    names = list(choices)
+    if not isinstance(value, str) or value not in names:
+        what, hint = not_one_of(value, names)
+        raise InputError(what, where=name, hint=hint)
 
 
 class NameNotFound(InputError):

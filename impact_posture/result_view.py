@@ -16,6 +16,7 @@ from impact_posture.posture.global_search import SelfMotionMap
 from impact_posture.posture.null_space_path import NullSpacePath
 from impact_posture.posture.problem_settings import Prepared, prepare, read_settings
 from impact_posture.settings import Against
+from impact_posture.text_file import read_text
 
 # Matplotlib is imported where it is used, because that takes longer than a small problem.
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
     if not (folder / "result.json").is_file():
         raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
     try:
-        document = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        document = json.loads(read_text(folder / "result.json"))
         prepared = prepare(read_settings(folder / "problem.toml"))
         with np.load(folder / "result.npz") as arrays:
             path = NullSpacePath(

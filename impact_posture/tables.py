@@ -10,7 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_type_hints
 
-from impact_posture.errors import InputError, SpecError, nearest, not_one_of
+from impact_posture.errors import InputError, SpecError, nearest, not_one_of, shown
+from impact_posture.text_file import read_text
 
 _Table = TypeVar("_Table")
 
@@ -34,6 +35,9 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
     try:
         # As JSON, because strict dataclasses do not accept Python dictionaries.
         text = json.dumps(data, default=_plain)
+    except ValueError as error:  # An integer with more digits than Python converts.
+        raise SpecError(f"cannot be read ({error})", where=where, hint="correct the value") from None
+    try:
         made: _Table = adapter(cls).validate_json(text)  # type: ignore[arg-type]
         return made
     except ValidationError as error:
@@ -44,12 +48,12 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
         path = ".".join(str(part) for part in location)
         if fault["type"] in _UNKNOWN:
             close = ", ".join(nearest(str(location[-1]), _keys_at(cls, location[:-1])))
-            raise SpecError(f"unknown key '{path}'", where=where, hint=f"did you mean {close}?") from None
+            raise SpecError(f"unknown key '{shown(path)}'", where=where, hint=f"did you mean {close}?") from None
         what, hint = str(fault["msg"]), "correct the value"
         if fault["type"] == "value_error":
             # The demand of a setting is the hint.
             raise SpecError(
-                f"key '{path}' is {fault['input']}", where=where, hint=str(fault["ctx"]["error"])
+                f"key '{path}' is {shown(fault['input'])}", where=where, hint=str(fault["ctx"]["error"])
             ) from None
         if fault["type"] == "literal_error":
             what, hint = not_one_of(fault["input"], re.findall(r"'([^']*)'", fault["ctx"]["expected"]))
@@ -100,14 +104,14 @@ def read_toml(path: Path) -> dict[str, object]:
         SpecError: There is no such file, it cannot be read, or it is no valid TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise SpecError("no such file", where=str(path), hint="check the path") from None
     except (OSError, UnicodeDecodeError) as error:
         raise SpecError(f"cannot be read ({error})", where=str(path), hint="check the file") from None
     except RecursionError:
         raise SpecError("is nested too deeply", where=str(path), hint="correct the syntax") from None
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # A TOMLDecodeError, or a number with more digits than Python converts.
         raise SpecError(f"is not valid TOML ({error})", where=str(path), hint="correct the syntax") from None
 
 
@@ -132,8 +136,10 @@ class Checked:
                 fault = max(error.errors(), key=lambda fault: len(fault["loc"]))
                 missing = fault["type"] == "missing"
                 index = "".join(f"[{part}]" for part in fault["loc"] if isinstance(part, int) and not missing)
+                given = fault["input"]
+                quoted = repr(given) if isinstance(given, str) else shown(given)
                 raise InputError(
-                    f"{name}{index} is {fault['input']!r}",
+                    f"{name}{index} is {quoted}",
                     where=type(self).__name__,
                     hint=fault["msg"].replace("Input should", "it should"),
                 ) from None

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from impact_posture.errors import FrameNotFound, ManifestMismatch, SpecError
+from impact_posture.text_file import read_text
 
 if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot
@@ -107,7 +108,7 @@ def read_checked(
         raise SpecError(words, where=str(path), hint=hint)
     (file,) = files
     try:
-        manifest = json.loads(file.read_text(encoding="utf-8"))
+        manifest = json.loads(read_text(file))
     except (OSError, ValueError, RecursionError) as error:
         words = getattr(error, "strerror", None) or str(error)
         raise SpecError(f"cannot be read ({words})", where=str(file), hint="run codegen again") from None
@@ -167,7 +168,7 @@ def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: s
 def _is_manifest(path: Path, schema: str) -> bool:
     """Return whether a file is the manifest of an export."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(read_text(path))
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(document, dict) and document.get("schema") == schema

@@ -27,6 +27,7 @@ from impact_posture.report.scene import Scene, Track, impact_curves
 from impact_posture.report.shapes import draw_robot
 from impact_posture.simulation.scenario_file import known_scenarios, scenario_path
 from impact_posture.simulation.series import Series, Window
+from impact_posture.text_file import read_text
 
 SIMULATION, COMPARISON, RUNS = "run.json", "comparison.json", "runs"
 # Metrics of a table: key, unit and meaning.
@@ -169,7 +170,7 @@ def _track(view: RunView, objective: ImpactObjective) -> Track:
 
 
 def _read(path: Path) -> Document:
-    document: Document = json.loads(path.read_text(encoding="utf-8"))
+    document: Document = json.loads(read_text(path))
     return document
 
 

@@ -9,7 +9,7 @@ from typing import get_args
 
 import numpy as np
 
-from impact_posture.errors import MetricError, not_one_of
+from impact_posture.errors import MetricError, check_choice
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import MetricKind
@@ -26,7 +26,8 @@ class Metric:
         source: Origin of the weights.
 
     Raises:
-        MetricError: There is no such kind, or the weights do not belong to it or are not all above zero.
+        InputError: The kind is none of them.
+        MetricError: The weights do not belong to the kind, or are not all above zero.
     """
 
     kind: MetricKind = "euclidean"
@@ -34,9 +35,7 @@ class Metric:
     source: str = ""
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(MetricKind):
-            what, hint = not_one_of(self.kind, get_args(MetricKind))
-            raise MetricError(what, where="metric", hint=hint)
+        check_choice("metric", self.kind, get_args(MetricKind))
         if (self.kind == "weighted") != (self.weights is not None):
             what = "needs weights" if self.weights is None else "takes no weights"
             raise MetricError(f"the {self.kind} metric {what}", where="metric", hint="see build_metric")
@@ -127,7 +126,7 @@ def _from_file(robot: Robot, path: Path) -> np.ndarray[tuple[int], np.dtype[np.f
                 values[:6] = np.array(value, dtype=float)
             else:
                 values[v_slice(robot.model, robot.joint_id(key))] = float(value)  # type: ignore[arg-type]
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise MetricError(
                 f"key '{key}' holds no number", where=str(path), hint="joint = weight; base = [6 numbers]"
             ) from None

@@ -74,7 +74,7 @@ def _armature_file(path: Path) -> dict[str, float]:
     values = table.get("joints", table) if isinstance(table, dict) else {}
     try:
         return {str(k): float(v) for k, v in values.items()}
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SpecError("holds no table joint = value", where=str(path), hint="write: joint_name = 0.01") from None
 
 

@@ -97,12 +97,18 @@ def check_mass_matrix(
         posture: Name of ``q``.
 
     Raises:
-        InertiaError: The matrix is singular; the message names the directions that move no inertia.
+        InertiaError: The matrix is not finite, or singular; the message names the directions that move no inertia.
     """
     upper = np.triu(pin.crba(model, model.createData(), q))
     moving = np.isfinite(model.armature)
     M = (upper + np.triu(upper, 1).T)[np.ix_(moving, moving)]
     diagonal = np.diag(M)
+    if not np.isfinite(M).all():
+        raise InertiaError(
+            f"the mass matrix has entries beyond all numbers at posture '{posture}'",
+            where=where,
+            hint="correct the masses, inertias and lengths; they are in kg, kg m² and m",
+        )
     free = diagonal <= _TINY
     if not free.any():
         scale = 1 / np.sqrt(diagonal)

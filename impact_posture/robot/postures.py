@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.errors import JointLocked, JointNotFound, PostureError, PostureNotFound, nearest
+from impact_posture.errors import JointLocked, JointNotFound, PostureError, PostureNotFound, nearest, shown
 from impact_posture.robot.model_joints import q_slice, scalar_entries
 from impact_posture.robot.robot import Robot
+from impact_posture.text_file import read_text
 
 SCHEMA = "impact-posture/posture/1"
 
@@ -77,9 +80,10 @@ def _load(path: Path) -> Mapping[str, object]:
 
     kind = "JSON" if path.suffix == ".json" else "YAML"
     try:
-        text = path.read_text(encoding="utf-8")
-        # `ros2 topic echo` ends every message with `---`, hence the first document is read.
-        data = json.loads(text) if kind == "JSON" else next(iter(yaml.safe_load_all(text)), None)
+        text = read_text(path)
+        # `ros2 topic echo` ends every message with `---`, hence the first document is read.  The base loader keeps
+        # every scalar as text: others read 1:30 as 90 and a joint called `on` as true, and fail on bad tags.
+        data = json.loads(text) if kind == "JSON" else next(yaml.load_all(text, yaml.BaseLoader), None)
     except FileNotFoundError:
         raise PostureError("no such file", where=str(path), hint="check the path") from None
     except OSError as error:
@@ -95,7 +99,7 @@ def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Arra
     """Read one of the three shapes, which differ in their keys."""
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
-        raise PostureError(f"schema '{schema}' is no posture", where=where, hint=f'give a file of "{SCHEMA}"')
+        raise PostureError(f"schema '{shown(schema)}' is no posture", where=where, hint=f'give a file of "{SCHEMA}"')
     if "q" in data:
         _only(data, _OUR_KEYS, where)
         return _in_order(robot, data, where)
@@ -114,7 +118,7 @@ def _only(data: Mapping[str, object], known: Sequence[str], where: str) -> None:
     for key in data:
         if key not in known:
             close = ", ".join(nearest(key, known))
-            raise PostureError(f"unknown key '{key}'", where=where, hint=f"did you mean {close}?")
+            raise PostureError(f"unknown key '{shown(key)}'", where=where, hint=f"did you mean {close}?")
 
 
 def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Array:
@@ -198,9 +202,9 @@ def _joint_state(name: object, position: object, where: str) -> dict[str, object
 def _names(value: object, key: str, where: str) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
         raise PostureError(f"'{key}' is no list of names", where=where, hint="correct it")
-    for name in value:
-        if value.count(name) > 1:
-            raise PostureError(f"'{key}' names '{name}' twice", where=where, hint="remove one of them")
+    twice = next((name for name, count in Counter(value).items() if count > 1), None)
+    if twice is not None:
+        raise PostureError(f"'{key}' names '{shown(twice)}' twice", where=where, hint="remove one of them")
     return value
 
 
@@ -211,10 +215,10 @@ def _numbers(value: object, key: str, where: str) -> list[float]:
 
 
 def _number(value: object, key: str, where: str) -> float:
-    # PyYAML reads 1e-3 as text, because YAML 1.1 demands a point in it.
+    # Every number from YAML is text, with a dot before inf and nan.
     if isinstance(value, (int, float, str)) and not isinstance(value, bool):
         try:
-            return float(value)
+            return float(re.sub(r"\.(?=(inf|nan)$)", "", value, flags=re.I) if isinstance(value, str) else value)
         except (ValueError, OverflowError):
             pass
-    raise PostureError(f"{key} is '{value}', no number", where=where, hint="correct it")
+    raise PostureError(f"{key} is '{shown(value)}', no number", where=where, hint="correct it")

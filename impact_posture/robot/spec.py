@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from impact_posture.errors import SpecError
+from impact_posture.errors import SpecError, shown
 from impact_posture.settings import ContactPose, Root, SupportKind, TransmissionKind, Vector3
 from impact_posture.tables import read_toml, validate
 
@@ -193,7 +193,7 @@ def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
     # Checked before the keys, because those of another schema are not misspelt.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
-        raise SpecError(f"schema '{schema}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
+        raise SpecError(f"schema '{shown(schema)}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
     return validate(RobotSpec, data, str(path))
 
 

@@ -14,7 +14,7 @@ from typing import IO
 
 import pinocchio as pin
 
-from impact_posture.errors import PackageNotFound, UrdfError
+from impact_posture.errors import PackageNotFound, SpecError, UrdfError
 from impact_posture.robot.inertia_checks import check_inertias
 
 # The data of Pinocchio always hold 6 nv³ numbers: 0.4 GB at 200 degrees of freedom and 48 GB at 1,000.
@@ -56,7 +56,10 @@ def resolve_path(text: str, base: Path) -> Path:
 
     Raises:
         PackageNotFound: There is no such file in the package; carries the nearest paths below ``robots/``.
+        SpecError: No path of any system has such characters.
     """
+    if "\0" in text:
+        raise SpecError(f"'{text}' is no path", where="robot.toml [model]", hint="remove the null character")
     if not text.startswith(EXAMPLE_PREFIX):
         return (base / Path(text).expanduser()).resolve()
     root = example_robot_data()

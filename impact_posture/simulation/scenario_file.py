@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from impact_posture.errors import InputError, ScenarioNotFound, SpecError
+from impact_posture.errors import InputError, ScenarioNotFound, SpecError, shown
 from impact_posture.robot.robot_loader import from_folder
 from impact_posture.simulation.scenario import SCHEMA, Scenario, ScenarioTable
 from impact_posture.tables import read_toml, validate
@@ -29,7 +29,7 @@ def read_scenario(scenario: str | Path) -> Scenario:
     # The schema comes first, because the keys of another schema are not misspelt.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
-        raise SpecError(f"schema '{schema}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
+        raise SpecError(f"schema '{shown(schema)}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
     data = from_folder(data, path.resolve().parent, ("srdf", "config", "armature", "posture"))
     try:
         table = validate(ScenarioTable, data, str(path))

@@ -18,6 +18,7 @@ from impact_posture.posture.problem_settings import dump_settings
 from impact_posture.sweep.case_solver import CaseSolver
 from impact_posture.sweep.shard_table import passes_of, read_postures
 from impact_posture.sweep.sweep_file import Sweep
+from impact_posture.text_file import read_text
 from impact_posture.version import __version__
 
 if TYPE_CHECKING:
@@ -192,7 +193,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     path = folder / MANIFEST
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(read_text(path))
         if found["schema"] != SCHEMA:
             raise ValueError(f"schema {found['schema']}")
         return {**found, "key": str(found["key"]), "version": str(found["version"])}
