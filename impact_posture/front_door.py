@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError
-from impact_posture.front_door_problem import PostureProblem, check_choice
+from impact_posture.errors import InputError, check_choice
+from impact_posture.front_door_problem import PostureProblem
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.global_search import GlobalSearch, SelfMotionMap, check_searchable, search_globally

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from impact_posture.errors import InputError, not_one_of
+from impact_posture.errors import InputError, check_choice, shown
 from impact_posture.impact import objective as core
 from impact_posture.impact.contact import ImpactContact, check_compliance
 from impact_posture.impact.contact_compression import ContactStiffness
@@ -129,14 +129,9 @@ class ImpactObjective(core.ImpactObjective):
         return write_export([self], Path(out), build=build, **options)
 
 
-def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
-    """Refuse a value that is none of the choices."""
-    if value not in choices:
-        what, hint = not_one_of(value, choices)
-        raise InputError(what, where=name, hint=hint)
-
-
 def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
+    if not isinstance(contact, ImpactContact):
+        raise InputError(f"'{shown(contact)}' is no contact", where="contact", hint="give an ImpactContact")
     own = robot.spec.contact
     if contact.frame != own.frame or any(contact.offset) or not any(own.offset):
         return contact
@@ -146,6 +141,10 @@ def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
 def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[Support, ...]:
     if supports is None:
         return resolve_supports(robot, None)
+    for support in supports:
+        if not isinstance(support, str | Support):
+            hint = "give FRAME, FRAME:point, FRAME:surface or a Support"
+            raise InputError(f"'{shown(support)}' is no support", where="supports", hint=hint)
     texts = tuple(support for support in supports if isinstance(support, str))
     return (*resolve_supports(robot, texts), *(support for support in supports if isinstance(support, Support)))
 

@@ -166,6 +166,10 @@ def test_a_result_draws_and_exports_itself(result: ip.PostureResult, tmp_path: P
     gradient = result.export(tmp_path / "c").load()
     value, slope = gradient.objective(result.q)
     assert value == pytest.approx(result.problem.problem.objective.value(result.q), rel=1e-9)
+    for q, n in ((0.1, UP), ([0.1], UP), (result.q, 1.0), (result.q, [1.0]), (result.q[None], UP), (result.q, None)):
+        # Spread over all joints, one number would give an answer.
+        with pytest.raises((TypeError, ValueError)):
+            gradient.value_and_gradient(q, n)
     robot = result.problem.problem.robot
     posture = ip.tsid.ImpactRobustPosture(robot, gradient)
     controller = ip.tsid.Controller(robot, ip.tsid.aerial_formulation(robot, posture))
@@ -266,3 +270,29 @@ def test_a_normal_frame_that_is_none() -> None:
 def test_a_friction_that_is_none(friction: Any) -> None:
     with pytest.raises(ip.ImpactPostureError, match="friction"):
         ip.ImpactContact("ee", (0, 0, 1), friction=friction)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"metric": "Kinetic"}, {"metric": "mass"}, {"metric": None}, {"kind": "Speed"}, {"supports": [3]},
+        {"supports": ["root", None]}, {"compliance": -1.0}, {"compliance": float("nan")}, {"others": ["ee"]},
+        {"others": [None]},
+    ],
+)  # fmt: skip
+def test_a_choice_that_is_none_changes_no_answer(arguments: dict[str, Any]) -> None:
+    """The objective would be that of a default otherwise, without a word."""
+    with pytest.raises(ip.ImpactPostureError):
+        arm(**arguments)
+
+
+def test_parts_of_an_objective_check_their_words() -> None:
+    for frame in ("World", "local", None, True):
+        with pytest.raises(InputError, match="normal_frame"):
+            ip.ImpactContact("ee", UP, normal_frame=frame)
+    with pytest.raises(ContactError, match="is no name"):
+        ip.ImpactContact(3, UP)
+    with pytest.raises(InputError, match="none of euclidean"):
+        ip.Metric("mass")
+    with pytest.raises(MetricError, match="needs weights"):
+        ip.Metric("weighted")

@@ -128,8 +128,16 @@ class ImpactGradient:
             ValueError: An input has another shape.
         """
         function, results = self._functions[name]
+        # Assignment alone would spread one number over all joints.
+        if len(q) != self.nq:  # type: ignore[arg-type]
+            raise ValueError(f"q has length {len(q)}, not {self.nq}")  # type: ignore[arg-type]
         self._q[:] = q
-        if n is not None:
+        if n is None:
+            if "n" in SIGNATURES[name][0]:
+                raise ValueError(f"{name} needs a normal")  # else that of the last call
+        else:
+            if len(n) != 3:  # type: ignore[arg-type]
+                raise ValueError(f"n has length {len(n)}, not 3")  # type: ignore[arg-type]
             self._n[:] = n
         return function(), results
 

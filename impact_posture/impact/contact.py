@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.errors import ContactError, InputError, not_one_of
+from impact_posture.errors import ContactError, InputError, check_choice, shown
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import Support as Support
 from impact_posture.settings import FRICTION, NormalFrame, Vector3
@@ -39,8 +39,8 @@ class ImpactContact:
         friction: Coulomb coefficient μ.
 
     Raises:
-        ContactError: The normal is zero, a number is not finite, the friction is negative, or there is no such
-            ``normal_frame``.
+        ContactError: The normal is zero, a number is not finite, or the friction is negative.
+        InputError: ``normal_frame`` is neither ``world`` nor ``contact``.
     """
 
     frame: str
@@ -51,9 +51,9 @@ class ImpactContact:
     friction: float = FRICTION
 
     def __post_init__(self) -> None:
-        if self.normal_frame not in get_args(NormalFrame):
-            what, hint = not_one_of(self.normal_frame, get_args(NormalFrame))
-            raise ContactError(what, where="normal_frame", hint=hint)
+        check_choice("normal_frame", self.normal_frame, get_args(NormalFrame))
+        if not isinstance(self.frame, str):
+            raise ContactError(f"'{shown(self.frame)}' is no name", where="frame", hint="give the name of a frame")
         n = np.array(self.normal, dtype=float)
         if n.shape != (3,) or not np.isfinite(n).all() or np.abs(n).max() < _DUST:
             raise ContactError(

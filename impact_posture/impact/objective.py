@@ -8,6 +8,7 @@ normals and model variants.  No combination is a class of its own.  Each shape o
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
@@ -18,6 +19,7 @@ import numpy as np
 from impact_posture.arrays import Array
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.tree import Tree
+from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support, default_compliance
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_kind import ImpactKind, QuadraticKind
@@ -107,7 +109,9 @@ class ImpactObjective:
     def __post_init__(self) -> None:
         check_cone(self.impact_kind, self.normal_cone_deg)
         check_contacts(self.contacts, self.impact_kind, bilateral=self.bilateral, cone=self.normal_cone_deg != 0)
-        if self.compliance <= 0:
+        if not 0 <= self.compliance < math.inf:
+            raise InputError(f"is {self.compliance:g}", where="compliance", hint="give 1/kg, zero or more")
+        if self.compliance == 0:
             object.__setattr__(self, "compliance", default_compliance(self.robot))
 
     @property
