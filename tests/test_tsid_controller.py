@@ -15,6 +15,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RotorSpec
 from impact_posture.tsid import relaxation
 from impact_posture.tsid.body_tasks import Tilt
+from impact_posture.tsid.contacts import SupportContact
 from impact_posture.tsid.controller import Command, Controller, Status
 from impact_posture.tsid.frame_tasks import FramePose, FramePosition, Impedance
 from impact_posture.tsid.limits import AccelerationBounds, LimitLaw
@@ -372,7 +373,7 @@ def test_a_fixed_arm() -> None:
         assert_limits(controller, command)
 
 
-@pytest.mark.parametrize("wrong", ["program", "names", "period", "early", "velocity", "shape"])
+@pytest.mark.parametrize("wrong", ["program", "names", "period", "early", "report", "velocity", "shape", "size"])
 def test_mistakes_are_refused(wrong: str) -> None:
     r = robot(ARM)
     with pytest.raises((InputError, PostureError)):
@@ -383,5 +384,17 @@ def test_mistakes_are_refused(wrong: str) -> None:
         controller = Controller(r, aerial_formulation(r, JointPosture(r)), period=0.0 if wrong == "period" else DT)
         if wrong == "early":
             controller.tick(0.0, r.posture(), np.zeros(r.nv))
+        if wrong == "report":
+            controller.report()
+        # Torques of such a velocity are not finite.
+        controller.reset(r.posture(), np.full(r.nv, 1e200 if wrong == "size" else 0.0))
         controller.reset(r.posture(), np.full(r.nv, np.nan if wrong == "velocity" else 0.0))
         controller.reset(r.posture(), np.zeros(3 if wrong == "shape" else r.nv))
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"kind": "sole"}, {"least": -1.0}, {"least": np.nan}, {"kp": np.nan}, {"kd": np.inf}], ids=str
+)
+def test_supports_that_are_none_are_refused(arguments: dict[str, object]) -> None:
+    with pytest.raises(InputError):
+        SupportContact(Point("ee"), **arguments)  # type: ignore[arg-type]

@@ -13,12 +13,14 @@ import pytest
 
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.errors import InputError, MetricError
+from impact_posture.errors import InputError, ManifestMismatch, MetricError
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.solve import solve
+from impact_posture.robot.joint_model import with_joint_model
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.tsid.activation import Activation, Phase
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.frame_tasks import FramePose
@@ -26,6 +28,7 @@ from impact_posture.tsid.impact_robust import ImpactRobustPosture, curvature_sca
 from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task_formulation import TaskFormulation, aerial_formulation, legged_formulation
 from tests.helpers import central_gradient, rng, robot
@@ -332,7 +335,17 @@ def test_a_standing_robot_braces_on_its_feet() -> None:
         assert np.linalg.norm(controller.state.at(contact.point).position - place) < 1e-3
 
 
-@pytest.mark.parametrize("kind", ["K", "fade", "every", "normal", "flat"])
+def test_an_export_of_another_robot_is_refused(exported: dict[str, ImpactGradient]) -> None:
+    """Of as many joints: its gradient would be taken without a word."""
+    other = load_robot(ARM, armature={joint: 0.5 for joint in robot(ARM).joint_names})
+    for make in (ImpactRobustPosture, ReferenceFlowPosture):
+        with pytest.raises(ManifestMismatch, match="armature"):
+            make(other, exported["impulse"])
+        make(with_joint_model(robot(ARM), "link"), exported["impulse"])
+        make(other, gradient_of(exported["impulse"]))  # for those who mean it
+
+
+@pytest.mark.parametrize("kind", ["K", "fade", "every", "normal", "flat", "endless", "spring", "base_weight"])
 def test_what_makes_no_term_is_refused(exported: dict[str, ImpactGradient], kind: str) -> None:
     r = robot(ARM)
     with pytest.raises((InputError, MetricError)):
@@ -342,6 +355,12 @@ def test_what_makes_no_term_is_refused(exported: dict[str, ImpactGradient], kind
             ImpactRobustPosture(r, gradient_of(exported["impulse"]), fade=(0.2, 0.1))
         elif kind == "every":
             ImpactRobustPosture(r, gradient_of(exported["impulse"]), every=0)
+        elif kind == "endless":
+            ImpactRobustPosture(r, gradient_of(exported["impulse"]), K=np.inf)
+        elif kind == "spring":
+            ImpactRobustPosture(r, gradient_of(exported["impulse"]), spring="Release")  # type: ignore[arg-type]
+        elif kind == "base_weight":
+            ImpactRobustPosture(r, gradient_of(exported["impulse"]), base_weight=-1.0)
         elif kind == "normal":
             gradient_of(exported["impulse"], (0, 0, 2))
         else:

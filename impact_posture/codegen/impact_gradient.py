@@ -15,6 +15,7 @@ from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.reader import check_library, check_robot, frame_block, read_manifest
 from impact_posture.errors import InputError, ManifestMismatch, MetricError, PostureError, SpecError
 from impact_posture.libraries import build_library, library_path, load_library
+from impact_posture.robot.joint_model import with_joint_model
 
 if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot
@@ -113,6 +114,15 @@ class ImpactGradient:
     def copy(self) -> ImpactGradient:
         """Return the same functions with buffers of their own, for another thread."""
         return ImpactGradient(self._library, self.manifest, self.frame, free=self.free)
+
+    def check_robot(self, robot: Robot) -> None:
+        """Refuse another robot than that of the export; its joint model may be another one.
+
+        Raises:
+            ManifestMismatch: Names the first difference.
+        """
+        joints = self.manifest["joint_model"]
+        check_robot(self.manifest, robot if joints == robot.joint_model else with_joint_model(robot, joints))
 
     # ---- one configuration ------------------------------------------------------------------------------------
 

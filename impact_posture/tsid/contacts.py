@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.errors import ContactError
+from impact_posture.errors import ContactError, check_choice
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import SupportKind
 from impact_posture.tsid.friction import point_cone, surface_cone, to_world
@@ -49,6 +51,11 @@ class SupportContact:
     def __post_init__(self) -> None:
         """Refuse values that make no contact."""
         where = f"contact at {self.point.frame}"
+        check_choice(f"{where}: kind", self.kind, get_args(SupportKind))
+        if not min(self.least, self.kp, self.kd) >= 0 or not math.isfinite(self.least + self.kp + self.kd):
+            raise ContactError(
+                "least, kp or kd is out of range", where=where, hint="give finite numbers from zero up"
+            )
         if not self.friction > 0:
             raise ContactError("friction is not positive", where=where, hint="give a coefficient above zero")
         if self.kind == "surface" and not min(self.half) > 0:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, PostureError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.assembly import Assembly
@@ -151,10 +151,12 @@ class Controller:
             The first command, which is also held if the first tick fails.
 
         Raises:
-            PostureError: ``q`` is no configuration of the robot, or ``v`` is no velocity.
+            PostureError: ``q`` is no configuration of the robot, ``v`` is no velocity, or their size is absurd.
         """
         q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False)
         v = checked_velocity(self.robot, v)
+        if not math.hypot(*q, *v) < math.sqrt(_ABSURD):
+            raise PostureError("q or ν is beyond all measurements", where="reset", hint="correct it; in SI units")
         state, assembly = self.state, self.assembly
         state.push(None)
         state.update(q, v)
@@ -191,8 +193,7 @@ class Controller:
             InputError: ``reset`` has not been called.
             ValueError: An array has another shape.
         """
-        if not self._ready:
-            raise InputError("has not been reset", where="controller", hint="call reset(q, v) first")
+        self._check_ready()
         state = self.state
         q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
         if q.shape != state.q.shape or v.shape != state.v.shape:
@@ -213,8 +214,17 @@ class Controller:
         self.assembly.build_qp(state)
         return self._finish(solve(self.assembly, self._solver))
 
+    def _check_ready(self) -> None:
+        if not self._ready:
+            raise InputError("has not been reset", where="controller", hint="call reset(q, v) first")
+
     def report(self) -> Report:
-        """Return the diagnosis of the last tick, computed by this call."""
+        """Return the diagnosis of the last tick, computed by this call.
+
+        Raises:
+            InputError: ``reset`` has not been called.
+        """
+        self._check_ready()
         assembly, state, posture = self.assembly, self.state, self.formulation.posture
         residuals, active, dynamics = {}, [], float("nan")
         deficient: tuple[Relaxed, ...] = ()

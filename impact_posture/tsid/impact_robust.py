@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from impact_posture.arrays import Array
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.errors import InputError, MetricError
+from impact_posture.errors import InputError, MetricError, check_choice
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.activation import Activation, Phase
 from impact_posture.tsid.posture_tasks import JointPosture
@@ -47,6 +47,14 @@ def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Grad
     if n.shape != (3,) or not abs(float(np.linalg.norm(n)) - 1) < 1e-6:
         raise InputError("is no unit vector of three", where="normal", hint="normalize it")
     return lambda q: export.value_and_gradient(q, n)
+
+
+def fitting_gradient(robot: Robot, gradient: Gradient | ImpactGradient) -> Gradient:
+    """Return the gradient as a function; an export of another robot raises :class:`ManifestMismatch`."""
+    if not isinstance(gradient, ImpactGradient):
+        return gradient
+    gradient.check_robot(robot)
+    return gradient_of(gradient)
 
 
 class ImpactRobustPosture(JointPosture):
@@ -123,16 +131,19 @@ class ImpactRobustPosture(JointPosture):
 
         Raises:
             InputError: A number is out of range.
+            ManifestMismatch: The export is of another robot.
         """
+        check_choice("spring", spring, get_args(Spring))
         super().__init__(robot, target, name=name, kp=kp, kd=kd, weight=weight, base_weight=base_weight)
-        if not (K >= 0 and reach > 0 and follow > 0 and 0 <= fade[0] < fade[1] and every >= 1 and (scale or 1) > 0):
+        gains = 0 <= K < math.inf and reach > 0 and follow > 0 and 0 <= fade[0] < fade[1]
+        if not (gains and every >= 1 and (scale or 1) > 0):
             raise InputError("a gain of the impact-robust term is out of range", where=name, hint="see its docstring")
         self.K, self.scale = float(K), 1.0 if scale is None else float(scale)
         self.activation = activation or Activation()
         self.spring, self.reach, self.every = spring, float(reach), int(every)
         if kd is None:
             self.kd = 2.0 * np.sqrt(self.kp + self.K)
-        self._function = gradient if callable(gradient) else gradient_of(gradient)
+        self._function = fitting_gradient(robot, gradient)
         self._measure, self._follow = scale is None, float(follow)
         ranges = JointRanges(robot)
         width = ranges.upper - ranges.lower

@@ -11,7 +11,7 @@ from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.smooth_step import smooth
 from impact_posture.tsid.state import State
-from impact_posture.tsid.task import Task
+from impact_posture.tsid.task import Task, gain
 
 
 class JointPosture(Task):
@@ -59,7 +59,7 @@ class JointPosture(Task):
         """
         super().__init__(name, robot.nv, kp=kp, kd=kd, weight=weight)
         if base_weight is not None and robot.floating:
-            self.weight[:6] = base_weight
+            self.weight[:6] = gain(base_weight, 1, f"{name}: base_weight")
         self._model, self._robot = robot.model, robot
         self._given = None if target is None else robot.check_posture(np.asarray(target), limits=False)
         self._target = robot.posture() if self._given is None else self._given.copy()

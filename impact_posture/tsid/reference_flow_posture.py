@@ -13,7 +13,7 @@ from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.body_tasks import BodyTaskLead
-from impact_posture.tsid.impact_robust import Gradient, gradient_of
+from impact_posture.tsid.impact_robust import Gradient, fitting_gradient
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.reference_flow import FlowOptions, ReferenceFlow
 from impact_posture.tsid.state import State
@@ -54,9 +54,10 @@ class ReferenceFlowPosture(JointPosture):
 
         Raises:
             PostureError: A posture of the path is no configuration of the robot.
+            ManifestMismatch: The export is of another robot.
         """
         super().__init__(robot, name=name, **gains)
-        self._function = gradient if callable(gradient) else gradient_of(gradient)
+        self._function = fitting_gradient(robot, gradient)
         self.options = options or FlowOptions()
         visited = np.zeros((0, robot.nq)) if path is None else np.atleast_2d(np.asarray(path, dtype=float))
         self._path = [robot.check_posture(q, limits=False) for q in visited]
