@@ -11,10 +11,11 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from impact_posture.errors import SpecError
+from impact_posture.errors import SpecError, shown
 from impact_posture.posture.global_search import SelfMotionMap
 from impact_posture.posture.null_space_path import NullSpacePath
 from impact_posture.posture.problem_settings import Prepared, prepare, read_settings
+from impact_posture.posture.result import SCHEMA
 from impact_posture.settings import Against
 from impact_posture.text_file import read_text
 
@@ -62,7 +63,11 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
     if not (folder / "result.json").is_file():
         raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
     try:
-        document = json.loads(read_text(folder / "result.json"))
+        document = json.loads(read_text(folder / "result.json"), parse_constant=_refuse_constant)
+        if document["schema"] != SCHEMA:
+            raise SpecError(
+                f"schema '{shown(document['schema'])}'", where=str(folder / "result.json"), hint="run optimize again"
+            )
         prepared = prepare(read_settings(folder / "problem.toml"))
         with np.load(folder / "result.npz") as arrays:
             path = NullSpacePath(
@@ -86,6 +91,10 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
         return prepared, view, document
     except _BROKEN as error:
         raise _broken(folder, error) from None
+
+
+def _refuse_constant(text: str) -> None:
+    raise ValueError(f"{text} is no number of JSON")
 
 
 def _broken(folder: Path, error: Exception) -> SpecError:

@@ -19,7 +19,7 @@ from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
 from impact_posture.simulation.scenario_file import scenario_path
-from tests.hostile.arena import attack
+from tests.hostile.arena import attack, strike
 from tests.hostile.values import TOML, spoiled
 from tests.settings import make_settings
 
@@ -197,6 +197,26 @@ def spoil_entries(folder: Path, rng: random.Random) -> None:
         path.mkdir()
     elif way == 1:
         path.symlink_to("/dev/null")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("schema", "impact-posture/result/2", "result/2"),
+        ("schema", ["a"] * 10_000, "schema"),
+        ("H", float("nan"), "NaN"),
+    ],
+    ids=["schema", "list", "nan"],
+)
+def test_results_of_another_version(key: str, value: object, words: str, result: Path, arena: Path) -> None:
+    shutil.copytree(result, arena / "out")
+    document = json.loads((result / "result.json").read_text())
+    (document if key == "schema" else document["optimal"])[key] = value
+    (arena / "out" / "result.json").write_text(json.dumps(document))
+    for command in (("plot", "out", "--figure", "jump"), ("report", "out")):
+        outcome = strike(arena, *command)
+        assert (outcome.code, outcome.complaints) == (1, []), outcome.err
+        assert words in outcome.err and len(outcome.err) < 500
 
 
 WAYS = (spoil_document, spoil_arrays, spoil_bytes, spoil_entries)
