@@ -19,6 +19,8 @@ from impact_posture.robot.inertia_checks import check_inertias
 
 # The data of Pinocchio always hold 6 nv³ numbers: 0.4 GB at 200 degrees of freedom and 48 GB at 1,000.
 MOST_DEGREES_OF_FREEDOM = 200
+# Joints from the root to a tip, fixed ones included; the URDF parser overflows the stack somewhere above 2,000.
+_DEEPEST = 1_000
 
 EXAMPLE_PREFIX = "example-robot-data:"
 
@@ -89,6 +91,7 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
         InertiaError: A link has a mass or inertia that no rigid body has.
     """
     root = parse_urdf(path)
+    _check_depth(root, path)
     try:
         with quiet_stderr() as words:
             model = pin.buildModelFromUrdf(str(path), *([pin.JointModelFreeFlyer()] if free_flyer else []))
@@ -111,6 +114,27 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
             hint="fix joints in the URDF that hardly matter",
         )
     return model, check_inertias(root, model, path, accept_inertias)
+
+
+def _check_depth(root: ET.Element, path: Path) -> None:
+    """Refuse trees that end the process: the URDF parser descends them without a bound, and follows circles."""
+    joints = [(joint.find("parent"), joint.find("child")) for joint in root.findall("joint")]
+    above = {c.get("link"): p.get("link") for p, c in joints if p is not None and c is not None}
+    depth: dict[str | None, int] = {}
+    for link in above:
+        way, seen = [], set[str | None]()
+        at: str | None = link
+        while at in above and at not in depth:
+            if at in seen:
+                raise UrdfError(f"link '{at}' is below itself", where=str(path), hint="correct its joints")
+            seen.add(at)
+            way.append(at)
+            at = above[at]
+        for at in reversed(way):
+            depth[at] = depth.get(above[at], 0) + 1
+        if depth[link] > _DEEPEST:
+            hint = "fix joints in the URDF that hardly matter"
+            raise UrdfError(f"has a chain of more than {_DEEPEST} joints", where=str(path), hint=hint)
 
 
 def parse_urdf(path: Path) -> ET.Element:

@@ -166,7 +166,25 @@ def comment() -> str:
     return "<!-- " + "a" * 100_000 + " -->"
 
 
-@pytest.mark.parametrize("make", [bomb, outside, nested, wide, long, wide_text, comment], ids=lambda f: f.__name__)
+def deep() -> str:
+    """A chain that overflows the stack of the URDF parser."""
+    links = "".join(
+        f'<link name="d{k}"/><joint name="e{k}" type="fixed"><parent link="{f"d{k - 1}" if k else "tip"}"/>'
+        f'<child link="d{k}"/></joint>'
+        for k in range(10_000)
+    )
+    return SMALL.replace("</robot>", f"{links}</robot>")
+
+
+def below_itself() -> str:
+    """A link that is its own parent, beside a root."""
+    joint = '<joint name="c" type="fixed"><parent link="lower"/><child link="lower"/></joint>'
+    return SMALL.replace("</robot>", f"{joint}</robot>")
+
+
+@pytest.mark.parametrize(
+    "make", [deep, below_itself, bomb, outside, nested, wide, long, wide_text, comment], ids=lambda f: f.__name__
+)
 def test_files_made_to_break_parsers(make: Callable[[], str], arena: Path) -> None:
     (arena / "bad.urdf").write_text(make())
     outcome = strike(arena, "inspect", "bad.urdf", "--json")
