@@ -80,7 +80,7 @@ def result_document(
         **({} if robustness is None else {"robustness": robustness.to_dict()}),
         "redundancy": solution.redundancy,
         "certificate": solution.certificate.to_dict(),
-        **({"collision": around.to_dict(solution.initial, solution.q)} if around and around.shapes.bodies else {}),
+        **({"collision": around.to_dict(solution.initial, solution.q)} if around and around.constraints else {}),
         "active": [json_block(active) for active in solution.certificate.active],
         "solver": {
             **{key: getattr(solution, key) for key in _SOLVER},

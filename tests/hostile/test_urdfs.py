@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -190,3 +191,16 @@ def test_files_made_to_break_parsers(make: Callable[[], str], arena: Path) -> No
     outcome = strike(arena, "inspect", "bad.urdf", "--json")
     assert not outcome.complaints, (outcome.complaints, outcome.err[-300:])
     assert len(outcome.err) < 5_000 and "root:" not in outcome.out
+
+
+def test_shapes_of_which_no_two_can_meet(arena: Path) -> None:
+    """Two neighbors have shapes: there is no pair whose distance a result could hold."""
+    box = '<collision><geometry><box size="0.1 0.1 0.5"/></geometry></collision>'
+    (arena / "boxes.urdf").write_text(SMALL.replace("</inertial>", f"</inertial>{box}"))
+    push = ("--frame", "tip", "--normal", "1", "0", "0", "--contact-pose", "free")
+    outcome = strike(
+        arena, "optimize", "boxes.urdf", *push, "--starts", "1", "--no-codegen", "--format", "svg", "--out", "out",
+        "--quiet",
+    )  # fmt: skip
+    assert (outcome.code, outcome.complaints) == (0, []), outcome.err
+    assert "collision" not in json.loads((arena / "out" / "result.json").read_text())
