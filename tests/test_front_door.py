@@ -257,12 +257,12 @@ def test_arguments_of_an_objective_that_do_not_fit(arguments: dict[str, Any], wo
     ],
 )
 def test_a_metric_that_is_none(arguments: tuple[Any, ...], words: str) -> None:
-    with pytest.raises(MetricError, match=words):
+    with pytest.raises(InputError, match=words):
         ip.Metric(*arguments)
 
 
 def test_a_normal_frame_that_is_none() -> None:
-    with pytest.raises(ContactError, match="'body' is none of world, contact"):
+    with pytest.raises(InputError, match="'body' is none of world, contact"):
         ip.ImpactContact("ee", (0, 0, 1), normal_frame="body")  # type: ignore[arg-type]
 
 
