@@ -323,6 +323,17 @@ def test_own_meshes_go_in_only_if_asked(tmp_path: Path) -> None:
     assert meshes.parts[0][3] == (0.5, 0.6, 0.7, 1.0)
 
 
+def test_small_shapes_beside_large_meshes_are_drawn() -> None:
+    """The base of this robot is a box of 1 mm, which is less than the length within which its meshes are welded."""
+    robot = ip.load_robot("example-robot-data:b1_description/urdf/b1-z1.urdf")
+    solids = draw_robot(robot).solids
+    assert all(len(solid.faces) for solid in solids)
+    box = min(solids, key=lambda solid: float(np.ptp(solid.points, axis=0).max()))
+    np.testing.assert_allclose(np.ptp(box.points, axis=0), 0.001, rtol=1e-4)
+    a, b, c = (box.points[box.faces[:, k]] for k in range(3))
+    assert np.all(np.sum(np.cross(b - a, c - a) * (a - box.points.mean(axis=0)), axis=1) > 0)
+
+
 def test_primitives_and_robots_without_shapes(tmp_path: Path) -> None:
     drawn = draw_robot(own(tmp_path, visual('<box size="0.1 0.2 0.3"/>'), visual('<sphere radius="0.1"/>')))
     assert np.allclose(np.ptp(drawn.solids[0].points, axis=0), [0.1, 0.2, 0.3], atol=1e-5) and not drawn.notes

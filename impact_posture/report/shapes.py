@@ -28,6 +28,11 @@ _LEVELS = 65535
 _GRAY = (0.72, 0.74, 0.77, 1.0)
 # Darker colors would hide the form.
 _DARKEST = 0.2
+# Triangles of a box whose corner k has the upper end of an axis where that bit of k is set.
+_BOX_FACES = np.array(
+    [[0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4], [2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5]],
+    dtype=np.uint32,
+).reshape(-1, 3)
 # Bytes of a COLLADA file in which its colors are sought.
 _HEAD = 200_000
 
@@ -128,8 +133,18 @@ def _reduced(solids: list[Solid]) -> list[Solid]:
     while sum(len(solid.faces) for solid in solids) > _MOST_TRIANGLES:
         length *= 2
         bits = [max(int(np.log2(length / solid.step)), 0) for solid in solids]
-        solids = [_welded(solid, k) if k else solid for solid, k in zip(solids, bits, strict=True)]
+        solids = [_coarser(solid, k) if k else solid for solid, k in zip(solids, bits, strict=True)]
     return solids
+
+
+def _coarser(solid: Solid, bits: int) -> Solid:
+    """Return a mesh without the last ``bits`` of its corners, or its bounding box if all triangles would vanish."""
+    welded = _welded(solid, bits)
+    if len(welded.faces):
+        return welded
+    ends = np.stack([solid.corners.min(axis=0), solid.corners.max(axis=0)])
+    corners = np.stack([ends[np.arange(8) >> axis & 1, axis] for axis in range(3)], axis=1)
+    return Solid(corners, _BOX_FACES, solid.low, solid.step)
 
 
 def _sticks(robot: Robot) -> tuple[list[Solid], list[tuple[int, int, pin.SE3, Color]]]:
