@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from impact_posture.setting import CONTACT, OUTPUT
+from impact_posture.setting import CONTACT, OUTPUT, SEARCH
 
 CompileMode = Literal["auto", "always", "never"]
 
@@ -94,8 +94,8 @@ Meshes = Annotated[
 ]
 Json = Annotated[bool, option("--json", panel=OUTPUT, help="Print one JSON document instead of tables.")]
 Quiet = Annotated[bool, option("--quiet", "-q", panel=OUTPUT, help="Print no warnings and no progress.")]
-Jobs = Annotated[int, option("--jobs", panel=OUTPUT, min=1, help="Number of processes that search.")]
-Compile = Annotated[CompileMode, option("--compile", panel=OUTPUT, help="Whether the solver runs compiled code.")]
+Jobs = Annotated[int, option("--jobs", panel=SEARCH, min=1, help="Number of processes that search.")]
+Compile = Annotated[CompileMode, option("--compile", panel=SEARCH, help="Whether the solver runs compiled code.")]
 Formats = Annotated[
     list[PictureFormat] | None,
     option("--format", panel=OUTPUT, show_default="png", help="Format of the pictures: png, svg or pdf; repeatable."),

@@ -10,7 +10,7 @@ from typing import Any
 from impact_posture.errors import ImpactPostureError, not_one_of
 from impact_posture.parsing import parse_contact
 
-CONTACT, METRIC, ROBOT, TASK, OUTPUT = "Contact", "Measure", "Robot", "Task", "Output"
+CONTACT, METRIC, ROBOT, TASK, SEARCH, OUTPUT = "Contact", "Measure", "Robot", "Task", "Search", "Output"
 _LARGEST = float("inf")
 # Degrees below which the cosine of a tilt says nothing at the precision that certifies.
 _LEAST_TILT = 0.1

@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 from impact_posture import setting as demand
 from impact_posture.errors import InputError
 from impact_posture.parsing import parse_armature, parse_number_or_name, parse_payloads
-from impact_posture.setting import CONTACT, METRIC, OUTPUT, ROBOT, TASK, Setting
+from impact_posture.setting import CONTACT, METRIC, ROBOT, SEARCH, TASK, Setting
 from impact_posture.tables import STRICT, Checked
 
 Vector3 = tuple[float, float, float]
@@ -422,11 +422,11 @@ class ProblemSettings(ImpactSettings):
         Search,
         Setting(
             "multistart, or global: maps self-motions of 1 or 2 degrees of freedom, else hops from the best optimum.",
-            OUTPUT, "HOW",
+            SEARCH, "HOW",
         ),
     ] = "multistart"  # fmt: skip
-    starts: Annotated[int, Setting("Number of starting points of the search.", OUTPUT, **demand.ONE_OR_MORE)] = 16
+    starts: Annotated[int, Setting("Number of starting points of the search.", SEARCH, **demand.ONE_OR_MORE)] = 16
     finish_all: Annotated[
-        bool, Setting("Finish starts of large programs that can no longer be the best: lists all optima.", OUTPUT)
+        bool, Setting("Finish starts of large programs that can no longer be the best: lists all optima.", SEARCH)
     ] = False
-    seed: Annotated[int, Setting("Seed of the random starts.", OUTPUT, **demand.ZERO_OR_MORE)] = 0
+    seed: Annotated[int, Setting("Seed of the random starts.", SEARCH, **demand.ZERO_OR_MORE)] = 0
