@@ -17,11 +17,11 @@ from impact_posture.plot.style import BLUE, GREEN, INK, VERMILLION, framed, shar
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
 NOTES = (
-    "Each kind is divided by its longest semi-axis before (of those that end), in both rows: the legend states it. "
+    "Each kind of ellipsoid is divided by its longest finite semi-axis before, which the legend states. "
     "Velocity J Jᵀ: contact velocities of joint velocities of norm 1. Force (J Jᵀ)⁻¹: contact forces of joint "
-    "torques of norm 1 (unbounded where J is singular). Both know nothing of inertia or of supports; impact "
-    "Λ$_c$ = J M⁻¹ W M⁻¹ Jᵀ does. Where a robot is easy to move it is hard to push with, and the other way round; "
-    "what an impact does need not follow either.",
+    "torques of norm 1 (unbounded where J is singular). Neither depends on inertia or supports; impact "
+    "Λ$_c$ = J M⁻¹ W M⁻¹ Jᵀ does. A direction of large velocity is one of small force. The jump of an impact "
+    "need not follow either.",
 )
 _LOOKS: dict[str, dict[str, Any]] = {
     "velocity": {"color": GREEN, "linestyle": (0, (5, 2)), "linewidth": 1.4, "zorder": 3.4},

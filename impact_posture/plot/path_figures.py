@@ -55,7 +55,7 @@ def path_figure(view: ResultView) -> Figure:
         axes = body.subplots()
         drawn = draw_shares(axes, path.s, path)
         _mark(axes, path)
-        axes.set_xlabel("path length in the null space, ∫‖dν‖  [rad, mixed with m]")
+        axes.set_xlabel("path length in the null space, ∫‖dq‖  [rad, mixed with m]")
         if drawn:
             body.legend(loc="outside right center", title="value / start", title_fontsize=7.5, handlelength=3.2)
     return figure

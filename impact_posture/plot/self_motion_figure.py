@@ -69,7 +69,7 @@ def _draw_curves(body: Any, data: SelfMotionMap, label: str) -> Any:
     if spreads(y[np.isfinite(y)]):
         log_axis(axes)
     axes.grid(True, axis="y")
-    axes.set_xlabel("path length along each component, ∫‖dν‖  [rad, mixed with m]")
+    axes.set_xlabel("path length along each component, ∫‖dq‖  [rad, mixed with m]")
     axes.set_ylabel(label)
     return axes
 
