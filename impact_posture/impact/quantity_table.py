@@ -34,9 +34,9 @@ def quantities(metric: Metric) -> list[tuple[str, str, str]]:
     return [
         ("H", per_impulse, "jump² per impulse²"),
         ("G", "1/kg", "inverse effective mass along n"),
-        ("V", per_speed, "jump² per approach speed², no friction"),
+        ("V", per_speed, "jump² per speed², no friction"),
         ("S", per_speed, "the same when the contact sticks"),
-        ("E", "kg", "energy lost per approach speed², e = 0"),
+        ("E", "kg", "energy lost per speed², e = 0"),
     ]
 
 
@@ -48,8 +48,10 @@ def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict
         initial: The block ``initial`` of ``result.json``.
         optimal: The block ``optimal`` of ``result.json``.
     """
-    minimized = ("objective", "", f"what was minimized ({impact.objective.kind})")
-    named = (minimized, *quantities(impact.metric))
+    named = quantities(impact.metric)
+    kind, per_speed = impact.objective.kind, named[2][1]
+    unit = {"impulse": "jump²", "energy": "kg"}.get(kind, per_speed)
+    named.insert(0, ("objective", unit, f"what was minimized ({kind})"))
     rows = [QuantityRow(key, initial[key], optimal[key], unit, words) for key, unit, words in named]
     jumps = [block["jump"]["coulomb"] for block in (initial, optimal)]
     forces = [(block["compression"] or {}).get("peak_force") for block in (initial, optimal)]
@@ -61,5 +63,5 @@ def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict
         rows.append(QuantityRow("force", forces[0], forces[1], "N", f"peak force {at}, no friction"))
     first, last = (block.get("attainable_speed") for block in (initial, optimal))
     if (first, last) != (None, None):
-        rows.append(QuantityRow("approach", first, last, "m/s", "fastest within the joints' velocity limits"))
+        rows.append(QuantityRow("approach", first, last, "m/s", "fastest within joint velocity limits"))
     return rows
