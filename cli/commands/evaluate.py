@@ -101,7 +101,7 @@ def _ellipsoids(page: Page, impact: ResolvedImpact, ellipsoids: dict[str, Ellips
         for k, radius in enumerate(ellipsoid.finite_radii):
             unit = units.get(name, "kg^-1/2" if kinetic else "jump/(N·s)") if k == 0 else ""
             axis = vector(ellipsoid.axes[:, k])
-            rows.append((f"  {name}" if k == 0 else "", number(radius, missing="endless"), unit, axis))
+            rows.append((f"  {name}" if k == 0 else "", number(radius, missing="unbounded"), unit, axis))
     page.gap()
     page.table(("  ellipsoid", "radius", "unit", "axis, world"), rows, right=(1, 3))
 
@@ -114,7 +114,10 @@ def _gradient(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
         (f"  {name}", number(value), "per m" if unit == "m/s" else "per rad")
         for name, value, unit in largest_entries(impact.robot, found.gradient)
     ]
-    page.table(("  gradient of H", "largest", ""), rows, right=(1,))
+    if rows:
+        page.table(("  gradient of H", "largest", ""), rows, right=(1,))
+    else:
+        page.line("  gradient of H: zero in this posture")
 
 
 def _jumps(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:

@@ -75,7 +75,7 @@ def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, 
     if not quiet:
         page.line("Check what was guessed:")
         page.table((), [("  -", line) for line in dict.fromkeys(draft.guesses)])
-        page.line("Then leave the options out that it answers, as in")
+        page.line("Options that this file answers are no longer needed:")
         beside = path.name == "robot.toml" and path.parent == Path(robot).parent
         config = "" if beside else f" --config {path}"
         # This line is not wrapped, because users copy it.

@@ -130,8 +130,8 @@ def _export_world(page: Page, scenario: Scenario, out: Path, force: bool) -> Non
 
 def _rigid(prediction: dict[str, Any]) -> str:
     if prediction["sticking"] is None:
-        return f"{number(prediction['frictionless'], missing='–')} if nobody controlled"
-    named = {"frictionless": "without friction", "coulomb": "with the surface's", "sticking": "sticking"}
+        return f"{number(prediction['frictionless'], missing='–')} without a controller"
+    named = {"frictionless": "without friction", "coulomb": "with that of the surface", "sticking": "sticking"}
     return ", ".join(f"{number(prediction[key], missing='–')} {words}" for key, words in named.items())
 
 
@@ -149,8 +149,8 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
             strict=True,
         )
     )  # fmt: skip
-    rows.append(("relaxed", f"{relaxed} of {ticks} ticks: limits made a task give way"))
-    rows.append(("held", f"{held} ticks: no command was found, the last one was kept"))
+    rows.append(("relaxed", f"{relaxed} of {ticks} ticks, in which limits made a task give way"))
+    rows.append(("held", f"{held} ticks, in which no command was found and the last one was kept"))
     if any(window["kind"] == "dwell" for window in document["windows"]):
         rows.append(("contacts", f"{made} of {asked}"))
     page.pairs(rows)
@@ -184,15 +184,18 @@ def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[
     """Return the metrics of a completed run as rows."""
     saturation = metrics["saturation_s"]
     joints = f"base {number(metrics['q_total_impact_base'])}, joints {number(metrics['q_total_impact_joints'])}"
-    rows = [("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints})")]
+    rows = [("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints}; rad, mixed with m)")]
     if metrics["q_total_dwell"]:
         rows.append(("q_total_dwell", number(metrics["q_total_dwell"])))
     return [
         *rows,
         ("q_total_recovery", f"{number(metrics['q_total_recovery'])}, until 1 s after each impact began"),
-        ("peak jump", f"{number(metrics['peak_jump'])}, at most {number(metrics['peak_jump_max'])}"),
+        (
+            "peak jump",
+            f"{number(metrics['peak_jump'])} in the mean, {number(metrics['peak_jump_max'])} at most (rad/s, m/s)",
+        ),
         ("peak, recovery", number(metrics["peak_recovery"])),
-        ("rigid model", _rigid(prediction)),
+        ("predicted jump", _rigid(prediction)),
         ("H before", number(prediction["H"], missing="–")),
         ("peak force", f"{number(metrics['peak_force'])} N"),
         ("saturated", f"{number(saturation['inside'])} s in the windows, {number(saturation['outside'])} s outside"),

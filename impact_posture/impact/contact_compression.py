@@ -155,8 +155,8 @@ class Compression:
         if self.x is None:
             if not self.by_material:
                 return ""
-            each = ", ".join(f"{name} {x:.2g}" for name, x in self.by_material.items())
-            return f"x on {each}: at most {SHORT:g} meets the links alone, from {LONG:g} on links and rotors"
+            each = ", ".join(f"{float(f'{x:.2g}'):g} on {name}" for name, x in self.by_material.items())
+            return f"x = {each} (an impact meets the links alone up to {SHORT:g}, links and rotors from {LONG:g})"
         if self.fitting == "link":
             meaning = "the contact is over before the rotors move: joint model 'link'"
         elif self.fitting == "reflected":

@@ -68,9 +68,9 @@ class ContactStability:
         """The verdict in words."""
         lifting = [foot.frame for foot in self.feet if foot.lifts]
         if lifting:
-            return f"the impact lifts {', '.join(lifting)}: the metric holds what the ground cannot"
+            return f"the impact lifts {', '.join(lifting)}, although the metric assumes that all feet stay"
         if self.friction is None:
-            return "a sole tips over its edge: the metric holds what the ground cannot"
+            return "a sole tips over its edge, although the metric assumes that all feet stay"
         if self.friction > _MOST_FRICTION:
             return f"the feet slide at any friction below {_MOST_FRICTION:g}"
         return f"the feet stay with a friction coefficient of {self.friction:.2f} or more"

@@ -261,12 +261,12 @@ def _warnings(scalars: Scalars, effect: float | None) -> tuple[str, ...]:
     lines = []
     if scalars.E is None:
         lines.append(
-            "the contact point cannot move along the normal in this posture: its effective mass is unbounded, "
-            "V and E are undefined"
+            "the contact point cannot move along the normal in this posture, so its effective mass is unbounded, "
+            "and V and E are undefined: choose another posture"
         )
     if scalars.S is None:
         lines.append(
-            "S is undefined: the contact point cannot move in every direction, and the normal leaves those it can"
+            "S is undefined: the normal has a part along which the contact point cannot move in this posture"
         )
     if effect is not None and effect > _SOFT:
         lines.append(

@@ -342,7 +342,7 @@ class _HeldPoint:
 def no_sticking() -> MetricError:
     """Build the error for a posture where S does not exist."""
     return MetricError(
-        "S does not exist here: the contact point cannot move in every direction and the normal leaves those it can",
+        "S does not exist here: the normal has a part along which the contact point cannot move",
         where="objective sticking",
         hint="choose `objective='speed'`, or another frame, normal or posture",
     )

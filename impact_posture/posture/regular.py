@@ -102,7 +102,7 @@ def regularize(problem: PostureProblem) -> PostureProblem:
             turn = HeldTurn(base_point(), rotation, axis, f"base {name}")
             if _only_to_first_order(problem, numeric, turn, postures[0]):
                 added.append(turn)
-                notes.append(f"{turn.name} held: the feet allow it to first order only")
+                notes.append(f"{turn.name} held: the feet block it, although their linearization allows it")
     problem = replace(problem, constraints=(*problem.constraints, *added), notes=(*problem.notes, *notes))
     # A posture may be singular by chance (a straight arm), so the most regular posture decides what repeats.
     generic = max(postures, key=lambda q: rank(equality_jacobian(problem, numeric.at(q))))

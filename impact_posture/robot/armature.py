@@ -46,7 +46,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
         source = option
     elif option:
         _set_joints(model, armature, option, "armature", InputError)
-        source = f"given values over {source}"
+        source = f"given values over {source}" if source != "none" else "given values"
     if is_free_flyer(model):
         armature[:6] = 0.0
     model.armature = armature

@@ -100,7 +100,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     draft.key("kind", kind, reason, guessed=True)
     if states := ", ".join(name for name in robot.postures if name != "neutral"):
         chosen = (
-            f"of the SRDF's: {states}" if default != "neutral" else f"the SRDF's leave the joint limits: {states}"
+            f"the SRDF names {states}" if default != "neutral" else f"the SRDF has only {states}, beyond joint limits"
         )
         draft.key("default_posture", default, chosen, guessed=True)
     draft.lines += ["", "[model]"]
