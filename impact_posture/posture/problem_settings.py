@@ -24,11 +24,8 @@ from impact_posture.settings import ProblemSettings
 from impact_posture.tables import read_toml, validate
 
 _FILES = ("srdf", "config")
-# Settings that are requirements as they are.
-_AS_SET = (
-    "target_position", "target_quaternion", "box", "base_box", "keep", "keep_contacts", "friction", "regularization",
-    "collision", "clearance", "surface", "obstacles", "holdable", "hold_force",
-)  # fmt: skip
+# Settings with the name of a requirement that is worked out from them and from the robot.
+_WORKED_OUT = {"contact_pose", "base", "hold", "com_margin", "limit_margin"}
 
 
 @dataclass(frozen=True)
@@ -98,6 +95,8 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
 def requirements(settings: ProblemSettings, objective: Objective) -> Requirements:
     """Return the demands of the task on the posture; a setting that is ``None`` comes from the robot.
 
+    A setting with the name of a requirement becomes that requirement, unless it is worked out here.
+
     Raises:
         InputError: A setting is about feet, but there are no supports.
     """
@@ -117,7 +116,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     if settings.approach and not 0 < settings.speed <= FASTEST:
         what = "needs an approach speed above zero"
         raise InputError(what, where="approach", hint=f"give `speed`, up to {FASTEST:g} m/s")
-    return Requirements(
+    worked_out = Requirements(
         approach_speed=settings.speed if settings.approach else 0.0,
         contact_pose=poses[0] if poses else "free",
         other_poses=tuple(poses[1:]),
@@ -129,8 +128,9 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
         least_mobility=_least_mobility(settings),
         largest_jump=_largest_jump(settings),
         limit_margin=spec.limit_margin if settings.limit_margin is None else settings.limit_margin,
-        **{key: getattr(settings, key) for key in _AS_SET},
     )
+    shared = {f.name for f in fields(Requirements)} & {f.name for f in fields(ProblemSettings)} - _WORKED_OUT
+    return replace(worked_out, **{key: getattr(settings, key) for key in shared})
 
 
 def _least_mobility(settings: ProblemSettings) -> float:
