@@ -131,12 +131,12 @@ def metric_panels(view: RunView) -> list[Panel]:
     else:
         friction = np.linalg.norm(view.force - normal[:, None] * n, axis=1)
         names = ("force: normal, peak", "force: friction")
-        note = "Normal: the largest within each tick of the controller."
+        note = "The normal force is the largest one within each tick of the controller."
         force = Panel("force  [N]", names, [np.stack([view.peak, friction], axis=1)], note=note)
     panels = [Panel("H  [‖Δν‖²/(N·s)²]", (), [view.objective[:, None]], scale="metric")]
     panels += [replace(speed_panel([view]), scale="auto", overlay=False), force]
     if np.ptp(view.level) > 1e-9:
-        panels.append(Panel("level of\nthe term  [1]", (), [view.level[:, None]]))
+        panels.append(Panel("activation of\nthe term  [1]", (), [view.level[:, None]]))
     return panels
 
 
@@ -161,7 +161,7 @@ def rotor_panel(views: Sequence[RunView]) -> Panel | None:
     names = [f"rotor {k + 1}" for k in range(count)]
     commands = [view.rotor_command / high for view in views]
     ranges = [np.stack([command.min(axis=1), command.max(axis=1)], axis=1) for command in commands]
-    note = "Rotors: lines as they turn; the band holds all commands."
+    note = "Rotors: the lines are measured speeds, and the band contains all commands."
     speeds, limits = [view.rotor_speed / high for view in views], (low / high, 1.0) if one.rotor_limits else ()
     return Panel("rotor speed / highest  [1]", names, speeds, limits, ranges, note=note, noisy=True)
 

@@ -61,8 +61,9 @@ def _draw_curves(body: Any, data: SelfMotionMap, label: str) -> Any:
     x, y = data.s + offsets[data.component], _drawable(data.objective)
     for k in range(count):
         mine = data.component == k
-        axes.plot(x[mine], y[mine], color=GRAY, linewidth=0.8, linestyle=(0, (1, 1.5)))
-        axes.plot(x[mine], np.where(data.feasible[mine], y[mine], np.nan), color=BLUE, linewidth=1.6)
+        names = ("infeasible", "feasible") if k == 0 else (None, None)
+        axes.plot(x[mine], y[mine], color=GRAY, linewidth=0.8, linestyle=(0, (1, 1.5)), label=names[0])
+        axes.plot(x[mine], np.where(data.feasible[mine], y[mine], np.nan), color=BLUE, linewidth=1.6, label=names[1])
         if k:
             axes.axvline(offsets[k] - gap / 2, color=PALE, linewidth=0.8)
     _mark(axes, data, x, y, np.ones(len(x), dtype=bool))

@@ -150,7 +150,7 @@ def test_metric_shows_H_speed_and_force(flying: RunView) -> None:
         "force  [N]",
     ]
     ramped = dataclasses.replace(flying, level=np.linspace(0, 1, TICKS))
-    assert "level of the term" in text_of(metric_figure(ramped))
+    assert "activation of the term" in text_of(metric_figure(ramped))
 
 
 def test_H_over_more_than_a_decade_gets_a_log_axis(flying: RunView) -> None:
