@@ -237,7 +237,7 @@ def _holding(page: Page, before: dict[str, Any] | None, after: dict[str, Any] | 
             used = (f"{share:.0%}" for share in shares[name])
             load = other["actuators"][name]
             rows.append((f"  {name}", *used, f"{number(load['low'])} to {number(load['high'])}", one["load"]))
-    page.line("share of the actuator limits used at rest (0% is the middle of the range)")
+    page.line("share of the limits of the actuators that hold the posture (0% is mid-range)")
     page.table(("", "before", "after", "range, N·m or N", ""), rows, right=(1, 2))
     page.gap()
 
