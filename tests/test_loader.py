@@ -395,3 +395,9 @@ def test_an_armature_file_without_numbers_is_refused(arm: Path) -> None:
         load_robot(str(arm), LoadOptions(armature=str(file)))
     with pytest.raises(SpecError, match="no such file"):
         load_robot(str(arm), LoadOptions(armature=str(file) + "x"))
+
+
+def test_a_robot_prints_in_one_line() -> None:
+    """Not the whole of its model and its data file, which an objective would repeat."""
+    robot = load_robot("panda")
+    assert repr(robot).startswith("Robot('panda', root='fixed', nq=9, nv=9, source=") and "\n" not in repr(robot)

@@ -71,6 +71,9 @@ class Robot:
     stated_armature: Array | None = None
     settings: RobotSettings | None = None
 
+    def __repr__(self) -> str:
+        return f"Robot({self.name!r}, root={self.root!r}, nq={self.nq}, nv={self.nv}, source={self.source!r})"
+
     @property
     def nq(self) -> int:
         """Dimension of the configuration vector."""
