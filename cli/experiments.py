@@ -52,9 +52,10 @@ def rows_table(page: Page, rows: tuple[Row, ...] | list[Row]) -> None:
         lines.append((f"  {row.controller}{'' if row.rested else ' *'}", *numbers, status))
     head = ("  controller", "q_total", "less %", "in 1 s %", "peak jump", "status")
     page.table(head, lines, right=(1, 2, 3, 4))
-    page.line("  less %: within the windows; in 1 s %: until 1 s after each impact began", style="dim")
+    page.line("  q_total: motion in the impact windows (rad, m); peak jump in rad/s and m/s", style="dim")
+    page.line("  less %: reduction of q_total; in 1 s %: from each impact until 1 s later", style="dim")
     if any(row.failed for row in rows):
-        page.line("  no reduction where a run did not complete, of either controller; means are of those that did",
+        page.line("  no reduction if a run of either controller did not complete; means are those of completed runs",
                   style="dim")  # fmt: skip
     for row in rows:
         for line in row.failed:
@@ -62,4 +63,4 @@ def rows_table(page: Page, rows: tuple[Row, ...] | list[Row]) -> None:
         if row.stops:
             page.line(f"  {row.controller} reaches the stops of {', '.join(row.stops)}")
     if not all(row.rested for row in rows):
-        page.line("  * was not at rest before the push: its own motion is in what is measured", style="dim")
+        page.line("  * was not at rest before the push: the numbers include its own motion", style="dim")

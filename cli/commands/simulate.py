@@ -175,7 +175,7 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
     if document["path"] and document["path"]["reason"]:
         notes.append(document["path"]["reason"])
     if document["metrics"] is not None and not document["metrics"]["rested"]:
-        notes.append("the robot was not at rest before the push: its own motion is in what is measured")
+        notes.append("the robot was not at rest before the push: the numbers include its own motion")
     page.warnings(notes)
     page.line(f"written: {folder}")
 
