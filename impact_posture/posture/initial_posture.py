@@ -36,7 +36,7 @@ def initial_posture(problem: PostureProblem, seed: int, rows: ProgramRows) -> tu
     answer = elastic(problem, seed, ElasticProgram(problem, rows))
     if answer.conflicts:
         limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
-        sign = "; check the sign of the normal, which points towards the robot"
+        sign = "; check the sign of the normal, which points towards the robot, and how far the `surface` reaches"
         struck = sign if any(" / surface at " in name for name in answer.conflicts) else ""
         raise Infeasible(
             answer.conflicts,
