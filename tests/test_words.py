@@ -18,7 +18,7 @@ LEFT = {
     r"workshops?": "controller factory",
     r"twins?": "repeated limbs",
     r"in_a_copy|shared_out": "fork_call, fork_map",
-    r"OneBlow|BoxOfImpulses|FewModels|InnerMaximum": "SingleImpact, ImpulseBox, ModelSet, WorstCase",
+    r"OneBlow|BoxOfImpulses|FewModels|InnerMaximum": "ImpactKind, ImpulseBox, ModelSet, WorstCase",
     r"ImpactScenario": "Scenario",
     r"Footing": "ContactStability, StanceGains",
 }

@@ -64,7 +64,7 @@ class WorstImpulses:
         }
 
 
-def check_contacts(contacts: Sequence[ImpactContact], kind: ImpactKind, *, bilateral: bool, cone: bool) -> None:
+def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *, bilateral: bool, cone: bool) -> None:
     """Refuse contacts that have no worst case over a box of impulses.
 
     Raises:

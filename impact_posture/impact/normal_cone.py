@@ -40,7 +40,7 @@ _INSIDE = ((0.03, 0.01), (0.3, 0.1), (0.003, 0.001))
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-def check_cone(kind: ImpactKind, degrees: float) -> None:
+def check_cone(kind: type[ImpactKind], degrees: float) -> None:
     """Refuse an angle that is no cone, and a kind without an exact worst case over a cone.
 
     Raises:
@@ -49,7 +49,7 @@ def check_cone(kind: ImpactKind, degrees: float) -> None:
     """
     if not 0 <= degrees < 90:
         raise InputError(f"the half angle is {degrees:g}°", where="normal_cone", hint="give 0 to below 90 degrees")
-    if degrees and not isinstance(kind, QuadraticKind):
+    if degrees and not issubclass(kind, QuadraticKind):
         raise MetricError(
             kind.no_cone,
             where="normal_cone",
@@ -62,16 +62,19 @@ class NormalCone:
     """The worst normal within ``degrees`` of the contact's own normal.
 
     Attributes:
-        oracle: Pinocchio's numbers.
         kind: The scalar that is minimized.
         degrees: Half angle of the cone.
         attempts: Guesses of the lifted form.
     """
 
-    oracle: ImpactOracle
     kind: QuadraticKind
     degrees: float
     attempts: int = len(_INSIDE)
+
+    @property
+    def oracle(self) -> ImpactOracle:
+        """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
+        return self.kind.oracle
 
     @property
     def axis(self) -> Array:
@@ -94,13 +97,13 @@ class NormalCone:
 
     def value(self, q: Array) -> float:
         """See :class:`~impact_posture.impact.worst_case.Minimized`."""
-        return float(self.kind.of_form(self.oracle.case, np.array(self.worst(q).value)))
+        return float(self.kind.of_form(np.array(self.worst(q).value)))
 
     def gradient(self, q: Array) -> Array:
         """Return the tangent gradient at the worst normal, held fixed (Danskin); at a tie, a subgradient."""
         found = self.worst(q)
-        slope = float(self.kind.of_form_slope(self.oracle.case, np.array(found.value)))
-        return slope * self.kind.form_gradient(self.oracle, q, found.normal)
+        slope = float(self.kind.of_form_slope(np.array(found.value)))
+        return slope * self.kind.form_gradient(q, found.normal)
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return the gradients at all worst normals, the leading normal first.
@@ -108,16 +111,16 @@ class NormalCone:
         An arc or a circle of worst normals gives a dense sample.  A normal counts if its objective is at most
         ``within`` below the maximum.
         """
-        case, kind, axis = self.oracle.case, self.kind, self.axis
+        kind, axis = self.kind, self.axis
         form = self._form(q)[0]
         found = worst_normal(form, axis, self.degrees)
-        size = max(float(np.abs(form).max() * kind.of_form_slope(case, np.array(found.value))), 1e-300)
+        size = max(float(np.abs(form).max() * kind.of_form_slope(np.array(found.value))), 1e-300)
         normals = tied_normals(form, axis, self.degrees, found, max(_ACTIVE, within / size))
         values = np.einsum("ki,ij,kj->k", normals, form, normals)
-        slopes = kind.of_form_slope(case, values)
-        gaps = np.maximum(kind.of_form(case, np.array(found.value)) - kind.of_form(case, values), 0.0)
+        slopes = kind.of_form_slope(values)
+        gaps = np.maximum(kind.of_form(np.array(found.value)) - kind.of_form(values), 0.0)
         if len(normals) <= 2:
-            gradients = np.array([kind.form_gradient(self.oracle, q, n) for n in normals])
+            gradients = np.array([kind.form_gradient(q, n) for n in normals])
         else:
             gradients = np.einsum("ki,ijv,kj->kv", normals, self._form_tensor(q), normals)
         return Subgradients(slopes[:, None] * gradients, gaps)
@@ -135,13 +138,13 @@ class NormalCone:
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
         """Return the dual over the cone: the unknowns are three jumps, ``τ``, ``ρ`` and the six entries of ``L``."""
-        case, kind, local = self.oracle.case, self.kind, cone_axes_symbolic(parameters)
-        world = in_world(case, tree, local)
-        jumps = [kind.lift_direction(case, tree, local[:, k], str(k)) for k in range(3)]
-        unit = kind.form_unit(case, scale)
+        kind, local = self.kind, cone_axes_symbolic(parameters)
+        world = in_world(kind.case, tree, local)
+        jumps = [kind.lift_direction(tree, local[:, k], str(k)) for k in range(3)]
+        unit = kind.form_unit(scale)
         form = ca.SX.zeros(3, 3)
         for i, j in _UPPER:
-            form[i, j] = form[j, i] = kind.lift_entry(case, world[:, i], jumps[i], jumps[j]) / unit
+            form[i, j] = form[j, i] = kind.lift_entry(world[:, i], jumps[i], jumps[j]) / unit
         tau, rho, root = ca.SX.sym("tau"), ca.SX.sym("rho"), ca.SX.sym("root", 6)
         c, s = self._cosine_sine
         t = form[0, 0] + s * tau
@@ -153,18 +156,16 @@ class NormalCone:
         return Lifted(
             variables=ca.vertcat(*[jump.variables for jump in jumps], tau, rho, root),
             residual=ca.vertcat(*[jump.residual for jump in jumps], *[gap[i, j] for i, j in _UPPER]),
-            value=kind.of_form_expression(case, unit * t),
+            value=kind.of_form_expression(unit * t),
         )
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """Return the auxiliaries of :meth:`lift` at ``q``, with ``Z`` inside the cone that it must stay in."""
-        oracle = self.oracle
         form, jumps, impulses = self._form(q, cone_axes(self.axis))
-        form = form / self.kind.form_unit(oracle.case, scale)
+        form = form / self.kind.form_unit(scale)
         parts: list[Array] = []
-        for k in range(3):
-            feet = -oracle.Js @ jumps[:, k] / oracle.compliance
-            parts += self.kind.guess_direction(jumps[:, k], feet, impulses[:, k])
+        for jump, impulse in zip(jumps.T, impulses.T, strict=True):
+            parts += [self.oracle.with_support_impulses(jump), *[impulse] * self.kind.unknown_impulse]
         c, s = self._cosine_sine
         worst = worst_normal(form, np.eye(3)[0], self.degrees)
         above, beyond = _INSIDE[attempt]
@@ -201,7 +202,7 @@ class NormalCone:
         mobility = self.oracle.J @ responses
         impulses = self.kind.directions(mobility, world)
         jumps = responses @ impulses
-        K = self.kind.form(self.oracle, mobility, world, jumps)
+        K = self.kind.form(mobility, world, jumps)
         return (K + K.T) / 2, jumps, impulses
 
     def _form_tensor(self, q: Array) -> Array:
@@ -210,6 +211,6 @@ class NormalCone:
         tensor = np.zeros((3, 3, self.oracle.robot.nv))
         # The diagonal comes first in the order of i, because the other entries need it.
         for i, j in sorted(_UPPER, key=lambda entry: entry[0] != entry[1]):
-            both = self.kind.form_gradient(self.oracle, q, axes[i] if i == j else axes[i] + axes[j])
+            both = self.kind.form_gradient(q, axes[i] if i == j else axes[i] + axes[j])
             tensor[i, j] = tensor[j, i] = both if i == j else (both - tensor[i, i] - tensor[j, j]) / 2
         return tensor

@@ -30,7 +30,7 @@ from impact_posture.impact.lifted import Guess, Lifted
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.normal_cone import NormalCone, check_cone
 from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.impact.worst_case import Minimized, ModelSet, SingleImpact, Subgradients, WorstCase
+from impact_posture.impact.worst_case import Minimized, ModelSet, Subgradients, WorstCase
 from impact_posture.robot.model_variant import ModelVariant
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import ObjectiveKind
@@ -107,17 +107,18 @@ class ImpactObjective:
     model_variants: tuple[ModelVariant, ...] = ()
 
     def __post_init__(self) -> None:
-        check_cone(self.impact_kind, self.normal_cone_deg)
-        check_contacts(self.contacts, self.impact_kind, bilateral=self.bilateral, cone=self.normal_cone_deg != 0)
+        kind = KINDS[self.kind]
+        check_cone(kind, self.normal_cone_deg)
+        check_contacts(self.contacts, kind, bilateral=self.bilateral, cone=self.normal_cone_deg != 0)
         if not 0 <= self.compliance < math.inf:
             raise InputError(f"is {self.compliance:g}", where="compliance", hint="give 1/kg, zero or more")
         if self.compliance == 0:
             object.__setattr__(self, "compliance", default_compliance(self.robot))
 
-    @property
+    @cached_property
     def impact_kind(self) -> ImpactKind:
-        """Formulas of the kind."""
-        return KINDS[self.kind]
+        """Formulas of the kind for the leading contact, on the robot as modeled."""
+        return KINDS[self.kind](self.oracle)
 
     @property
     def name(self) -> str:
@@ -132,7 +133,7 @@ class ImpactObjective:
     @property
     def scale(self) -> float:
         """The value divided by H, V, S or E: λ̄² for ``impulse``, else 1."""
-        return self.impact_kind.factor(self.case)
+        return self.impact_kind.factor
 
     @property
     def structure(self) -> str:
@@ -199,8 +200,7 @@ class ImpactObjective:
             return ModelSet(tuple(member.worst_case for member in self.by_variant))
         if self.others:
             return ImpulseBox(tuple(single.oracle for single in self.singles), self.bilateral)
-        cone = self.normal_cone
-        return SingleImpact(self.oracle, self.impact_kind) if cone is None else cone
+        return self.normal_cone or self.impact_kind
 
     @cached_property
     def normal_cone(self) -> NormalCone | None:
@@ -208,12 +208,12 @@ class ImpactObjective:
         kind = self.impact_kind
         if not self.normal_cone_deg or not isinstance(kind, QuadraticKind):
             return None
-        return NormalCone(self.oracle, kind, self.normal_cone_deg)
+        return NormalCone(kind, self.normal_cone_deg)
 
     @property
     def is_multiple_of_H(self) -> bool:
         """Whether the objective is ``λ̄²H`` of the leading contact."""
-        return self.impact_kind.symbol == "H" and isinstance(self.worst_case, SingleImpact)
+        return self.impact_kind.symbol == "H" and isinstance(self.worst_case, ImpactKind)
 
     # ---- symbolic ---------------------------------------------------------------------------------------------
 

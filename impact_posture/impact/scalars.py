@@ -8,9 +8,9 @@ import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.errors import MetricError
+from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import SINGULAR, ImpactQuantities
-from impact_posture.impact.worst_case import SingleImpact
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def objective_value(objective: ImpactObjective, q: Array) -> float | None:
     if objective.model_variants:
         values = [objective_value(member, q) for member in objective.by_variant]
         return None if None in values else max(v for v in values if v is not None)
-    if isinstance(objective.worst_case, SingleImpact) and objective.kind != "coulomb":
+    if isinstance(objective.worst_case, ImpactKind) and objective.kind != "coulomb":
         scalars = Scalars.of(objective.oracle.quantities(q))
         alone: float | None = getattr(scalars, objective.impact_kind.symbol)
         return None if alone is None else objective.scale * alone

@@ -1,8 +1,9 @@
 """The inner maximum of ``min_q max ‖Δν‖²``, over normals, impulses, models, or nothing at all.
 
 Each shape of the maximum has an exact form of its own.  One protocol hides which shape it is from the program, the
-C export and the certificate.  This module has the two shapes that need no mathematics of their own:
-:class:`SingleImpact` (no maximum) and :class:`ModelSet` (the worst of several robot models).
+C export and the certificate.  This module has the protocol, and the shape that needs no mathematics of its own:
+:class:`ModelSet` (the worst of several robot models).  No maximum at all is an
+:class:`~impact_posture.impact.impact_kind.ImpactKind`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree
-from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import ABOVE, Guess, Lifted, worst_of, worst_of_guesses
 from impact_posture.impact.oracle import ImpactOracle
@@ -92,45 +92,6 @@ class WorstCase(Minimized, Protocol):
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Return value and tangent gradient (nv) in the symbols of a kernel of the objective's robot and contact."""
         ...
-
-
-@dataclass(frozen=True)
-class SingleImpact:
-    """One impact along one normal: there is no maximum, because ``λ = λ̄``.
-
-    Attributes:
-        oracle: Pinocchio's numbers.
-        kind: The scalar that is minimized.
-        attempts: Guesses of the lifted form.
-    """
-
-    oracle: ImpactOracle
-    kind: ImpactKind
-    attempts: int = 1
-
-    def value(self, q: Array) -> float:
-        """See :class:`Minimized`."""
-        return self.kind.value(self.oracle, q)
-
-    def gradient(self, q: Array) -> Array:
-        """See :class:`WorstCase`."""
-        return self.kind.gradient(self.oracle, q)
-
-    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """See :class:`Minimized`."""
-        return Subgradients(*self.kind.subgradients(self.oracle, q, within))
-
-    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """See :class:`WorstCase`."""
-        return self.kind.expressions(k)
-
-    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """See :class:`Minimized`."""
-        return self.kind.lift(self.oracle.case, tree, parameters)
-
-    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """See :class:`Minimized`."""
-        return self.kind.guess(self.oracle, q)
 
 
 @dataclass(frozen=True)

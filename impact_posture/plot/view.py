@@ -15,11 +15,11 @@ from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import MetricError
 from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import point_on
+from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities
 from impact_posture.impact.scalars import objective_value
 from impact_posture.impact.velocity_jump import tangent_units
-from impact_posture.impact.worst_case import SingleImpact
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import Against
 
@@ -209,7 +209,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
 
 def _worst_values(view: ResultView) -> str:
     """Return the objective before and after, where it is the worst of several impacts."""
-    if isinstance(view.objective.worst_case, SingleImpact):
+    if isinstance(view.objective.worst_case, ImpactKind):
         return ""
     found = [objective_value(view.objective, q) for q in (view.q_initial, view.q_optimal)]
     return " " + " → ".join(number(value) for value in found)

@@ -70,7 +70,7 @@ def predict(setup: Setup, objective: ImpactObjective, run: Run) -> tuple[Predict
             approach = float(-scenario.normal @ numeric.at(q).jacobian(point)[:3] @ v)
             smooth = approach * float(np.sqrt(here.V))
             sticking = None if here.S is None else approach * float(np.sqrt(here.S))
-            coulomb = approach * float(np.sqrt(KINDS["coulomb"].value(objective.oracle, q)))
+            coulomb = approach * float(np.sqrt(KINDS["coulomb"](objective.oracle).value(q)))
         measured = jump(setup, run.series, window)
         expected = smooth if coulomb is None else coulomb
         ratio = measured / expected if expected > 1e-9 else None
