@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -42,14 +40,22 @@ class Chart:
 
     def __init__(self, model: pin.Model) -> None:
         self.slots: list[JointSlot] = []
+        # Places in q and x of the numbers that both have, and of each angle, whose sine follows its cosine in q.
+        copied: list[tuple[int, int]] = []
+        angles: list[tuple[int, int]] = []
         start = 0
         for i in range(1, model.njoints):
             kind = joint_kind(model.joints[i], str(model.names[i]))
-            width = {"continuous": 1, "planar": 3}.get(kind.family, kind.nq)
-            q0, v0 = int(model.idx_qs[i]), int(model.idx_vs[i])
-            columns = slice(q0, q0 + kind.nq), slice(v0, v0 + kind.nv), slice(start, start + width)
+            angle = kind.family in _ANGLES
+            q0, v0, end = int(model.idx_qs[i]), int(model.idx_vs[i]), start + kind.nq - angle
+            columns = slice(q0, q0 + kind.nq), slice(v0, v0 + kind.nv), slice(start, end)
             self.slots.append(JointSlot(i, str(model.names[i]), kind, *columns))
-            start += width
+            copied += [(q0 + k, start + k) for k in range(kind.nq - 2 * angle)]
+            if angle:
+                angles.append((q0 + kind.nq - 2, end - 1))
+            start = end
+        self._q, self._x = np.array(copied, dtype=int).reshape(-1, 2).T
+        self._cosine, self._angle = np.array(angles, dtype=int).reshape(-1, 2).T
         self.nx = start
         self.nq, self.nv = int(model.nq), int(model.nv)
         self._model = model
@@ -69,19 +75,12 @@ class Chart:
 
     def configuration(self, x: ca.SX) -> ca.SX:
         """Return ``q(x)``, shape (nq, 1)."""
-        parts: list[ca.SX] = self._parts(x, ca.cos, ca.sin)
+        parts = [ca.SX(0)] * self.nq
+        for k, place in zip(self._q, self._x, strict=True):
+            parts[k] = x[int(place)]
+        for k, place in zip(self._cosine, self._angle, strict=True):
+            parts[k], parts[k + 1] = ca.cos(x[int(place)]), ca.sin(x[int(place)])
         return ca.vertcat(*parts)
-
-    def _parts(self, x: Any, cos: Callable[[Any], Any], sin: Callable[[Any], Any]) -> list[Any]:
-        """Return the entries of ``q(x)`` in order, with cosine and sine of every angle."""
-        parts: list[Any] = []
-        for slot in self.slots:
-            angle = slot.kind.family in _ANGLES
-            last = slot.x.stop - 1
-            # CasADi gives an entry for the empty part of a scalar x, which a single continuous joint has.
-            parts += [x[slot.x.start : last]] if angle and last > slot.x.start else []
-            parts += [cos(x[last]), sin(x[last])] if angle else [x[slot.x]]
-        return parts
 
     def quaternion_slices(self) -> list[slice]:
         """Return where ``x`` holds quaternions (x y z w)."""
@@ -93,18 +92,18 @@ class Chart:
 
     def to_x(self, q: Array) -> Array:
         """Return the chart coordinates of a configuration, shape (nx,)."""
-        if self.nx == self.nq:
-            return np.array(q, dtype=float)
-        parts: list[Any] = []
-        for slot in self.slots:
-            piece = q[slot.q]
-            angle = slot.kind.family in _ANGLES
-            parts += [piece[:-2], np.arctan2(piece[-1], piece[-2])] if angle else [piece]
-        return np.hstack([np.zeros(0), *parts])
+        x = np.zeros(self.nx)
+        x[self._x] = q[self._q]
+        if self._angle.size:
+            x[self._angle] = np.arctan2(q[self._cosine + 1], q[self._cosine])
+        return x
 
     def to_q(self, x: Array) -> Array:
         """Return the configuration of chart coordinates, shape (nq,), with normalized quaternions."""
-        q = x if self.nx == self.nq else np.hstack(self._parts(x, np.cos, np.sin))
+        q = np.zeros(self.nq)
+        q[self._q] = x[self._x]
+        if self._angle.size:
+            q[self._cosine], q[self._cosine + 1] = np.cos(x[self._angle]), np.sin(x[self._angle])
         return np.asarray(pin.normalize(self._model, q))
 
     def bounds(self) -> tuple[Array, Array]:

@@ -11,7 +11,6 @@ The two differ in these points:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -54,39 +53,28 @@ class MjcfLayout:
     """
 
     def __init__(self, model: pin.Model, order: Sequence[int], free: frozenset[int]) -> None:
-        by_index = {slot.index: slot for slot in Chart(model).slots}
+        self._chart = chart = Chart(model)
+        self.nqpos, self.nv, self.nq = chart.nx, chart.nv, chart.nq
+        by_index = {slot.index: slot for slot in chart.slots}
         self.slots: list[MjcfSlot] = []
-        q = v = 0
+        # The place in the chart of each entry of qpos, which has the same numbers, and that in v of each of qvel.
+        places: list[int] = []
+        rates: list[int] = []
         for i in order:
             joint = by_index[i]
-            # One number for an angle and four for a quaternion, as in the chart.
-            width, rates = joint.x.stop - joint.x.start, joint.kind.nv
+            x, v = list(range(joint.x.start, joint.x.stop)), range(joint.v.start, joint.v.stop)
+            if joint.kind.family in ("spherical", "free-flyer"):
+                x = [*x[:-4], x[-1], *x[-4:-1]]
             place = pin.SE3(model.jointPlacements[i])
             moved = i in free and not place.isIdentity(0.0)
-            self.slots.append(MjcfSlot(joint, slice(q, q + width), slice(v, v + rates), place, moved))
-            q, v = q + width, v + rates
-        self.nqpos, self.nv, self.nq = q, v, int(model.nq)
-        # A simulation converts in every tick, so all joints are converted at once: numbers that both sides have are
-        # copied by index, then come the angles.  Left are quaternions to normalize and poses from another frame.
-        copied: list[tuple[int, int]] = []
-        angles: list[tuple[int, int]] = []
-        self._quaternions: list[tuple[slice, slice]] = []
-        # The velocity map before the linear parts are rotated, and the place in qvel of each entry of v.
-        self._permutation = np.zeros((self.nv, self.nv))
-        for slot in self.slots:
-            self._permutation[slot.qvel, slot.joint.v] = np.eye(slot.joint.kind.nv)
-            family, order = slot.joint.kind.family, list(range(slot.joint.q.start, slot.joint.q.stop))
-            if family in ("continuous", "planar"):
-                angles.append((order[-2], slot.qpos.stop - 1))
-                order = order[:-2]
-            elif family in ("spherical", "free-flyer"):
-                theirs = slice(slot.qpos.stop - 4, slot.qpos.stop)
-                self._quaternions.append((slice(order[-4], order[-1] + 1), theirs))
-                order = [*order[:-4], order[-1], *order[-4:-1]]
-            copied += zip(order, range(slot.qpos.start, slot.qpos.stop), strict=False)
-        self._rates = self._permutation.argmax(axis=0)
-        self._q, self._qpos = np.array(copied, dtype=int).reshape(-1, 2).T
-        self._cosine, self._angle = np.array(angles, dtype=int).reshape(-1, 2).T
+            ends = slice(len(places), len(places) + len(x)), slice(len(rates), len(rates) + len(v))
+            self.slots.append(MjcfSlot(joint, *ends, place, moved))
+            places += x
+            rates += v
+        # A simulation converts in every tick, so all joints are converted at once, and only poses from another frame
+        # and linear velocities joint by joint.
+        self._places, self._permutation = np.array(places, dtype=int), np.eye(self.nv)[rates]
+        self._rates = np.argsort(rates)
         self._moved = [slot for slot in self.slots if slot.moved]
         self._turning = [slot for slot in self.slots if slot.joint.kind.family in ("free-flyer", "planar")]
 
@@ -95,19 +83,13 @@ class MjcfLayout:
         for slot in self._moved:
             q = q.copy()
             q[slot.joint.q] = pin.SE3ToXYZQUAT(slot.placement * pin.XYZQUATToSE3(q[slot.joint.q]))
-        found = np.zeros(self.nqpos)
-        found[self._qpos] = q[self._q]
-        found[self._angle] = np.arctan2(q[self._cosine + 1], q[self._cosine])
-        return found
+        return np.asarray(self._chart.to_x(q)[self._places])
 
     def q(self, qpos: Array) -> Array:
         """Return the configuration, shape (nq,), of a ``qpos``, shape (nqpos,), with quaternions normalized."""
-        found = np.zeros(self.nq)
-        found[self._q] = qpos[self._qpos]
-        if self._angle.size:
-            found[self._cosine], found[self._cosine + 1] = np.cos(qpos[self._angle]), np.sin(qpos[self._angle])
-        for ours, theirs in self._quaternions:
-            found[ours] /= math.sqrt(qpos[theirs].dot(qpos[theirs]))
+        x = np.zeros(self.nqpos)
+        x[self._places] = qpos
+        found = self._chart.to_q(x)
         for slot in self._moved:
             pose = slot.placement.actInv(pin.XYZQUATToSE3(found[slot.joint.q]))
             found[slot.joint.q] = pin.SE3ToXYZQUAT(pose)
