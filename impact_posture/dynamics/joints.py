@@ -19,6 +19,8 @@ _FAMILIES = {
     **dict.fromkeys(("PX", "PY", "PZ", "PrismaticUnaligned"), "prismatic"),
     **{"FreeFlyer": "free-flyer", "Planar": "planar", "Spherical": "spherical", "Translation": "translation"},
 }
+# Families that turn by an angle about an axis, and by a quaternion, which is the end of their configuration.
+_TURNING, _QUATERNION = ("revolute", "continuous", "planar"), ("free-flyer", "spherical")
 
 
 @dataclass(frozen=True)
@@ -69,18 +71,15 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
 
 def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return rotation (3, 3) and translation (3,) of the moved frame in the rest frame of the joint."""
-    zero, axis = ca.SX(3, 1), tuple(kind.axis.tolist())
-    if kind.family == "revolute":
-        return axis_rotation(ca.cos(q[0]), ca.sin(q[0]), axis=axis), zero
-    if kind.family == "continuous":
-        return axis_rotation(q[0], q[1], axis=axis), zero
-    if kind.family == "free-flyer":
-        return quaternion_matrix(q[3:7]), q[:3]
-    if kind.family == "planar":
-        return axis_rotation(q[2], q[3], axis=axis), ca.sparsify(ca.vertcat(q[0], q[1], 0))
-    if kind.family == "spherical":
-        return quaternion_matrix(q), zero
-    return ca.SX.eye(3), constant(kind.subspace[:3]) @ q
+    rotation, translation = ca.SX.eye(3), ca.SX(3, 1)
+    if kind.family in _TURNING:
+        rotation = axis_rotation(*_cosine_sine(kind, q), axis=tuple(kind.axis.tolist()))
+    elif kind.family in _QUATERNION:
+        rotation = quaternion_matrix(q[-4:])
+    sliding = kind.subspace[:3, kind.subspace[:3].any(axis=0)]
+    if sliding.size:
+        translation = constant(sliding) @ q[: sliding.shape[1]]
+    return rotation, translation
 
 
 def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
@@ -88,9 +87,14 @@ def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
     axis = int(np.argmax(np.abs(kind.axis)))
     if kind.family not in ("revolute", "continuous") or abs(kind.axis[axis]) < 1 - 1e-15:
         return None
-    cosine, sine = (ca.cos(q[0]), ca.sin(q[0])) if kind.family == "revolute" else (q[0], q[1])
+    cosine, sine = _cosine_sine(kind, q)
     sense = float(np.sign(kind.axis[axis]))
     return Spin(axis, cosine, sense * sine, sense)
+
+
+def _cosine_sine(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return cosine and sine of the angle of a joint, the last entries of its configuration or those of its angle."""
+    return (ca.cos(q[0]), ca.sin(q[0])) if kind.family == "revolute" else (q[-2], q[-1])
 
 
 @template
@@ -106,16 +110,7 @@ def joint_quaternion(kind: JointKind, x: ca.SX) -> ca.SX:
     Continuous and planar joints enter by their angle (see :class:`~impact_posture.dynamics.chart.Chart`), because a
     half angle is no smooth function of its cosine and sine.
     """
-    if kind.family in ("revolute", "continuous"):
-        return _half(kind.axis, x[0])
-    if kind.family == "planar":
-        return _half(kind.axis, x[2])
-    if kind.family == "free-flyer":
-        return x[3:7]
-    if kind.family == "spherical":
-        return x
-    return ca.SX([0, 0, 0, 1])
-
-
-def _half(axis: NDArray[np.float64], angle: ca.SX) -> ca.SX:
-    return ca.vertcat(ca.densify(constant(axis)) * ca.sin(angle / 2), ca.cos(angle / 2))
+    if kind.family in _TURNING:
+        half = x[-1] / 2
+        return ca.vertcat(ca.densify(constant(kind.axis)) * ca.sin(half), ca.cos(half))
+    return x[-4:] if kind.family in _QUATERNION else ca.SX([0, 0, 0, 1])

@@ -137,21 +137,20 @@ def _limb(model: pin.Model, root: int) -> tuple[int, ...]:
 
 def _alike(model: pin.Model, one: tuple[int, ...], other: tuple[int, ...]) -> bool:
     """Return whether two limbs have the same joints in the same order, and nearly the same zeros."""
-    if len(one) != len(other):
+    if _joints(model, one) != _joints(model, other):
         return False
-    for i, j in zip(one, other, strict=True):
-        kinds = [joint_kind(model.joints[k], str(model.names[k])) for k in (i, j)]
-        if kinds[0].family != kinds[1].family or not np.array_equal(kinds[0].axis, kinds[1].axis):
-            return False
-        if len({bool(finite_armature(model)[1][model.idx_vs[k]]) for k in (i, j)}) > 1:
-            return False
-        parents = [b.index(int(model.parents[k])) if k != b[0] else -1 for k, b in ((i, one), (j, other))]
-        if parents[0] != parents[1]:
-            return False
-        numbers = [_numbers(model, k) != 0.0 for k in (i, j)]
-        if np.count_nonzero(numbers[0] | numbers[1]) > _FILL * max(np.count_nonzero(n) for n in numbers):
-            return False
-    return True
+    pairs = [[_numbers(model, k) != 0.0 for k in pair] for pair in zip(one, other, strict=True)]
+    return all(np.count_nonzero(a | b) <= _FILL * max(map(np.count_nonzero, (a, b))) for a, b in pairs)
+
+
+def _joints(model: pin.Model, limb: tuple[int, ...]) -> list[tuple[object, ...]]:
+    """Return family, axis, whether it is locked, and place of the parent in the limb, for each joint of a limb."""
+    kinds, locked = [joint_kind(model.joints[k], str(model.names[k])) for k in limb], finite_armature(model)[1]
+    parents = [-1, *[limb.index(int(model.parents[k])) for k in limb[1:]]]
+    return [
+        (kind.family, *kind.axis, locked[model.idx_vs[k]], parent)
+        for k, kind, parent in zip(limb, kinds, parents, strict=True)
+    ]
 
 
 def _numbers(model: pin.Model, joint: int) -> NDArray[np.float64]:
