@@ -108,7 +108,8 @@ class ImpactKernel:
         if self.metric.kind == "kinetic" and not self._supported and r is None:
             return self.tree.pair_gradient(jump, jump)
         adjoint = self.tree.respond(self._weigh(jump.a, jump.velocities), [] if r is None else self._alike(r))
-        return 2 * self.tree.pair_gradient(jump, adjoint) + self._metric_gradient(jump.velocities)
+        gradient = 2 * self.tree.pair_gradient(jump, adjoint)
+        return gradient + self.tree.energy_gradient(jump.velocities) if self.metric.kind == "kinetic" else gradient
 
     def adjoint_velocity(self, x: Response) -> ca.SX:
         """Return ``JM⁻¹Wa`` of a response, world, shape (3,)."""
@@ -146,7 +147,7 @@ class ImpactKernel:
     def _axes(self) -> list[Response]:
         """``M⁻¹Jᵀe_k`` for the three world directions."""
         eye = np.eye(3)
-        return [self.tree.respond(wrenches=self._alike(self._force(ca.SX(eye[k])))) for k in range(3)]
+        return [self.answer([self._force(ca.SX(eye[k]))]) for k in range(3)]
 
     @cached_property
     def ellipsoid(self) -> ca.SX:
@@ -173,7 +174,7 @@ class ImpactKernel:
     @cached_property
     def _sticking(self) -> Response:
         """Response to the impulse ``s = (JM⁻¹Jᵀ)⁻¹n`` per unit approach speed."""
-        return self.tree.respond(wrenches=self._alike(self._force(self._mobility_inverse @ self.world_normal)))
+        return self.answer([self._force(self._mobility_inverse @ self.world_normal)])
 
     @cached_property
     def S(self) -> ca.SX:
@@ -198,12 +199,6 @@ class ImpactKernel:
         if self.metric.weights is None:
             return a
         return self.tree.by_joint("weight", self.metric.diagonal(self.tree.nv)) * a
-
-    def _metric_gradient(self, velocities: ByJoint) -> ca.SX:
-        """``∂_q aᵀWa`` with ``a`` held fixed: zero unless W = M."""
-        if self.metric.kind != "kinetic":
-            return ca.SX.zeros(self.tree.nv)
-        return self.tree.energy_gradient(velocities)
 
     def _force(self, impulse: ca.SX) -> Wrench:
         return Wrench(self.point, impulse, ca.SX.zeros(3))

@@ -147,7 +147,4 @@ def worst_of(parts: Sequence[Lifted], values: Sequence[ca.SX], scale: ca.SX) -> 
 
 def worst_of_guesses(parts: Sequence[Guess], largest: float, attempt: int) -> Guess:
     """Return the start of :func:`worst_of`, with ``t`` above the largest value (in units of the scale)."""
-    return Guess(
-        np.concatenate([*[p.values for p in parts], [largest + ABOVE[attempt]]]),
-        np.concatenate([*[p.lower for p in parts], [-np.inf]]),
-    )
+    return Guess.joined([*parts, Guess.unbounded(np.array([largest + ABOVE[attempt]]))])

@@ -77,10 +77,10 @@ def tangent_units(robot: Robot) -> tuple[str, ...]:
     return tuple(units)
 
 
-def largest_entries(robot: Robot, values: Array, count: int = 5) -> tuple[tuple[str, float, str], ...]:
-    """Return ``(name, value, unit)`` of the largest entries of a tangent vector, above 0.1 % of the first."""
+def largest_entries(robot: Robot, values: Array) -> tuple[tuple[str, float, str], ...]:
+    """Return ``(name, value, unit)`` of the five largest entries of a tangent vector, above 0.1 % of the first."""
     units = tangent_units(robot)
-    return tuple((robot.tangent_names[k], float(values[k]), units[k]) for k in _largest(np.abs(values), count))
+    return tuple((robot.tangent_names[k], float(values[k]), units[k]) for k in _largest(np.abs(values), 5))
 
 
 def _largest(sizes: Array, count: int) -> list[int]:
