@@ -71,22 +71,17 @@ class Numeric:
         follow by rotation, because its LOCAL_WORLD_ALIGNED derivatives leave the rotation of the frame out.
         """
         pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
-        dv_dq = pin.getJointVelocityDerivatives(self.model, self.data, point.joint, pin.LOCAL)[0]
-        dv_dq = np.asarray(dv_dq).reshape(6, -1)
-        motion = self.data.v[point.joint]
-        R = np.array(self.data.oMi[point.joint].rotation)
-        shift = -pin.skew(point.position)
-        d_linear = dv_dq[:3] + shift @ dv_dq[3:]
-        linear = motion.linear + shift @ motion.angular
-        axes = point.rotation if in_frame else R.T
-        force, moment = axes @ wrench[:3], axes @ wrench[3:]
-        gradient = d_linear.T @ force + dv_dq[3:].T @ moment
+        at = self.model, self.data, point.joint, point.placement, pin.LOCAL
+        dv_dq = np.asarray(pin.getFrameVelocityDerivatives(*at)[0]).reshape(6, -1)
+        motion = point.placement.actInv(self.data.v[point.joint])
         self.at(self.q)
-        if not in_frame:
-            local = pin.getJointJacobian(self.model, self.data, point.joint, pin.LOCAL)
-            angular = np.asarray(local).reshape(6, -1)[3:]
-            gradient = gradient + angular.T @ (_cross(linear, force) + _cross(motion.angular, moment))
-        return np.asarray(gradient)
+        if in_frame:
+            return np.asarray(dv_dq.T @ wrench)
+        R = self.placement(point).rotation.T
+        force, moment = R @ wrench[:3], R @ wrench[3:]
+        angular = np.asarray(pin.getFrameJacobian(*at)).reshape(6, -1)[3:]
+        turning = _cross(motion.linear, force) + _cross(motion.angular, moment)
+        return np.asarray(dv_dq.T @ np.concatenate([force, moment]) + angular.T @ turning)
 
     def turning_gradient(self, point: PointOnLink, direction: Array, covector: Array) -> Array:
         """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), of a world direction that turns with the link."""
