@@ -152,32 +152,29 @@ def _inside(P: Array, c: float, size: float) -> Array:
 
 def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
     """Maxima on the edge of the cap ``n = (c, s cos φ, s sin φ)``; three of its points if the value is constant."""
-    b1, b2 = float(P[0, 1]), float(P[0, 2])
-    h, k = float(P[1, 1] - P[2, 2]) / 2, float(P[1, 2])
+    # The value is Re(A z + B z²) + constant with z = exp(iφ), divided by 2s.
+    A, B = c * complex(P[0, 1], -P[0, 2]), s * complex(P[1, 1] - P[2, 2], -2 * P[1, 2]) / 4
 
-    def slope(x: Array) -> Array:
-        return np.asarray(c * (b2 * np.cos(x) - b1 * np.sin(x)) + s * (k * np.cos(2 * x) - h * np.sin(2 * x)))
+    def height(x: Array, order: int = 0) -> Array:
+        """The value without its constant, or its derivative."""
+        z = np.exp(1j * x)
+        return np.asarray((1j**order * (A * z + 2**order * B * z * z)).real)
 
-    def bend(x: Array) -> Array:
-        return np.asarray(-c * (b2 * np.sin(x) + b1 * np.cos(x)) - 2 * s * (k * np.sin(2 * x) + h * np.cos(2 * x)))
-
-    def height(x: Array) -> Array:
-        return np.asarray(2 * c * (b1 * np.cos(x) + b2 * np.sin(x)) + s * (h * np.cos(2 * x) + k * np.sin(2 * x)))
-
-    # The zeros of the slope are roots z = exp(iφ).  The angles of all roots are candidates.
-    roots = np.roots([s * complex(k, h), c * complex(b2, b1), 0, c * complex(b2, -b1), s * complex(k, -h)])
+    # The zeros of the slope are roots z.  The angles of all roots are candidates.
+    roots = np.roots([2 * B, A, 0, -A.conjugate(), -2 * B.conjugate()])
     phi = np.concatenate([np.angle(roots), _GRID[[int(height(_GRID).argmax())]]])
-    swing = max(c * np.hypot(b1, b2) + s * np.hypot(h, k), _SMALL)
+    swing = max(abs(A) + 2 * abs(B), _SMALL)
     for _ in range(_POLISH):
-        curved = bend(phi) < 0
-        step = np.where(curved, slope(phi) / np.minimum(bend(phi), -1e-8 * swing), 0.0)
+        slope, bend = height(phi, 1), height(phi, 2)
+        step = np.where(bend < 0, slope / np.minimum(bend, -1e-8 * swing), 0.0)
         phi = phi - np.clip(step, -0.2, 0.2)
         if np.abs(step).max() < 1e-15:
             break
-    kept = (bend(phi) < 0) & (np.abs(slope(phi)) <= 1e-10 * swing)
+    kept = (height(phi, 2) < 0) & (np.abs(height(phi, 1)) <= 1e-10 * swing)
     # A maximum that is flat to third order is no simple root, so the highest candidate is kept as well.
-    highest = int(height(phi).argmax())
-    kept[highest] |= not (height(phi)[kept] >= height(phi)[highest] - _EQUAL * swing).any()
+    heights = height(phi)
+    highest = int(heights.argmax())
+    kept[highest] |= not (heights[kept] >= heights[highest] - _EQUAL * swing / 2).any()
     phi = phi[kept]
     if 4 * swing <= TIED * size:
         phi = np.concatenate([phi, 2 * np.pi / 3 * np.arange(3)])
