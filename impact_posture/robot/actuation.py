@@ -74,11 +74,6 @@ class LateralForce:
     left: float
     right: float
 
-    @property
-    def least(self) -> float:
-        """Smallest of the four forces, N."""
-        return float(np.min([self.forward, self.backward, self.left, self.right]))
-
 
 def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
     """Return the smallest and the largest thrust of a rotor, ``c_f ω²`` at the speed limits, N."""

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from impact_posture.errors import InertiaError
 from impact_posture.robot.model_joints import v_slice
+from impact_posture.robot.robot import Robot
 
 # A mass (kg) or a moment (kg m²) below _TINY counts as zero.  A relative fault below the slack counts as rounding.
 _TINY = 1e-10
@@ -81,25 +80,21 @@ def check_moved_mass(model: pin.Model, where: str) -> None:
         )
 
 
-def check_mass_matrix(
-    model: pin.Model, q: NDArray[np.float64], tangent_names: Sequence[str], where: str, posture: str
-) -> None:
-    """Refuse a singular mass matrix.
+def check_mass_matrix(robot: Robot, where: str) -> None:
+    """Refuse a robot whose mass matrix is singular at the default posture.
 
     Causes are a massless floating base, a point mass that turns, or two joints about one axis.  ``M`` is first scaled
     to a unit diagonal, so that kilograms and kg m² compare.
 
     Args:
-        model: The model, armature included.
-        q: Configuration, shape (nq,).
-        tangent_names: Names of the nv directions.
+        robot: The robot, armature included.
         where: Source of the model.
-        posture: Name of ``q``.
 
     Raises:
         InertiaError: The matrix is not finite, or singular; the message names the directions that move no inertia.
     """
-    upper = np.triu(pin.crba(model, model.createData(), q))
+    model = robot.model
+    upper = np.triu(pin.crba(model, model.createData(), robot.posture()))
     moving = np.isfinite(model.armature)
     M = (upper + np.triu(upper, 1).T)[np.ix_(moving, moving)]
     diagonal = np.diag(M)
@@ -118,11 +113,11 @@ def check_mass_matrix(
         # The free motion in rad and m (per s).
         motion = np.abs(scale * vectors[:, 0])
         free = motion >= 0.1 * motion.max()
-    names = [name for name, moves in zip(tangent_names, moving, strict=True) if moves]
+    names = [name for name, moves in zip(robot.tangent_names, moving, strict=True) if moves]
     named = [name for name, moves in zip(names, free, strict=True) if moves]
     verb = "moves no inertia" if len(named) == 1 else "move no inertia together"
     raise InertiaError(
-        f"the mass matrix is singular at posture '{posture}': {', '.join(named)} {verb}",
+        f"the mass matrix is singular at posture '{robot.default_posture}': {', '.join(named)} {verb}",
         where=where,
         hint="give the links mass and rotational inertia, or the joints `armature`, or `lock` one",
     )

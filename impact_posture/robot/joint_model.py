@@ -112,12 +112,9 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
         return replace(robot, joint_model=joint_model, stated_armature=stated)
     model = pin.Model(robot.model)
     model.armature = armature
-    found_robot = replace(robot, model=model, joint_model=joint_model, stated_armature=stated)
-    q = robot.postures[robot.default_posture]
-    check_mass_matrix(
-        model, q, robot.tangent_names, f"{robot.source}, joint model '{joint_model}'", robot.default_posture
-    )
-    return found_robot
+    changed = replace(robot, model=model, joint_model=joint_model, stated_armature=stated)
+    check_mass_matrix(changed, f"{robot.source}, joint model '{joint_model}'")
+    return changed
 
 
 def describe_joints(robot: Robot) -> str:

@@ -86,7 +86,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
         armature_source=armature_source,
         warnings=warnings,
     )
-    check_mass_matrix(model, postures[default], loaded.tangent_names, source, default)
+    check_mass_matrix(loaded, source)
     return loaded
 
 
