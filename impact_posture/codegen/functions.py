@@ -177,14 +177,15 @@ def library(exported: Sequence[NamedObjective]) -> Library:
             found = {f"o{number}_{output}": value for output, value in part.items()}
             functions.append(Exported(v.stem, name, tuple(found)))
             outputs |= found
-    inputs = [q, n, ca.vertcat(ca.SX(0, 1), *limbs.parameters)]
+    constants = [value for _, value in limbs.parameters.values()]
+    inputs = [q, n, ca.vertcat(ca.SX(0, 1), *[symbol for symbol, _ in limbs.parameters.values()])]
     names = ["q", "n", "constants"], [*outputs]
     function = ca.Function("library", inputs, [*outputs.values()], *names, {"cse": True})
-    return Library(function, tuple(limbs.values), _seeds(model, limbs), tuple(functions))
+    return Library(function, tuple(constants), _seeds(model, limbs), tuple(functions))
 
 
 def _seeds(model: object, limbs: RepeatedLimbs) -> dict[tuple[str, int], Seed]:
-    found = {("constants", i): Seed(group, lane, name) for i, (group, lane, name) in enumerate(limbs.keys)}
+    found = {("constants", i): Seed(group, lane, name) for i, (group, lane, name) in enumerate(limbs.parameters)}
     for slot in Chart(model).slots:
         place = limbs.places.get(slot.index)
         if place is not None:

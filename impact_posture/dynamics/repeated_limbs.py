@@ -44,9 +44,7 @@ class RepeatedLimbs:
     Attributes:
         groups: For each group its limbs, and for each limb its joints in one order.
         places: Joint index → its place; joints outside repeated limbs are missing.
-        parameters: Symbols of the parameters, in order.
-        values: Values of the parameters.
-        keys: For each parameter its group, its lane and a name that all lanes share.
+        parameters: Symbol and value of each parameter, by its group, its lane, and a name that all lanes share.
     """
 
     def __init__(self, model: pin.Model) -> None:
@@ -57,10 +55,7 @@ class RepeatedLimbs:
             for lane, limb in enumerate(limbs)
             for position, joint in enumerate(limb)
         }
-        self.parameters: list[ca.SX] = []
-        self.values: list[float] = []
-        self.keys: list[tuple[int, int, str]] = []
-        self._known: dict[tuple[int, int, str], ca.SX] = {}
+        self.parameters: dict[tuple[int, int, str], tuple[ca.SX, float]] = {}
 
     def counterparts(self, joint: int) -> list[int]:
         """Return the joints at the same position of all limbs, by lane; the joint alone outside repeated limbs."""
@@ -100,12 +95,9 @@ class RepeatedLimbs:
 
     def _parameter(self, place: Place, name: str, value: float) -> ca.SX:
         key = (place.group, place.lane, name)
-        if key not in self._known:
-            self._known[key] = ca.SX.sym(f"c{len(self.values)}")
-            self.parameters.append(self._known[key])
-            self.values.append(value)
-            self.keys.append(key)
-        return self._known[key]
+        if key not in self.parameters:
+            self.parameters[key] = ca.SX.sym(f"c{len(self.parameters)}"), value
+        return self.parameters[key][0]
 
 
 def _groups(model: pin.Model) -> tuple[tuple[tuple[int, ...], ...], ...]:
