@@ -184,7 +184,7 @@ def test_the_largest_of_separate_objectives(name: str, feet: bool, kind: str) ->
         alone = [replace(objective, robot=s.robot, model_variants=()) for s in objective.model_variants]
         values = np.array([one.value(q) for one in alone])
         value, worst = objective.value(q), int(values.argmax())
-        assert value == values.max() and few(objective).worst(q) == worst
+        assert value == values.max()
         seen.add(worst)
         assert np.sort(values)[-2] < value * (1 - 1e-4), "no tie here"
         gradient = objective.gradient(q)

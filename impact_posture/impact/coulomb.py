@@ -173,14 +173,10 @@ class CoulombKind(ImpactKind):
         jump = coulomb_impact(self.oracle, q).jump
         return float(jump @ self.oracle.weigh(jump))
 
-    def gradient(self, q: Array) -> Array:
-        """Return the tangent gradient from Pinocchio's numbers, shape (nv,); at the kink, that of sticking."""
-        return coulomb_gradient(self.oracle, q, coulomb_impact(self.oracle, q))
-
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return the gradient, and that of the other branch where both nearly tie and the value is the larger.
 
-        Where the value is the smaller of both, no optimum lies at the kink.
+        The first is that of sticking at the kink.  Where the value is the smaller of both, no optimum lies there.
         """
         oracle, sides = self.oracle, [coulomb_impact(self.oracle, q)]
         with suppress(MetricError):

@@ -67,13 +67,10 @@ class ImpactKind(ABC):
             raise no_sticking()
         return self.factor * float(found)
 
-    def gradient(self, q: Array) -> Array:
-        """Return the tangent gradient from Pinocchio's numbers, shape (nv,)."""
-        return np.asarray(self.factor * getattr(self.oracle, f"gradient_{self.symbol}")(q))
-
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradient, because the value is smooth."""
-        return Subgradients(self.gradient(q)[None, :], np.zeros(1))
+        """Return the tangent gradient from Pinocchio's numbers alone, because the value is smooth."""
+        gradient = self.factor * getattr(self.oracle, f"gradient_{self.symbol}")(q)
+        return Subgradients(gradient[None, :], np.zeros(1))
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Return value and tangent gradient (nv) in the symbols of a kernel."""

@@ -138,21 +138,17 @@ class ImpulseBox:
     def worst(self, q: Array) -> WorstImpulses:
         """Return the worst corner at ``q``, from Pinocchio's numbers."""
         jumps, values = self._jumps_and_values(q)
-        leading, tied, _ = finite_maximum(values)
-        impulses = self.corners[leading]
-        return WorstImpulses(float(values[leading]), impulses, self.corners[tied], jumps @ impulses)
+        tied = finite_maximum(values)[0]
+        impulses = self.corners[tied[0]]
+        return WorstImpulses(float(values[tied[0]]), impulses, self.corners[tied], jumps @ impulses)
 
     def value(self, q: Array) -> float:
         """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
         return float(self._jumps_and_values(q)[1].max())
 
-    def gradient(self, q: Array) -> Array:
-        """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
-        return self._gradient(q, self.worst(q).impulses)
-
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """See :class:`~impact_posture.impact.worst_case.Minimized`; all corners that tie contribute."""
-        _, tied, gaps = finite_maximum(self._jumps_and_values(q)[1], within)
+        tied, gaps = finite_maximum(self._jumps_and_values(q)[1], within)
         return Subgradients(np.array([self._gradient(q, self.corners[k]) for k in tied]), gaps)
 
     def _jumps_and_values(self, q: Array) -> tuple[Array, Array]:

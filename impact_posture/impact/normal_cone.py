@@ -99,14 +99,8 @@ class NormalCone:
         """See :class:`~impact_posture.impact.worst_case.Minimized`."""
         return float(self.kind.of_form(np.array(self.worst(q).value)))
 
-    def gradient(self, q: Array) -> Array:
-        """Return the tangent gradient at the worst normal, held fixed (Danskin); at a tie, a subgradient."""
-        found = self.worst(q)
-        slope = float(self.kind.of_form_slope(np.array(found.value)))
-        return slope * self.kind.form_gradient(q, found.normal)
-
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradients at all worst normals, the leading normal first.
+        """Return the gradients at all worst normals, each held fixed (Danskin), the leading normal first.
 
         An arc or a circle of worst normals gives a dense sample.  A normal counts if its objective is at most
         ``within`` below the maximum.

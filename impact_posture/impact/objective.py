@@ -276,7 +276,7 @@ class ImpactObjective:
 
     def gradient(self, q: Array) -> Array:
         """Return the tangent gradient at ``q`` from Pinocchio's numbers, shape (nv,); a subgradient at a tie."""
-        return self.worst_case.gradient(q)
+        return self.subgradients(q).first
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return the gradients of all members of the maximum that tie or lie at most ``within`` below."""

@@ -40,7 +40,7 @@ class Subgradients:
 
     @property
     def first(self) -> Array:
-        """The first subgradient, shape (nv,)."""
+        """The gradient of the leading member, shape (nv,)."""
         return np.asarray(self.gradients[0])
 
 
@@ -68,7 +68,7 @@ class Minimized(Protocol):
         """Return vectors that span the subdifferential at ``q``, from Pinocchio's numbers.
 
         There is one gradient where the value is smooth.  Members of a maximum count if they are at most ``within``
-        below it.
+        below it, the leading member first.
         """
         ...
 
@@ -83,10 +83,6 @@ class WorstCase(Minimized, Protocol):
     @property
     def oracle(self) -> ImpactOracle:
         """Pinocchio's numbers for the leading contact, on the robot as modeled."""
-        ...
-
-    def gradient(self, q: Array) -> Array:
-        """Return the tangent gradient, shape (nv,); at a tie, the gradient of one member."""
         ...
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
@@ -121,21 +117,13 @@ class ModelSet:
         """Return the value on each model, from Pinocchio's numbers, shape (k,)."""
         return np.array([member.value(q) for member in self.members])
 
-    def worst(self, q: Array) -> int:
-        """Return the index of the worst model."""
-        return finite_maximum(self.values(q))[0]
-
     def value(self, q: Array) -> float:
         """See :class:`Minimized`."""
         return float(self.values(q).max())
 
-    def gradient(self, q: Array) -> Array:
-        """See :class:`WorstCase`."""
-        return self.members[self.worst(q)].gradient(q)
-
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """See :class:`Minimized`; all models that tie contribute."""
-        _, tied, gaps = finite_maximum(self.values(q), within)
+        tied, gaps = finite_maximum(self.values(q), within)
         # The gap of a model below the worst model uses up that much of ``within``.
         parts = [self.members[k].subgradients(q, max(within - gap, 0.0)) for k, gap in zip(tied, gaps, strict=True)]
         return Subgradients(
@@ -166,8 +154,8 @@ class ModelSet:
         return worst_of_guesses(parts, self.value(q) / scale, attempt)
 
 
-def finite_maximum(values: Array, within: float = 0.0) -> tuple[int, NDArray[np.int_], Array]:
-    """Return the first index of the largest values, the indices that tie with it (it first), and their gaps.
+def finite_maximum(values: Array, within: float = 0.0) -> tuple[NDArray[np.int_], Array]:
+    """Return the indices of the values that tie with the largest, the leading index first, and their gaps.
 
     A value ties if it is at most a share :data:`ACTIVE`, or ``within``, below the largest value.
     """
@@ -176,7 +164,7 @@ def finite_maximum(values: Array, within: float = 0.0) -> tuple[int, NDArray[np.
     # The leading index must not depend on rounding, so it is the first of those that differ by rounding alone.
     leading = int(np.flatnonzero(values >= largest - 1e-12 * abs(largest))[0])
     order = np.concatenate([[leading], near[near != leading]])
-    return leading, order, np.asarray(largest - values[order])
+    return order, np.asarray(largest - values[order])
 
 
 def first_of_largest(values: Sequence[ca.SX], choices: Sequence[ca.SX]) -> tuple[ca.SX, ca.SX]:
