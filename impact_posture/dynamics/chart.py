@@ -16,7 +16,7 @@ from impact_posture.robot.model_joints import ENDLESS
 # Joints whose last coordinate is an angle; their q has its cosine and sine.
 _ANGLES = ("continuous", "planar")
 # Joints whose coordinates may have limits.
-_BOUNDED = ("revolute", "prismatic", "translation")
+BOUNDED = ("revolute", "prismatic", "translation")
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Chart:
     @cached_property
     def bounded(self) -> tuple[list[int], list[int]]:
         """Tangent indices and chart indices of coordinates that may have limits, and equal their tangent entry."""
-        slots = [slot for slot in self.slots if slot.kind.family in _BOUNDED]
+        slots = [slot for slot in self.slots if slot.kind.family in BOUNDED]
         in_v = [k for slot in slots for k in range(slot.v.start, slot.v.stop)]
         return in_v, [k for slot in slots for k in range(slot.x.start, slot.x.stop)]
 
@@ -110,7 +110,7 @@ class Chart:
         """Return the position limits in chart coordinates, infinite where there are none."""
         lower, upper = np.full(self.nx, -np.inf), np.full(self.nx, np.inf)
         for slot in self.slots:
-            if slot.kind.family in _BOUNDED:
+            if slot.kind.family in BOUNDED:
                 low = np.array(self._model.lowerPositionLimit[slot.q])
                 high = np.array(self._model.upperPositionLimit[slot.q])
                 lower[slot.x] = np.where(low < -ENDLESS, -np.inf, low)

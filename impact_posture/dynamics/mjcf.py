@@ -14,9 +14,9 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.dynamics.chart import Chart, JointSlot
+from impact_posture.dynamics.chart import BOUNDED, Chart, JointSlot
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
-from impact_posture.errors import InputError, UnsupportedJoint
+from impact_posture.errors import InputError
 from impact_posture.escape import xml_name
 from impact_posture.robot.model_joints import ENDLESS
 
@@ -138,7 +138,7 @@ def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
         name: Name of the MuJoCo model.
 
     Raises:
-        UnsupportedJoint: MuJoCo has no form for a joint.
+        UnsupportedJoint: No URDF makes such a joint.
         InputError: MuJoCo is not installed, or has no place for an armature that differs between axes of a joint.
     """
     order = _depth_first(model)
@@ -201,9 +201,12 @@ def _unique(name: str, taken: set[str]) -> str:
 
 
 def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken: set[str]) -> tuple[str, ...]:
-    """Add the MuJoCo joints of a Pinocchio joint to its body and return their names."""
-    family, armature, types = slot.kind.family, np.asarray(model.armature)[slot.v], import_mujoco().mjtJoint
-    names = []
+    """Add the MuJoCo joints of a Pinocchio joint to its body and return their names.
+
+    A column of the motion subspace is a slide or a hinge.  Three columns of rotation are a ball.
+    """
+    subspace, armature, types = slot.kind.subspace, np.asarray(model.armature)[slot.v], import_mujoco().mjtJoint
+    names: list[str] = []
 
     def add(kind: str, suffix: str, value: float, axis: Array | None = None, limit: int | None = None) -> None:
         names.append(_unique(slot.name + suffix, taken))
@@ -215,39 +218,32 @@ def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken:
             if low < high and max(-low, high) < ENDLESS:
                 joint.range = (low, high)
 
-    def add_slides(count: int, values: Array, limited: bool = False) -> None:
-        for k, (letter, axis) in enumerate(zip("xyz"[:count], np.eye(3), strict=False)):
-            add("SLIDE", f".{letter}", values[k], axis, slot.q.start + k if limited else None)
-
-    if family in ("revolute", "continuous", "prismatic"):
-        kind = "SLIDE" if family == "prismatic" else "HINGE"
-        add(kind, "", armature[0], np.array(slot.kind.axis), None if family == "continuous" else slot.q.start)
-    elif family == "translation":
-        add_slides(3, armature, limited=True)
-    elif family == "planar":
-        add_slides(2, _alike(armature[:2], slot))
-        add("HINGE", ".turn", armature[2], np.array([0.0, 0.0, 1.0]))
-    elif family == "spherical":
-        add("BALL", "", _alike(armature, slot)[0])
-    elif family == "free-flyer" and free:
+    if free:
         add("FREE", "", armature[0])
-    elif family == "free-flyer":
-        add_slides(3, _alike(armature[:3], slot))
-        add("BALL", ".turn", _alike(armature[3:], slot)[0])
-    else:
-        raise UnsupportedJoint(
-            f"joint '{slot.name}' of family {family} has no form in MJCF", where="MJCF", hint="lock it (--lock)"
-        )
+        return tuple(names)
+    slides = np.flatnonzero(subspace[:3].any(axis=0))
+    turns = np.flatnonzero(subspace[3:].any(axis=0))
+    if turns.size:
+        _alike(armature[slides], slot)
+    limited = slot.kind.family in BOUNDED
+    for k in slides:
+        suffix = f".{'xyz'[k]}" if slot.kind.nv > 1 else ""
+        add("SLIDE", suffix, armature[k], subspace[:3, k], slot.q.start + int(k) if limited else None)
+    suffix = ".turn" if slides.size else ""
+    if turns.size == 1:
+        add("HINGE", suffix, armature[turns[0]], subspace[3:, turns[0]], slot.q.start if limited else None)
+    elif turns.size:
+        _alike(armature[turns], slot)
+        add("BALL", suffix, armature[turns[0]])
     return tuple(names)
 
 
-def _alike(armature: Array, slot: JointSlot) -> Array:
-    """Return the armature of a ball, or of axes that turn against each other, which must all be equal."""
-    if np.ptp(armature) > 0:
+def _alike(armature: Array, slot: JointSlot) -> None:
+    """Refuse different armatures of a ball, or of axes that turn against each other."""
+    if armature.size and np.ptp(armature) > 0:
         raise InputError(
             f"the armature of joint '{slot.name}' differs between its axes", where="MJCF", hint="give it one value"
         )
-    return armature
 
 
 # ---- inertias and sites -----------------------------------------------------------------------------------------
