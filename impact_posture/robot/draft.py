@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.errors import InertiaError, InputError, OutputError
+from impact_posture.errors import InputError, OutputError
 from impact_posture.escape import toml
 from impact_posture.robot import guess
 from impact_posture.robot.draft_text import Draft, comment_lines
 from impact_posture.robot.foot_shape import foot_specs, support_depth
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
-from impact_posture.robot.spec import SCHEMA, ModelSpec, RobotSpec
+from impact_posture.robot.spec import SCHEMA, ModelSpec, RobotSpec, Support
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolve_path
 from impact_posture.settings import LoadOptions, Root
 
@@ -77,13 +77,13 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
         folder: Folder of the draft, from which relative paths start.
     """
     srdf = resolve_path(options.srdf, Path()) if options.srdf else guess.srdf_near(located.urdf)
-    robot, faults = _load(located, options, options.root or "fixed", srdf)
+    robot = _load(located, options, options.root or "fixed", srdf)
     ends = guess.srdf_end_effectors(srdf)
     legs = [link for link, words in ends.items() if "leg" in words or "foot" in words]
     feet = guess.feet(robot, legs)
     root, why = (options.root, "as --root says") if options.root else guess.likely_root(robot, feet, srdf)
     if root != robot.root:
-        robot, faults = _load(located, options, root, srdf)
+        robot = _load(located, options, root, srdf)
     if root == "fixed":
         feet = ()
     default = guess.start_posture(robot)
@@ -107,7 +107,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     if srdf is not None:
         draft.key("srdf", _path(srdf, folder), "as --srdf says" if options.srdf else "found near the URDF")
     draft.key("root", root, why, guessed=options.root is None)
-    _model(draft, robot, options, faults, folder)
+    _model(draft, robot, options, folder)
     if default == "neutral":
         base = ("base = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]",) if robot.floating else ()
         draft.note(
@@ -118,31 +118,24 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
             f"joints = {toml(dict.fromkeys(robot.joint_names[:2], 0.5))}",
         )
     carrying = _contact(draft, robot, feet, [link for link in ends if link not in legs])
-    _supports(draft, robot, feet, located.urdf)
-    _constraints(draft, robot, feet, carrying, located.urdf)
+    supports = foot_specs(robot, feet, located.urdf)
+    _supports(draft, robot, supports)
+    _constraints(draft, robot, supports, carrying, located.urdf)
     _limits(draft, robot)
     _armature(draft, robot, options)
     return draft
 
 
-def _load(located: Located, options: LoadOptions, root: Root, srdf: Path | None) -> tuple[Robot, tuple[str, ...]]:
-    """Load the robot without a robot.toml; return it with the faults of its inertias that had to be accepted."""
+def _load(located: Located, options: LoadOptions, root: Root, srdf: Path | None) -> Robot:
+    """Load the robot without a robot.toml; it warns about impossible inertias."""
     plain = LoadOptions(
         package_dir=options.package_dir, armature=options.armature, lock=options.lock, lock_massless=True
     )
-
-    def load(accept: bool) -> Robot:
-        model = ModelSpec(root=root, srdf=None if srdf is None else str(srdf), accept_inertias=accept)
-        return build_robot(located._replace(spec=RobotSpec(model=model)), plain)
-
-    try:
-        return load(False), ()
-    except InertiaError:
-        robot = load(True)
-    return robot, tuple(w.partition("; accepted")[0] for w in robot.warnings if "; accepted" in w)
+    model = ModelSpec(root=root, srdf=None if srdf is None else str(srdf), accept_inertias=True)
+    return build_robot(located._replace(spec=RobotSpec(model=model)), plain)
 
 
-def _model(draft: Draft, robot: Robot, options: LoadOptions, faults: Sequence[str], folder: Path) -> None:
+def _model(draft: Draft, robot: Robot, options: LoadOptions, folder: Path) -> None:
     if options.package_dir:
         dirs = [_path(Path(name), folder) for name in options.package_dir]
         draft.key("package_dirs", dirs, "as --package-dir says")
@@ -154,6 +147,7 @@ def _model(draft: Draft, robot: Robot, options: LoadOptions, faults: Sequence[st
     massless = [joint for joint in robot.locked if not any(fnmatchcase(joint, p) for p in options.lock)]
     if massless:
         draft.key("lock_massless", True, f"these joints move no mass: {', '.join(massless)}")
+    faults = [warning.partition("; accepted")[0] for warning in robot.warnings if "; accepted" in warning]
     if faults:
         why = f"no rigid body has these inertias, correct the URDF: {'; '.join(faults)}"
         draft.key("accept_inertias", True, why, guessed=True)
@@ -186,27 +180,27 @@ def _contact(draft: Draft, robot: Robot, feet: Sequence[str], ends: Sequence[str
     return joints
 
 
-def _supports(draft: Draft, robot: Robot, feet: Sequence[str], urdf: Path) -> None:
+def _supports(draft: Draft, robot: Robot, feet: Sequence[Support]) -> None:
     if robot.floating and not feet:
         text = "No feet were found: it is taken to float. If it stands, list each foot:"
         draft.note(text, "[[supports]]", 'frame = "FOOT"', 'kind = "point"')
-    for foot, spec in zip(feet, foot_specs(robot, feet, urdf), strict=True):
+    for foot in feet:
         draft.lines += ["", "[[supports]]"]
-        draft.key("frame", foot, "a foot by the SRDF, its name or its height", guessed=True)
-        reason = "a flat collision shape" if any(spec.size) else "one of two feet, on a leg of six joints"
-        reason = reason if spec.kind == "surface" else "no flat collision shape"
-        draft.key("kind", spec.kind, reason, guessed=True)
-        if any(spec.offset):
-            draft.key("offset", list(spec.offset), "lowest of its collision shapes at the default posture")
+        draft.key("frame", foot.frame, "a foot by the SRDF, its name or its height", guessed=True)
+        reason = "a flat collision shape" if any(foot.size) else "one of two feet, on a leg of six joints"
+        reason = reason if foot.kind == "surface" else "no flat collision shape"
+        draft.key("kind", foot.kind, reason, guessed=True)
+        if any(foot.offset):
+            draft.key("offset", list(foot.offset), "lowest of its collision shapes at the default posture")
         else:
             draft.lines += comment_lines(
                 "offset: its shape is a mesh (not opened) or none, so the frame's origin touches"
             )
-        if any(spec.size):
-            draft.key("size", list(spec.size), "the sole, from its collision shapes")
+        if any(foot.size):
+            draft.key("size", list(foot.size), "the sole, from its collision shapes")
 
 
-def _constraints(draft: Draft, robot: Robot, feet: Sequence[str], carrying: Sequence[str], urdf: Path) -> None:
+def _constraints(draft: Draft, robot: Robot, feet: Sequence[Support], carrying: Sequence[str], urdf: Path) -> None:
     mimics = {j.get("name") for j in ET.parse(urdf).getroot().iter("joint") if j.find("mimic") is not None}
     free = [joint for joint in robot.joint_names if joint not in carrying]
     hold = [joint for joint in free if joint in mimics or joint in guess.fingers(robot)]
@@ -216,7 +210,7 @@ def _constraints(draft: Draft, robot: Robot, feet: Sequence[str], carrying: Sequ
     if robot.floating and not feet:
         keys.key("level_base", True, "it floats, upright", guessed=True)
     if feet:
-        depth = support_depth(robot, foot_specs(robot, feet, urdf))
+        depth = support_depth(robot, feet)
         if depth > _LEAST_DEPTH:
             keys.key("com_over_feet", True, f"at the default posture it is {depth:.2g} m inside", guessed=True)
             keys.key("com_margin", 0.01, "m, our choice", guessed=True)
