@@ -17,6 +17,7 @@ from impact_posture.codegen.simd_lanes import Seed, packed
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.errors import InputError
+from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactOracle
 
@@ -166,13 +167,14 @@ def library(exported: Sequence[NamedObjective]) -> Library:
     outputs: dict[str, ca.SX] = {}
     functions: list[Exported] = []
     for number, v in enumerate(exported):
-        k = v.objective.kernel_of(q, n, limbs)
+        k = ImpactKernel(v.objective.case, q, n, limbs)
         parts: dict[str, dict[str, ca.SX]] = {}
         if not v.joint:
             parts["eval"], parts["value"] = {"H": k.H, "grad": k.grad_H}, {"H": k.H}
             parts["jump"], parts["ellipsoid"] = {"a": k.jump.a, "G": k.G, "H": k.H}, {"L": k.ellipsoid}
         if not v.objective.is_multiple_of_H:
-            parts["objective"] = dict(zip(("value", "gradient"), v.objective.expressions(k), strict=True))
+            expressions = v.objective.worst_case.expressions(k)
+            parts["objective"] = dict(zip(("value", "gradient"), expressions, strict=True))
         for name, part in parts.items():
             found = {f"o{number}_{output}": value for output, value in part.items()}
             functions.append(Exported(v.stem, name, tuple(found)))

@@ -17,7 +17,6 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support, default_compliance
@@ -220,15 +219,7 @@ class ImpactObjective:
     @cached_property
     def kernel(self) -> ImpactKernel:
         """The expressions on new symbols q and n."""
-        return self.kernel_of(ca.SX.sym("q", self.robot.nq), ca.SX.sym("n", 3))
-
-    def kernel_of(self, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> ImpactKernel:
-        """Return the expressions on given symbols, of one form for ``limbs`` that repeat."""
-        return ImpactKernel(self.case, q, n, limbs)
-
-    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and tangent gradient (nv) in the symbols of a kernel of this contact, metric and supports."""
-        return self.worst_case.expressions(k)
+        return ImpactKernel(self.case, ca.SX.sym("q", self.robot.nq), ca.SX.sym("n", 3))
 
     def value_fun(self) -> ca.Function:
         """Return ``(q, n) → value``, with ``n`` as in :meth:`gradient_fun`."""
@@ -242,7 +233,7 @@ class ImpactObjective:
         ``n`` is the axis of a cone of normals.  The gradient is a subgradient where the inner maximum is tied.
         """
         k = self.kernel
-        value, gradient = self.expressions(k)
+        value, gradient = self.worst_case.expressions(k)
         names = ["q", "n"], ["value", "gradient"]
         return ca.Function("gradient", [k.q, k.n], [value, gradient], *names, {"cse": True})
 
