@@ -139,17 +139,9 @@ class Kinematics:
 
         They do not depend on the joints below both links, which world placements would bring in.
         """
-        chain = self._chain(base)
-        meeting = next(i for i in self._chain(joint) if i in chain)
+        meeting = max({*self.model.supports[base]} & {*self.model.supports[joint]})
         (R_base, p_base), (R, p) = (self._below(meeting, i) for i in (base, joint))
         return R_base.T @ R, R_base.T @ (p - p_base)
-
-    def _chain(self, joint: int) -> list[int]:
-        """A joint and those below it, down to the world."""
-        chain = [joint]
-        while chain[-1]:
-            chain.append(self._parents[chain[-1]])
-        return chain
 
     def _below(self, base: int, joint: int) -> tuple[ca.SX, ca.SX]:
         """Placement of a link in the coordinates of a link below it."""
@@ -183,7 +175,7 @@ class Kinematics:
 
     def to_link(self, joint: int, direction: ca.SX) -> ca.SX:
         """Rotate a world direction into link coordinates, down the chain from the root."""
-        for i in self._chain(joint)[-2::-1]:
+        for i in list(self.model.supports[joint])[1:]:
             direction = transposed_times(self._R[i], direction)
         return direction
 

@@ -36,11 +36,7 @@ _LEVEL = 0.1
 
 def chain(robot: Robot, joint: int) -> list[int]:
     """Return the joint and its ancestors, without the free-flyer."""
-    found, first = [], joint_range(robot.model).start
-    while joint >= first:
-        found.append(joint)
-        joint = int(robot.model.parents[joint])
-    return found
+    return [int(i) for i in robot.model.supports[joint] if i in joint_range(robot.model)][::-1]
 
 
 def joints_to(robot: Robot, frame: str) -> list[str]:
@@ -55,8 +51,7 @@ def _links(robot: Robot, joint: int) -> list[str]:
 
 
 def _leaves(robot: Robot) -> list[int]:
-    parents = {int(p) for p in robot.model.parents}
-    return [i for i in joint_range(robot.model) if i not in parents]
+    return [i for i in joint_range(robot.model) if not len(robot.model.children[i])]
 
 
 def upright_frames(robot: Robot) -> pin.Data:
