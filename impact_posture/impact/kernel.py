@@ -12,8 +12,8 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array, null_space
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Wrench
@@ -204,21 +204,14 @@ class ImpactKernel:
         return Wrench(self.point, impulse, ca.SX.zeros(3))
 
 
-def frozen_directions(robot: Robot, point: PointOnLink) -> NDArray[np.float64]:
+def frozen_directions(robot: Robot, point: PointOnLink) -> Array:
     """Return the projector on the world directions in which a point can never move, shape (3, 3).
 
     It is zero except for planar robots.  Added to ``JM⁻¹Jᵀ``, it makes the inverse act as the pseudo-inverse.
     """
     numeric, generator = Numeric(robot.model), np.random.default_rng(0)
-    rest = pin.neutral(robot.model)
-    columns = np.hstack(
-        [
-            numeric.at(pin.integrate(robot.model, rest, generator.normal(size=robot.nv))).jacobian(point)[:3]
-            for _ in range(3)
-        ]
-    )
-    axes, sizes, _ = np.linalg.svd(columns)
-    missing = axes[:, sizes <= _FROZEN * sizes[0]]
+    drawn = [pin.integrate(robot.model, pin.neutral(robot.model), generator.normal(size=robot.nv)) for _ in range(3)]
+    missing = null_space(np.vstack([numeric.at(q).jacobian(point)[:3].T for q in drawn]), _FROZEN)
     return np.asarray(missing @ missing.T)
 
 
