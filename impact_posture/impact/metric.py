@@ -9,6 +9,7 @@ from typing import get_args
 
 import numpy as np
 
+from impact_posture.arrays import Array
 from impact_posture.errors import MetricError, check_choice
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
@@ -45,7 +46,7 @@ class Metric:
                     f"a weight is {value:g}", where=self.source or "weights", hint="every weight must be above zero"
                 )
 
-    def diagonal(self, nv: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    def diagonal(self, nv: int) -> Array:
         """Return the diagonal of ``W`` of a constant metric, shape (nv,)."""
         return np.ones(nv) if self.weights is None else np.array(self.weights)
 
@@ -101,7 +102,7 @@ def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
         raise MetricError(f"has {np.size(weights)} entries", where="weights", hint=hint)
 
 
-def _from_limits(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _from_limits(robot: Robot) -> Array:
     limits = np.array(robot.model.upperVelocityLimit, dtype=float)
     base = 6 if robot.floating else 0
     # A base has no velocity limits.  1 m/s and 1 rad/s keep it in the sum.
@@ -116,7 +117,7 @@ def _from_limits(robot: Robot) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     return np.asarray(1.0 / limits**2)
 
 
-def _from_file(robot: Robot, path: Path) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _from_file(robot: Robot, path: Path) -> Array:
     table = read_toml(path)
     values = np.ones(robot.nv)
     base = 6 if robot.floating else 0

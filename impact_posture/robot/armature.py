@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError, SpecError
 from impact_posture.robot.model_joints import is_free_flyer, joint_index, joint_range, v_slice
 from impact_posture.robot.spec import RobotSpec
@@ -79,11 +79,7 @@ def _armature_file(path: Path) -> dict[str, float]:
 
 
 def _set_joints(
-    model: pin.Model,
-    armature: NDArray[np.float64],
-    values: Mapping[str, float],
-    where: str,
-    error: type[InputError] = SpecError,
+    model: pin.Model, armature: Array, values: Mapping[str, float], where: str, error: type[InputError] = SpecError
 ) -> None:
     for joint, value in values.items():
         index = joint_index(model, joint, where)
