@@ -83,14 +83,9 @@ class ContactStability:
 
 
 def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Array) -> ContactStability:
-    """Find impulses within the friction cones, or impulses with the least pull.
+    """Find impulses within the friction cones at ``q``, shape (nq,), or impulses with the least pull.
 
     The ground is level, so the axis of the cones is world z.  A sole with a ``size`` bears moments up to its edges.
-
-    Args:
-        oracle: Numbers of the impact with these supports.
-        supports: Feet that the impact must not move.
-        q: Configuration, shape (nq,).
     """
     particular = oracle.quantities(q).support_impulse
     values, vectors = np.linalg.eigh(oracle.Js @ oracle.Js.T)

@@ -93,9 +93,6 @@ class ElasticImpact:
     The armature is that stated for the robot, whatever its joint model, and the springs are those of robot.toml
     ``[transmission]``.  A metric W = M weighs the links and the rotors of rigid joints.
 
-    Args:
-        case: Robot, contact, metric and supports.
-
     Raises:
         InputError: No joint has a rotor on a spring of known stiffness.
         InertiaError: The mass matrix is singular without the rotors on springs.

@@ -54,11 +54,8 @@ class Metric:
 def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...] | None = None) -> Metric:
     """Build a metric.
 
-    Args:
-        robot: The robot.
-        kind: Kind of the metric.
-        weights: Weights of the weighted metric: nv numbers, ``velocity-limits``, or a TOML file of joint = weight
-            (``base = [6 numbers]``).
+    The weighted metric takes ``weights``: nv numbers, ``velocity-limits``, or a TOML file of joint = weight
+    (``base = [6 numbers]``).
 
     Raises:
         MetricError: Weights are missing, zero or negative.
@@ -103,12 +100,12 @@ def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
 
 
 def _from_limits(robot: Robot) -> Array:
-    limits = np.array(robot.model.upperVelocityLimit, dtype=float)
+    limits = robot.velocity_limits
     base = 6 if robot.floating else 0
     # A base has no velocity limits.  1 m/s and 1 rad/s keep it in the sum.
     limits[:base] = 1.0
     for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
-        if not (np.isfinite(limit) and 0 < limit < 1e6):
+        if not limit < 1e6:
             raise MetricError(
                 f"joint '{name}' has no velocity limit",
                 where="weights",

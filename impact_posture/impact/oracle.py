@@ -89,11 +89,7 @@ class Answer:
 
 
 class ImpactOracle:
-    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact.
-
-    Args:
-        case: Robot, contact, metric and supports.
-    """
+    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact."""
 
     def __init__(self, case: ImpactCase) -> None:
         self.case, self.robot, self.contact, self.metric = case, case.robot, case.contact, case.metric

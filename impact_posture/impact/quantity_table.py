@@ -43,10 +43,7 @@ def quantities(metric: Metric) -> list[tuple[str, str, str]]:
 def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
     """Return objective, H to E, impulse with friction, peak force without, and fastest approach, where known.
 
-    Args:
-        impact: The impact.
-        initial: The block ``initial`` of ``result.json``.
-        optimal: The block ``optimal`` of ``result.json``.
+    They come from the blocks ``initial`` and ``optimal`` of ``result.json``.
     """
     named = quantities(impact.metric)
     kind, per_speed = impact.objective.kind, named[2][1]

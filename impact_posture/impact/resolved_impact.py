@@ -29,11 +29,7 @@ FLOATS = "because its data name neither feet nor rotors"
 
 
 def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImpact:
-    """Load the robot and check all settings against it; a setting that is ``None`` comes from the robot.
-
-    Args:
-        settings: The impact as the user states it.
-        robot: The robot, if it is loaded already.
+    """Load the robot, unless it is given, and check all settings against it; one that is ``None`` comes from it.
 
     Raises:
         ImpactPostureError: A setting is wrong; the first fault, in one line.

@@ -69,13 +69,7 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
 
 
 def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
-    """Return the draft for a URDF.
-
-    Args:
-        located: Files of the robot.
-        options: Data that the user states.
-        folder: Folder of the draft, from which relative paths start.
-    """
+    """Return the draft for a URDF, with paths relative to ``folder``."""
     srdf = resolve_path(options.srdf, Path()) if options.srdf else guess.srdf_near(located.urdf)
     robot = _load(located, options, options.root or "fixed", srdf)
     ends = guess.srdf_end_effectors(srdf)

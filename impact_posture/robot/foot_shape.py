@@ -28,11 +28,7 @@ _UPRIGHT = float(np.cos(np.radians(1.0)))
 def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> Support:
     """Return a foot with its contact point or sole, as far as primitive collision shapes define them.
 
-    Args:
-        robot: The robot.
-        frame: Frame of the foot.
-        urdf: URDF with the shapes.
-        flat: Whether a foot without shapes counts as a surface.
+    A foot without shapes counts as a surface if it is ``flat``.
     """
     data, index = upright_frames(robot), robot.frame_id(frame)
     points = _lowest_points(robot, data, index, urdf)

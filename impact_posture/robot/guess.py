@@ -66,9 +66,7 @@ def upright_frames(robot: Robot) -> pin.Data:
 def feet(robot: Robot, named: Sequence[str] = ()) -> tuple[str, ...]:
     """Return frames that look like feet: ends of legs that reach the lowest level of the default posture.
 
-    Args:
-        robot: The robot.
-        named: Feet that the SRDF names as end effectors; they replace the guess.
+    Feet that the SRDF names as end effectors (``named``) replace the guess.
     """
     known = tuple(name for name in named if name in robot.frame_names)
     if known:

@@ -86,10 +86,6 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
     Causes are a massless floating base, a point mass that turns, or two joints about one axis.  ``M`` is first scaled
     to a unit diagonal, so that kilograms and kg m² compare.
 
-    Args:
-        robot: The robot, armature included.
-        where: Source of the model.
-
     Raises:
         InertiaError: The matrix is not finite, or singular; the message names the directions that move no inertia.
     """

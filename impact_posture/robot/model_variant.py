@@ -134,12 +134,9 @@ def _variant(robot: Robot, factor: float, payload: Payload | None) -> ModelVaria
 
 
 def between(variants: Sequence[ModelVariant], count: int, seed: int) -> list[Robot]:
-    """Return random robots between variants: any factor on the armature, any share of one of the payloads.
+    """Return random robots between variants of :func:`build_model_variants`, the robot as modeled first.
 
-    Args:
-        variants: Variants of :func:`build_model_variants`, the robot as modeled first.
-        count: Number of robots.
-        seed: Seed of the draw.
+    They have any factor on the armature, and any share of one of the payloads.
     """
     generator = np.random.default_rng(seed)
     factors = [variant.armature_factor for variant in variants]
