@@ -13,10 +13,10 @@ from impact_posture.arrays import Array
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.path import timing
-from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.posture_path import PosturePath, posture_path
+from impact_posture.path.timing import ActuatorLimits
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.problem_settings import prepare

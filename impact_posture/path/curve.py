@@ -29,6 +29,7 @@ class PathCurve:
     Attributes:
         s: Places of the postures on the curve, evenly by path length, shape (n,).
         z: Tangent coordinates of the postures at the first one, shape (n, nv).
+        spline: The function ``z(s)``.
     """
 
     def __init__(self, space: PathSpace, postures: Sequence[Array]) -> None:
@@ -42,24 +43,20 @@ class PathCurve:
             if slot.kind.family == "continuous":
                 z[:, slot.v] = np.unwrap(z[:, slot.v], axis=0)
         self.z = z
-        self._spline = CubicSpline(self.s, z)
+        self.spline = CubicSpline(self.s, z)
 
     def at(self, z: Array) -> Array:
         """Return the posture of tangent coordinates, ``q₀ ⊕ z``, shape (nq,)."""
         return np.asarray(pin.integrate(self._space.model, self._start, z))
 
-    def coordinates(self, s: Array) -> Array:
-        """Return ``z(s)``, shape (n, nv)."""
-        return np.asarray(self._spline(s))
-
     def posture(self, s: float) -> Array:
         """Return ``q(s)``, shape (nq,)."""
-        return self.at(self._spline(s))
+        return self.at(self.spline(s))
 
     def velocity(self, s: float) -> Array:
         """Return ``ν = dq/ds`` in the tangent space at ``q(s)``, shape (nv,)."""
-        turn = pin.dIntegrate(self._space.model, self._start, self._spline(s), pin.ARG1)
-        return np.asarray(turn @ self._spline(s, 1))
+        turn = pin.dIntegrate(self._space.model, self._start, self.spline(s), pin.ARG1)
+        return np.asarray(turn @ self.spline(s, 1))
 
     def acceleration(self, s: float) -> Array:
         """Return ``dν/ds``, shape (nv,)."""

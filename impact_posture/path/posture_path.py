@@ -10,12 +10,11 @@ import numpy as np
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import Objective
-from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import fitted_curve
 from impact_posture.path.own_component import OwnComponent
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.search import EFFORT, Connection, connect, shortened
-from impact_posture.path.timing import LimitUse, limit_use, timed
+from impact_posture.path.timing import ActuatorLimits, LimitUse, limit_use, timed
 from impact_posture.posture.solve import PostureSolution
 
 # Optima that are tried, best first.
