@@ -40,7 +40,7 @@ class Chart:
 
     def __init__(self, model: pin.Model) -> None:
         self.slots: list[JointSlot] = []
-        # Places in q and x of the numbers that both have, and of each angle, whose sine follows its cosine in q.
+        # Places in q and x of the numbers that both have, and of each angle, which is a cosine and then a sine in q.
         copied: list[tuple[int, int]] = []
         angles: list[tuple[int, int]] = []
         start = 0

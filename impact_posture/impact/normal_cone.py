@@ -159,7 +159,9 @@ class NormalCone:
         form = form / self.kind.form_unit(scale)
         parts: list[Array] = []
         for jump, impulse in zip(jumps.T, impulses.T, strict=True):
-            parts += [self.oracle.with_support_impulses(jump), *[impulse] * self.kind.unknown_impulse]
+            parts.append(self.oracle.with_support_impulses(jump))
+            if self.kind.unknown_impulse:
+                parts.append(impulse)
         c, s = self._cosine_sine
         worst = worst_normal(form, np.eye(3)[0], self.degrees)
         above, beyond = _INSIDE[attempt]

@@ -157,8 +157,7 @@ def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
         }
         if pin.Quaternion(np.array(q[3:7])).toRotationMatrix()[2, 2] > 1 - 1e-6:
             lateral = lateral_force_range(model, propulsion, q)
-            sides = ("forward", "backward", "left", "right")
-            entry["lateral_force"] = {side: _finite(getattr(lateral, side)) for side in sides}
+            entry["lateral_force"] = {side: _finite(force) for side, force in vars(lateral).items()}
         postures.append(entry)
     return {
         "rotors": len(propulsion.rotors),
