@@ -71,15 +71,15 @@ class Numeric:
         follow by rotation, because its LOCAL_WORLD_ALIGNED derivatives leave the rotation of the frame out.
         """
         pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
-        at = self.model, self.data, point.joint, point.placement, pin.LOCAL
-        dv_dq = np.asarray(pin.getFrameVelocityDerivatives(*at)[0]).reshape(6, -1)
+        frame = self.model, self.data, point.joint, point.placement, pin.LOCAL
+        dv_dq = np.asarray(pin.getFrameVelocityDerivatives(*frame)[0]).reshape(6, -1)
         motion = point.placement.actInv(self.data.v[point.joint])
         self.at(self.q)
         if in_frame:
             return np.asarray(dv_dq.T @ wrench)
         R = self.placement(point).rotation.T
         force, moment = R @ wrench[:3], R @ wrench[3:]
-        angular = np.asarray(pin.getFrameJacobian(*at)).reshape(6, -1)[3:]
+        angular = np.asarray(pin.getFrameJacobian(*frame)).reshape(6, -1)[3:]
         turning = _cross(motion.linear, force) + _cross(motion.angular, moment)
         return np.asarray(dv_dq.T @ np.concatenate([force, moment]) + angular.T @ turning)
 

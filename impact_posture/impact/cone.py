@@ -152,11 +152,11 @@ def _inside(P: Array, c: float, size: float) -> Array:
 
 def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
     """Maxima on the edge of the cap ``n = (c, s cos φ, s sin φ)``; three of its points if the value is constant."""
-    # The value is Re(A z + B z²) + constant with z = exp(iφ), divided by 2s.
+    # Divided by 2s, the value is Re(A z + B z²) plus a constant, with z = exp(iφ).
     A, B = c * complex(P[0, 1], -P[0, 2]), s * complex(P[1, 1] - P[2, 2], -2 * P[1, 2]) / 4
 
     def height(x: Array, order: int = 0) -> Array:
-        """The value without its constant, or its derivative."""
+        """The value without its constant, or a derivative of it."""
         z = np.exp(1j * x)
         return np.asarray((1j**order * (A * z + 2**order * B * z * z)).real)
 

@@ -109,7 +109,9 @@ class ImpactKernel:
             return self.tree.pair_gradient(jump, jump)
         adjoint = self.tree.respond(self._weigh(jump.a, jump.velocities), [] if r is None else self._alike(r))
         gradient = 2 * self.tree.pair_gradient(jump, adjoint)
-        return gradient + self.tree.energy_gradient(jump.velocities) if self.metric.kind == "kinetic" else gradient
+        if self.metric.kind == "kinetic":
+            gradient = gradient + self.tree.energy_gradient(jump.velocities)
+        return gradient
 
     def adjoint_velocity(self, x: Response) -> ca.SX:
         """Return ``JM⁻¹Wa`` of a response, world, shape (3,)."""
