@@ -142,8 +142,8 @@ def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
         InputError: MuJoCo is not installed, or has no place for an armature that differs between axes of a joint.
     """
     order = _depth_first(model)
-    slots = {slot.index: slot for slot in Chart(model).slots}
-    free = frozenset(i for i in order if _is_free(model, slots[i]))
+    slots = Chart(model).slots
+    free = frozenset(i for i in order if _is_free(model, slots[i - 1]))
     spec = import_mujoco().MjSpec()
     spec.modelname = xml_name(name)
     for key, value in _COMPILER.items():
@@ -156,7 +156,7 @@ def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
         names[i] = _unique(_link_name(model, i), taken)
         inertia, exact = _inertia(model.inertias[i])
         body = elements[int(model.parents[i])].add_body(name=names[i], **pose(model.jointPlacements[i]), **inertia)
-        joints[i] = _add_joints(body, model, slots[i], i in free, joint_names)
+        joints[i] = _add_joints(body, model, slots[i - 1], i in free, joint_names)
         if exact is not None:
             moments[names[i]] = exact
         elements[i] = body

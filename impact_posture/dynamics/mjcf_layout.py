@@ -55,13 +55,12 @@ class MjcfLayout:
     def __init__(self, model: pin.Model, order: Sequence[int], free: frozenset[int]) -> None:
         self._chart = chart = Chart(model)
         self.nqpos, self.nv, self.nq = chart.nx, chart.nv, chart.nq
-        by_index = {slot.index: slot for slot in chart.slots}
         self.slots: list[MjcfSlot] = []
         # The place in the chart of each entry of qpos, which has the same numbers, and that in v of each of qvel.
         places: list[int] = []
         rates: list[int] = []
         for i in order:
-            joint = by_index[i]
+            joint = chart.slots[i - 1]
             x, v = list(range(joint.x.start, joint.x.stop)), range(joint.v.start, joint.v.stop)
             if joint.kind.family in ("spherical", "free-flyer"):
                 x = [*x[:-4], x[-1], *x[-4:-1]]

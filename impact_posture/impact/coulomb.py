@@ -23,7 +23,7 @@ from impact_posture.errors import MetricError
 from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump
-from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities, no_sticking
+from impact_posture.impact.oracle import ImpactOracle, no_sticking
 from impact_posture.impact.worst_case import Subgradients
 
 # An eigenvalue of B_tt below this share of the trace of B is zero.
@@ -220,19 +220,17 @@ class CoulombKind(ImpactKind):
         slip, inside = jump.variables[-2], jump.variables[-1]
         return Lifted(jump.variables, jump.residual, self.lifted_value(jump), slip * inside - _CORNER)
 
-    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
-        """Return the frictionless jump, which :meth:`guess` replaces."""
-        return found.jump / found.G, np.array([1 / found.G, 0, 0, 0, 0, 1])
-
-    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return the unknowns of :meth:`lift` that solve its equations at ``q``; ``κ`` and ``o`` are ≥ 0."""
+    def jump(self, q: Array) -> tuple[Array, Array]:
+        """Return the jump with friction, and ``λ``, ``d``, ``κ`` and ``o``."""
         oracle, friction = self.oracle, self.oracle.contact.friction
         found = coulomb_impact(oracle, q)
         n, p = oracle.n, found.impulse
         size, slip = float(n @ p), float(np.linalg.norm(found.slip))
         d = (n - p / size) / friction if found.sticks and friction > NO_FRICTION else found.slip / max(slip, 1e-300)
-        ends = np.array([slip, max(1 - float(d @ d), 0.0)])
-        values = (oracle.with_support_impulses(found.jump), np.array([size]), oracle.axes.T @ d, ends)
-        guess = Guess.unbounded(np.concatenate(values))
+        return found.jump, np.array([size, *(oracle.axes.T @ d), slip, max(1 - float(d @ d), 0.0)])
+
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
+        """Return the unknowns of :meth:`lift` that solve its equations at ``q``; ``κ`` and ``o`` are ≥ 0."""
+        guess = super().guess(q, scale, attempt)
         guess.lower[-2:] = 0.0
         return guess

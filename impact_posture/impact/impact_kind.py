@@ -14,7 +14,7 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump, weighed
-from impact_posture.impact.oracle import ImpactOracle, ImpactQuantities, no_sticking
+from impact_posture.impact.oracle import ImpactOracle, no_sticking
 from impact_posture.impact.worst_case import Subgradients
 
 
@@ -81,8 +81,8 @@ class ImpactKind(ABC):
         """Return the unknown jump at ``tree.q`` along the normal ``n``, with the equations that fix it."""
 
     @abstractmethod
-    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
-        """Return the jump (nv,) and the unknown impulse that solve the equations of :meth:`unknowns`."""
+    def jump(self, q: Array) -> tuple[Array, Array]:
+        """Return the jump (nv,) and the other unknowns that solve the equations of :meth:`unknowns` at ``q``."""
 
     def lifted_value(self, jump: UnknownJump) -> ca.SX:
         """Return the value in terms of the unknown jump: ``aᵀWa`` times the factor."""
@@ -95,8 +95,8 @@ class ImpactKind(ABC):
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """Return the unknowns of :meth:`lift` that solve its equations at ``q``."""
-        a, impulse = self.jump(self.oracle.quantities(q))
-        return Guess.unbounded(np.concatenate([self.oracle.with_support_impulses(a), impulse]))
+        a, others = self.jump(q)
+        return Guess.unbounded(np.concatenate([self.oracle.with_support_impulses(a), others]))
 
 
 class FrictionlessKind(ImpactKind):
@@ -108,8 +108,9 @@ class FrictionlessKind(ImpactKind):
         jump = unknown_jump(self.case, tree, impact_at(self.case, n * impulse), label)
         return jump.with_impulse(impulse, ca.dot(in_world(self.case, tree, n), jump.contact_velocity) - 1)
 
-    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
+    def jump(self, q: Array) -> tuple[Array, Array]:
         """Return ``a/G`` and ``λ = 1/G``."""
+        found = self.oracle.quantities(q)
         return found.jump / found.G, np.array([1 / found.G])
 
 

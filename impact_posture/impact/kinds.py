@@ -13,7 +13,7 @@ from impact_posture.impact.coulomb import CoulombKind
 from impact_posture.impact.impact_kind import FrictionlessKind, ImpactKind, QuadraticKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import UnknownJump, impact_at, in_world, unknown_jump
-from impact_posture.impact.oracle import SINGULAR, ImpactQuantities, no_sticking
+from impact_posture.impact.oracle import SINGULAR, no_sticking
 from impact_posture.settings import ObjectiveKind
 
 
@@ -33,9 +33,9 @@ class ImpulseKind(QuadraticKind):
         """Return ``M a − J_sᵀf − Jᵀn = 0``, ``J_s a + εf = 0``."""
         return unknown_jump(self.case, tree, impact_at(self.case, n), label)
 
-    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
+    def jump(self, q: Array) -> tuple[Array, Array]:
         """Return ``a = M⁻¹Jᵀn``; no impulse is unknown."""
-        return found.jump, np.zeros(0)
+        return self.oracle.quantities(q).jump, np.zeros(0)
 
     def form_gradient(self, q: Array, n: Array) -> Array:
         """Return ``∇H`` along ``n``."""
@@ -70,8 +70,9 @@ class StickingKind(QuadraticKind):
         jump = unknown_jump(self.case, tree, Wrench(self.case.point, impulse, ca.SX.zeros(3)), label)
         return jump.with_impulse(impulse, jump.contact_velocity - in_world(self.case, tree, n))
 
-    def jump(self, found: ImpactQuantities) -> tuple[Array, Array]:
+    def jump(self, q: Array) -> tuple[Array, Array]:
         """Return jump and impulse ``s``; without friction where ``S`` does not exist."""
+        found = self.oracle.quantities(q)
         if found.sticking_jump is None or found.sticking_impulse is None:
             return found.jump / found.G, found.normal / found.G
         return found.sticking_jump, found.sticking_impulse
