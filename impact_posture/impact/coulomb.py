@@ -181,10 +181,10 @@ class CoulombKind(ImpactKind):
         oracle, sides = self.oracle, [coulomb_impact(self.oracle, q)]
         with suppress(MetricError):
             sides.append(coulomb_impact(oracle, q, other=True))
-        gaps = [self.value(q) - float(side.jump @ oracle.weigh(side.jump)) for side in sides]
+        values = np.array([side.jump @ oracle.weigh(side.jump) for side in sides])
+        gaps = values[0] - values
         near = [k for k, gap in enumerate(gaps) if k == 0 or 0 <= gap <= within]
-        gradients = np.array([coulomb_gradient(oracle, q, sides[k]) for k in near])
-        return Subgradients(gradients, np.array([gaps[k] for k in near]))
+        return Subgradients(np.array([coulomb_gradient(oracle, q, sides[k]) for k in near]), gaps[near])
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Return value and tangent gradient (nv) in the symbols of a kernel; at the kink, that of sticking."""
