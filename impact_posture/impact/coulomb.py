@@ -179,8 +179,9 @@ class CoulombKind(ImpactKind):
         The first is that of sticking at the kink.  Where the value is the smaller of both, no optimum lies there.
         """
         oracle, sides = self.oracle, [coulomb_impact(self.oracle, q)]
-        with suppress(MetricError):
-            sides.append(coulomb_impact(oracle, q, other=True))
+        if within > 0:
+            with suppress(MetricError):
+                sides.append(coulomb_impact(oracle, q, other=True))
         values = np.array([side.jump @ oracle.weigh(side.jump) for side in sides])
         gaps = values[0] - values
         near = [k for k, gap in enumerate(gaps) if k == 0 or 0 <= gap <= within]
