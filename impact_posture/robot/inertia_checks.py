@@ -96,7 +96,7 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
     diagonal = np.diag(M)
     if not np.isfinite(M).all():
         raise InertiaError(
-            f"the mass matrix has entries beyond all numbers at posture '{posture}'",
+            f"the mass matrix has entries beyond all numbers at posture '{robot.default_posture}'",
             where=where,
             hint="correct the masses, inertias and lengths; they are in kg, kg m² and m",
         )
