@@ -15,8 +15,8 @@ from impact_posture.tsid.limits import LimitLaw
 from impact_posture.tsid.ranges import JointRanges
 
 Rule = Literal["finite", "nonnegative", "positive", "limit", "amount", "share"]
-# Numbers of the rules in C.
-RULES: dict[Rule, int] = {"finite": 0, "nonnegative": 1, "positive": 2, "limit": 3, "amount": 4, "share": 5}
+# Numbers of the rules in C: 1 finite, 2 not negative, 4 not zero, 8 at most one.
+RULES: dict[Rule, int] = {"finite": 1, "nonnegative": 3, "positive": 6, "limit": 0, "amount": 7, "share": 14}
 
 
 class Field(NamedTuple):

@@ -149,6 +149,7 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
         "task_impedance": [int(isinstance(t, FrameTask) and t._soften is not None) for t in tasks],
         "contact_point": [points.index(c.point) for c in contacts],
         "contact_row": np.cumsum([0, *(c.size for c in contacts)]).tolist(),
+        "force_contact": [k for k, c in enumerate(contacts) for _ in range(c.size)],
         "contact_cone": np.cumsum([0, *(c.cone(np.eye(3)).shape[0] for c in contacts)]).tolist(),
         "contact_hard": [int(c.weight is None) for c in contacts],
         "level_rows": [rows.stop - rows.start for _, rows in assembly.levels],

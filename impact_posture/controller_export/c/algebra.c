@@ -17,11 +17,8 @@ static double ip_most(double a, double b)
 /* Part of a heading across the unit vector n; return its length. */
 static double ip_across(const double *n, const double *heading, double *across)
 {
-  const double along = ip_dot(n, heading, 3);
-  int i;
-  for (i = 0; i < 3; ++i) {
-    across[i] = heading[i] - n[i] * along;
-  }
+  memcpy(across, heading, sizeof(double) * 3);
+  ip_add(across, -ip_dot(n, heading, 3), n, 3);
   return sqrt(ip_dot(across, across, 3));
 }
 
@@ -81,10 +78,7 @@ static void ip_log_quaternion(const double *x, double *w)
 {
   const double sine = sqrt(ip_dot(x, x, 3)), sign = x[3] < 0.0 ? -1.0 : 1.0;
   const double scale = sine < 1e-8 ? 2.0 : 2.0 * atan2(sine, sign * x[3]) / sine;
-  int i;
-  for (i = 0; i < 3; ++i) {
-    w[i] = sign * scale * x[i];
-  }
+  ip_scaled(x, sign * scale, w, 3);
 }
 
 static void ip_log3(const double *R, double *w)
@@ -138,7 +132,7 @@ static void ip_product(const double *a, const double *b, int conjugate, double *
 static void ip_difference(const double *a, const double *b, double *v)
 {
   double x[4], R[9], way[3], p[3];
-  int k, i;
+  int k;
   for (k = 0; k < IP_JOINTS; ++k) {
     const double *from = a + ip_joint_q[k], *to = b + ip_joint_q[k];
     double *out = v + ip_joint_v[k];
@@ -146,9 +140,7 @@ static void ip_difference(const double *a, const double *b, double *v)
       ip_product(from + 3, to + 3, 1, x);
       ip_log_quaternion(x, out + 3);
       ip_matrix(from + 3, R);
-      for (i = 0; i < 3; ++i) {
-        way[i] = to[i] - from[i];
-      }
+      ip_subtract(to, from, way, 3);
       ip_turn(R, way, 1, p);
       ip_log6_linear(out + 3, p, out);
     } else if (ip_joint_family[k] == IP_SPHERICAL) {
@@ -166,11 +158,7 @@ static void ip_difference(const double *a, const double *b, double *v)
 static void ip_exponential(const double *w, double *x)
 {
   const double t2 = ip_dot(w, w, 3), t = sqrt(t2);
-  const double scale = t < 1e-4 ? 0.5 - t2 / 48.0 : sin(0.5 * t) / t;
-  int i;
-  for (i = 0; i < 3; ++i) {
-    x[i] = scale * w[i];
-  }
+  ip_scaled(w, t < 1e-4 ? 0.5 - t2 / 48.0 : sin(0.5 * t) / t, x, 3);
   x[3] = cos(0.5 * t);
 }
 
@@ -184,16 +172,12 @@ static void ip_integrate(const double *q, const double *v, double step, double *
     double *to = out + ip_joint_q[k];
     const int turns = ip_joint_family[k] == IP_FREE_FLYER ? 3 : 0;
     if (ip_joint_family[k] == IP_FREE_FLYER || ip_joint_family[k] == IP_SPHERICAL) {
-      for (i = 0; i < 3; ++i) {
-        w[i] = step * way[turns + i];
-      }
+      ip_scaled(way + turns, step, w, 3);
       if (turns) {
         const double t2 = ip_dot(w, w, 3), t = sqrt(t2);
         const double b = t < 1e-2 ? 0.5 - t2 * (1.0 / 24.0 - t2 / 720.0) : (1.0 - cos(t)) / t2;
         const double c = t < 1e-2 ? 1.0 / 6.0 - t2 * (1.0 / 120.0 - t2 / 5040.0) : (t - sin(t)) / (t2 * t);
-        for (i = 0; i < 3; ++i) {
-          p[i] = step * way[i];
-        }
+        ip_scaled(way, step, p, 3);
         ip_cross(w, p, once);
         ip_cross(w, once, twice);
         for (i = 0; i < 3; ++i) {

@@ -6,10 +6,7 @@
 /* Row of the Jacobian of a contact that belongs to an entry of f. */
 static const double *ip_contact_motion(const ip_context *c, int entry)
 {
-  int k = 0;
-  while (entry >= ip_contact_row[k + 1]) {
-    ++k;
-  }
+  const int k = ip_force_contact[entry];
   return c->m.jacobian[ip_contact_point[k]] + (entry - ip_contact_row[k]) * IP_NV;
 }
 
@@ -20,9 +17,7 @@ static void ip_contact_rows(ip_context *c)
   for (k = 0; k < IP_CONTACTS; ++k) {
     const int point = ip_contact_point[k], row = ip_contact_row[k], size = ip_contact_row[k + 1] - row;
     double e[6], R[9], w[3];
-    for (i = 0; i < 3; ++i) {
-      e[i] = c->home_position[k][i] - c->m.position[point][i];
-    }
+    ip_subtract(c->home_position[k], c->m.position[point], e, 3);
     if (size == 6) {
       ip_relative(c->m.rotation[point], c->home_rotation[k], R);
       ip_log3(R, w);
@@ -50,7 +45,8 @@ static int ip_on_edge(const ip_context *c)
   return 0;
 }
 
-/* Hold the contacts where they are, with friction cones in world axes (friction.py has the formulas). */
+/* Hold the contacts where they are, and write the rows of their friction cones, with axes of the world (contacts.py has
+ * the formulas).  Only the forces of their contacts are in these rows, so the rest stays zero. */
 static void ip_hold_contacts(ip_context *c)
 {
   int k, i, j, b;
@@ -76,10 +72,8 @@ static void ip_hold_contacts(ip_context *c)
         heading[i] = i == j ? 1.0 : 0.0;
       }
     }
-    for (i = 0; i < 3; ++i) {
-      axes[i] /= length;
-      axes[6 + i] = n[i];
-    }
+    ip_scaled(axes, 1.0 / length, axes, 3);
+    memcpy(axes + 6, n, sizeof(double) * 3);
     ip_cross(n, axes, axes + 3);
     local[0][2] = 1.0;
     for (i = 0; i < 4; ++i) {
@@ -99,8 +93,9 @@ static void ip_hold_contacts(ip_context *c)
       row[5] = sign;
     }
     for (i = 0; i < ip_contact_cone[k + 1] - ip_contact_cone[k]; ++i) {
+      double *row = c->rows[IP_EQUATIONS + IP_CONTROLS + ip_contact_cone[k] + i] + IP_NV + IP_SPARE + ip_contact_row[k];
       for (b = 0; b < size; b += 3) {
-        ip_turn(axes, local[i] + b, 1, c->cone[ip_contact_cone[k] + i] + b);
+        ip_turn(axes, local[i] + b, 1, row + b);
       }
     }
   }

@@ -31,11 +31,10 @@ static void ip_qr_step(double *d, double *e, double *V, int n, int low, int high
   const double half = 0.5 * (d[high - 1] - d[high]), t = e[high - 1];
   const double root = sqrt(half * half + t * t), shift = d[high] - t * t / (half + (half < 0.0 ? -root : root));
   double x = d[low] - shift, z = e[low];
-  int i, k;
+  int k;
   for (k = low; k < high; ++k) {
     const double r = hypot(x, z), c = r > 0.0 ? x / r : 1.0, s = r > 0.0 ? z / r : 0.0;
     const double a = d[k], b = e[k], g = d[k + 1];
-    double *one = V + k * n, *other = one + n;
     if (k > low) {
       e[k - 1] = r;
     }
@@ -47,18 +46,15 @@ static void ip_qr_step(double *d, double *e, double *V, int n, int low, int high
       z = s * e[k + 1];
       e[k + 1] *= c;
     }
-    for (i = 0; i < n; ++i) {
-      const double u = one[i], w = other[i];
-      one[i] = c * u + s * w;
-      other[i] = c * w - s * u;
-    }
+    ip_rotate(V + k * n, V + (k + 1) * n, c, s, n);
   }
 }
 
-/* Eigenvalues of the symmetric n x n matrix A on its diagonal, and eigenvectors in the rows of V. */
-static void ip_eigen(double *A, double *V, int n)
+/* Eigenvalues of the symmetric n x n matrix A on its diagonal, and eigenvectors in the rows of V.  Return the largest
+ * eigenvalue, or 0 if all are negative. */
+static double ip_eigen(double *A, double *V, int n)
 {
-  double v[IP_LARGEST], e[IP_LARGEST], d[IP_LARGEST];
+  double v[IP_LARGEST], e[IP_LARGEST], d[IP_LARGEST], most = 0.0;
   int i, k, high, step;
   for (i = 0; i < n * n; ++i) {
     V[i] = i % (n + 1) == 0 ? 1.0 : 0.0;
@@ -94,5 +90,7 @@ static void ip_eigen(double *A, double *V, int n)
   }
   for (i = 0; i < n; ++i) {
     A[i * (n + 1)] = d[i];
+    most = fmax(most, d[i]);
   }
+  return most;
 }

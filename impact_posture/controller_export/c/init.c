@@ -7,23 +7,11 @@ void ip_default_params(ip_params *params)
   *params = ip_defaults;
 }
 
-/* Whether a number fulfills a rule of ip_rules. */
+/* Whether a number, which may never be NaN, fulfills a rule of ip_rules. */
 static int ip_holds(int rule, double x)
 {
-  switch (rule) {
-  case 0:
-    return isfinite(x);
-  case 1:
-    return isfinite(x) && x >= 0.0;
-  case 2:
-    return x > 0.0;
-  case 4:
-    return isfinite(x) && x > 0.0;
-  case 5:
-    return x > 0.0 && x <= 1.0;
-  default:
-    return !isnan(x);
-  }
+  return !isnan(x) && (!(rule & IP_IS_FINITE) || isfinite(x)) && (!(rule & IP_NOT_NEGATIVE) || x >= 0.0)
+         && (!(rule & IP_NOT_ZERO) || x != 0.0) && (!(rule & IP_AT_MOST_ONE) || x <= 1.0);
 }
 
 int ip_init(ip_context *c, const ip_params *p)

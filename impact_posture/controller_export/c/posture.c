@@ -21,22 +21,20 @@ static void ip_flow_lead(ip_context *c, double dt);
 /* Evaluate the term at q; keep the previous one where the gradient does not exist. */
 static void ip_evaluate(ip_context *c)
 {
-  double term[IP_NV], value, square = 0.0;
+  double term[IP_NV], value, square;
   const double bound = c->p.robust_gain[0] * c->p.robust_reach[0];
   int i, s;
   c->failed = 1;
   if (IP_GRADIENT(c->q, &value, term) != 0) {
     return;
   }
-  for (i = 0; i < IP_NV; ++i) {
-    term[i] *= -c->p.robust_gain[0] / c->scale;
-    square += term[i] * term[i];
-  }
+  ip_scaled(term, -c->p.robust_gain[0] / c->scale, term, IP_NV);
+  square = ip_dot(term, term, IP_NV);
   if (!isfinite(square)) {
     return;
   }
-  for (i = 0; i < IP_NV && square > bound * bound; ++i) {
-    term[i] *= bound / sqrt(square);
+  if (square > bound * bound) {
+    ip_scaled(term, bound / sqrt(square), term, IP_NV);
   }
   for (i = 0; i < IP_NV && c->least_room < c->p.robust_far[0]; ++i) {
     for (s = 0; s < 2; ++s) {
@@ -78,7 +76,7 @@ static void ip_multiply(const double *A, const double *B, double *C, int n)
 static int ip_normalize(ip_context *c)
 {
   enum { N = IP_NV };
-  double *A = c->scratch, *V = A + N * N, *P = V + N * N, q[IP_NQ], g[2][N], value, largest = 0.0;
+  double *A = c->scratch, *V = A + N * N, *P = V + N * N, q[IP_NQ], g[2][N], value, largest;
   int all, i, j, k, found = 0;
   c->scale = c->p.robust_scale[0];
   if (c->scale > 0.0) {
@@ -86,7 +84,7 @@ static int ip_normalize(ip_context *c)
   }
   /* What weighted tasks leave; if that is nothing, what contacts and strict levels leave; else everything. */
   for (all = 1; all >= 0 && !found; --all) {
-    double most = 0.0;
+    double most;
     memset(A, 0, sizeof(double) * N * N);
     memset(P, 0, sizeof(double) * N * N);
     for (k = 0; k < IP_FORCES + (all ? IP_ROWS : IP_STRICT); ++k) {
@@ -95,10 +93,7 @@ static int ip_normalize(ip_context *c)
         ip_add(A + i * N, row[i], row, N);
       }
     }
-    ip_eigen(A, V, N);
-    for (i = 0; i < N; ++i) {
-      most = fmax(most, A[i * (N + 1)]);
-    }
+    most = ip_eigen(A, V, N);
     for (k = 0; k < N; ++k) {
       const double *z = V + k * N;
       for (i = 0; i < N * N && !(A[k * (N + 1)] > 1e-12 * fmax(most, 1e-24)); ++i) {
@@ -131,14 +126,11 @@ static int ip_normalize(ip_context *c)
   for (i = 0; i < N; ++i) {
     ip_combine(P + i * N, N, V + i, N, V, N, N);
   }
-  ip_eigen(P, V, N);
-  for (i = 0; i < N; ++i) {
-    largest = fmax(largest, P[i * (N + 1)]);
-  }
+  largest = sqrt(ip_eigen(P, V, N));
   if (IP_GRADIENT(c->q, &value, g[0]) != 0) {
     return 0;
   }
-  c->scale = fmax(sqrt(largest), 1e-3 * fabs(value));
+  c->scale = fmax(largest, 1e-3 * fabs(value));
   return isfinite(c->scale) && c->scale > 0.0;
 }
 #endif
@@ -201,12 +193,12 @@ static void ip_advance(ip_context *c, double dt)
 #endif
 }
 
-/* The wanted accelerations of the posture task. */
+/* The wanted accelerations of the posture task.  Without one they stay zero. */
 static void ip_posture_wanted(ip_context *c)
 {
-  int i;
 #if IP_POSTURE
   double e[IP_NV], slow[IP_NV], pull = 1.0;
+  int i;
   ip_difference(c->q, c->posture, e);
   if (c->blend < 1.0) {
     const double share = ip_smooth(c->blend);
@@ -219,9 +211,7 @@ static void ip_posture_wanted(ip_context *c)
 #if IP_ROBUST
   pull = c->p.robust_spring[0] == 1.0 ? 1.0 - c->level : 1.0;
 #endif
-  for (i = 0; i < IP_NV; ++i) {
-    slow[i] = c->posture_velocity[i] - c->v[i];
-  }
+  ip_subtract(c->posture_velocity, c->v, slow, IP_NV);
   for (i = 0; i < IP_NV; ++i) {
 #if IP_STIFF
     c->wanted[i] = pull * ip_dot(c->p.stiffness + i * IP_NV, e, IP_NV) + ip_dot(c->p.damping + i * IP_NV, slow, IP_NV);
@@ -231,9 +221,7 @@ static void ip_posture_wanted(ip_context *c)
     c->wanted[i] += c->posture_acceleration[i] + c->level * c->term[i];
   }
 #else
-  for (i = 0; i < IP_NV; ++i) {
-    c->wanted[i] = 0.0;
-  }
+  (void)c;
 #endif
 }
 

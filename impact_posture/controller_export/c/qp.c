@@ -75,16 +75,11 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
  * pulls towards g: weighted tasks, contacts that are not hard, and the posture. */
 static void ip_cost(const ip_context *c, double *H, int stride, double *g)
 {
-  int i, k, r;
+  int i, r;
   for (r = IP_STRICT; r < IP_ROWS + IP_FORCES; ++r) {
-    const int f = r - IP_ROWS;
+    const int f = r - IP_ROWS, k = f < 0 ? 0 : ip_force_contact[f];
     const double *J = f < 0 ? c->J[r] : ip_contact_motion(c, f), a = f < 0 ? c->a[r] : c->contact_a[f];
-    double weight = f < 0 ? c->p.task_weight[r] : 0.0;
-    for (k = 0; k < IP_CONTACTS; ++k) {
-      if (f >= ip_contact_row[k] && f < ip_contact_row[k + 1] && !ip_contact_hard[k]) {
-        weight = c->p.contact_weight[k];
-      }
-    }
+    const double weight = f < 0 ? c->p.task_weight[r] : ip_contact_hard[k] ? 0.0 : c->p.contact_weight[k];
     for (i = 0; i < IP_NV && weight > 0.0; ++i) {
       const double s = weight * J[i];
       g[i] += s * a;
@@ -117,10 +112,7 @@ static void ip_factorize(ip_context *c)
       out[j] = i == j ? pivot : 0.0;
     }
     for (k = i + 1; k < IP_NV; ++k) {
-      const double s = -R[i * IP_NV + k] * pivot;
-      for (j = k; j < IP_NV; ++j) {
-        out[j] += s * inverse[k * IP_NV + j];
-      }
+      ip_add(out + k, -R[i * IP_NV + k] * pivot, inverse + k * (IP_NV + 1), IP_NV - k);
     }
   }
 #else
@@ -185,7 +177,7 @@ static void ip_put(ip_context *c, int r, double lower, double upper)
 static void ip_assemble(ip_context *c)
 {
   double to[2], one = 1.0, bias;
-  int i, j, k, r = 0;
+  int i, j, r = 0;
   c->sum = 0.0;
   ip_factorize(c);
   for (i = 0; i < IP_BLIND; ++i) {
@@ -196,9 +188,9 @@ static void ip_assemble(ip_context *c)
     bias = ip_force_row(c, s, 0, IP_BASE, c->rows[r]);
     ip_put(c, r++, -bias, -bias);
   }
-  for (k = 0; k < IP_CONTACTS; ++k) {
-    for (i = ip_contact_row[k]; ip_contact_hard[k] && i < ip_contact_row[k + 1]; ++i) {
-      memcpy(c->rows[r], c->m.jacobian[ip_contact_point[k]] + (i - ip_contact_row[k]) * IP_NV, sizeof(double) * IP_NV);
+  for (i = 0; i < IP_FORCES; ++i) {
+    if (ip_contact_hard[ip_force_contact[i]]) {
+      memcpy(c->rows[r], ip_contact_motion(c, i), sizeof(double) * IP_NV);
       ip_put(c, r++, c->contact_a[i], c->contact_a[i]);
     }
   }
@@ -249,7 +241,7 @@ static void ip_cool(ip_context *c)
 /* Weights that a reset reads, and the rows of the cones. */
 static void ip_begin_qp(ip_context *c)
 {
-  int i, j, k;
+  int i, k;
   for (i = 0; i < IP_NV; ++i) {
     /* The cost always needs a minimum. */
     c->added[i] = fmax(c->p.posture_weight[i], 1e-8);
@@ -266,22 +258,15 @@ static void ip_begin_qp(ip_context *c)
     c->ease[IP_NV + i] = 1.0 / sqrt(c->p.spare_weight[0]);
   }
   for (i = 0; i < IP_FORCES; ++i) {
-    int own = 0;
-    for (k = 0; k < IP_CONTACTS; ++k) {
-      own = i >= ip_contact_row[k] ? i - ip_contact_row[k] : own;
-    }
+    const int own = i - ip_contact_row[ip_force_contact[i]];
     /* A moment in N m counts like a force of 10 N. */
     c->ease[IP_NV + IP_SPARE + i] = 1.0 / sqrt(c->p.force_weight[0] * (own < 3 ? 1.0 : 100.0));
   }
   memset(c->center, 0, sizeof c->center);
   for (k = 0; k < IP_CONTACTS; ++k) {
     for (i = ip_contact_cone[k]; i < ip_contact_cone[k + 1]; ++i) {
-      const int r = IP_EQUATIONS + IP_CONTROLS + i;
-      memset(c->rows[r], 0, sizeof c->rows[r]);
-      for (j = ip_contact_row[k]; j < ip_contact_row[k + 1]; ++j) {
-        c->rows[r][IP_NV + IP_SPARE + j] = c->cone[i][j - ip_contact_row[k]];
-      }
-      ip_put(c, r, i == ip_contact_cone[k] ? c->p.contact_least[k] : 0.0, INFINITY);
+      const double least = i == ip_contact_cone[k] ? c->p.contact_least[k] : 0.0;
+      ip_put(c, IP_EQUATIONS + IP_CONTROLS + i, least, INFINITY);
     }
   }
   ip_cool(c);

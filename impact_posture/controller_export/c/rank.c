@@ -28,12 +28,11 @@ static void ip_measure_rank(ip_context *c)
 #if IP_LEVELS
   enum { N = IP_EQUATIONS };
   const double least = IP_SINGULAR;
-  double *G = c->scratch, *S = c->scratch + N * N, way = 0.0, low, high, trace = 0.0;
-  double one[IP_VARIABLES], other[IP_VARIABLES];
+  double *G = c->scratch, *S = G + N * N, *B = S + N * N, moved[IP_VARIABLES], way = 0.0, low, high, trace = 0.0;
   int i, j, k;
   for (i = 0; i < N; ++i) {
-    ip_in_units(c, c->rows[i], c->reference[i], 1.0 / c->length[i], one);
-    way += ip_dot(one, one, IP_VARIABLES);
+    ip_in_units(c, c->rows[i], c->reference[i], 1.0 / c->length[i], moved);
+    way += ip_dot(moved, moved, IP_VARIABLES);
   }
   if (way < c->space) {
     return;
@@ -45,10 +44,9 @@ static void ip_measure_rank(ip_context *c)
     return;
   }
   for (i = 0; i < N; ++i) {
-    ip_in_units(c, c->rows[i], NULL, 1.0 / c->length[i], one);
+    ip_in_units(c, c->rows[i], NULL, 1.0 / c->length[i], B + i * IP_VARIABLES);
     for (j = 0; j <= i; ++j) {
-      ip_in_units(c, c->rows[j], NULL, 1.0 / c->length[j], other);
-      G[i * N + j] = G[j * N + i] = ip_dot(one, other, IP_VARIABLES);
+      G[i * N + j] = G[j * N + i] = ip_dot(B + i * IP_VARIABLES, B + j * IP_VARIABLES, IP_VARIABLES);
     }
     trace += G[i * (N + 1)];
   }
@@ -107,7 +105,7 @@ static void ip_begin_rank(ip_context *c)
  * left singular vectors and, times the singular values, the right ones (Hestenes 1958). */
 static void ip_orthogonalize(double *B, double *U, int k, int n)
 {
-  int i, j, l, sweep, turned = 1;
+  int i, j, sweep, turned = 1;
   for (i = 0; i < k * k; ++i) {
     U[i] = i % (k + 1) == 0 ? 1.0 : 0.0;
   }
@@ -115,7 +113,7 @@ static void ip_orthogonalize(double *B, double *U, int k, int n)
     turned = 0;
     for (i = 0; i < k; ++i) {
       for (j = i + 1; j < k; ++j) {
-        double *x = B + i * n, *y = B + j * n, *u = U + i * k, *w = U + j * k;
+        double *x = B + i * n, *y = B + j * n;
         const double xx = ip_dot(x, x, n), yy = ip_dot(y, y, n), xy = ip_dot(x, y, n), half = 0.5 * (yy - xx);
         double t, c, s;
         if (!(fabs(xy) > 1e-15 * sqrt(xx * yy)) || xy == 0.0) {
@@ -126,16 +124,8 @@ static void ip_orthogonalize(double *B, double *U, int k, int n)
         t = half < 0.0 ? -t : t;
         c = 1.0 / sqrt(1.0 + t * t);
         s = t * c;
-        for (l = 0; l < n; ++l) {
-          const double a = x[l], b = y[l];
-          x[l] = c * a - s * b;
-          y[l] = s * a + c * b;
-        }
-        for (l = 0; l < k; ++l) {
-          const double a = u[l], b = w[l];
-          u[l] = c * a - s * b;
-          w[l] = s * a + c * b;
-        }
+        ip_rotate(y, x, c, s, n);
+        ip_rotate(U + j * k, U + i * k, c, s, k);
       }
     }
   }
@@ -209,11 +199,9 @@ static void ip_reduce(ip_context *c, double *H, double *g)
           }
         }
       }
-    }
-    for (i = 0; i < count; ++i) {
-      const double *v = B + i * N, s = sqrt(ip_dot(v, v, N)), x = fmin(s / (IP_SINGULAR * c->length[r]), 1.0);
       if (x > IP_DROPPED) {
-        ip_remove(Z, v, s, 1.0 - sqrt(1.0 - ip_smooth(x)), N);
+        /* Z times the other rows stays the same, because they are orthogonal to this one. */
+        ip_remove(Z, v, s, 1.0 - sqrt(1.0 - alpha), N);
       }
     }
   }

@@ -26,20 +26,18 @@ static void ip_flow_place(ip_context *c, const double *q, double *error)
   static const double still[IP_NV] = {0};
   ip_flow *f = &c->flow;
   double e[6], drift[6];
-  int i, k, row = 0, size;
+  int k, row = 0, size;
   ip_dynamics(q, still, &f->m);
   for (k = 0; k < IP_CONTACTS; ++k, row += size) {
     const int point = ip_contact_point[k];
     size = ip_contact_row[k + 1] - ip_contact_row[k];
     memcpy(f->J[row], f->m.jacobian[point], sizeof(double) * (size_t)size * IP_NV);
-    for (i = 0; i < 3; ++i) {
-      e[i] = c->home_position[k][i] - f->m.position[point][i];
-    }
+    ip_subtract(c->home_position[k], f->m.position[point], e, 3);
     if (size == 6) {
       ip_pose_error(f->m.rotation[point], c->home_rotation[k], e);
     }
-    for (i = 0; error && i < size; ++i) {
-      error[row + i] = e[i];
+    if (error) {
+      memcpy(error + row, e, sizeof(double) * (size_t)size);
     }
   }
   for (k = 0; k < IP_TASKS; ++k) {
@@ -48,8 +46,8 @@ static void ip_flow_place(ip_context *c, const double *q, double *error)
     }
     size = ip_task_row[k + 1] - ip_task_row[k];
     ip_task_output(&c->target[k], k, &f->m, q, f->J[row], e, drift);
-    for (i = 0; error && i < size; ++i) {
-      error[row + i] = e[i];
+    if (error) {
+      memcpy(error + row, e, sizeof(double) * (size_t)size);
     }
     row += size;
   }
@@ -115,9 +113,7 @@ static void ip_flow_look(ip_context *c)
   /* A look that failed has no slope. */
   if (length > IP_MOVED && !f->failed && ip_dot(slope, slope, IP_NV) > 0.0) {
     ip_flow_reduce(f, f->before, slope);
-    for (i = 0; i < IP_NV; ++i) {
-      way[i] /= length;
-    }
+    ip_scaled(way, 1.0 / length, way, IP_NV);
     ip_flow_compare(f, way, length, slope, shares);
   }
   memcpy(f->before, f->J, sizeof f->before);
@@ -141,9 +137,7 @@ static void ip_flow_aim(ip_flow *f)
     }
     ip_flow_project(f, z);
     s = sqrt(fmax(ip_dot(z, z, IP_NV), 1e-24));
-    for (i = 0; i < IP_NV; ++i) {
-      z[i] /= s;
-    }
+    ip_scaled(z, 1.0 / s, z, IP_NV);
   }
 }
 

@@ -36,10 +36,8 @@ static void ip_flow_limits(ip_context *c)
   ip_flow *f = &c->flow;
   const ip_params *p = &c->p;
   double position[3], J[3 * IP_NV], drift[3], coasting[IP_NV];
-  int i, j, k, r;
-  for (i = 0; i < IP_NV; ++i) {
-    coasting[i] = f->flow[i] * p->flow_speed[0] / p->flow_acceleration[0] / 2.0;
-  }
+  int j, k, r;
+  ip_scaled(f->flow, p->flow_speed[0] / p->flow_acceleration[0] / 2.0, coasting, IP_NV);
   ip_center_of_mass(&f->m, f->q, position, J, drift);
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
     double high = INFINITY, low = -INFINITY, ahead = 0.0;
@@ -104,9 +102,7 @@ APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *
     length = ip_dot(row, row, n);
     shift = ip_dot(row, slope, n);
     scaling[r] = length >= IP_NOTHING ? 1.0 / sqrt(length) : 1.0;
-    for (k = 0; k < n; ++k) {
-      row[k] *= scaling[r];
-    }
+    ip_scaled(row, scaling[r], row, n);
     upper[r] = (f->high[r] + shift) * scaling[r];
     lower[r] = (f->low[r] + shift) * scaling[r];
     /* A row of zeros bounds nothing. */

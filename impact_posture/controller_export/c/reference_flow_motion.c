@@ -12,9 +12,8 @@
 static void ip_shorten(double *x, double most)
 {
   const double size = ip_largest(x, 0);
-  int i;
-  for (i = 0; i < IP_NV && size > most; ++i) {
-    x[i] *= most / size;
+  if (size > most) {
+    ip_scaled(x, most / size, x, IP_NV);
   }
 }
 
@@ -24,9 +23,7 @@ static void ip_flow_back(ip_context *c, double *back)
   ip_flow *f = &c->flow;
   double rate[IP_LARGEST];
   int i, k, row;
-  for (i = 0; i < IP_HELD; ++i) {
-    rate[i] = f->error[i] / IP_RETURN;
-  }
+  ip_scaled(f->error, 1.0 / IP_RETURN, rate, IP_HELD);
   for (k = 0, row = IP_FORCES; k < IP_TASKS; ++k) {
     for (i = 0; !ip_flow_led[k] && i < ip_task_row[k + 1] - ip_task_row[k]; ++i) {
       rate[row++] += c->target[k].velocity[i];
@@ -162,10 +159,9 @@ static int ip_flow_begin(ip_context *c)
   ip_dynamics_constants(&f->m);
   ip_dynamics_constants(&f->ahead);
   for (k = 0; k < IP_TASKS; ++k) {
-    for (i = 0; !ip_flow_led[k] && i < ip_task_row[k + 1] - ip_task_row[k] && row < IP_HELD; ++i, ++row) {
-      if (ip_task_kind[k] <= IP_BASE_TURN) {
-        f->J[row][3 + i] = 1.0;
-      }
+    if (!ip_flow_led[k]) {
+      ip_constant_rows(k, f->J[row]);
+      row += ip_task_row[k + 1] - ip_task_row[k];
     }
   }
   for (i = 0; row < IP_HELD; ++i, ++row) {
@@ -192,6 +188,7 @@ static int ip_flow_begin(ip_context *c)
 /* Advance the flow by dt seconds, and move the targets of the posture task and of the tasks that it leads. */
 static void ip_flow_lead(ip_context *c, double dt)
 {
+  static void (*const phases[])(ip_context *) = {ip_flow_look, ip_flow_probe, ip_flow_direct, ip_flow_govern};
   ip_flow *f = &c->flow;
   double position[3], J[3 * IP_NV], drift[3];
   int i, k;
@@ -202,21 +199,9 @@ static void ip_flow_lead(ip_context *c, double dt)
   f->elapsed += dt;
   k = f->phase;
   f->phase = (f->phase + 1) % 5;
-  switch (k) {
-  case 0:
-    ip_flow_look(c);
-    break;
-  case 1:
-    ip_flow_probe(c);
-    break;
-  case 2:
-    ip_flow_direct(c);
-    break;
-  case 3:
-    ip_flow_govern(c);
-    break;
-  default: /* Nothing, as in Python. */
-    break;
+  /* The last phase does nothing, as in Python. */
+  if (k < 4) {
+    phases[k](c);
   }
   ip_add(f->velocity, dt, f->acceleration, IP_NV);
   ip_integrate(f->q, f->velocity, dt, f->q);

@@ -38,17 +38,14 @@ static void ip_solve_factor(const double *R, int n, double *b)
 static void ip_flow_space(ip_flow *f)
 {
   enum { N = IP_NV, M = IP_HELD };
-  double *G = f->work, *U = G + M * M, *held = U + M * M, beta[IP_LARGEST], most = 0.0;
+  double *G = f->work, *U = G + M * M, *held = U + M * M, beta[IP_LARGEST], most;
   int i, j, k, rank = 0;
   for (i = 0; i < M; ++i) {
     for (j = 0; j <= i; ++j) {
       G[i * M + j] = G[j * M + i] = ip_dot(f->J[i], f->J[j], N);
     }
   }
-  ip_eigen(G, U, M);
-  for (i = 0; i < M; ++i) {
-    most = fmax(most, G[i * (M + 1)]);
-  }
+  most = ip_eigen(G, U, M);
   memset(f->inverse, 0, sizeof f->inverse);
   for (k = 0; k < M && rank < N; ++k) {
     const double value = G[k * (M + 1)];
@@ -109,14 +106,12 @@ static void ip_flow_project(const ip_flow *f, double *x)
 static void ip_flow_carry(ip_flow *f)
 {
 #if IP_CONTACTS
-  double square[36] = {0}, trace = 0.0, s[6];
-  int i, k, row;
-  for (k = 0; k < IP_CONTACTS; ++k) {
-    for (row = ip_contact_row[k]; row < ip_contact_row[k + 1]; ++row) {
-      const double ease = row - ip_contact_row[k] < 3 ? 1.0 : 1.0 / IP_MOMENT;
-      for (i = 0; i < 6; ++i) {
-        ip_add(square + 6 * i, ease * f->J[row][i], f->J[row], 6);
-      }
+  double square[36] = {0}, trace = 0.0, s[6], ease[IP_FORCES];
+  int i, k;
+  for (k = 0; k < IP_FORCES; ++k) {
+    ease[k] = k - ip_contact_row[ip_force_contact[k]] < 3 ? 1.0 : 1.0 / IP_MOMENT;
+    for (i = 0; i < 6; ++i) {
+      ip_add(square + 6 * i, ease[k] * f->J[k][i], f->J[k], 6);
     }
   }
   for (i = 0; i < 6; ++i) {
@@ -131,16 +126,11 @@ static void ip_flow_carry(ip_flow *f)
     f->failed = 1;
     return;
   }
-  for (k = 0; k < IP_CONTACTS; ++k) {
-    for (row = ip_contact_row[k]; row < ip_contact_row[k + 1]; ++row) {
-      const double ease = row - ip_contact_row[k] < 3 ? 1.0 : 1.0 / IP_MOMENT;
-      for (i = 0; i < 6; ++i) {
-        s[i] = ease * f->J[row][i];
-      }
-      ip_solve_factor(square, 6, s);
-      for (i = 0; i < IP_NV; ++i) {
-        ip_add(f->carried[i], f->J[row][i], s, 6);
-      }
+  for (k = 0; k < IP_FORCES; ++k) {
+    ip_scaled(f->J[k], ease[k], s, 6);
+    ip_solve_factor(square, 6, s);
+    for (i = 0; i < IP_NV; ++i) {
+      ip_add(f->carried[i], f->J[k][i], s, 6);
     }
   }
 #else
@@ -159,12 +149,9 @@ static double ip_flow_half(const ip_params *p, int i)
 static void ip_flow_needed(const ip_context *c, const double *force, double *shares)
 {
   double rest[IP_NV];
-  int i, j;
+  int i;
   for (i = 0; i < IP_NV; ++i) {
-    rest[i] = force[i];
-    for (j = 0; j < 6 && IP_CONTACTS; ++j) {
-      rest[i] -= c->flow.carried[i][j] * force[j];
-    }
+    rest[i] = force[i] - (IP_CONTACTS ? ip_dot(c->flow.carried[i], force, 6) : 0.0);
   }
   for (i = 0; i < IP_CONTROLS; ++i) {
     const double half = ip_flow_half(&c->p, i);

@@ -40,14 +40,16 @@ static void ip_center_of_mass(const ip_model *m, const double *q, double *positi
 #if IP_BASE == 6
   const double *M = m->M, *R = m->base;
   const double mass = M[0], lever[3] = {M[IP_NV + 5], -M[5], M[4]};
-  int i, j;
-  ip_turn(R, lever, 0, position);
-  ip_turn(R, m->h, 0, drift);
+  double scaled[9];
+  int i;
+  ip_scaled(R, 1.0 / mass, scaled, 9);
+  ip_turn(scaled, lever, 0, position);
+  ip_turn(scaled, m->h, 0, drift);
   for (i = 0; i < 3; ++i) {
-    position[i] = q[i] + position[i] / mass;
-    drift[i] = drift[i] / mass + ip_gravity[i];
-    for (j = 0; J && j < IP_NV; ++j) {
-      J[i * IP_NV + j] = (R[3 * i] * M[j] + R[3 * i + 1] * M[IP_NV + j] + R[3 * i + 2] * M[2 * IP_NV + j]) / mass;
+    position[i] += q[i];
+    drift[i] += ip_gravity[i];
+    if (J) {
+      ip_combine(J + i * IP_NV, IP_NV, scaled + 3 * i, 1, M, IP_NV, 3);
     }
   }
 #else
@@ -71,11 +73,11 @@ static void ip_shortest(const double *to, double *e)
 }
 
 /* Rows of a task that never change. */
-static void ip_constant_rows(ip_context *c, int k)
+static void ip_constant_rows(int k, double *J)
 {
-  int row;
-  for (row = ip_task_row[k]; row < ip_task_row[k + 1] && ip_task_kind[k] <= IP_BASE_TURN; ++row) {
-    c->J[row][3 + row - ip_task_row[k]] = 1.0;
+  int i;
+  for (i = 0; i < ip_task_row[k + 1] - ip_task_row[k] && ip_task_kind[k] <= IP_BASE_TURN; ++i) {
+    J[i * IP_NV + 3 + i] = 1.0;
   }
 }
 
@@ -121,7 +123,7 @@ static void ip_task_output(const ip_target *target, int k, const ip_model *m, co
   const int point = ip_task_point[k];
   const double *axis = ip_task_axis + 9 * k;
   double R[9], w[3] = {0}, p[3];
-  int i, j;
+  int i;
   switch (ip_task_kind[k]) {
   case IP_TILT:
     ip_turn(m->base, target->position, 1, w);
@@ -133,14 +135,10 @@ static void ip_task_output(const ip_target *target, int k, const ip_model *m, co
     break;
   case IP_MASS_CENTER:
     ip_center_of_mass(m, q, p, J, drift);
-    for (i = 0; i < 3; ++i) {
-      e[i] = target->position[i] - p[i];
-    }
+    ip_subtract(target->position, p, e, 3);
     break;
   default:
-    for (i = 0; i < 3; ++i) {
-      e[i] = target->position[i] - m->position[point][i];
-    }
+    ip_subtract(target->position, m->position[point], e, 3);
     memcpy(J, m->jacobian[point], sizeof(double) * 3 * IP_NV);
     memcpy(drift, ip_task_kind[k] == IP_POSE ? m->spatial[point] : m->drift[point], sizeof(double) * 6);
   }
@@ -168,11 +166,7 @@ static void ip_task_output(const ip_target *target, int k, const ip_model *m, co
     }
     for (i = 0; i < 2; ++i) {
       w[i] = ip_dot(across[i], drift + 3, 3);
-      for (j = 0; j < IP_NV; ++j) {
-        const double *angular = m->jacobian[point] + 3 * IP_NV + j;
-        J[(3 + i) * IP_NV + j] = across[i][0] * angular[0] + across[i][1] * angular[IP_NV]
-                                 + across[i][2] * angular[2 * IP_NV];
-      }
+      ip_combine(J + (3 + i) * IP_NV, IP_NV, across[i], 1, m->jacobian[point] + 3 * IP_NV, IP_NV, 3);
     }
     memcpy(drift + 3, w, sizeof(double) * 2);
   }

@@ -53,7 +53,7 @@ static void ip_hold(ip_context *c, int status, const double *v, ip_command *out)
 
 static void ip_build(ip_context *c)
 {
-  int k, i, j;
+  int k;
   for (k = 0; k < IP_TASKS; ++k) {
     ip_task_rows(c, k);
   }
@@ -61,13 +61,9 @@ static void ip_build(ip_context *c)
   ip_posture_wanted(c);
   memcpy(c->free_force, c->m.h, sizeof(double) * IP_NV);
 #if IP_FORCE_POINT >= 0
-  for (i = 0; i < 6 && c->pushed; ++i) {
-    for (j = 0; j < IP_NV; ++j) {
-      c->free_force[j] -= c->force[i] * c->m.jacobian[IP_FORCE_POINT][i * IP_NV + j];
-    }
+  for (k = 0; k < 6 && c->pushed; ++k) {
+    ip_add(c->free_force, -c->force[k], c->m.jacobian[IP_FORCE_POINT] + k * IP_NV, IP_NV);
   }
-#else
-  (void)i, (void)j;
 #endif
 }
 
@@ -125,7 +121,7 @@ static int ip_measured(const double *q, const double *v, const double *force)
 
 int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_command *out)
 {
-  int i, j, k;
+  int i, k;
   if (!ip_measured(q, v, NULL)) {
     return 1;
   }
@@ -135,7 +131,7 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
     return 3;
   }
   for (k = 0; k < IP_TASKS; ++k) {
-    ip_constant_rows(c, k);
+    ip_constant_rows(k, c->J[ip_task_row[k]]);
     if (c->target[k].set <= 0.0) {
       ip_present(c, k, &c->target[k]);
     }
@@ -162,11 +158,8 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   }
   /* The command that is held first carries the robot against gravity. */
   for (i = 0; i < IP_CONTROLS; ++i) {
-    double force = 0.0;
-    for (j = 0; i < IP_ROTORS && j < IP_BASE; ++j) {
-      force += ip_inverse[i * IP_BASE + j] * c->m.h[j];
-    }
-    force = i < IP_ROTORS ? force : c->m.h[IP_BASE + i - IP_ROTORS];
+    const double *h = c->m.h;
+    const double force = i < IP_ROTORS ? ip_dot(ip_inverse + i * IP_BASE, h, IP_BASE) : h[IP_BASE + i - IP_ROTORS];
     c->held[i] = fmin(fmax(force, c->p.control_lower[i]), c->p.control_upper[i]);
   }
   ip_answer(c, out);

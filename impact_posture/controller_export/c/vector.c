@@ -41,6 +41,33 @@ static void ip_scaled(const double *x, double s, double *out, int n)
   }
 }
 
+/* out = a - b. */
+static inline void ip_subtract(const double *a, const double *b, double *out, int n)
+{
+  int i;
+  for (i = 0; i < n; ++i) {
+    out[i] = a[i] - b[i];
+  }
+}
+
+/* x = c x + s y and y = c y - s x at once. */
+static inline void ip_rotate(double *restrict x, double *restrict y, double c, double s, int n)
+{
+  int i = 0;
+#if defined(__GNUC__)
+  for (; i + 1 < n; i += 2) {
+    const ip_pair a = IP_PAIR(x + i), b = IP_PAIR(y + i);
+    IP_PUT_PAIR(x + i, c * a + s * b);
+    IP_PUT_PAIR(y + i, c * b - s * a);
+  }
+#endif
+  for (; i < n; ++i) {
+    const double a = x[i], b = y[i];
+    x[i] = c * a + s * b;
+    y[i] = c * b - s * a;
+  }
+}
+
 /* out += s x. */
 static inline void ip_add(double *restrict out, double s, const double *restrict x, int n)
 {
