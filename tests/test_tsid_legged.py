@@ -7,9 +7,8 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import ContactError, InputError
-from impact_posture.tsid.contacts import SupportContact, support_contacts
+from impact_posture.tsid.contacts import SupportContact, point_cone, support_contacts, surface_cone, to_world
 from impact_posture.tsid.controller import Controller, Status
-from impact_posture.tsid.friction import point_cone, surface_cone, to_world
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.task_formulation import legged_formulation
