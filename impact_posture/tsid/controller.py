@@ -14,7 +14,7 @@ from impact_posture.errors import InputError, PostureError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.assembly import Assembly
-from impact_posture.tsid.daqp_solver import DaqpSolver
+from impact_posture.tsid.daqp_solver import DaqpSolver, WhitenedSolver
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.qp import EQUALITY, Solver
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
@@ -132,9 +132,6 @@ class Controller:
         n, m = self.assembly.qp.n, self.assembly.qp.m
         self._solver: Solver = DaqpSolver(n, m)
         if formulation.weighted and robot.nv >= _LARGE:
-            # Imported here, because SciPy takes long to import and only humanoids need it.
-            from impact_posture.tsid.whitened import WhitenedSolver
-
             self._solver = WhitenedSolver(n, m, robot.nv)
         self._tasks = formulation.tasks
         # Most tasks have no memory to advance.
