@@ -17,9 +17,9 @@ from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.controller import Controller, Status
-from impact_posture.tsid.flow_direction import Redundancy
+from impact_posture.tsid.flow_direction import FlowOptions, Redundancy
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.reference_flow import PHASES, FlowOptions, ReferenceFlow
+from impact_posture.tsid.reference_flow import PHASES, ReferenceFlow
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from tests.benchmarks.flow_course import formulation_for
 from tests.helpers import Vector, rng, robot

@@ -20,7 +20,7 @@ from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.progress import tell
 from impact_posture.settings import FRICTION, ProblemSettings
 from impact_posture.simulation.scenario import Setup
-from impact_posture.tsid.reference_flow import FlowOptions
+from impact_posture.tsid.flow_direction import FlowOptions
 
 # Share of the limits that holding a posture may take.
 SHARE = 0.8

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from impact_posture.arrays import Array
+from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.qp import QP
@@ -25,6 +26,45 @@ _LEVEL = 1e-6
 _NEAR = 1e-3
 # Stiffness of those springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
 _STIFFNESS = 3e4
+
+
+@dataclass(frozen=True)
+class FlowOptions:
+    """Parameters of the reference flow; the same for every robot.
+
+    Attributes:
+        speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
+        acceleration: Largest acceleration ``a``, rad/s² (m/s²); ``v/a`` is the time constant of the flow.
+        rho: ρ, pull of the joints towards the start per rad², relative to ``H₀``.
+        mu: μ, least curvature per rad², relative to ``H₀``.
+        epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.
+        joint_margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
+        com_margin: Distance of the center of mass from the edges of the support polygon, m.
+        tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
+        share: Share of the actuators' limits that holding ``q_r`` may take.
+        haste: Share that accelerating may take of what is then left of the actuators' limits.
+        tracking: Error of the joints at which the flow waits for the robot, rad (m).
+    """
+
+    speed: float = 1.0
+    acceleration: float = 2.0
+    rho: float = 0.01
+    mu: float = 0.05
+    epsilon: float = 3e-4
+    joint_margin: float = 0.1
+    com_margin: float = 0.05
+    tilt: float = 0.8
+    share: float = 0.8
+    haste: float = 0.5
+    tracking: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Refuse numbers out of range."""
+        may_vanish = ("rho", "joint_margin", "com_margin")
+        # Comparisons one by one refuse what is not a number, too.
+        good = all(x > 0 or (x == 0 and name in may_vanish) for name, x in asdict(self).items())
+        if not (good and max(self.share, self.haste) <= 1):
+            raise InputError("a number is out of range", where="flow options", hint="see the docstring")
 
 
 @dataclass(frozen=True)
@@ -78,28 +118,23 @@ class FlowDirection:
         failures: Number of steps that the solver did not find.  They are zero.
     """
 
-    def __init__(
-        self, robot: Robot, edges: Array, controls: int, *, rho: float, mu: float, margin: float, tilt: float
-    ) -> None:
+    def __init__(self, robot: Robot, edges: Array, controls: int, options: FlowOptions) -> None:
         """Size the buffers.
 
         Args:
             robot: The robot.
             edges: Normals of the support polygon, shape (k, 2).
             controls: Number of static controls with limits.
-            rho: ρ, per rad².
-            mu: μ, per rad².
-            margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
-            tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
+            options: Parameters of the flow.
         """
         nv, ranges = robot.nv, JointRanges(robot)
         self._joints = np.flatnonzero(np.isfinite(ranges.lower) & np.isfinite(ranges.upper))
         width = (ranges.upper - ranges.lower)[self._joints]
-        self._margin = np.minimum(margin, width / 8)
-        self._edges, self._mu, self._tilt = edges, mu, tilt
+        self._margin = np.minimum(options.joint_margin, width / 8)
+        self._edges, self._mu, self._tilt = edges, options.mu, options.tilt
         self._up = robot.upright
         # The pull towards the start acts on joints.  Others lead the base.
-        self._pull = np.full(nv, rho)
+        self._pull = np.full(nv, options.rho)
         self._pull[: 6 if robot.floating else 0] = 0.0
         self.B, self.gain, self.failures = np.zeros((nv, nv)), 0.0, 0
         # The sizes never change.  Directions that the constraints take keep columns of zeros.

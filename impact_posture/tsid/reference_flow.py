@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError, MetricError
+from impact_posture.errors import MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
-from impact_posture.tsid.flow_direction import FlowDirection, Redundancy, limited
+from impact_posture.tsid.flow_direction import FlowDirection, FlowOptions, Redundancy, limited
 from impact_posture.tsid.frame_tasks import FramePose, FramePosition
+from impact_posture.tsid.impact_robust import Gradient
 from impact_posture.tsid.qp import stacked_rows
 from impact_posture.tsid.state import State
 from impact_posture.tsid.static_controls import StaticControls, support_edges
 from impact_posture.tsid.task import Task
 from impact_posture.tsid.task_formulation import TaskFormulation
-
-Gradient = Callable[[Array], tuple[float, Array]]
 
 # Step of the differences along the redundancy, rad.
 _STEP = 1e-4
@@ -40,45 +38,6 @@ _EMPTY = 1e-24
 _NEW = 0.1
 # Pull to zero of the base's share in a motion that the joints do not determine.
 _IDLE = 1e-9
-
-
-@dataclass(frozen=True)
-class FlowOptions:
-    """Parameters of the reference flow; the same for every robot.
-
-    Attributes:
-        speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
-        acceleration: Largest acceleration ``a``, rad/s² (m/s²); ``v/a`` is the time constant of the flow.
-        rho: ρ, pull of the joints towards the start per rad², relative to ``H₀``.
-        mu: μ, least curvature per rad², relative to ``H₀``.
-        epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.
-        joint_margin: Distance from the joint limits, rad (m).
-        com_margin: Distance of the center of mass from the edges of the support polygon, m.
-        tilt: Largest angle between a floating base and its upright in the default posture, rad.
-        share: Share of the actuators' limits that holding ``q_r`` may take.
-        haste: Share that accelerating may take of what is then left of the actuators' limits.
-        tracking: Error of the joints at which the flow waits for the robot, rad (m).
-    """
-
-    speed: float = 1.0
-    acceleration: float = 2.0
-    rho: float = 0.01
-    mu: float = 0.05
-    epsilon: float = 3e-4
-    joint_margin: float = 0.1
-    com_margin: float = 0.05
-    tilt: float = 0.8
-    share: float = 0.8
-    haste: float = 0.5
-    tracking: float = 0.3
-
-    def __post_init__(self) -> None:
-        """Refuse numbers out of range."""
-        may_vanish = ("rho", "joint_margin", "com_margin")
-        # Comparisons one by one refuse what is not a number, too.
-        good = all(x > 0 or (x == 0 and name in may_vanish) for name, x in asdict(self).items())
-        if not (good and max(self.share, self.haste) <= 1):
-            raise InputError("a number is out of range", where="flow options", hint="see the docstring")
 
 
 class ReferenceFlow:
@@ -147,7 +106,7 @@ class ReferenceFlow:
         Raises:
             MetricError: The gradient does not exist there, or ``H`` vanishes.
         """
-        options, state = self.options, self._state
+        state = self._state
         self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
         self._first, self._here = self.q.copy(), self.q.copy()
         self._wanted, self._flow, self._slope = np.zeros((3, self.velocity.size))
@@ -164,10 +123,7 @@ class ReferenceFlow:
             self._J[rows] = task.jacobian(state)
         self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
         self._edges, self._offsets = support_edges(state, self._contacts)
-        self.direction = FlowDirection(
-            self.robot, self._edges, self._static.limited.size,
-            rho=options.rho, mu=options.mu, margin=options.joint_margin, tilt=options.tilt,
-        )  # fmt: skip
+        self.direction = FlowDirection(self.robot, self._edges, self._static.limited.size, self.options)
         self.start = 1.0
         self.value, _ = self._evaluate(self.q)
         if not (np.isfinite(self.value) and self.value != 0):

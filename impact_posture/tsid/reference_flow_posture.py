@@ -13,9 +13,10 @@ from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.body_tasks import BodyTaskLead
+from impact_posture.tsid.flow_direction import FlowOptions
 from impact_posture.tsid.impact_robust import Gradient, fitting_gradient
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.reference_flow import FlowOptions, ReferenceFlow
+from impact_posture.tsid.reference_flow import ReferenceFlow
 from impact_posture.tsid.state import State
 from impact_posture.tsid.task_formulation import TaskFormulation
 

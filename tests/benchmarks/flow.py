@@ -16,7 +16,7 @@ from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.posture.search import run_start
 from impact_posture.posture.starts import feasible_start
 from impact_posture.processes import fork_map
-from impact_posture.tsid.reference_flow import FlowOptions
+from impact_posture.tsid.flow_direction import FlowOptions
 from tests.benchmarks.cases import AHEAD, DOWN, Case
 from tests.benchmarks.core import Request, Vector, collected, machine, table
 from tests.benchmarks.flow_course import CompiledFlow, Course

@@ -14,9 +14,10 @@ from impact_posture.errors import MetricError
 from impact_posture.libraries import library_path, load_library
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.robot.robot import Robot
+from impact_posture.tsid.flow_direction import FlowOptions
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.ranges import JointRanges
-from impact_posture.tsid.reference_flow import PHASES, FlowOptions
+from impact_posture.tsid.reference_flow import PHASES
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task_formulation import (
     TaskFormulation,

@@ -17,7 +17,7 @@ from impact_posture.simulation.offline import SHARE, offline_posture, scenario_r
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
-from impact_posture.tsid.reference_flow import FlowOptions
+from impact_posture.tsid.flow_direction import FlowOptions
 from tests.benchmarks.robustness.outcomes import is_held
 from tests.simulation.factories import needs_mujoco
 
