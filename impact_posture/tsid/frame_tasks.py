@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -169,23 +170,18 @@ class FrameAligned(FrameTask[pin.SE3]):
 
     title, rows = "axis", 5
 
-    def __init__(
-        self,
-        point: Point,
-        axis: ArrayLike = (0.0, 0.0, 1.0),
-        *,
-        name: str | None = None,
-        kp: ArrayLike = 100.0,
-        kd: ArrayLike | None = None,
-        weight: ArrayLike = 1.0,
-        impedance: Impedance | None = None,
-    ) -> None:
-        """Set gains and the axis, in the frame and of any length; see :class:`FrameTask`.
+    def __init__(self, point: Point, axis: ArrayLike = (0.0, 0.0, 1.0), **gains: Any) -> None:
+        """Set the axis, in the frame and of any length.
+
+        Args:
+            point: The point.
+            axis: The axis.
+            gains: As of :class:`FrameTask`.
 
         Raises:
             InputError: The axis has no direction, or a gain is invalid.
         """
-        super().__init__(point, name=name, kp=kp, kd=kd, weight=weight, impedance=impedance)
+        super().__init__(point, **gains)
         self._axis = np.array(axis, dtype=float)
         length = float(np.linalg.norm(self._axis))
         if not (length > 0 and math.isfinite(length)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pinocchio as pin
@@ -97,10 +97,6 @@ class ImpactRobustPosture(JointPosture):
         *,
         K: float = 10.0,
         name: str = "impact-robust posture",
-        kp: ArrayLike = 10.0,
-        kd: ArrayLike | None = None,
-        weight: ArrayLike = 1.0,
-        base_weight: float | None = None,
         spring: Spring = "keep",
         follow: float = 0.5,
         reach: float = 2.0,
@@ -108,8 +104,9 @@ class ImpactRobustPosture(JointPosture):
         every: int = 5,
         scale: float | None = None,
         activation: Activation | None = None,
+        **gains: Any,
     ) -> None:
-        """Set gains; see the class, and :class:`~impact_posture.tsid.posture_tasks.JointPosture` for the others.
+        """Set gains and options; see the class.
 
         Args:
             robot: The robot.
@@ -117,10 +114,6 @@ class ImpactRobustPosture(JointPosture):
             target: ``q_des``, shape (nq,); the posture at ``reset`` by default.
             K: Gain, 1/s².
             name: Name in reports.
-            kp: Stiffness, 1/s².
-            kd: Damping, 1/s.
-            weight: Weight in the cost, one number or (nv,).
-            base_weight: Weight of the six base entries, if it differs.
             spring: What becomes of ``K_p`` while the term is on.
             follow: Time constant of ``spring = "follow"``, s.
             reach: Bound of the term divided by ``K``, rad.
@@ -128,20 +121,21 @@ class ImpactRobustPosture(JointPosture):
             every: Ticks between evaluations of the gradient.
             scale: ``λ``, if it is not to be measured at ``reset``.
             activation: The state machine; a new one by default.
+            gains: As of :class:`~impact_posture.tsid.posture_tasks.JointPosture`.
 
         Raises:
             InputError: A number is out of range.
             ManifestMismatch: The export is of another robot.
         """
         check_choice("spring", spring, get_args(Spring))
-        super().__init__(robot, target, name=name, kp=kp, kd=kd, weight=weight, base_weight=base_weight)
-        gains = 0 <= K < math.inf and reach > 0 and follow > 0 and 0 <= fade[0] < fade[1]
-        if not (gains and every >= 1 and (scale or 1) > 0):
+        super().__init__(robot, target, name=name, **gains)
+        sound = 0 <= K < math.inf and reach > 0 and follow > 0 and 0 <= fade[0] < fade[1]
+        if not (sound and every >= 1 and (scale or 1) > 0):
             raise InputError("a gain of the impact-robust term is out of range", where=name, hint="see its docstring")
         self.K, self.scale = float(K), 1.0 if scale is None else float(scale)
         self.activation = activation or Activation()
         self.spring, self.reach, self.every = spring, float(reach), int(every)
-        if kd is None:
+        if gains.get("kd") is None:
             self.kd = 2.0 * np.sqrt(self.kp + self.K)
         self._function = fitting_gradient(robot, gradient)
         self._measure, self._follow = scale is None, float(follow)
