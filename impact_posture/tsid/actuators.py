@@ -57,13 +57,7 @@ class Actuators:
 
     def solve(self, force: Array, spare: Array) -> Array:
         """Return ``u`` for a generalized force, shape (nv,), and the choice ``w``; a fresh array (controls,)."""
-        u = np.empty(self.controls)
-        u[self.rotors :] = force[self.base :]
-        if self.rotors:
-            np.matmul(self.inverse, force[: self.base], out=u[: self.rotors])
-            if spare.size:
-                u[: self.rotors] += self.spare @ spare
-        return u
+        return np.concatenate([self.inverse @ force[: self.base] + self.spare @ spare, force[self.base :]])
 
     def rotor_speeds(self, thrusts: Array) -> Array:
         """Return ``√(thrust/c_f)`` in the unit of ``speed_max``, zero for a negative thrust; shape (rotors,)."""

@@ -71,7 +71,8 @@ class PointKinematics:
         self._J, self._dJ_transposed = data.J, data.dJ.T
         mask = np.zeros((count, nv))
         for k, frame in enumerate(frames):
-            mask[k, _support(model, frame.parentJoint)] = 1.0
+            for joint in model.supports[frame.parentJoint]:
+                mask[k, model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]] = 1.0
         self._mask, self._rows_mask = mask, np.repeat(mask, 6, axis=0)
         self._position, rotation = np.zeros((count, 3)), np.zeros((count, 3, 3))
         # Views on the same memory in the shapes of the products.
@@ -140,12 +141,3 @@ def _fixed(frame: pin.Frame, point: Point) -> tuple[Array | None, Array | None]:
     offset = placement.act(np.array(point.offset, dtype=float))
     turn = np.array(placement.rotation)
     return (offset if np.any(offset) else None), (None if np.array_equal(turn, np.eye(3)) else turn)
-
-
-def _support(model: pin.Model, joint: int) -> list[int]:
-    """Return the entries of ν that move the body of a joint."""
-    columns: list[int] = []
-    while joint > 0:
-        columns += range(model.idx_vs[joint], model.idx_vs[joint] + model.nvs[joint])
-        joint = model.parents[joint]
-    return columns

@@ -42,10 +42,7 @@ class StaticControls:
         self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
         self._count, self._base = self._ease.size, base
         # u = inverse · force for everything but the contacts.
-        self._inverse = np.zeros((actuators.controls, actuators.G.shape[0]))
-        self._inverse[: actuators.rotors, :base] = actuators.inverse
-        self._inverse[actuators.rotors :, base:] = np.eye(actuators.controls - actuators.rotors)
-        self._inverse = self._inverse[self.limited] / self._half[:, None]
+        self._inverse = np.linalg.pinv(actuators.G, rcond=1e-9)[self.limited] / self._half[:, None]
         # Forces on the contacts that carry the base, times -Jᵀ: what they take from generalized forces.
         self._carried = np.zeros((actuators.G.shape[0], base))
         if contacts:
