@@ -81,10 +81,6 @@ def solve(assembly: Assembly, solver: Solver) -> Outcome:
         solved = DaqpSolver(qp.n, qp.m, proximal=_FLAT).solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
-    return _relax(assembly)
-
-
-def _relax(assembly: Assembly) -> Outcome:
     nearest = lexicographic(_hierarchy(assembly), assembly.rank.units)
     if nearest is None:
         return Outcome(None)
@@ -145,9 +141,10 @@ def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, .
 
 
 def _gave_way(assembly: Assembly, z: Array) -> tuple[Relaxed, ...]:
-    limits = assembly.limits
-    most = float(np.max(_passed(assembly.qp, z, limits), initial=0.0))
-    opened = most > _OFF * (1.0 + float(np.max(np.abs(assembly.qp.values(z)[limits]))))
+    qp, limits = assembly.qp, assembly.limits
+    values = qp.values(z)[limits]
+    most = float(np.max(np.maximum(qp.lower[limits] - values, values - qp.upper[limits]), initial=0.0))
+    opened = most > _OFF * (1.0 + float(np.max(np.abs(values))))
     return (*([Relaxed("joint limits", most)] if opened else []), *missed(assembly, z, equations=True))
 
 
@@ -172,9 +169,3 @@ def _hierarchy(assembly: Assembly) -> list[Level]:
         Level(np.vstack([np.eye(n), qp.A])[limits], qp.lower[limits], qp.upper[limits]),
         *(Level(qp.A[rows], lower[rows], upper[rows]) for rows in levels),
     ]
-
-
-def _passed(qp: QP, z: Array, limits: NDArray[np.intp]) -> Array:
-    """Return the violation of the bounds of joint limits by ``z``; negative where they hold."""
-    values = qp.values(z)[limits]
-    return np.asarray(np.maximum(qp.lower[limits] - values, values - qp.upper[limits]))
