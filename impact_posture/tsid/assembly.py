@@ -169,19 +169,26 @@ class Assembly:
 
     def _place_rows(self, blind: slice, hard: slice, levels: slice, controls: slice, cones: slice) -> None:
         qp, nv, actuators = self.qp, self._nv, self.actuators
-        self._blind, self._hard, self._levels, self._cones = blind, hard, levels, cones
-        thrusts = slice(controls.start, controls.start + actuators.rotors)
-        torques = slice(thrusts.stop, controls.stop)
+        self._blind, self._hard, self._levels, self._controls, self._cones = blind, hard, levels, controls, cones
         for rows in (blind, hard, levels):
             qp.sense[self._at(rows)] = EQUALITY
+        thrusts = slice(controls.start, controls.start + actuators.rotors)
+        torques = slice(thrusts.stop, controls.stop)
         qp.A[thrusts, self._w] = actuators.spare
-        self._controls = controls
-        self._A_blind, self._A_blind_f = qp.A[blind, :nv], qp.A[blind, self._f]
-        self._A_thrust, self._A_thrust_f = qp.A[thrusts, :nv], qp.A[thrusts, self._f]
-        self._A_torque, self._A_torque_f = qp.A[torques, :nv], qp.A[torques, self._f]
         self._A_hard, self._A_controls = qp.A[hard, :nv], qp.A[controls]
-        self._blind_transposed = np.ascontiguousarray(actuators.blind.T)
-        self._known = np.zeros(actuators.controls)
+        self._free_blind, self._known = np.zeros(actuators.blind.shape[1]), np.zeros(actuators.controls)
+        # Rows of the dynamics, where their constants go, their part of a generalized force, and what turns it.
+        base, joints = slice(actuators.base), slice(actuators.base, nv)
+        parts: list[tuple[slice, Array, slice, Array | None]] = [
+            (blind, self._free_blind, base, np.ascontiguousarray(actuators.blind.T) if actuators.rotors else None),
+            (thrusts, self._known[: actuators.rotors], base, actuators.inverse),
+            (torques, self._known[actuators.rotors :], joints, None),
+        ]
+        self._dynamics = [
+            (qp.A[rows, :nv], qp.A[rows, self._f], known, part, turn)
+            for rows, known, part, turn in parts
+            if known.size
+        ]
 
     def _place_cost(self, robot: Robot) -> None:
         nv, contacts = self._nv, self.contacts
@@ -217,33 +224,23 @@ class Assembly:
         return (*contacts, *zip(named, rows, strict=True))
 
     def _fill_dynamics(self, state: State) -> None:
-        qp, actuators, base, J = self.qp, self.actuators, self.actuators.base, self.contacts.J
-        M, free = state.M, self._free
+        qp, actuators, J, M, free = self.qp, self.actuators, self.contacts.J, state.M, self._free
         free[:] = state.h
         if self.formulation.force_point is not None and state.pushed:
             free -= state.force @ state.at(self.formulation.force_point).jacobian
-        M_base = M[:base]
-        if self._A_blind.shape[0]:
-            plain = not actuators.rotors
-            self._A_blind[:] = M_base if plain else self._blind_transposed @ M_base
-            rhs = free[:base] if plain else self._blind_transposed @ free[:base]
-            self._equate(self._blind, -rhs)
+        for A, A_f, known, part, turn in self._dynamics:
+            if turn is None:
+                A[:], known[:] = M[part], free[part]
+            else:
+                np.matmul(turn, M[part], out=A)
+                np.matmul(turn, free[part], out=known)
             if J.size:
-                turned = J[:, :base].T if plain else self._blind_transposed @ J[:, :base].T
-                np.negative(turned, out=self._A_blind_f)
-        self._A_torque[:] = M[base:]
-        known = self._known
-        known[actuators.rotors :] = free[base:]
-        if actuators.rotors:
-            np.matmul(actuators.inverse, M_base, out=self._A_thrust)
-            np.matmul(actuators.inverse, free[:base], out=known[: actuators.rotors])
-        if J.size:
-            np.negative(J[:, base:].T, out=self._A_torque_f)
-            if actuators.rotors:
-                self._A_thrust_f[:] = -actuators.inverse @ J[:, :base].T
+                np.negative(J[:, part].T if turn is None else turn @ J[:, part].T, out=A_f)
+        if self._free_blind.size:
+            self._equate(self._blind, -self._free_blind)
         at = self._at(self._controls)
-        np.subtract(actuators.lower, known, out=qp.lower[at])
-        np.subtract(actuators.upper, known, out=qp.upper[at])
+        np.subtract(actuators.lower, self._known, out=qp.lower[at])
+        np.subtract(actuators.upper, self._known, out=qp.upper[at])
         if self._hard_rows.size:
             self._A_hard[:] = J[self._hard_rows]
             self._equate(self._hard, self.contacts.a[self._hard_rows])
