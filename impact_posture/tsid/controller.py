@@ -16,7 +16,7 @@ from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.daqp_solver import DaqpSolver, WhitenedSolver
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
-from impact_posture.tsid.qp import EQUALITY, Solver
+from impact_posture.tsid.qp import EQUALITY
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.relaxation import Outcome, Relaxed, missed, solve
 from impact_posture.tsid.state import State, checked_velocity
@@ -130,9 +130,8 @@ class Controller:
         self.actuators = Actuators(robot)
         self.assembly = Assembly(robot, formulation, self.actuators)
         n, m = self.assembly.qp.n, self.assembly.qp.m
-        self._solver: Solver = DaqpSolver(n, m)
-        if formulation.weighted and robot.nv >= _LARGE:
-            self._solver = WhitenedSolver(n, m, robot.nv)
+        white = formulation.weighted and robot.nv >= _LARGE
+        self._solver = WhitenedSolver(n, m, robot.nv) if white else DaqpSolver(n, m)
         self._tasks = formulation.tasks
         # Most tasks have no memory to advance.
         self._advancing = [task for task in self._tasks if type(task).advance is not Task.advance]

@@ -47,7 +47,7 @@ class DaqpSolver:
         self._cold = True
 
     def solve(self, qp: QP) -> Solved | None:
-        """Return the solution, or ``None`` if there is none."""
+        """Return the solution, or ``None`` if there is none or none was found (see :attr:`infeasible`)."""
         sense = qp.sense if self._cold else None
         self._flag = self._model.update(qp.H, qp.g, qp.A, qp.upper, qp.lower, sense)
         if self._flag >= 0:
@@ -60,7 +60,7 @@ class DaqpSolver:
 
     @property
     def infeasible(self) -> bool:
-        """Whether the last program had no solution."""
+        """Whether the last program had no solution, in contrast to a solver that found none."""
         return self._flag == _NONE
 
 

@@ -1,11 +1,10 @@
-"""A quadratic program in buffers that are sized once, and the protocol of its solvers."""
+"""A quadratic program in buffers that are sized once."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from itertools import accumulate, pairwise
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,20 +90,6 @@ class Solved:
     z: Array
     multipliers: Array
     iterations: int
-
-
-class Solver(Protocol):
-    """Solver of a sequence of QPs, all of the same size."""
-
-    def reset(self) -> None:
-        """Discard what earlier solutions left for a warm start."""
-
-    def solve(self, qp: QP) -> Solved | None:
-        """Return the solution, or ``None`` if there is none or none was found (see :attr:`infeasible`)."""
-
-    @property
-    def infeasible(self) -> bool:
-        """Whether the last program had no solution, in contrast to a solver that found none."""
 
 
 def stacked_rows(sizes: Iterable[int]) -> tuple[tuple[slice, ...], int]:

@@ -12,7 +12,7 @@ from impact_posture.arrays import Array, null_space
 from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.daqp_solver import SOLVED, DaqpSolver
 from impact_posture.tsid.hierarchy import Level, lexicographic
-from impact_posture.tsid.qp import EQUALITY, QP, Solved, Solver
+from impact_posture.tsid.qp import EQUALITY, QP, Solved
 
 # Miss that counts, relative to the terms of a row.
 _OFF = 1e-6
@@ -54,7 +54,7 @@ class Outcome:
     relaxed: tuple[Relaxed, ...] = ()
 
 
-def solve(assembly: Assembly, solver: Solver) -> Outcome:
+def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
     """Solve the QP of the assembly; if that fails, relax it lexicographically.
 
     Dynamics, control limits and friction always hold, because every state has an acceleration that satisfies them.

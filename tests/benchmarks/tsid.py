@@ -17,10 +17,11 @@ from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.body_tasks import CenterOfMass
 from impact_posture.tsid.controller import Controller, Status
+from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.frame_tasks import FramePose
 from impact_posture.tsid.impact_robust import Gradient, ImpactRobustPosture, gradient_of
 from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.qp import QP, Solved, Solver
+from impact_posture.tsid.qp import QP, Solved
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task_formulation import aerial_formulation, legged_formulation
 from tests.benchmarks.cases import CASES
@@ -49,7 +50,7 @@ GOALS = {
 class Timed:
     """A solver that notes what it takes, µs, and keeps every tenth of the programs."""
 
-    def __init__(self, inner: Solver) -> None:
+    def __init__(self, inner: DaqpSolver) -> None:
         self.inner, self.times, self.kept = inner, list[float](), list[tuple[QP, Solved | None]]()
         self.reset = inner.reset
 
