@@ -14,25 +14,14 @@ from impact_posture.errors import CompilerError
 # Operations that C has on vectors.  A division is a product with a reciprocal, which several divisions share.
 ARITHMETIC = frozenset({"+", "-", "*", "neg", "inv"})
 _COMMUTE = frozenset({"+", "*"})
+# Functions of C that CasADi calls by the same names, of one number and of two.
+_OF_ONE = ("exp", "log", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "tanh", "fabs")
+_OF_TWO = ("pow", "atan2", "hypot", "fmin", "fmax")
 # The C of the other operations.  Operands are names or stand in parentheses.
 CALLS = {
-    ca.OP_EXP: "exp({0})",
-    ca.OP_LOG: "log({0})",
-    ca.OP_POW: "pow({0}, {1})",
+    **{getattr(ca, f"OP_{name.upper()}"): f"{name}({{0}})" for name in _OF_ONE},
+    **{getattr(ca, f"OP_{name.upper()}"): f"{name}({{0}}, {{1}})" for name in _OF_TWO},
     ca.OP_CONSTPOW: "pow({0}, {1})",
-    ca.OP_SQRT: "sqrt({0})",
-    ca.OP_SIN: "sin({0})",
-    ca.OP_COS: "cos({0})",
-    ca.OP_TAN: "tan({0})",
-    ca.OP_ASIN: "asin({0})",
-    ca.OP_ACOS: "acos({0})",
-    ca.OP_ATAN: "atan({0})",
-    ca.OP_ATAN2: "atan2({0}, {1})",
-    ca.OP_TANH: "tanh({0})",
-    ca.OP_HYPOT: "hypot({0}, {1})",
-    ca.OP_FABS: "fabs({0})",
-    ca.OP_FMIN: "fmin({0}, {1})",
-    ca.OP_FMAX: "fmax({0}, {1})",
     ca.OP_SIGN: "(double)(({0} > 0.0) - ({0} < 0.0))",
     ca.OP_LT: "(double)({0} < {1})",
     ca.OP_LE: "(double)({0} <= {1})",
