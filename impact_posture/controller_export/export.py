@@ -103,7 +103,7 @@ def export_controller(
         hint = "give the objective of its gradient" if objective is None else "give a posture task that follows one"
         raise InputError(what, where="controller export", hint=hint)
     sources = daqp_sources(daqp)
-    fields = parameters(structure, period)
+    fields = tuple(parameters(structure, period))
     manifest = _manifest(structure, fields, prefix)
     metric = f"{prefix}_metric" if objective is not None else None
     own = [f"{prefix}_relaxation.c", *([] if metric is None else [f"{metric}.c"])]

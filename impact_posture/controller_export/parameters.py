@@ -35,17 +35,13 @@ class Field(NamedTuple):
     value: Array
 
 
-def parameters(s: Structure, period: float) -> tuple[Field, ...]:
-    """Return the parameters of a formulation with their values, in the order of the C structure.
+def parameters(s: Structure, period: float) -> Iterator[Field]:
+    """Yield the parameters of a formulation with their values, in the order of the C structure.
 
     Args:
         s: Structure of the formulation.
         period: Expected time between ticks, s.
     """
-    return tuple(_fields(s, period))
-
-
-def _fields(s: Structure, period: float) -> Iterator[Field]:
     formulation, actuators, ranges = s.formulation, s.actuators, JointRanges(s.robot)
     posture, robust, contacts = formulation.posture, s.robust, formulation.contacts
     law = formulation.law or LimitLaw()

@@ -140,8 +140,7 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
         "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
         "identity": identity, "tables": tables, "named": named_fields, "literals": _initializer,
         "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
-        "constants": code.constants, "blocks": code.blocks, "angles": code.angles, "work": code.work,
-        "places": _braced(map(str, code.angles)), "outputs": code.outputs, "constant_outputs": code.constant_outputs,
+        "code": code, "places": _braced(map(str, code.angles)),
         "core": "\n".join(_own(name) for name in _files(sizes)),
     }  # fmt: skip
     templates = environment("impact_posture.controller_export", c_comment)

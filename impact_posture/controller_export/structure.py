@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import InputError
-from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot import Robot, unit_parts
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
@@ -99,7 +99,7 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     dense = (bool(formulation.weighted) or not assembly.contacts.hard.all()) and not momentum
     forces, hard = assembly.contacts.size, int(assembly.contacts.hard.sum())
     joints = nv - actuators.base
-    slots = Chart(robot.model).slots
+    slots, units = Chart(robot.model).slots, [part for _, part in unit_parts(robot.model)]
     sizes = {
         "NQ": robot.nq,
         "NV": nv,
@@ -142,7 +142,7 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
         "joint_q": [s.q.start for s in slots],
         "joint_v": [s.v.start for s in slots],
         "limit_q": ranges.index.tolist(),
-        "unit": [x for part in _units(slots) for x in part],
+        "unit": [x for part in units for x in (part.start, part.stop - part.start)],
         "task_kind": [_KINDS.index(type(t)) for t in tasks],
         "task_point": [points.index(t.point) if isinstance(t, FrameTask) else -1 for t in tasks],
         "task_row": task_rows.tolist(),
@@ -154,7 +154,7 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
         "contact_hard": [int(c.weight is None) for c in contacts],
         "level_rows": [rows.stop - rows.start for _, rows in assembly.levels],
     }
-    sizes |= {"UNITS": len(tables["unit"]) // 2, "LEVELS": len(tables["level_rows"])}
+    sizes |= {"UNITS": len(units), "LEVELS": len(tables["level_rows"])}
     _add_flow(robot, formulation, sizes, tables)
     doubles: dict[str, Any] = {
         "inverse": actuators.inverse,
@@ -238,13 +238,6 @@ def _check(robot: Robot, formulation: TaskFormulation) -> None:
     for slot in Chart(robot.model).slots:
         if slot.kind.family not in _FAMILIES:
             raise refuse(f"joint '{slot.name}' ({slot.kind.family}) has no C code")
-
-
-def _units(slots: list[Any]) -> list[tuple[int, int]]:
-    """Return start and length of each quaternion and cosine-sine pair in ``q``."""
-    widths = {"free-flyer": 4, "spherical": 4, "continuous": 2}
-    found = [(s.q.stop - widths[s.kind.family], widths[s.kind.family]) for s in slots if s.kind.family in widths]
-    return found
 
 
 def _axes(task: Task) -> Array:
