@@ -45,8 +45,11 @@ static int ip_relax(ip_context *c)
 {
   enum { N = IP_VARIABLES, M = IP_OTHERS };
   double g[N] = {0}, unit[N], lower[N + M], upper[N + M], *H = c->scratch;
-  int level[N + M], i, j, k, r, flag;
-  relaxation_problem problem = {0};
+  int level[N + M] = {0}, i, j, k, r, flag;
+  const relaxation_problem problem = {
+    .n = N, .m = M, .levels = 1 + IP_LEVELS, .A = c->rows[0], .lower = lower, .upper = upper, .level = level, .H = H,
+    .g = g, .unit = unit
+  };
   relaxation_report report;
   memset(H, 0, sizeof(double) * N * N);
   ip_cost(c, H, N, g);
@@ -63,7 +66,6 @@ static int ip_relax(ip_context *c)
 #endif
   for (i = 0; i < N; ++i) {
     unit[i] = i < IP_NV + IP_SPARE ? 1.0 : IP_FORCE_UNIT * c->m.M[0];
-    level[i] = 0;
     lower[i] = -INFINITY;
     upper[i] = INFINITY;
     g[i] = -g[i];
@@ -77,26 +79,13 @@ static int ip_relax(ip_context *c)
     lower[IP_BASE + i] = c->low[at];
     upper[IP_BASE + i] = c->high[at];
   }
-  for (r = 0; r < M; ++r) {
-    level[N + r] = 0;
-    lower[N + r] = c->low[IP_SIMPLE + r];
-    upper[N + r] = c->high[IP_SIMPLE + r];
-  }
+  memcpy(lower + N, c->low + IP_SIMPLE, sizeof(double) * M);
+  memcpy(upper + N, c->high + IP_SIMPLE, sizeof(double) * M);
   for (k = 0, r = IP_BLIND; k < IP_LEVELS; r += ip_level_rows[k++]) {
     for (i = r; i < r + ip_level_rows[k]; ++i) {
       level[N + i] = 2 + k;
     }
   }
-  problem.n = N;
-  problem.m = M;
-  problem.levels = 1 + IP_LEVELS;
-  problem.A = c->rows[0];
-  problem.lower = lower;
-  problem.upper = upper;
-  problem.level = level;
-  problem.H = H;
-  problem.g = g;
-  problem.unit = unit;
   flag = relaxation_solve(&problem, c->relaxation, IP_ITERATIONS, c->z, &report);
   c->iterations += report.iterations;
   memset(c->multipliers, 0, sizeof c->multipliers);
