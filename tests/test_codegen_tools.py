@@ -124,7 +124,7 @@ def test_no_compiler(small: ImpactObjective, tmp_path: Path, monkeypatch: pytest
     assert written.agreement is None
     assert all(p.is_file() for p in written.files)
     with pytest.raises(CompilerError, match="no C compiler"):
-        compile_and_check(tmp_path, written.prefix, small)
+        compile_and_check(tmp_path, written.prefix, [small])
 
 
 def test_compiler_that_fails(pendulum: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,7 +146,7 @@ def test_compiler_says_why(pendulum: str, tmp_path: Path) -> None:
     source = tmp_path / "pend.c"
     source.write_text(source.read_text().replace("return 0;", "return nothing_of_that_name;"))
     with pytest.raises(CompilerError, match=r"pend\.c:\d+.*error.*nothing_of_that_name.*command: ") as caught:
-        compile_and_check(tmp_path, "pend", objective)
+        compile_and_check(tmp_path, "pend", [objective])
     assert "\n" not in caught.value.line
 
 
@@ -159,7 +159,7 @@ def test_compiled_code_that_computes_something_else(pendulum: str, tmp_path: Pat
     assert changed != source.read_text()
     source.write_text(changed)
     with pytest.raises(CompilerError, match="differ from those of CasADi"):
-        compile_and_check(tmp_path, "pend", objective)
+        compile_and_check(tmp_path, "pend", [objective])
 
 
 def test_cc_may_carry_options(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def self_test_tolerance(objective: ImpactObjective, real: Real) -> float:
 def compile_and_check(
     export_dir: Path,
     prefix: str,
-    objective: ImpactObjective | Sequence[ImpactObjective],
+    objectives: Sequence[ImpactObjective],
     *,
     keep: bool = False,
 ) -> float:
@@ -73,13 +73,12 @@ def compile_and_check(
     Args:
         export_dir: The folder of the export.
         prefix: The prefix of the export.
-        objective: The exported objective, or one for each frame.
+        objectives: The exported objectives, one for each frame.
         keep: Leave the library in the folder of the export, even if it fails.
 
     Raises:
         CompilerError: There is no compiler, it failed, or its code computes other numbers.
     """
-    objectives = (objective,) if isinstance(objective, ImpactObjective) else tuple(objective)
     manifest, _ = read_manifest(export_dir / f"{prefix}.json")
     real, worst = REALS[manifest["real"]], 0.0
     with scratch_folder() as folder:
