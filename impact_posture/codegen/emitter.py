@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.codegen.graph import COSINE, Node
-from impact_posture.codegen.layout import Block, Layout, is_leaf
+from impact_posture.codegen.layout import Block, Layout
 
 # Approximate number of characters in the place of a constant.
 _PLACE = 7
@@ -250,7 +250,7 @@ class Emitter:
         node = self._graph.nodes[k]
         if not top and k in names:
             return names[k]
-        if is_leaf(self._graph, self.layout.trig, k):
+        if k in self.layout.leaves:
             return self._leaf(k, node, number, names, lines)
         if not top and k not in self.layout.inlined:
             return self._slot(k)

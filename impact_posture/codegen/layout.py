@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 
 from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph
@@ -40,6 +40,7 @@ class Layout:
         sizes: Width → length of the work array.
         angles: Inputs whose sine and cosine are taken, in the order of the array of sines.
         trig: Sine or cosine node → its first place in that array.
+        leaves: Nodes that every block has at hand, so that they need no statement.
     """
 
     graph: Graph
@@ -49,11 +50,7 @@ class Layout:
     sizes: Mapping[int, int]
     angles: tuple[int, ...]
     trig: Mapping[int, int]
-
-
-def is_leaf(graph: Graph, trig: Mapping[int, int], k: int) -> bool:
-    """Return whether every block has a node at hand, so that it needs no statement."""
-    return graph.nodes[k].op in ("const", "in", "lane") or k in trig
+    leaves: frozenset[int]
 
 
 def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOCK) -> Layout:
@@ -66,18 +63,19 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
     """
     order = _depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
     angles, trig = _trig(graph, order)
-    needed = _needed(graph, functions, trig)
+    leaves = frozenset(k for k in order if graph.nodes[k].op in ("const", "in", "lane") or k in trig)
+    needed = _needed(graph, functions, leaves)
     # A node that only the array of sines uses has no statement.
     order = [k for k in order if k in needed]
     users: dict[int, list[int]] = {}
     for k in order:
-        for a in set(_sources(graph, trig, k)):
+        for a in set(_sources(graph, leaves, k)):
             users.setdefault(a, []).append(k)
     outputs = {_source(graph, k) for names in functions for name in names for k in graph.outputs[name]}
-    inlined = _inlined(graph, order, users, outputs, needed, trig)
+    inlined = _inlined(graph, [k for k in order if k not in leaves], users, outputs, needed)
     groups: dict[frozenset[int], list[int]] = {}
     for k in order:
-        if k not in inlined and not is_leaf(graph, trig, k):
+        if k not in inlined and k not in leaves:
             groups.setdefault(needed[k], []).append(k)
     blocks = [
         Block(mask, tuple(nodes[at : at + block]))
@@ -94,7 +92,7 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
 
     last = {k: len(blocks) if k in outputs else max((home(u) for u in users.get(k, ())), default=-1) for k in at}
     slots, sizes = _slots(graph, blocks, last)
-    return Layout(graph, tuple(blocks), frozenset(inlined), slots, sizes, angles, trig)
+    return Layout(graph, tuple(blocks), frozenset(inlined), slots, sizes, angles, trig, leaves)
 
 
 def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
@@ -127,8 +125,8 @@ def _source(graph: Graph, k: int) -> int:
     return graph.nodes[k].args[0] if graph.nodes[k].op == "lane" else k
 
 
-def _sources(graph: Graph, trig: Mapping[int, int], k: int) -> list[int]:
-    return [] if is_leaf(graph, trig, k) else [_source(graph, a) for a in graph.nodes[k].operands]
+def _sources(graph: Graph, leaves: Set[int], k: int) -> list[int]:
+    return [] if k in leaves else [_source(graph, a) for a in graph.nodes[k].operands]
 
 
 def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
@@ -173,7 +171,7 @@ def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int
     return tuple(angles), trig
 
 
-def _needed(graph: Graph, functions: Sequence[Sequence[str]], trig: Mapping[int, int]) -> dict[int, frozenset[int]]:
+def _needed(graph: Graph, functions: Sequence[Sequence[str]], leaves: Set[int]) -> dict[int, frozenset[int]]:
     """Node → numbers of the exported functions that need it."""
     found: dict[int, set[int]] = {}
     for number, names in enumerate(functions):
@@ -182,7 +180,7 @@ def _needed(graph: Graph, functions: Sequence[Sequence[str]], trig: Mapping[int,
             k = waiting.pop()
             if number not in found.setdefault(k, set()):
                 found[k].add(number)
-                waiting += _sources(graph, trig, k)
+                waiting += _sources(graph, leaves, k)
     return {k: frozenset(v) for k, v in found.items()}
 
 
@@ -192,15 +190,12 @@ def _inlined(
     users: Mapping[int, list[int]],
     outputs: set[int],
     needed: Mapping[int, frozenset[int]],
-    trig: Mapping[int, int],
 ) -> set[int]:
     """Arithmetic that one other operation of the same functions uses, once."""
     size: dict[int, int] = {}
     inlined: set[int] = set()
     for k in order:
         node, own = graph.nodes[k], users.get(k, ())
-        if is_leaf(graph, trig, k):
-            continue
         size[k] = 1 + sum(size[a] for a in node.operands if a in inlined)
         if len(own) != 1 or k in outputs or node.op not in ARITHMETIC or size[k] >= _STATEMENT:
             continue
