@@ -45,8 +45,8 @@ static int ip_on_edge(const ip_context *c)
   return 0;
 }
 
-/* Hold the contacts where they are, and write the rows of their friction cones, with axes of the world (contacts.py has
- * the formulas).  Only the forces of their contacts are in these rows, so the rest stays zero. */
+/* Hold the contacts where they are, and write the rows of their friction cones in world axes (contacts.py has the
+ * formulas).  A row has entries at the forces of its contact only, so the others stay zero. */
 static void ip_hold_contacts(ip_context *c)
 {
   int k, i, j, b;
