@@ -25,17 +25,16 @@ from impact_posture.escape import c_comment
 from impact_posture.impact.contact import point_on
 from impact_posture.version import __version__
 
-# Files in c/, in the order in which one source has them, and those that follow objectives and flow add.
+# Files in c/, in the order in which one source has them.
 _CORE = (
-    "vector.c", "algebra.c", "tasks.c", "contacts.c", "posture.c", "qp.c", "rank.c", "solve.c", "give_way.c",
-    "init.c", "tick.c", "report.c",
+    "vector.c", "eigen.c", "algebra.c", "tasks.c", "contacts.c", "posture.c", "qp.c", "rank.c", "solve.c",
+    "give_way.c", "reference_flow_space.c", "reference_flow_direction.c", "reference_flow.c",
+    "reference_flow_motion.c", "init.c", "tick.c", "report.c",
 )  # fmt: skip
-_FOLLOW = ("eigen.c",)
 _RELAXATION = (
     "relaxation_memory.c", "vector.c", "relaxation_rows.c", "relaxation_elimination.c", "relaxation_level.c",
     "relaxation_cost.c", "relaxation.c",
 )  # fmt: skip
-_FLOW = ("reference_flow_space.c", "reference_flow_direction.c", "reference_flow.c", "reference_flow_motion.c")
 # Parameters that init compares with others.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
 # Bytes of variables, saved registers and return addresses of all functions below a tick, beside the arrays.
@@ -151,11 +150,11 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
     return {name: named(text, prefix) for name, text in texts.items()} | _relaxation(prefix)
 
 
-def _files(sizes: dict[str, int]) -> tuple[str, ...]:
+def _files(sizes: dict[str, int]) -> list[str]:
     """Return the files of ``c/`` that a structure needs."""
-    after = _CORE.index("init.c")
-    follow = _FOLLOW if sizes["ROBUST"] or sizes["FLOW"] else ()
-    return (_CORE[0], *follow, *_CORE[1:after], *(_FLOW if sizes["FLOW"] else ()), *_CORE[after:])
+    needed = {"eigen.c": sizes["ROBUST"] or sizes["FLOW"]}
+    needed |= {name: sizes["FLOW"] for name in _CORE if name.startswith("reference_flow")}
+    return [name for name in _CORE if needed.get(name, True)]
 
 
 def _relaxation_room(n: int, m: int, levels: int) -> int:

@@ -74,20 +74,6 @@ static void ip_flow_reduce(const ip_flow *f, double (*J)[IP_NV], double *slope)
   }
 }
 
-/* Learn from the reduced gradients and the static controls at both ends of a way, z times its length. */
-static void ip_flow_compare(ip_flow *f, const double *z, double length, const double *slope, const double *shares)
-{
-  double curvature[IP_NV], controls[IP_CONTROLS];
-  int i;
-  for (i = 0; i < IP_NV; ++i) {
-    curvature[i] = (slope[i] - f->reduced[i]) / length;
-  }
-  for (i = 0; i < IP_CONTROLS; ++i) {
-    controls[i] = (shares[i] - f->shares[i]) / length;
-  }
-  ip_flow_learn(f, z, curvature, controls);
-}
-
 /* Evaluate objective, constraints and limits at q_r, and learn from the way since the last look. */
 static void ip_flow_look(ip_context *c)
 {
@@ -114,7 +100,7 @@ static void ip_flow_look(ip_context *c)
   if (length > IP_MOVED && !f->failed && ip_dot(slope, slope, IP_NV) > 0.0) {
     ip_flow_reduce(f, f->before, slope);
     ip_scaled(way, 1.0 / length, way, IP_NV);
-    ip_flow_compare(f, way, length, slope, shares);
+    ip_flow_learn(f, way, length, slope, shares);
   }
   memcpy(f->before, f->J, sizeof f->before);
   ip_flow_limits(c);
@@ -157,7 +143,7 @@ static void ip_flow_probe(ip_context *c)
   ip_flow_reduce(f, f->J, slope);
   ip_flow_shares(c, shares);
   if (!f->failed) {
-    ip_flow_compare(f, f->seen[f->probed], IP_PROBE, slope, shares);
+    ip_flow_learn(f, f->seen[f->probed], IP_PROBE, slope, shares);
     ++f->next;
   }
 }

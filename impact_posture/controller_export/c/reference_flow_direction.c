@@ -173,13 +173,14 @@ static void ip_flow_newton(ip_context *c)
   f->gain *= root;
 }
 
-/* Learn the curvature and the slope of the static controls along the direction of the last probe. */
-static void ip_flow_learn(ip_flow *f, const double *z, const double *curvature, const double *controls)
+/* Learn the curvature and the slope of the static controls along a unit vector z, from the reduced gradient and the static
+ * controls at the end of a way, z times its length, that begins at the last look. */
+static void ip_flow_learn(ip_flow *f, const double *z, double length, const double *slope, const double *shares)
 {
   double missing[IP_NV], along;
   int i;
   for (i = 0; i < IP_NV; ++i) {
-    missing[i] = curvature[i] - ip_dot(f->B + i * IP_NV, z, IP_NV);
+    missing[i] = (slope[i] - f->reduced[i]) / length - ip_dot(f->B + i * IP_NV, z, IP_NV);
   }
   along = ip_dot(z, missing, IP_NV) / 2.0;
   ip_add(missing, -along, z, IP_NV);
@@ -188,7 +189,7 @@ static void ip_flow_learn(ip_flow *f, const double *z, const double *curvature, 
     ip_add(f->B + i * IP_NV, z[i], missing, IP_NV);
   }
   for (i = 0; i < IP_CONTROLS; ++i) {
-    ip_add(f->T[i], controls[i] - ip_dot(f->T[i], z, IP_NV), z, IP_NV);
+    ip_add(f->T[i], (shares[i] - f->shares[i]) / length - ip_dot(f->T[i], z, IP_NV), z, IP_NV);
   }
 }
 

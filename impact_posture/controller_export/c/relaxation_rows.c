@@ -32,11 +32,6 @@ static double violation(const Relaxation *r, int entry) {
 /* Smallest violation of an entry that counts. */
 static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
 
-/* Compute [z; A z]. */
-static void update_values(Relaxation *r) {
-    for (int i = 0; i < r->entries; i++) r->value[i] = entry_of(r, r->z, i);
-}
-
 /* Make r->way the motion of z by a step in the coordinates that are left. */
 static void find_way(Relaxation *r, const double *step) {
     for (int i = 0; i < r->n; i++) r->way[i] = ip_dot(r->Z + i * r->n + r->fixed, step, r->n - r->fixed);
@@ -45,5 +40,5 @@ static void find_way(Relaxation *r, const double *step) {
 /* Go a part of r->way. */
 static void go(Relaxation *r, double part) {
     ip_add(r->z, part, r->way, r->n);
-    update_values(r);
+    for (int i = 0; i < r->entries; i++) r->value[i] = entry_of(r, r->z, i);
 }
