@@ -81,6 +81,10 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
         solved = DaqpSolver(qp.n, qp.m, proximal=_FLAT).solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
+    return _relax(assembly)
+
+
+def _relax(assembly: Assembly) -> Outcome:
     nearest = lexicographic(_hierarchy(assembly), assembly.rank.units)
     if nearest is None:
         return Outcome(None)
