@@ -24,7 +24,6 @@ static void ip_evaluate(ip_context *c)
   double term[IP_NV], value, square;
   const double bound = c->p.robust_gain[0] * c->p.robust_reach[0];
   int i, s;
-  c->failed = 1;
   if (IP_GRADIENT(c->q, &value, term) != 0) {
     return;
   }
@@ -47,7 +46,6 @@ static void ip_evaluate(ip_context *c)
   }
   memcpy(c->term, term, sizeof term);
   c->value = value;
-  c->failed = 0;
 }
 
 /* Advance the level of the activation by dt seconds. */
@@ -144,7 +142,7 @@ static void ip_reset_posture(ip_context *c)
   c->x = c->level = c->goal = 0.0;
   c->phase = IP_FREE;
   c->waiting = 0;
-  c->count = c->hold = c->failed = 0;
+  c->count = c->hold = 0;
   c->value = NAN;
   memset(c->term, 0, sizeof c->term);
 #if IP_ROBUST
