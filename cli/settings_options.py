@@ -121,7 +121,7 @@ def _options(settings: type[RobotSettings], without: Collection[str]) -> dict[st
     for name in sorted((n for n in known if n not in without), key=lambda n: _PANELS.index(known[n][1].panel)):
         kind, setting = known[name]
         default = None if isinstance(defaults[name], tuple) else defaults[name]
-        words = setting.default
+        words = setting.words
         if words is None and isinstance(defaults[name], tuple) and defaults[name]:
             words = " ".join(f"{value:g}" for value in defaults[name])
         option = typer.Option(

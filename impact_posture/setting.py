@@ -1,11 +1,11 @@
-"""The annotation of a setting: its meaning, its spelling as an option, and the demand on its value."""
+"""The description of a setting: its meaning, its spelling as an option, and the demand on its value."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import Field, dataclass, field
+from typing import Annotated, Any, TypeVar
 
 from impact_posture.errors import ImpactPostureError, not_one_of
 from impact_posture.parsing import parse_contact
@@ -17,16 +17,18 @@ _LEAST_TILT = 0.1
 # Largest distance of the norm of a given quaternion from 1.
 _UNIT = 1e-3
 
+_Class = TypeVar("_Class", bound=type)
+
 
 @dataclass(frozen=True)
 class Setting:
-    """Annotation of a setting, besides its type.
+    """Description of a setting, besides its type and default.
 
     Attributes:
         help: Meaning in one line.
         panel: Part of ``--help`` with the option.
         takes: Placeholder of the value in ``--help``.
-        default: Default in words, if it comes from the robot.
+        words: Default in words, if it comes from the robot.
         demand: Demand on a value, as an error states it.
         holds: Whether a value meets the demand.
         option: Spelling of the option, if it differs from the field.
@@ -37,7 +39,7 @@ class Setting:
     help: str
     panel: str = TASK
     takes: str | None = None
-    default: str | None = None
+    words: str | None = None
     demand: str = ""
     holds: Callable[[Any], bool] | None = None
     option: str | None = None
@@ -58,6 +60,19 @@ class Setting:
         from pydantic_core import core_schema
 
         return core_schema.no_info_after_validator_function(self.check, handler(source))
+
+
+def setting(default: Any, *description: Any, **more: Any) -> Any:
+    """Return a field with a default and the arguments of :class:`Setting`, for a class :func:`with_demands`."""
+    return field(default=default, metadata={"setting": Setting(*description, **more)})
+
+
+def with_demands(cls: _Class) -> _Class:
+    """Put each :func:`setting` of a class into its annotation, where pydantic and the command line find it."""
+    for name, value in vars(cls).items():
+        if isinstance(value, Field) and "setting" in value.metadata:
+            cls.__annotations__[name] = Annotated[cls.__annotations__[name], value.metadata["setting"]]
+    return cls
 
 
 def _finite(value: Any) -> bool:

@@ -1,8 +1,8 @@
 """Settings of a problem, described once for the command line, ``problem.toml`` and Python.
 
-A setting is a field of :class:`RobotSettings`, :class:`ImpactSettings` or :class:`ProblemSettings`.  Its annotation
-carries its type, allowed values, meaning and spelling as an option.  The command line makes its options from these
-fields, ``problem.toml`` its keys, and Python its keyword arguments.
+A setting is a field of :class:`RobotSettings`, :class:`ImpactSettings` or :class:`ProblemSettings`.  It carries its
+type, allowed values, meaning and spelling as an option.  The command line makes its options from these fields,
+``problem.toml`` its keys, and Python its keyword arguments.
 
 Nothing heavy is imported here, because ``--help`` reads this module.
 """
@@ -12,12 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from impact_posture import setting as demand
 from impact_posture.errors import InputError
 from impact_posture.parsing import parse_armature, parse_number_or_name, parse_payloads
-from impact_posture.setting import CONTACT, METRIC, ROBOT, SEARCH, TASK, Setting
+from impact_posture.setting import CONTACT, METRIC, ROBOT, SEARCH, TASK, setting, with_demands
 from impact_posture.tables import STRICT, Checked
 
 Vector3 = tuple[float, float, float]
@@ -49,6 +49,7 @@ TRADEOFF_POINTS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_demands
 class LoadOptions:
     """Options of loading a robot; the ``robot.toml`` provides a value for ``None``.
 
@@ -66,36 +67,25 @@ class LoadOptions:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
-    lock: Annotated[
-        tuple[str, ...],
-        Setting(
-            "Make a joint rigid, or all that fit a pattern such as 'gripper_*' (in quotes); repeatable.",
-            ROBOT, "JOINT", repeatable=True,
-        ),
-    ] = ()  # fmt: skip
-    lock_massless: Annotated[bool, Setting("Make all joints that move no mass rigid.", ROBOT)] = False
-    root: Annotated[Root | None, Setting("Joint between the world and the base.", ROBOT, default="robot.toml's")] = (
-        None
+    lock: tuple[str, ...] = setting(
+        (), "Make a joint rigid, or all that fit a pattern such as 'gripper_*' (in quotes); repeatable.", ROBOT,
+        "JOINT", repeatable=True,
+    )  # fmt: skip
+    lock_massless: bool = setting(False, "Make all joints that move no mass rigid.", ROBOT)
+    root: Root | None = setting(None, "Joint between the world and the base.", ROBOT, words="robot.toml's")
+    armature: str | Mapping[str, float] | None = setting(
+        None, "Rotor inertia at the joint, kg·m²; JOINT=VALUE is repeatable.", ROBOT, "none|FILE|JOINT=VALUE",
+        "robot.toml's, else the SRDF's", parse=parse_armature, repeatable=True,
+    )  # fmt: skip
+    config: str | None = setting(
+        None, "File of data that the URDF cannot hold.", ROBOT, "ROBOT.TOML", "beside the URDF"
     )
-    armature: Annotated[
-        str | Mapping[str, float] | None,
-        Setting(
-            "Rotor inertia at the joint, kg·m²; JOINT=VALUE is repeatable.",
-            ROBOT, "none|FILE|JOINT=VALUE", "robot.toml's, else the SRDF's", parse=parse_armature, repeatable=True,
-        ),
-    ] = None  # fmt: skip
-    config: Annotated[
-        str | None, Setting("File of data that the URDF cannot hold.", ROBOT, "ROBOT.TOML", "beside the URDF")
-    ] = None
-    srdf: Annotated[
-        str | None,
-        Setting(
-            "Named postures and rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "robot.toml's"
-        ),
-    ] = None  # fmt: skip
-    package_dir: Annotated[
-        tuple[str, ...], Setting("Folder of package:// paths; repeatable.", ROBOT, "DIR", repeatable=True)
-    ] = ()
+    srdf: str | None = setting(
+        None, "Named postures and rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "robot.toml's"
+    )
+    package_dir: tuple[str, ...] = setting(
+        (), "Folder of package:// paths; repeatable.", ROBOT, "DIR", repeatable=True
+    )
     mounting: Mapping[str, Vector3] = field(default_factory=dict)
 
 
@@ -111,123 +101,83 @@ class RobotSettings(LoadOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_demands
 class ImpactSettings(RobotSettings):
     """An impact of a robot; the robot provides a value for ``None``."""
 
-    frame: Annotated[str | None, Setting("Contact frame.", CONTACT, "F", "the robot's")] = None
-    normal: Annotated[
-        Vector3 | None,
-        Setting(
-            "Direction out of the surface, towards the robot, of any length. Required unless --contact is given.",
-            CONTACT, "X Y Z", **demand.DIRECTION,
-        ),
-    ] = None  # fmt: skip
-    offset: Annotated[
-        Vector3 | None,
-        Setting(
-            "Contact point from the frame's origin, in the frame, m.", CONTACT, "X Y Z", "0 0 0", **demand.NUMBERS
-        ),
-    ] = None
-    normal_frame: Annotated[NormalFrame, Setting("Axes in which the normal is given.", CONTACT)] = "world"
-    contact: Annotated[
-        str | tuple[str, ...] | None,
-        Setting(
-            "Contact, in place of --frame and --normal; repeatable for up to 6 contacts at once.",
-            CONTACT, "FRAME:NX,NY,NZ[:IMPULSE]", **demand.CONTACTS, repeatable=True,
-        ),
-    ] = None  # fmt: skip
-    bilateral: Annotated[bool, Setting("Contacts can also pull, as in a grasp.", CONTACT)] = False
-    impulse: Annotated[float, Setting("Bound on the impulse, N·s.", CONTACT, **demand.ABOVE_ZERO)] = 1.0
-    speed: Annotated[float, Setting("Approach speed, m/s.", CONTACT, **demand.ZERO_OR_MORE)] = 1.0
-    restitution: Annotated[
-        float,
-        Setting(
-            "Coefficient of restitution, 0 (plastic) to 1 (elastic).",
-            CONTACT, **demand.SHARE,
-        ),
-    ] = 0.0  # fmt: skip
-    contact_stiffness: Annotated[
-        str | float | None,
-        Setting(
-            f"Stiffness of the contact, or the material that a steel tip touches: {', '.join(MATERIALS)}.",
-            CONTACT, "N/M|MATERIAL", "not known", parse=parse_number_or_name,
-            **demand.between(1.0, 1e12, "N/m", tuple(MATERIALS)),
-        ),
-    ] = None  # fmt: skip
-    contact_duration: Annotated[
-        float | None,
-        Setting(
-            "Time from touch to greatest compression, s.", CONTACT, default="not known",
-            **demand.between(1e-7, 100.0, "s"),
-        ),
-    ] = None  # fmt: skip
-    friction: Annotated[
-        float, Setting("Friction coefficient at the impact and at the feet.", CONTACT, **demand.ZERO_OR_MORE)
-    ] = FRICTION
-    metric: Annotated[
-        MetricKind,
-        Setting("Norm of the velocity jump: euclidean, kinetic or weighted.", METRIC, "KIND"),
-    ] = "euclidean"
-    weights: Annotated[
-        str | tuple[float, ...] | None,
-        Setting(
-            "Weights of the weighted metric: TOML of joint = weight, or 1/limit².", METRIC, "FILE|velocity-limits"
-        ),
-    ] = None  # fmt: skip
-    objective: Annotated[
-        ObjectiveChoice,
-        Setting(
-            "impulse (jump per impulse, H), speed (jump per approach speed without friction, V), sticking (without "
-            "slip, S), coulomb (with --friction: sticks or slips, C), energy (E), or auto (by speed and friction).",
-            METRIC, "KIND",
-        ),
-    ] = "impulse"  # fmt: skip
-    joint_model: Annotated[
-        JointModel,
-        Setting(
-            "Inertia at the joints: reflected (links and rotors), link (without the rotors behind elastic "
-            "transmissions), locked (rigid joints) or elastic (rotors on springs; evaluate only).",
-            METRIC, "KIND",
-        ),
-    ] = "reflected"  # fmt: skip
-    normal_cone: Annotated[
-        float,
-        Setting(
-            "Half angle of the cone of normals that are possible; the worst normal counts.",
-            METRIC, "DEG", **demand.HALF_ANGLE,
-        ),
-    ] = 0.0  # fmt: skip
-    armature_range: Annotated[
-        tuple[float, float] | None,
-        Setting(
-            "Lowest and highest factor on the armature that are possible; the worst case counts.",
-            METRIC, "LOW HIGH", "as stated", **demand.FACTORS,
-        ),
-    ] = None  # fmt: skip
-    payload: Annotated[
-        tuple[tuple[str, float], ...],
-        Setting(
-            "Mass in kg that the robot may carry at the frame; repeatable; the worst case counts.",
-            METRIC, "FRAME MASS", parse=parse_payloads, repeatable=True, **demand.MASSES,
-        ),
-    ] = ()  # fmt: skip
-    posture: Annotated[
-        str | None,
-        Setting(
-            "Named posture, posture.json, or a JointState as .yaml.", ROBOT, "NAME|FILE", "the robot's"
-        ),
-    ] = None  # fmt: skip
-    support: Annotated[
-        tuple[str, ...] | None,
-        Setting(
-            "Foot that stays on the ground; repeatable.", ROBOT, "FRAME[:point|surface]", "the robot's",
-            repeatable=True,
-        ),
-    ] = None  # fmt: skip
+    frame: str | None = setting(None, "Contact frame.", CONTACT, "F", "the robot's")
+    normal: Vector3 | None = setting(
+        None, "Direction out of the surface, towards the robot, of any length. Required unless --contact is given.",
+        CONTACT, "X Y Z", **demand.DIRECTION,
+    )  # fmt: skip
+    offset: Vector3 | None = setting(
+        None, "Contact point from the frame's origin, in the frame, m.", CONTACT, "X Y Z", "0 0 0", **demand.NUMBERS
+    )
+    normal_frame: NormalFrame = setting("world", "Axes in which the normal is given.", CONTACT)
+    contact: str | tuple[str, ...] | None = setting(
+        None, "Contact, in place of --frame and --normal; repeatable for up to 6 contacts at once.", CONTACT,
+        "FRAME:NX,NY,NZ[:IMPULSE]", **demand.CONTACTS, repeatable=True,
+    )  # fmt: skip
+    bilateral: bool = setting(False, "Contacts can also pull, as in a grasp.", CONTACT)
+    impulse: float = setting(1.0, "Bound on the impulse, N·s.", CONTACT, **demand.ABOVE_ZERO)
+    speed: float = setting(1.0, "Approach speed, m/s.", CONTACT, **demand.ZERO_OR_MORE)
+    restitution: float = setting(
+        0.0, "Coefficient of restitution, 0 (plastic) to 1 (elastic).", CONTACT, **demand.SHARE
+    )
+    contact_stiffness: str | float | None = setting(
+        None, f"Stiffness of the contact, or the material that a steel tip touches: {', '.join(MATERIALS)}.",
+        CONTACT, "N/M|MATERIAL", "not known", parse=parse_number_or_name,
+        **demand.between(1.0, 1e12, "N/m", tuple(MATERIALS)),
+    )  # fmt: skip
+    contact_duration: float | None = setting(
+        None, "Time from touch to greatest compression, s.", CONTACT, words="not known",
+        **demand.between(1e-7, 100.0, "s"),
+    )  # fmt: skip
+    friction: float = setting(
+        FRICTION, "Friction coefficient at the impact and at the feet.", CONTACT, **demand.ZERO_OR_MORE
+    )
+    metric: MetricKind = setting(
+        "euclidean", "Norm of the velocity jump: euclidean, kinetic or weighted.", METRIC, "KIND"
+    )
+    weights: str | tuple[float, ...] | None = setting(
+        None, "Weights of the weighted metric: TOML of joint = weight, or 1/limit².", METRIC, "FILE|velocity-limits"
+    )
+    objective: ObjectiveChoice = setting(
+        "impulse",
+        "impulse (jump per impulse, H), speed (jump per approach speed without friction, V), sticking (without "
+        "slip, S), coulomb (with --friction: sticks or slips, C), energy (E), or auto (by speed and friction).",
+        METRIC, "KIND",
+    )  # fmt: skip
+    joint_model: JointModel = setting(
+        "reflected",
+        "Inertia at the joints: reflected (links and rotors), link (without the rotors behind elastic "
+        "transmissions), locked (rigid joints) or elastic (rotors on springs; evaluate only).",
+        METRIC, "KIND",
+    )  # fmt: skip
+    normal_cone: float = setting(
+        0.0, "Half angle of the cone of normals that are possible; the worst normal counts.", METRIC, "DEG",
+        **demand.HALF_ANGLE,
+    )  # fmt: skip
+    armature_range: tuple[float, float] | None = setting(
+        None, "Lowest and highest factor on the armature that are possible; the worst case counts.", METRIC,
+        "LOW HIGH", "as stated", **demand.FACTORS,
+    )  # fmt: skip
+    payload: tuple[tuple[str, float], ...] = setting(
+        (), "Mass in kg that the robot may carry at the frame; repeatable; the worst case counts.", METRIC,
+        "FRAME MASS", parse=parse_payloads, repeatable=True, **demand.MASSES,
+    )  # fmt: skip
+    posture: str | None = setting(
+        None, "Named posture, posture.json, or a JointState as .yaml.", ROBOT, "NAME|FILE", "the robot's"
+    )
+    support: tuple[str, ...] | None = setting(
+        None, "Foot that stays on the ground; repeatable.", ROBOT, "FRAME[:point|surface]", "the robot's",
+        repeatable=True,
+    )  # fmt: skip
     support_compliance: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_demands
 class Obstacle(Checked):
     """A box or a ball that the robot stays clear of.
 
@@ -244,12 +194,12 @@ class Obstacle(Checked):
     """
 
     name: str
-    box: Annotated[Vector3 | None, Setting("Edge lengths, m.", **demand.LENGTHS)] = None
-    sphere: Annotated[float | None, Setting("Radius, m.", **demand.ABOVE_ZERO)] = None
-    position: Annotated[Vector3, Setting("Center in the world, m.", **demand.NUMBERS)] = (0.0, 0.0, 0.0)
-    quaternion: Annotated[
-        tuple[float, float, float, float], Setting("Orientation x y z w.", **demand.NUMBERS)
-    ] = (0.0, 0.0, 0.0, 1.0)  # fmt: skip
+    box: Vector3 | None = setting(None, "Edge lengths, m.", **demand.LENGTHS)
+    sphere: float | None = setting(None, "Radius, m.", **demand.ABOVE_ZERO)
+    position: Vector3 = setting((0.0, 0.0, 0.0), "Center in the world, m.", **demand.NUMBERS)
+    quaternion: tuple[float, float, float, float] = setting(
+        (0.0, 0.0, 0.0, 1.0), "Orientation x y z w.", **demand.NUMBERS
+    )
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -269,164 +219,112 @@ class Obstacle(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
+@with_demands
 class ProblemSettings(ImpactSettings):
     """Content of a ``problem.toml``; the robot or the default of the option provides a value for ``None``."""
 
     schema: Literal["impact-posture/problem/1"] = "impact-posture/problem/1"
     q: tuple[float, ...] | None = None
-    target_position: Annotated[
-        Vector3 | None, Setting("Contact frame's position, world, m.", TASK, "X Y Z", "where it is", **demand.NUMBERS)
-    ] = None
-    target_quaternion: Annotated[
-        tuple[float, float, float, float] | None,
-        Setting("Contact frame's orientation, scalar last.", TASK, "X Y Z W", "as it is", **demand.UNIT),
-    ] = None
-    contact_pose: Annotated[
-        str | None,
-        Setting(
-            "Constraint on the contact frame: full, position, aligned (spin free), aligned:DEG (and tilted by up to "
-            "DEG), free or box.",
-            TASK, "KIND", "robot.toml's, else full", **demand.kind_or_tilt(get_args(ContactPose), "aligned"),
-        ),
-    ] = None  # fmt: skip
-    box: Annotated[Vector3, Setting("Half extents of --contact-pose box, m.", TASK, "X Y Z", **demand.LENGTHS)] = (
-        0.05,
-        0.05,
-        0.05,
+    target_position: Vector3 | None = setting(
+        None, "Contact frame's position, world, m.", TASK, "X Y Z", "where it is", **demand.NUMBERS
     )
-    keep: Annotated[
-        tuple[str, ...], Setting("Hold the pose of another frame; repeatable.", TASK, "FRAME", repeatable=True)
-    ] = ()
-    hold: Annotated[
-        tuple[str, ...] | None,
-        Setting("Keep a joint at its value; repeatable.", TASK, "JOINT", "robot.toml's", repeatable=True),
-    ] = None
-    base: Annotated[
-        str | None,
-        Setting(
-            "Constraint on a floating base: free, level (yaw free), level:DEG (and tilted by up to DEG), fixed or "
-            "box.",
-            TASK, "KIND", "robot.toml's, else free", **demand.kind_or_tilt(get_args(BaseMode), "level"),
-        ),
-    ] = None  # fmt: skip
-    base_box: Annotated[Vector3, Setting("Half extents of --base box, m.", TASK, "X Y Z", **demand.LENGTHS)] = (
-        0.2,
-        0.2,
-        0.2,
+    target_quaternion: tuple[float, float, float, float] | None = setting(
+        None, "Contact frame's orientation, scalar last.", TASK, "X Y Z W", "as it is", **demand.UNIT
     )
-    com: Annotated[
-        bool | None,
-        Setting(
-            "Keep the center of mass above the feet.", TASK, default="robot.toml's", option="--com/--no-com"
-        ),
-    ] = None  # fmt: skip
-    com_margin: Annotated[
-        float | None,
-        Setting(
-            "Distance of the center of mass from the support polygon's edges, m.", TASK, default="robot.toml's",
-            **demand.ZERO_OR_MORE,
-        ),
-    ] = None  # fmt: skip
-    keep_contacts: Annotated[bool, Setting("The impact must neither lift nor slide a foot.", TASK)] = False
-    holdable: Annotated[
-        bool,
-        Setting(
-            "Keep joint torques, rotor thrusts and forces of the feet within their limits at rest, where the robot's "
-            "data say them.",
-            TASK, option="--holdable/--no-holdable",
-        ),
-    ] = True  # fmt: skip
-    approach: Annotated[
-        bool,
-        Setting("The joints can bring the contact to the surface at --speed within their velocity limits.", TASK),
-    ] = False
-    hold_force: Annotated[
-        float,
-        Setting(
-            "Force along the normal that the robot also has to hold after the impact, N.", TASK, "N",
-            **demand.between(0.0, 1e6, "N"),
-        ),
-    ] = 0.0  # fmt: skip
-    max_force: Annotated[
-        float | None,
-        Setting(
-            "Largest allowed peak force, N, without friction; needs --contact-stiffness or --contact-duration.", TASK,
-            default="no bound", **demand.between(1e-6, 1e9, "N"),
-        ),
-    ] = None  # fmt: skip
-    max_joint_jump: Annotated[
-        float | None,
-        Setting(
-            "Largest allowed velocity jump of a joint without friction, rad/s or m/s.", TASK, default="no bound",
-            **demand.between(1e-6, 1e9, "rad/s or m/s"),
-        ),
-    ] = None  # fmt: skip
-    max_torque: Annotated[
-        float | None,
-        Setting(
-            "Largest torque with which the controller may answer the jump, N·m; needs --velocity-gain.", TASK,
-            default="no bound", **demand.between(1e-6, 1e9, "N·m"),
-        ),
-    ] = None  # fmt: skip
-    velocity_gain: Annotated[
-        float | None,
-        Setting(
-            "Gain K_d of the controller for --max-torque, N·m·s/rad.", TASK, default="not known",
-            **demand.between(1e-6, 1e9, "N·m·s/rad"),
-        ),
-    ] = None  # fmt: skip
-    collision: Annotated[
-        bool,
-        Setting(
-            "Keep the links clear of each other, the surface, the ground and obstacles.", TASK,
-            option="--collision/--no-collision",
-        ),
-    ] = True  # fmt: skip
-    clearance: Annotated[
-        float, Setting("Least distance of links that stay apart, m.", TASK, **demand.between(1e-4, 1.0, "m"))
-    ] = CLEARANCE
-    surface: Annotated[
-        str | float | None,
-        Setting(
-            "Surface at the contact: an endless plane, none, or a square of this edge length, m.", TASK,
-            "plane|none|M", f"the plane, or {PATCH:g} where the robot stands behind it", parse=parse_number_or_name,
-            **demand.between(1e-3, 1e3, "m", ("plane", "none")),
-        ),
-    ] = None  # fmt: skip
+    contact_pose: str | None = setting(
+        None,
+        "Constraint on the contact frame: full, position, aligned (spin free), aligned:DEG (and tilted by up to "
+        "DEG), free or box.",
+        TASK, "KIND", "robot.toml's, else full", **demand.kind_or_tilt(get_args(ContactPose), "aligned"),
+    )  # fmt: skip
+    box: Vector3 = setting(
+        (0.05, 0.05, 0.05), "Half extents of --contact-pose box, m.", TASK, "X Y Z", **demand.LENGTHS
+    )
+    keep: tuple[str, ...] = setting((), "Hold the pose of another frame; repeatable.", TASK, "FRAME", repeatable=True)
+    hold: tuple[str, ...] | None = setting(
+        None, "Keep a joint at its value; repeatable.", TASK, "JOINT", "robot.toml's", repeatable=True
+    )
+    base: str | None = setting(
+        None,
+        "Constraint on a floating base: free, level (yaw free), level:DEG (and tilted by up to DEG), fixed or "
+        "box.",
+        TASK, "KIND", "robot.toml's, else free", **demand.kind_or_tilt(get_args(BaseMode), "level"),
+    )  # fmt: skip
+    base_box: Vector3 = setting((0.2, 0.2, 0.2), "Half extents of --base box, m.", TASK, "X Y Z", **demand.LENGTHS)
+    com: bool | None = setting(
+        None, "Keep the center of mass above the feet.", TASK, words="robot.toml's", option="--com/--no-com"
+    )
+    com_margin: float | None = setting(
+        None, "Distance of the center of mass from the support polygon's edges, m.", TASK, words="robot.toml's",
+        **demand.ZERO_OR_MORE,
+    )  # fmt: skip
+    keep_contacts: bool = setting(False, "The impact must neither lift nor slide a foot.", TASK)
+    holdable: bool = setting(
+        True,
+        "Keep joint torques, rotor thrusts and forces of the feet within their limits at rest, where the robot's "
+        "data say them.",
+        TASK, option="--holdable/--no-holdable",
+    )  # fmt: skip
+    approach: bool = setting(
+        False, "The joints can bring the contact to the surface at --speed within their velocity limits.", TASK
+    )
+    hold_force: float = setting(
+        0.0, "Force along the normal that the robot also has to hold after the impact, N.", TASK, "N",
+        **demand.between(0.0, 1e6, "N"),
+    )  # fmt: skip
+    max_force: float | None = setting(
+        None, "Largest allowed peak force, N, without friction; needs --contact-stiffness or --contact-duration.",
+        TASK, words="no bound", **demand.between(1e-6, 1e9, "N"),
+    )  # fmt: skip
+    max_joint_jump: float | None = setting(
+        None, "Largest allowed velocity jump of a joint without friction, rad/s or m/s.", TASK, words="no bound",
+        **demand.between(1e-6, 1e9, "rad/s or m/s"),
+    )  # fmt: skip
+    max_torque: float | None = setting(
+        None, "Largest torque with which the controller may answer the jump, N·m; needs --velocity-gain.", TASK,
+        words="no bound", **demand.between(1e-6, 1e9, "N·m"),
+    )  # fmt: skip
+    velocity_gain: float | None = setting(
+        None, "Gain K_d of the controller for --max-torque, N·m·s/rad.", TASK, words="not known",
+        **demand.between(1e-6, 1e9, "N·m·s/rad"),
+    )  # fmt: skip
+    collision: bool = setting(
+        True, "Keep the links clear of each other, the surface, the ground and obstacles.", TASK,
+        option="--collision/--no-collision",
+    )  # fmt: skip
+    clearance: float = setting(
+        CLEARANCE, "Least distance of links that stay apart, m.", TASK, **demand.between(1e-4, 1.0, "m")
+    )
+    surface: str | float | None = setting(
+        None, "Surface at the contact: an endless plane, none, or a square of this edge length, m.", TASK,
+        "plane|none|M", f"the plane, or {PATCH:g} where the robot stands behind it", parse=parse_number_or_name,
+        **demand.between(1e-3, 1e3, "m", ("plane", "none")),
+    )  # fmt: skip
     obstacles: tuple[Obstacle, ...] = ()
-    limit_margin: Annotated[
-        float | None,
-        Setting("Distance from the joint limits, rad or m.", TASK, default="robot.toml's", **demand.ZERO_OR_MORE),
-    ] = None
-    regularization: Annotated[
-        float, Setting("Weight of the distance from the start.", TASK, **demand.ZERO_OR_MORE)
-    ] = 0.0
-    tradeoff: Annotated[
-        int,
-        Setting(
-            "Also find the best posture within each of K distances from the start, which shows what a smaller change "
-            f"gains; {TRADEOFF_POINTS} distances without K, none for 0.",
-            TASK, "[K]", **demand.ZERO_OR_MORE,
-        ),
-    ] = 0  # fmt: skip
-    tradeoff_against: Annotated[
-        Against,
-        Setting(
-            "What --tradeoff bounds: the distance from the start, or the peak force of the impact.", TASK, "WHAT"
-        ),
-    ] = "distance"  # fmt: skip
-    path: Annotated[
-        bool, Setting("Also find and time a path from the start to the optimum on which all constraints hold.", TASK)
-    ] = False
-    search: Annotated[
-        Search,
-        Setting(
-            "multistart, or global: maps self-motions of 1 or 2 degrees of freedom, else hops from the best optimum.",
-            SEARCH, "HOW",
-        ),
-    ] = "multistart"  # fmt: skip
-    starts: Annotated[int, Setting("Number of starting points of the search.", SEARCH, **demand.ONE_OR_MORE)] = 16
-    finish_all: Annotated[
-        bool, Setting("Finish starts of large programs that can no longer be the best: lists all optima.", SEARCH)
-    ] = False
-    seed: Annotated[int, Setting("Seed of the random starts.", SEARCH, **demand.ZERO_OR_MORE)] = 0
+    limit_margin: float | None = setting(
+        None, "Distance from the joint limits, rad or m.", TASK, words="robot.toml's", **demand.ZERO_OR_MORE
+    )
+    regularization: float = setting(0.0, "Weight of the distance from the start.", TASK, **demand.ZERO_OR_MORE)
+    tradeoff: int = setting(
+        0,
+        "Also find the best posture within each of K distances from the start, which shows what a smaller change "
+        f"gains; {TRADEOFF_POINTS} distances without K, none for 0.",
+        TASK, "[K]", **demand.ZERO_OR_MORE,
+    )  # fmt: skip
+    tradeoff_against: Against = setting(
+        "distance", "What --tradeoff bounds: the distance from the start, or the peak force of the impact.", TASK,
+        "WHAT",
+    )  # fmt: skip
+    path: bool = setting(
+        False, "Also find and time a path from the start to the optimum on which all constraints hold.", TASK
+    )
+    search: Search = setting(
+        "multistart",
+        "multistart, or global: maps self-motions of 1 or 2 degrees of freedom, else hops from the best optimum.",
+        SEARCH, "HOW",
+    )  # fmt: skip
+    starts: int = setting(16, "Number of starting points of the search.", SEARCH, **demand.ONE_OR_MORE)
+    finish_all: bool = setting(
+        False, "Finish starts of large programs that can no longer be the best: lists all optima.", SEARCH
+    )
+    seed: int = setting(0, "Seed of the random starts.", SEARCH, **demand.ZERO_OR_MORE)

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from impact_posture.errors import SpecError, nearest
 from impact_posture.escape import printable
 from impact_posture.robot.robot_loader import from_folder
-from impact_posture.setting import Setting, between
+from impact_posture.setting import between, setting, with_demands
 from impact_posture.settings import ProblemSettings
 from impact_posture.sweep.grid import Axis, Grid
 from impact_posture.tables import STRICT, read_toml, validate
@@ -28,6 +28,7 @@ _MOST = 10**15
 
 
 @dataclass(frozen=True)
+@with_demands
 class SweepSettings:
     """Content of a ``SWEEP.toml``.
 
@@ -42,7 +43,7 @@ class SweepSettings:
 
     problem: str | dict[str, Any]
     grid: dict[str, Any]
-    shard: Annotated[int, Setting("Points of a shard.", **between(1, 1e6, "points"))] = 256
+    shard: int = setting(256, "Points of a shard.", **between(1, 1e6, "points"))
     schema: Literal["impact-posture/sweep/1"] = "impact-posture/sweep/1"
 
 
