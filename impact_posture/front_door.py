@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError, check_choice
 from impact_posture.front_door_problem import PostureProblem
+from impact_posture.output_folder import whole_folder, write_json
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.global_search import GlobalSearch, SelfMotionMap, check_searchable, search_globally
 from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.pareto import pareto_front
-from impact_posture.posture.problem_settings import Prepared
-from impact_posture.posture.result import result_document
+from impact_posture.posture.problem_settings import Prepared, dump_settings, resolved_settings
+from impact_posture.posture.result import result_arrays, result_document
 from impact_posture.posture.robustness import Robustness, compare_variants, solve_robustly
 from impact_posture.posture.search import Progress
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
-from impact_posture.result_folder import FORMATS, Finish, Written, write_result
+from impact_posture.result_folder import FORMATS, Finish, FinishRequest, Written, finish_result
 from impact_posture.result_view import result_view
+from impact_posture.robot.postures import write_posture
 from impact_posture.settings import Against, Search
 
 # The C export and the pictures are imported where they are used, because that takes longer than a small problem.
@@ -183,12 +187,31 @@ class PostureResult:
         Raises:
             OutputError: The folder exists without ``force``, or cannot be written.
         """
-        return write_result(
-            self._prepared, self.solution, self.document, Path(out), tradeoff=self.tradeoff, motion=self.motion,
-            mapped=self._mapped,
-            force=force, codegen=codegen, formats=formats, report=report, meshes=meshes, jobs=jobs,
-            progress=progress, finish=finish,
-        )  # fmt: skip
+        prepared, found, mapped = self._prepared, self.solution, self._mapped
+        path = null_space_path(found.problem, found.initial, found.q)
+        export: Export | None = None
+        compiler_error = report_error = ""
+        with whole_folder(Path(out), force=force, kind="result") as folder:
+            write_json(folder / "result.json", self.document)
+            arrays = result_arrays(found, path, self.tradeoff, mapped)
+            np.savez_compressed(folder / "result.npz", **arrays)  # type: ignore[arg-type]
+            write_json(folder / "posture.json", write_posture(prepared.impact.robot, found.q))
+            (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
+            if self.motion is not None:
+                from impact_posture.path.files import write_path
+
+                write_path(folder, prepared.impact.robot, self.motion)
+            request = FinishRequest(
+                folder, found.initial, found.q, path, mapped, self.document, codegen, formats, report, meshes, jobs
+            )
+            for done, count, result in (finish or partial(finish_result, prepared))(request):
+                if isinstance(result, str):
+                    report_error = result
+                elif result is not None:
+                    export, compiler_error = result
+                if progress:
+                    progress(done, count)
+        return Written(Path(out), export, compiler_error, report_error)
 
     def plot(
         self, out: str | Path, formats: Sequence[str] = FORMATS, only: Sequence[str] | None = None

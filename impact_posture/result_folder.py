@@ -1,4 +1,4 @@
-"""Write the solution of a posture problem into a result folder, whole or not at all."""
+"""What finishes a result folder: figures, C code and report, in this process or in another."""
 
 from __future__ import annotations
 
@@ -9,41 +9,63 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from impact_posture.arrays import Array
 from impact_posture.errors import CompilerError, one_line
 from impact_posture.escape import file_name
-from impact_posture.output_folder import whole_folder, write_json, write_record
+from impact_posture.output_folder import write_record
 from impact_posture.posture.global_search import SelfMotionMap
-from impact_posture.posture.null_space_path import NullSpacePath, null_space_path
-from impact_posture.posture.problem_settings import Prepared, dump_settings, resolved_settings
-from impact_posture.posture.result import result_arrays
-from impact_posture.posture.solve import PostureSolution
-from impact_posture.posture.tradeoff import TradeOff
+from impact_posture.posture.null_space_path import NullSpacePath
+from impact_posture.posture.problem_settings import Prepared
 from impact_posture.processes import fork_map
 from impact_posture.result_view import motion_of, result_view
-from impact_posture.robot.postures import write_posture
 
 # Matplotlib and the C export are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
-    from impact_posture.path.posture_path import PosturePath
     from impact_posture.plot import ResultView
     from impact_posture.report.scene import Scene
 
 FORMATS = ("png",)
 
-FinishRequest = tuple[
-    Path, np.ndarray, np.ndarray, NullSpacePath, SelfMotionMap | None, dict[str, Any], bool, Sequence[str], int,
-    bool, bool,
-]  # fmt: skip
+
+@dataclass(frozen=True, eq=False)
+class FinishRequest:
+    """What :func:`finish_result` draws, exports and reports.  It can be sent to a process.
+
+    Attributes:
+        folder: The folder, with the files of the path to the optimum, if it was searched.
+        initial: Posture before, shape (nq,).
+        optimal: Posture after, shape (nq,).
+        path: The null-space path between them.
+        mapped: The self-motion map, if it was computed.
+        document: The content of ``result.json``.
+        codegen: Whether to export, build and check the C code.
+        formats: Formats of the figures.
+        report: Whether to write ``report.html``.
+        meshes: Whether the report may hold the meshes of the user's own URDF.
+        jobs: Processes that draw and compile side by side.
+    """
+
+    folder: Path
+    initial: Array
+    optimal: Array
+    path: NullSpacePath
+    mapped: SelfMotionMap | None
+    document: dict[str, Any]
+    codegen: bool
+    formats: Sequence[str]
+    report: bool
+    meshes: bool
+    jobs: int
+
+
 Finished = tuple[int, int, "tuple[Export, str] | str | None"]
 Finish = Callable[[FinishRequest], Iterator[Finished]]
 
 
 @dataclass(frozen=True)
 class Written:
-    """Result folder that :func:`write_result` wrote.
+    """A result folder that was written.
 
     Attributes:
         out: The folder.
@@ -63,105 +85,35 @@ def default_out(prepared: Prepared) -> Path:
     return Path(file_name(f"{prepared.impact.robot.name}-{prepared.impact.contact.frame}"))
 
 
-def write_result(
-    prepared: Prepared,
-    solution: PostureSolution,
-    document: dict[str, Any],
-    out: Path,
-    *,
-    tradeoff: TradeOff | None = None,
-    motion: PosturePath | None = None,
-    mapped: SelfMotionMap | None = None,
-    force: bool = False,
-    codegen: bool = True,
-    formats: Sequence[str] = FORMATS,
-    report: bool = True,
-    meshes: bool = False,
-    jobs: int = 1,
-    progress: Callable[[int, int], None] | None = None,
-    finish: Finish | None = None,
-) -> Written:
-    """Write the result folder, whole or not at all.
-
-    Args:
-        prepared: The problem.
-        solution: Its solution.
-        document: The content of ``result.json``, from :func:`~impact_posture.posture.result.result_document`.
-        out: The folder.
-        tradeoff: The trade-off, if it was computed.
-        motion: The path to the optimum, if it was searched.
-        mapped: The self-motion map, if it was computed.
-        force: Replace an earlier result.
-        codegen: Export, build and check the C code, too.
-        formats: Formats of the figures.
-        report: Write ``report.html``, too.
-        meshes: Let it hold the meshes of the user's own URDF.
-        jobs: Processes that draw and compile side by side.
-        progress: Called with ``(done, all)`` after each figure, the C code and the report.
-        finish: :func:`finish_result` of this problem, in another process; in this one by default.
-
-    Raises:
-        OutputError: The folder exists without ``force``, or cannot be written.
-    """
-    path = null_space_path(solution.problem, solution.initial, solution.q)
-    made: Export | None = None
-    failure = report_error = ""
-    with whole_folder(out, force=force, kind="result") as folder:
-        write_json(folder / "result.json", document)
-        np.savez_compressed(folder / "result.npz", **result_arrays(solution, path, tradeoff, mapped))  # type: ignore[arg-type]
-        write_json(folder / "posture.json", write_posture(prepared.impact.robot, solution.q))
-        (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
-        if motion is not None:
-            from impact_posture.path.files import write_path
-
-            write_path(folder, prepared.impact.robot, motion)
-        request = (
-            folder, solution.initial, solution.q, path, mapped, document, codegen, formats, jobs, report, meshes
-        )  # fmt: skip
-        for done, count, result in (finish or partial(finish_result, prepared))(request):
-            if isinstance(result, str):
-                report_error = result
-            elif result is not None:
-                made, failure = result
-            if progress:
-                progress(done, count)
-    return Written(out, made, failure, report_error)
-
-
 def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finished]:
     """Draw the figures of a result, export its C code and write its report; yield after each.
-
-    Args:
-        prepared: The problem.
-        request: The folder, the postures before and after, the path between them, the self-motion map, the content of
-            ``result.json``, whether to export, the formats of the figures, the number of processes, whether to write
-            a report, and whether it may hold the user's own meshes.  It can be sent to a process.
 
     Yields:
         The number of finished files, the number of all files, and what :func:`_export` or :func:`_report` returns if
         it has ended.
     """
-    folder, initial, optimal, path, mapped, document, codegen, formats, jobs, report, meshes = request
     # The C code comes first, because it takes longest.
-    tasks: list[Callable[[], Any]] = [partial(_export, prepared, optimal, folder / "c")] if codegen else []
-    motion = motion_of(folder, document, prepared.impact.robot)
-    view = result_view(prepared, initial, optimal, path, document, motion, mapped)
-    tasks += _drawings(view, folder, formats, report)
-    count = len(tasks) + report
+    exports = [partial(_export, prepared, request)] if request.codegen else []
+    motion = motion_of(request.folder, request.document, prepared.impact.robot)
+    view = result_view(
+        prepared, request.initial, request.optimal, request.path, request.document, motion, request.mapped
+    )
+    tasks: list[Callable[[], Any]] = [*exports, *_drawings(view, request.folder, request.formats, request.report)]
+    count = len(tasks) + request.report
     scene: Scene | None = None
     pictures: list[tuple[str, str]] = []
-    with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
-        if report:
+    with fork_map(lambda index: tasks[index](), len(tasks), request.jobs) as results:
+        if request.report:
             # This process would only wait.  What goes wrong here goes wrong again for the report, which says so.
             with suppress(Exception):
-                scene = _scene(prepared, view, meshes)
+                scene = _scene(prepared, view, request.meshes)
         for done, (index, result) in enumerate(results, start=1):
-            exported = codegen and index == 0
+            exported = index < len(exports)
             pictures += [] if exported else result
             yield done, count, result if exported else None
-    if report:
+    if request.report:
         # It shows the figures, so it comes last.
-        yield count, count, _report(folder, prepared, view, document, meshes, scene, sorted(pictures))
+        yield count, count, _report(prepared, view, request, scene, sorted(pictures))
 
 
 def _scene(prepared: Prepared, view: ResultView, meshes: bool) -> Scene:
@@ -176,11 +128,9 @@ def _scene(prepared: Prepared, view: ResultView, meshes: bool) -> Scene:
 
 
 def _report(
-    folder: Path,
     prepared: Prepared,
     view: ResultView,
-    document: dict[str, Any],
-    meshes: bool,
+    request: FinishRequest,
     scene: Scene | None,
     pictures: Sequence[tuple[str, str]],
 ) -> str:
@@ -188,20 +138,22 @@ def _report(
     try:
         from impact_posture.report.result_report import write_result_report
 
-        write_result_report(folder, prepared, view, document, meshes=meshes, scene=scene, pictures=pictures)
+        write_result_report(
+            request.folder, prepared, view, request.document, meshes=request.meshes, scene=scene, pictures=pictures
+        )
     except Exception as error:
         return one_line(f"{type(error).__name__}: {error}")
     return ""
 
 
-def _export(prepared: Prepared, optimal: np.ndarray, folder: Path) -> tuple[Export, str]:
+def _export(prepared: Prepared, request: FinishRequest) -> tuple[Export, str]:
     """Write the C export; return it and the reason if it could not be built."""
     from impact_posture.codegen.export import export
     from impact_posture.codegen.naming import products
     from impact_posture.impact.contact_compression import compression
 
+    folder, optimal, failure, impact = request.folder / "c", request.optimal, "", prepared.impact
     folder.mkdir()
-    failure, impact = "", prepared.impact
     squeezed = compression(impact.objective, optimal, impact.speed, impact.contact_stiffness)
     try:
         made = export(impact.objective, folder, posture=optimal, compression=squeezed)

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture import plot, result_folder
+from impact_posture import plot
+from impact_posture.front_door import PostureResult
+from impact_posture.front_door_problem import PostureProblem
 from impact_posture.posture.problem_settings import prepare
-from impact_posture.posture.result import result_document
 from impact_posture.posture.solve import solve
 from impact_posture.simulation.scenario_file import scenario_path
 from tests.hostile.arena import attack, strike
@@ -149,10 +150,8 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     solution = solve(prepared.problem, starts=1, compile="never")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plot, "draw_all", lambda *_: [])
-        result_folder.write_result(
-            prepared, solution, result_document(prepared, solution), place / "out",
-            codegen=False, report=False, jobs=1,
-        )  # fmt: skip
+        found = PostureResult(PostureProblem.of(prepared), solution)
+        found.save(place / "out", codegen=False, report=False, jobs=1)
     return place / "out"
 
 
