@@ -135,7 +135,6 @@ def result_view(
 
     impact, around = prepared.impact, prepared.problem.surroundings
     return ResultView(
-        robot=impact.robot,
         objective=impact.objective,
         q_initial=initial,
         q_optimal=optimal,

@@ -276,7 +276,7 @@ def test_figure_of_such_a_robot(arm: Robot, tmp_path: Path) -> None:
     name = "$\\frac{$\x1b[31m]]>\n--" * 500
     robot = renamed(arm, name)
     objective = ImpactObjective(robot, ImpactContact(name, (0, 1, 0), (0.3, 0, 0), "contact"))
-    view = ResultView(robot, objective, robot.posture(), robot.posture() + 0.1)
+    view = ResultView(objective, robot.posture(), robot.posture() + 0.1)
     (path,) = save(jump_figure(view), tmp_path, "jump", ["svg"])
     assert ElementTree.parse(path).getroot().tag.endswith("svg")
     assert_plain(path.read_text(encoding="utf-8"))

@@ -11,7 +11,7 @@ from impact_posture.experiment.batch import Document, Store
 from impact_posture.experiment.jobs import Job, controller_factory
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction
-from impact_posture.plot import Bar, RunView, Span, draw_bars, draw_comparison, draw_run, draw_snapshots
+from impact_posture.plot import Bar, RunView, bars_figure, comparison_figures, run_figures, save, save_all
 from impact_posture.progress import tell
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Series, Window
@@ -27,8 +27,7 @@ def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, f
         into = folder if one is runs[0] else folder / "minus"
         tell("drawing")
         view = run_view(job, one.series, one.windows, one.sign, part["status"])
-        draw_run(view, into, formats)
-        draw_snapshots([view], into, formats)
+        save_all(run_figures(view), into, formats)
 
 
 def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]) -> None:
@@ -36,8 +35,7 @@ def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: 
     tell("drawing")
     views = [view for job in jobs if (view := _stored_view(job, store)) is not None]
     if views:
-        draw_comparison(views, folder, formats)
-        draw_snapshots(views, folder, formats)
+        save_all(comparison_figures(views), folder, formats)
 
 
 def draw_reproduction(found: Reproduction, store: Store, folder: Path, formats: Sequence[str]) -> None:
@@ -49,7 +47,7 @@ def draw_reproduction(found: Reproduction, store: Store, folder: Path, formats: 
         mean = np.nan if total is None else total.mean
         # The paper has the nominal and the robust controller.
         bars.append(Bar(row.scenario, row.controller, mean, half, getattr(paper, row.controller, None)))
-    draw_bars(bars, folder, formats)
+    save(bars_figure(bars), folder, "bars", formats)
     for scenario in found.scenarios:
         best = found.best(scenario)
         shown = dict.fromkeys(("nominal", "robust", *(() if best is None else (best.controller,))))
@@ -67,7 +65,7 @@ def run_view(job: Job, series: Series, windows: Sequence[Window], sign: int, sta
         robot=setup.robot,
         contact=objective.contact,
         **{name: getattr(series, name) for name in _COLUMNS},
-        windows=tuple(Span(w.kind, w.begin, w.end, w.contact, w.touched) for w in windows if w.kind != "recovery"),
+        windows=tuple(windows),
         surface=np.array(setup.world.built.points[scenario.surface.name]) if scenario.contacts else None,
         supports=objective.supports,
         label=job.label if status == "completed" else f"{job.label} ({status})",

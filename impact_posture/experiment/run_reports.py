@@ -20,7 +20,7 @@ from impact_posture.experiment.jobs import Job, controller_factory
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.output_folder import typed_command
-from impact_posture.plot.run_view import RunView, Span, run_header
+from impact_posture.plot.run_view import RunView, run_header
 from impact_posture.plot.view import number
 from impact_posture.report.page import Content, Table, write_page
 from impact_posture.report.scene import Scene, Track, impact_curves
@@ -109,7 +109,7 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
         raise SpecError(what, where=str(folder), hint="run simulate or compare again") from None
 
 
-def thin(series: Series, windows: Iterable[Window | Span]) -> Series:
+def thin(series: Series, windows: Iterable[Window]) -> Series:
     """Return the ticks of a run that a report shows; a force is the largest since the last of them.
 
     The ticks end where the state runs away.

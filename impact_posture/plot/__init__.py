@@ -1,6 +1,6 @@
 """Figures of a result: :func:`draw_all` writes them, the ``*_figure`` functions return matplotlib figures.
 
-Figures of simulated runs: :func:`draw_run`, :func:`draw_comparison`, :func:`draw_snapshots` and :func:`draw_bars`.
+Figures of simulated runs: :func:`run_figures`, :func:`comparison_figures` and :func:`bars_figure`.
 
 The package does not change the global state of pyplot and shows no window.
 """
@@ -21,20 +21,11 @@ from impact_posture.plot import (
     path_figures,
     self_motion_figure,
 )
-from impact_posture.plot.bars import Bar, bars_figure, draw_bars
+from impact_posture.plot.bars import Bar, bars_figure
 from impact_posture.plot.robot_drawing import postures_figure
-from impact_posture.plot.run_figures import (
-    comparison_figure,
-    controls_comparison_figure,
-    controls_figure,
-    draw_comparison,
-    draw_run,
-    joints_figure,
-    metric_figure,
-)
-from impact_posture.plot.run_view import RunView, Span
-from impact_posture.plot.snapshots import draw_snapshots, snapshots_figure
-from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save
+from impact_posture.plot.run_figures import comparison_figures, run_figures
+from impact_posture.plot.run_view import RunView
+from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save, save_all
 from impact_posture.plot.view import ResultView, TradeOffData
 
 __all__ = [
@@ -44,23 +35,14 @@ __all__ = [
     "FigureNotFound",
     "ResultView",
     "RunView",
-    "Span",
     "TradeOffData",
     "bars_figure",
-    "comparison_figure",
-    "controls_comparison_figure",
-    "controls_figure",
+    "comparison_figures",
     "draw_all",
-    "draw_bars",
-    "draw_comparison",
-    "draw_run",
-    "draw_snapshots",
     "drawable",
-    "joints_figure",
-    "metric_figure",
-    "postures_figure",
+    "run_figures",
     "save",
-    "snapshots_figure",
+    "save_all",
 ]
 
 # What takes longest comes first, so that processes that draw side by side end together.

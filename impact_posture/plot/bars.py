@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,16 +13,7 @@ from matplotlib.patches import Patch
 
 from impact_posture.errors import InputError
 from impact_posture.escape import plot_label
-from impact_posture.plot.style import (
-    AFTER_BAR,
-    BEFORE_BAR,
-    DEFAULT_FORMATS,
-    INK,
-    VERMILLION,
-    framed,
-    save,
-    shared_legend,
-)
+from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, INK, VERMILLION, framed, shared_legend
 from impact_posture.plot.view import number
 
 NOTES = (
@@ -51,16 +41,6 @@ class Bar:
     mean: float
     half_width: float = float("nan")
     paper: float | None = None
-
-
-def draw_bars(rows: Sequence[Bar], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write ``bars`` into ``out_dir``; return the paths.
-
-    Raises:
-        InputError: No rows, or an unknown format.
-        OutputError: The folder or a file cannot be written.
-    """
-    return save(bars_figure(rows), out_dir, "bars", formats)
 
 
 def bars_figure(rows: Sequence[Bar]) -> Figure:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from matplotlib.figure import Figure
 
@@ -22,7 +21,7 @@ from impact_posture.plot.run_panels import (
     whole,
 )
 from impact_posture.plot.run_view import RunView, check_same
-from impact_posture.plot.style import DEFAULT_FORMATS, save
+from impact_posture.plot.snapshots import snapshots_figure
 
 HINT = "Less H is better: it is the squared velocity jump of an impulse of 1 N·s along n."
 LEFT = "Left: the whole run. Right: the first impact."
@@ -32,47 +31,36 @@ COLUMNS = 3
 _WIDTHS = (1.7, 1.0)
 
 
-def draw_run(view: RunView, out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write the figures ``metric``, ``controls`` and ``joints`` of a run into ``out_dir``; return the paths.
+def run_figures(view: RunView) -> dict[str, Figure]:
+    """Return the figures of a run by name: ``metric``, ``controls``, ``joints`` and ``snapshots``.
 
     A robot without actuators has no ``controls``, a robot without joints has no ``joints``.
-
-    Raises:
-        InputError: An unknown format.
-        OutputError: The folder or a file cannot be written.
     """
     figures = {"metric": metric_figure(view)}
     if control_panels([view]):
         figures["controls"] = controls_figure(view)
     if joint_panels([view]):
         figures["joints"] = joints_figure([view])
-    return _write(figures, out_dir, formats)
+    return figures | {"snapshots": snapshots_figure([view])}
 
 
-def draw_comparison(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write the figures of several controllers in a scenario into ``out_dir``; return the paths.
+def comparison_figures(views: Sequence[RunView]) -> dict[str, Figure]:
+    """Return the figures of several controllers in a scenario by name.
 
-    They are ``comparison-metric``, ``comparison-controls`` and ``comparison-joints``.
+    They are ``comparison-metric``, ``comparison-controls``, ``comparison-joints`` and ``snapshots``.
 
     Args:
         views: A run of each controller (of a push: with the same sign). The nominal controller is drawn first.
-        out_dir: Folder, made if missing; files of the same name are replaced.
-        formats: Some of ``png``, ``svg`` and ``pdf``.
 
     Raises:
-        InputError: No view, views of different scenarios or robots, an unknown format.
-        OutputError: The folder or a file cannot be written.
+        InputError: No view, or views of different scenarios or robots.
     """
     figures = {"comparison-metric": comparison_figure(views)}
     if control_panels(views):
         figures["comparison-controls"] = controls_comparison_figure(views)
     if joint_panels(views):
         figures["comparison-joints"] = joints_figure(views)
-    return _write(figures, out_dir, formats)
-
-
-def _write(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str]) -> list[Path]:
-    return [path for name, figure in figures.items() for path in save(figure, out_dir, name, formats)]
+    return figures | {"snapshots": snapshots_figure(views)}
 
 
 def metric_figure(view: RunView) -> Figure:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,26 +17,11 @@ from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.plot.view import number
 from impact_posture.robot.robot import Robot
 
+# Imported for its name alone, because the figures need no simulation.
+if TYPE_CHECKING:
+    from impact_posture.simulation.series import Window
+
 Flags = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Span:
-    """Shaded stretch of time.
-
-    Attributes:
-        kind: ``impact`` for an impact window; ``dwell`` for the time of a requested contact (drawn lighter).
-        begin: Begin, s.
-        end: End, s.
-        contact: Index of its contact or push, from 0.
-        touched: Whether the impact came; else the span begins at the expected time.
-    """
-
-    kind: str
-    begin: float
-    end: float
-    contact: int = 0
-    touched: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +46,10 @@ class RunView:
         objective: H of the impact, shape (n,); NaN where it was not evaluated.
         level: Level of the impact-robust term, 0 to 1, shape (n,).
         at_stop: Whether a joint is at a position limit, shape (n, nv).
-        windows: Shaded spans; the first span of kind ``impact`` is the first impact.
+        windows: Windows of time, of which those of kind ``impact`` and ``dwell`` are shaded.
         surface: A point on the surface that is hit, world, m, shape (3,); ``None`` for a push.
         supports: Feet that stay.
         label: Name of the run beside others; the name of the controller if empty.
-        title: First line of its figures; scenario and controller if empty.
         facts: Facts for the small print below the title, for example the seed and the sign of the push.
     """
 
@@ -84,11 +68,10 @@ class RunView:
     objective: Array
     level: Array
     at_stop: Flags
-    windows: tuple[Span, ...] = ()
+    windows: tuple[Window, ...] = ()
     surface: Array | None = None
     supports: tuple[Support, ...] = ()
     label: str = ""
-    title: str = ""
     facts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -124,7 +107,7 @@ class RunView:
         return 6 if self.robot.floating else 0
 
     @property
-    def impacts(self) -> tuple[Span, ...]:
+    def impacts(self) -> tuple[Window, ...]:
         """Impact windows in the order of time."""
         return tuple(sorted((w for w in self.windows if w.kind == "impact"), key=lambda w: w.begin))
 
@@ -185,7 +168,6 @@ def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
     """Return title and small print of a figure of runs of a scenario."""
     one = views[0]
     names = ", ".join(view.name for view in views) if len(views) < 5 else f"{len(views)} controllers"
-    title = one.title if one.title and len(views) == 1 else f"{one.scenario}: {names}"
     n = ", ".join(number(value) for value in one.contact.normal)
     facts = [f"robot {one.robot.name}"]
     if one.pushed:
@@ -196,7 +178,7 @@ def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
         facts += [f"contact {one.contact.frame}", f"n = ({n})", f"contacts {counts} of {len(one.impacts)}"]
     facts.append(f"on {', '.join(s.frame for s in one.supports)}" if one.supports else "no supports")
     shared = [fact for fact in one.facts if all(fact in view.facts for view in views)]
-    return title, ["  ·  ".join([*facts, *shared])]
+    return f"{one.scenario}: {names}", ["  ·  ".join([*facts, *shared])]
 
 
 def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -28,33 +27,13 @@ from impact_posture.plot.run_view import RunView, check_same, run_header
 from impact_posture.plot.shapes import Plane
 from impact_posture.plot.silhouette import silhouette_handles
 from impact_posture.plot.skeleton import Skeleton, build_skeleton
-from impact_posture.plot.style import (
-    BLUE,
-    DEFAULT_FORMATS,
-    GRAY,
-    INK,
-    PALE,
-    VERMILLION,
-    framed,
-    save,
-    shared_legend,
-)
+from impact_posture.plot.style import BLUE, GRAY, INK, PALE, VERMILLION, framed, shared_legend
 
 _START_NOTE = "Gray sticks show the robot at the start of the run."
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
 _START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
 # Time before the impact at which no tick contains it, s.
 _BEFORE = 0.005
-
-
-def draw_snapshots(views: Sequence[RunView], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write ``snapshots`` of a run of each controller (nominal first) into ``out_dir``; return the paths.
-
-    Raises:
-        InputError: No view, views of different scenarios or robots, an unknown format.
-        OutputError: The folder or a file cannot be written.
-    """
-    return save(snapshots_figure(views), out_dir, "snapshots", formats)
 
 
 def instants(view: RunView) -> list[tuple[str, float]]:

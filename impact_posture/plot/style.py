@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -204,6 +204,16 @@ def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
         if one not in FORMATS:
             raise InputError(f"no format '{one}'", where="plot", hint=f"choose from {', '.join(FORMATS)}")
     return wanted
+
+
+def save_all(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
+    """Write each figure under its name; return the paths.
+
+    Raises:
+        InputError: As :func:`save`.
+        OutputError: As :func:`save`.
+    """
+    return [path for name, figure in figures.items() for path in save(figure, out_dir, name, formats)]
 
 
 def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:

@@ -72,8 +72,7 @@ class ResultView:
     """Data that the figures of a result need.
 
     Attributes:
-        robot: The robot.
-        objective: ImpactContact, metric, kind and supports; its oracle gives the numbers.
+        objective: Robot, contact, metric, kind and supports; its oracle gives the numbers.
         q_initial: Posture before, shape (nq,).
         q_optimal: Posture after, shape (nq,).
         speed: Approach speed along the normal, m/s.
@@ -82,12 +81,10 @@ class ResultView:
         tradeoff: The trade-off of objective against distance, if it was computed.
         motion: The path to the optimum over time, if it was searched.
         self_motion: The map of the self-motion manifold, if it was computed.
-        title: First line of every figure; robot and contact frame if empty.
         collisions: Names of the shapes that collide, in pairs, before and after.
         depths: How far behind its contact point each surface lies, m; empty for none.
     """
 
-    robot: Robot
     objective: ImpactObjective
     q_initial: Array
     q_optimal: Array
@@ -97,9 +94,13 @@ class ResultView:
     tradeoff: TradeOffData | None = None
     motion: PosturePath | None = None
     self_motion: SelfMotionMap | None = None
-    title: str = ""
     collisions: tuple[Sequence[tuple[str, str]], Sequence[tuple[str, str]]] = ((), ())
     depths: tuple[float, ...] = ()
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return self.objective.robot
 
     @cached_property
     def before(self) -> ImpactQuantities:
@@ -180,12 +181,9 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
     contact, robot = view.objective.contact, view.robot
     named = zip(view.objective.contacts, contact_letters(view), strict=True)
     frames = ", ".join(f"{one.frame}{letter and f' ({letter.strip()})'}" for one, letter in named)
-    title = view.title or f"{robot.name}, impact at {frames}"
     normal = ", ".join(number(v) for v in contact.normal)
     axes = "world" if contact.normal_frame == "world" else "contact frame"
-    facts = [f"robot {robot.name}", f"contact {contact.frame}"] if view.title else []
-    if any(contact.offset):
-        facts.append(f"offset ({', '.join(number(v) for v in contact.offset)}) m")
+    facts = [f"offset ({', '.join(number(v) for v in contact.offset)}) m"] if any(contact.offset) else []
     cone = view.objective.normal_cone_deg
     facts += [
         f"n = ({normal}) in {axes}" + (f", worst within {cone:g}°" if cone else ""),
@@ -204,7 +202,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
         first, second = getattr(view.before, name), getattr(view.after, name)
         shown = f" {unit}" if (first, second) != (None, None) else ""
         numbers.append(f"{name} {number(first)} → {number(second)}{shown}")
-    return title, [SEPARATOR.join(facts), SEPARATOR.join(numbers)]
+    return f"{robot.name}, impact at {frames}", [SEPARATOR.join(facts), SEPARATOR.join(numbers)]
 
 
 def _worst_values(view: ResultView) -> str:

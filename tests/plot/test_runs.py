@@ -15,30 +15,21 @@ from matplotlib.figure import Figure
 
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact
-from impact_posture.plot import (
-    FORMATS,
-    Bar,
-    RunView,
-    Span,
-    bars_figure,
+from impact_posture.plot import FORMATS, Bar, RunView, bars_figure, comparison_figures, run_figures, save, save_all
+from impact_posture.plot.run_axes import AT_LIMIT, LIMIT, SHADES, STOP
+from impact_posture.plot.run_figures import (
     comparison_figure,
     controls_comparison_figure,
     controls_figure,
-    draw_bars,
-    draw_comparison,
-    draw_run,
-    draw_snapshots,
     joints_figure,
     metric_figure,
-    save,
-    snapshots_figure,
 )
-from impact_posture.plot.run_axes import AT_LIMIT, LIMIT, SHADES, STOP
 from impact_posture.plot.run_panels import SHOWN
 from impact_posture.plot.skeleton import build_skeleton
-from impact_posture.plot.snapshots import instants
+from impact_posture.plot.snapshots import instants, snapshots_figure
 from impact_posture.plot.style import framed
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.simulation.series import Window
 from tests.plot.page import defects
 from tests.plot.views import PENDULUM, text_of
 
@@ -59,8 +50,8 @@ def make_run(
     objective = np.where(np.arange(TICKS) % 10 == 0, 3.0 + np.cos(t), np.nan)
     supports = robot.spec.supports
     hits = (1.0,) if push else (1.0, 2.5)
-    windows = [Span("impact", at, at + 0.3, k) for k, at in enumerate(hits)]
-    windows += [] if push else [Span("dwell", at, at + 0.8, k) for k, at in enumerate(hits)]
+    windows = [Window("impact", k, at, at + 0.3, True) for k, at in enumerate(hits)]
+    windows += [] if push else [Window("dwell", k, at, at + 0.8, True) for k, at in enumerate(hits)]
     force = np.zeros((TICKS, 3))
     inside = np.any([(t > at) & (t <= at + 0.3) for at in hits], axis=0)
     force[inside] = (6.0, 0.0, 0.0)
@@ -246,7 +237,7 @@ def test_H_that_was_never_evaluated_and_a_run_without_contact(flying: RunView, t
     assert len(panels(comparison_figure([run, run]))) == 1
     for figure in (controls_comparison_figure([run]), snapshots_figure([run]), joints_figure([run])):
         figure.draw_without_rendering()
-    missed = dataclasses.replace(flying, windows=(Span("impact", 1.0, 1.3, touched=False),))
+    missed = dataclasses.replace(flying, windows=(Window("impact", 0, 1.0, 1.3, False),))
     assert "time since expected touch" in text_of(metric_figure(missed))
 
 
@@ -271,7 +262,7 @@ def test_comparison_puts_nominal_first_and_counts_from_each_ones_touch(flying: R
 
 
 def test_pushes_share_the_push_as_zero(pushed: RunView) -> None:
-    late = dataclasses.replace(pushed, controller="robust", windows=(Span("impact", 2.0, 2.3),))
+    late = dataclasses.replace(pushed, controller="robust", windows=(Window("impact", 0, 2.0, 2.3, True),))
     upper, _ = panels(comparison_figure([pushed, late]))
     assert upper.get_xlabel() == "time since push  [s]"
     np.testing.assert_allclose(upper.get_xlim(), (-1.99, 3.0))
@@ -359,15 +350,16 @@ def test_nothing_overlaps(name: str, figure: Any, request: pytest.FixtureRequest
 
 def test_files_in_all_formats_and_the_same_each_time(flying: RunView, fixed: RunView, tmp_path: Path) -> None:
     short = dataclasses.replace(fixed, windows=())
-    paths = draw_run(short, tmp_path, ("svg",)) + draw_comparison([short, short], tmp_path, ("pdf",))
-    paths += draw_snapshots([flying], tmp_path, ("png",)) + draw_bars(ROWS, tmp_path, FORMATS)
+    paths = save_all(run_figures(short), tmp_path, ("svg",))
+    paths += save_all(comparison_figures([short, short]), tmp_path, ("pdf",))
+    paths += save(bars_figure(ROWS), tmp_path, "bars", FORMATS)
     assert [path.name for path in paths] == [
-        "metric.svg", "controls.svg", "joints.svg",
-        "comparison-metric.pdf", "comparison-controls.pdf", "comparison-joints.pdf",
-        "snapshots.png", "bars.png", "bars.svg", "bars.pdf",
+        "metric.svg", "controls.svg", "joints.svg", "snapshots.svg",
+        "comparison-metric.pdf", "comparison-controls.pdf", "comparison-joints.pdf", "snapshots.pdf",
+        "bars.png", "bars.svg", "bars.pdf",
     ]  # fmt: skip
     assert all(path.stat().st_size > 8_000 for path in paths)
-    again = draw_bars(ROWS, tmp_path / "again", ("svg", "pdf"))
+    again = save(bars_figure(ROWS), tmp_path / "again", "bars", ("svg", "pdf"))
     again += save(metric_figure(short), tmp_path / "again", "metric", ("svg",))
     for path in again:
         assert path.read_bytes() == (tmp_path / path.name).read_bytes()
@@ -396,11 +388,11 @@ def test_bad_input(flying: RunView, pushed: RunView, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no course of time"):
         dataclasses.replace(flying, t=flying.t[::-1])
     with pytest.raises(InputError, match="there is no run to draw"):
-        draw_comparison([], tmp_path)
+        comparison_figures([])
     with pytest.raises(InputError, match=r"robot of nominal is solo8, of nominal tilthex_arm.*same scenario"):
-        draw_snapshots([flying, pushed], tmp_path)
+        snapshots_figure([flying, pushed])
     with pytest.raises(InputError, match="no format 'gif'"):
-        draw_run(flying, tmp_path, ("gif",))
+        save(metric_figure(flying), tmp_path, "metric", ("gif",))
     with pytest.raises(InputError, match="nothing to draw"):
-        draw_bars([], tmp_path)
+        bars_figure([])
     assert not list(tmp_path.iterdir())

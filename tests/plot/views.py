@@ -58,7 +58,6 @@ def make_view(
         v[:6] *= 0.2
     way = [pin.integrate(robot.model, q0, v * t) for t in np.linspace(0, 1, 12)]
     return ResultView(
-        robot,
         objective,
         q0,
         way[-1],
