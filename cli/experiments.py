@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from impact_posture_cli.options import CompileMode
+from impact_posture_cli.options import CompileMode, option
 from impact_posture_cli.output import Page
 
 if TYPE_CHECKING:
@@ -23,17 +23,15 @@ ScenarioName = Annotated[
         "g1-strike, solo12-landing, panda-tap, hextilt-poke, or a path to a scenario.toml.",
     ),
 ]
-Seeds = Annotated[int, typer.Option("--seeds", min=1, rich_help_panel=RUN, help="Seeds of each controller, from 0.")]
+Seeds = Annotated[int, option("--seeds", panel=RUN, min=1, help="Seeds of each controller, from 0.")]
 Compile = Annotated[
     CompileMode,
-    typer.Option(
-        "--compile", rich_help_panel=RUN,
+    option(
+        "--compile", panel=RUN,
         help="Whether controllers are compiled to machine code. auto: from 3 seeds on, which pay for it.",
     ),
 ]  # fmt: skip
-Processes = Annotated[
-    int, typer.Option("--jobs", min=1, rich_help_panel=RUN, help="Number of processes that run at the same time.")
-]
+Processes = Annotated[int, option("--jobs", panel=RUN, min=1, help="Number of processes that run at the same time.")]
 
 
 def rows_table(page: Page, rows: tuple[Row, ...] | list[Row]) -> None:

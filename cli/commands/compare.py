@@ -14,8 +14,8 @@ from impact_posture_cli.progress_line import progress
 
 Controllers = Annotated[
     str,
-    typer.Option(
-        "--controllers", metavar="A,B,…", rich_help_panel=RUN,
+    options.option(
+        "--controllers", metavar="A,B,…", panel=RUN,
         help="Names as in simulate. robust:held is robust with --mode held, and robust:free is robust with --free.",
     ),
 ]  # fmt: skip

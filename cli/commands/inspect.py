@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from impact_posture.setting import OUTPUT
 from impact_posture.settings import RobotSettings
 from impact_posture_cli import options
@@ -20,13 +18,13 @@ if TYPE_CHECKING:
 
 WriteRobotToml = Annotated[
     str | None,
-    typer.Option(
-        "--write-robot-toml", metavar="[FILE.toml]", rich_help_panel=OUTPUT,
+    options.option(
+        "--write-robot-toml", metavar="[FILE.toml]", panel=OUTPUT,
         help="Draft a robot.toml for a URDF, with every guess marked. Without FILE it is written beside the URDF, or "
         "here as NAME.toml if the URDF belongs to a package.",
     ),
 ]  # fmt: skip
-ForceFile = Annotated[bool, typer.Option("--force", rich_help_panel=OUTPUT, help="Replace an existing robot.toml.")]
+ForceFile = Annotated[bool, options.option("--force", panel=OUTPUT, help="Replace an existing robot.toml.")]
 
 
 @with_settings(RobotSettings)

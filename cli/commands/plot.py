@@ -15,11 +15,10 @@ ResultFolder = Annotated[str, typer.Argument(metavar="RESULT_DIR", help="A folde
 Figures = Annotated[
     list[str] | None,
     typer.Option(
-        "--figure",
+        "--figure", show_default="all",
         help="Figure to draw: ellipsoid, postures, jump, nullspace, classical, tradeoff or self_motion; repeatable.",
-        show_default="all",
     ),
-]
+]  # fmt: skip
 PictureOut = Annotated[
     str | None, typer.Option("--out", metavar="DIR", help="Folder for the pictures.", show_default="RESULT_DIR")
 ]

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Processes, Seeds, rows_table
 from impact_posture_cli.output import Page, print_json
@@ -14,15 +12,14 @@ from impact_posture_cli.progress_line import progress
 
 All = Annotated[
     bool,
-    typer.Option(
-        "--all",
-        rich_help_panel=RUN,
+    options.option(
+        "--all", panel=RUN,
         help="Run every controller, not only nominal, robust, robust-flow and the recommended ones.",
     ),
-]
+]  # fmt: skip
 Scenarios = Annotated[
     list[str] | None,
-    typer.Option("--scenario", rich_help_panel=RUN, show_default="all four", help="Run this one only; repeatable."),
+    options.option("--scenario", panel=RUN, show_default="all four", help="Run this one only; repeatable."),
 ]
 Out = Annotated[str, options.out_option("Folder of the results.")]
 

@@ -22,39 +22,39 @@ _FAILED = 4
 
 Controller = Annotated[
     str,
-    typer.Option(
-        "--controller", rich_help_panel=RUN,
+    options.option(
+        "--controller", panel=RUN,
         help="nominal, robust, robust-speed, robust-sticking, robust-release, robust-flow, robust-flow-sticking, "
         "posture, posture-sticking, path, stiff, posture-stiff, invariant, walker, reference-spreading, "
         "impact-aware, or the name that an installed package has registered.",
     ),
 ]  # fmt: skip
-RunSeed = Annotated[int, typer.Option("--seed", min=0, rich_help_panel=RUN, help="Seed of the sensors' noise.")]
+RunSeed = Annotated[int, options.option("--seed", panel=RUN, min=0, help="Seed of the sensors' noise.")]
 RunMode = Annotated[
     Mode,
-    typer.Option(
-        "--mode", rich_help_panel=RUN,
+    options.option(
+        "--mode", panel=RUN,
         help="live keeps the impact-robust term on in the impact; held keeps the posture that was reached before.",
     ),
 ]  # fmt: skip
 Free = Annotated[
-    bool, typer.Option("--free", rich_help_panel=RUN, help="Gradient and optimum as if the feet were in the air.")
+    bool, options.option("--free", panel=RUN, help="Gradient and optimum as if the feet were in the air.")
 ]
 Gain = Annotated[
     float | None,
-    typer.Option(
-        "--gain", rich_help_panel=RUN, callback=positive, show_default="the scenario's",
+    options.option(
+        "--gain", panel=RUN, callback=positive, show_default="the scenario's",
         help="Gain K of the impact-robust term, 1/s².",
     ),
 ]  # fmt: skip
 Sign = Annotated[
     Literal["+1", "1", "-1"] | None,
-    typer.Option("--sign", rich_help_panel=RUN, show_default="both", help="Which way a robot is pushed."),
+    options.option("--sign", panel=RUN, show_default="both", help="Which way a robot is pushed."),
 ]
 ExportWorld = Annotated[
     str | None,
-    typer.Option(
-        "--export-world", metavar="DIR", rich_help_panel=RUN,
+    options.option(
+        "--export-world", metavar="DIR", panel=RUN,
         help="Write MuJoCo's model and the parameters of the scenario for a program in C++, and run nothing.",
     ),
 ]  # fmt: skip

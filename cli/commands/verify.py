@@ -21,16 +21,15 @@ if TYPE_CHECKING:
 
 NormalOfFirst = Annotated[
     Vector3 | None,
-    typer.Option(
-        "--normal", metavar="X Y Z", callback=check_direction, rich_help_panel=CONTACT,
+    options.option(
+        "--normal", metavar="X Y Z", callback=check_direction, panel=CONTACT,
         show_default="0 0 1", help="Normal of the first sample; the others' are random.",
     ),
 ]  # fmt: skip
 Samples = Annotated[
-    int,
-    typer.Option("--samples", min=1, rich_help_panel=OUTPUT, help="Number of random postures and normals."),
+    int, options.option("--samples", panel=OUTPUT, min=1, help="Number of random postures and normals.")
 ]
-SampleSeed = Annotated[int, typer.Option("--seed", min=0, rich_help_panel=OUTPUT, help="Seed of the random samples.")]
+SampleSeed = Annotated[int, options.option("--seed", panel=OUTPUT, min=0, help="Seed of the random samples.")]
 
 
 _WITHOUT = {
