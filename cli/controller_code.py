@@ -1,14 +1,12 @@
-"""``impact-posture codegen ROBOT --controller KIND``: the whole online controller as C."""
+"""What ``impact-posture codegen ROBOT --controller KIND`` exports."""
 
 from __future__ import annotations
 
 from dataclasses import fields
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from impact_posture.settings import ImpactSettings, LoadOptions, RobotSettings
 from impact_posture_cli.error_boundary import UsageError
-from impact_posture_cli.output import Page, print_json
 from impact_posture_cli.settings_options import Given
 
 if TYPE_CHECKING:
@@ -18,42 +16,7 @@ if TYPE_CHECKING:
     from impact_posture.tsid.task_formulation import TaskFormulation
 
 
-def write_controller(
-    given: Given,
-    robot: str,
-    kind: ControllerKind,
-    *,
-    flow: bool,
-    scenario: str | None,
-    daqp: str | None,
-    prefix: str | None,
-    out: str | None,
-    build: bool,
-    force: bool,
-    json: bool,
-    quiet: bool,
-) -> None:
-    """Write the controller and say what was written."""
-    from impact_posture.controller_export.export import export_controller
-
-    made, formulation, objective = _formulation(given, robot, kind, flow, scenario)
-    folders = (None if name is None else Path(name) for name in (out, daqp))
-    written = export_controller(
-        made, formulation, next(folders), objective=objective, prefix=prefix, daqp=next(folders), build=build,
-        force=force,
-    )  # fmt: skip
-    if json:
-        print_json(written.to_dict())
-        return
-    page = Page(quiet=quiet)
-    posture = "nominal posture" if objective is None else "reference flow" if flow else "impact-robust"
-    page.title(f"{made.name}, {kind}", posture)
-    tasks = ", ".join(task["name"] for task in written.manifest["tasks"])
-    page.pairs([("folder", str(written.out)), ("tasks", tasks), ("header", f"{written.prefix}.h")])
-    page.line(written.verdict)
-
-
-def _formulation(
+def controller_parts(
     given: Given, robot: str, kind: ControllerKind, flow: bool, scenario: str | None
 ) -> tuple[Robot, TaskFormulation, ImpactObjective | None]:
     """Return the robot, its tasks, and the objective that the posture task follows."""

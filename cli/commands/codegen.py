@@ -8,13 +8,17 @@ from typing import TYPE_CHECKING
 
 from impact_posture.settings import ImpactSettings
 from impact_posture_cli import options
-from impact_posture_cli.controller_code import write_controller
+from impact_posture_cli.controller_code import controller_parts
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, print_json
 from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
+    from impact_posture.arrays import Array
+    from impact_posture.codegen.export import Export
+    from impact_posture.controller_export.export import ControllerExport
+    from impact_posture.impact.contact_compression import Compression
     from impact_posture.impact.objective import ImpactObjective
 
 _IMPACT = {"speed", "restitution", "posture"}
@@ -39,66 +43,52 @@ def codegen(
 ) -> None:
     """Run ``impact-posture codegen``."""
     from_result = given.is_result(robot, {"prefix", "out", "float_", "portable", "compile", "force"})
-    if controller is not None:
-        if float_ or portable:
-            raise UsageError("--controller is double and plain C99: leave --float and --portable out.")
-        write_controller(
-            given, robot, controller, flow=flow, scenario=scenario, daqp=daqp, prefix=prefix, out=out,
-            build=compile, force=force, json=json, quiet=quiet,
-        )  # fmt: skip
-        return
-    if flow or scenario is not None or daqp is not None:
-        raise UsageError("--flow, --scenario and --daqp belong to --controller: give aerial, legged or arm.")
-    if not from_result:
-        _check_problem(given, robot)
-    from impact_posture.codegen.export import write_export
-
-    posture = squeezed = None
-    objectives: list[ImpactObjective]
+    if controller is None:
+        if flow or scenario is not None or daqp is not None:
+            raise UsageError("--flow, --scenario and --daqp belong to --controller: give aerial, legged or arm.")
+        if not from_result:
+            _check_problem(given, robot)
+    elif float_ or portable:
+        raise UsageError("--controller is double and plain C99: leave --float and --portable out.")
     warnings: tuple[str, ...] = ()
-    if from_result:
-        from impact_posture.result_view import load_view
+    written: ControllerExport | Export
+    place = Path(out) if out else None
+    if controller is not None:
+        from impact_posture.controller_export.export import export_controller
 
-        view = load_view(Path(robot))
-        objectives, posture = [view.objective], view.q_optimal
+        made, formulation, objective = controller_parts(given, robot, controller, flow, scenario)
+        written = export_controller(
+            made, formulation, place, objective=objective, prefix=prefix, daqp=Path(daqp) if daqp else None,
+            build=compile, force=force,
+        )  # fmt: skip
+        posture = "nominal posture" if objective is None else "reference flow" if flow else "impact-robust"
+        title = f"{made.name}, {controller}", posture
+        tasks = ", ".join(task["name"] for task in written.manifest["tasks"])
+        rows = [("tasks", tasks), ("header", f"{written.prefix}.h")]
     else:
-        from impact_posture.impact.contact_compression import compression
-        from impact_posture.impact.resolved_impact import resolve
+        from impact_posture.codegen.export import write_export
 
-        objectives = []
-        for frame in given.values.get("frame", (None,)):
-            impact = resolve(given.fill(ImpactSettings, robot=robot, frame=frame))
-            objectives.append(impact.objective)
-            squeezed = squeezed or compression(impact.objective, impact.q, impact.speed, impact.contact_stiffness)
-            warnings = impact.warnings
-    with progress("writing and compiling" if compile else "writing", shown=not (quiet or json)):
-        written = write_export(
-            objectives,
-            Path(out) if out else None,
-            prefix=prefix,
-            posture=posture,
-            compression=squeezed,
-            single=float_,
-            portable=portable,
-            build=compile,
-            force=force,
-        )
+        objectives, optimum, squeezed, warnings = _objectives(given, robot, from_result)
+        with progress("writing and compiling" if compile else "writing", shown=not (quiet or json)):
+            written = write_export(
+                objectives, place, prefix=prefix, posture=optimum, compression=squeezed, single=float_,
+                portable=portable, build=compile, force=force,
+            )  # fmt: skip
+        where = ", ".join(contact.frame for o in objectives for contact in o.contacts)
+        title = f"{objectives[0].robot.name} at {where}", f"objective {objectives[0].name}"
+        rows = [
+            ("functions", ", ".join(written.functions)),
+            ("posture", "the result's optimum" if optimum is not None else "none"),
+            ("numbers", written.manifest["real"]),
+            ("stack", f"at most {written.manifest['stack_bytes']} bytes"),
+        ]
     if json:
         print_json(written.to_dict())
         return
     page = Page(quiet=quiet)
     page.warnings(warnings)
-    where = ", ".join(contact.frame for o in objectives for contact in o.contacts)
-    page.title(f"{objectives[0].robot.name} at {where}", f"objective {objectives[0].name}")
-    page.pairs(
-        [
-            ("folder", str(written.out)),
-            ("functions", ", ".join(written.functions)),
-            ("posture", "the result's optimum" if posture is not None else "none"),
-            ("numbers", written.manifest["real"]),
-            ("stack", f"at most {written.manifest['stack_bytes']} bytes"),
-        ]
-    )
+    page.title(*title)
+    page.pairs([("folder", str(written.out)), *rows])
     page.line(written.verdict)
 
 
@@ -111,3 +101,21 @@ def _check_problem(given: Given, robot: str) -> None:
         if robot not in known_robots():
             load_view(Path(robot))
     given.check_contact()
+
+
+def _objectives(
+    given: Given, robot: str, from_result: bool
+) -> tuple[list[ImpactObjective], Array | None, Compression | None, tuple[str, ...]]:
+    """Return objectives, the optimum of a result, the first known compression of a contact, and warnings."""
+    if from_result:
+        from impact_posture.result_view import load_view
+
+        view = load_view(Path(robot))
+        return [view.objective], view.q_optimal, None, ()
+    from impact_posture.impact.contact_compression import compression
+    from impact_posture.impact.resolved_impact import resolve
+
+    frames = given.values.get("frame", (None,))
+    impacts = [resolve(given.fill(ImpactSettings, robot=robot, frame=frame)) for frame in frames]
+    known = (compression(one.objective, one.q, one.speed, one.contact_stiffness) for one in impacts)
+    return [one.objective for one in impacts], None, next(filter(None, known), None), impacts[-1].warnings

@@ -339,8 +339,12 @@ def test_a_base_with_legs_is_a_body(name: str) -> None:
     assert not any(np.allclose(end, base.translation) for bone in seen.bones for end in bone)
     # The shapes show the body better.  A robot without shapes has its box.
     assert "body" not in text_of(postures_figure(view)).split(" | ")
-    bare = dataclasses.replace(view, robot=dataclasses.replace(view.robot, settings=None))
-    assert "body" in text_of(postures_figure(bare)).split(" | ")
+    assert "body" in text_of(postures_figure(without_shapes(view))).split(" | ")
+
+
+def without_shapes(view: ResultView) -> ResultView:
+    robot = dataclasses.replace(view.robot, settings=None)
+    return dataclasses.replace(view, objective=dataclasses.replace(view.objective, robot=robot))
 
 
 def silhouettes(axes: Axes) -> list[PathPatch]:
@@ -394,9 +398,7 @@ def test_shapes_in_collision_have_a_color_and_a_name(talos: ResultView) -> None:
 
 
 def test_a_robot_without_shapes_is_drawn_by_its_sticks(pendulum: ResultView) -> None:
-    objective = dataclasses.replace(pendulum.objective, robot=dataclasses.replace(pendulum.robot, settings=None))
-    bare = dataclasses.replace(pendulum, objective=objective)
-    figure = postures_figure(bare)
+    figure = postures_figure(without_shapes(pendulum))
     assert not any(silhouettes(axes) for axes in figure.axes)
     assert "They do not show the shapes of the links." in text_of(figure)
     assert "shapes" not in text_of(figure).split(" | ")
