@@ -13,6 +13,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import typer
@@ -48,51 +49,51 @@ def run(command: Any, arguments: Sequence[str]) -> int:
             code = command.main(args=list(arguments), prog_name="impact-posture", standalone_mode=False)
         sys.stdout.flush()
         if code == _INTERRUPTED:  # newer Typers hand Ctrl-C back as a code
-            return _interrupted(wants_json)
+            raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
-    except BrokenPipeError:
-        return _closed_pipe()
     except (KeyboardInterrupt, typer.Abort):
-        return _interrupted(wants_json)
+        return _report(_Fault(_INTERRUPTED, "Interrupted", "interrupted"), wants_json)
     except SystemExit as error:
         # Rich leaves this way when its pipe closes.
         return error.code if isinstance(error.code, int) else 1
     except Exception as error:
+        if isinstance(error, BrokenPipeError) or getattr(error, "errno", None) == errno.EPIPE:
+            # The reader has closed the pipe (``| head``), which is no fault.
+            _discard_output()
+            return 1
         if os.environ.get(DEBUG_VARIABLE):
             traceback.print_exc()
-        return _explain(error, wants_json)
+        return _usage(error, wants_json) if isinstance(error, UsageError) else _report(_explain(error), wants_json)
 
 
-def _interrupted(wants_json: bool) -> int:
-    return _report(_INTERRUPTED, "Interrupted", "interrupted", wants_json=wants_json)
+@dataclass(frozen=True)
+class _Fault:
+    """Exit code of an error, and what is said of it."""
+
+    code: int
+    kind: str
+    what: str
+    where: str = ""
+    hint: str = ""
 
 
-def _explain(error: Exception, wants_json: bool) -> int:
+def _explain(error: Exception) -> _Fault:
     kind = type(error).__name__
     if isinstance(error, ImpactPostureError):
         what, where, hint = as_options(error.what), option_of(error.where), as_options(error.hint)
-        return _report(error.exit_code, kind, what, where, hint, wants_json=wants_json)
-    if isinstance(error, UsageError):
-        return _usage(error, wants_json)
+        return _Fault(error.exit_code, kind, what, where, hint)
     if isinstance(error, OSError):
-        if error.errno == errno.EPIPE:
-            return _closed_pipe()
         hint = "free some space" if error.errno == errno.ENOSPC else "check the path and its permissions"
         where = str(error.filename) if error.filename is not None else ""
-        return _report(1, kind, error.strerror or str(error), where, hint, wants_json=wants_json)
+        return _Fault(1, kind, error.strerror or str(error), where, hint)
     if isinstance(error, MemoryError) or "bad_alloc" in str(error):
-        return _report(
-            1,
-            "MemoryError",
-            "out of memory",
-            hint="free some, raise its limit (ulimit -v), or give fewer --jobs",
-            wants_json=wants_json,
-        )
+        hint = "free some, raise its limit (ulimit -v), or give fewer --jobs"
+        return _Fault(1, "MemoryError", "out of memory", hint=hint)
     if isinstance(error, RecursionError):
-        return _report(1, kind, "an input is nested too deeply", hint="correct the file", wants_json=wants_json)
+        return _Fault(1, kind, "an input is nested too deeply", hint="correct the file")
     what = f"{kind}: {error}" if str(error) else kind
     hint = f"please report it with the output of {DEBUG_VARIABLE}=1"
-    return _report(1, "InternalError", what, "internal error", hint, wants_json=wants_json)
+    return _Fault(1, "InternalError", what, "internal error", hint)
 
 
 def _usage(error: Any, wants_json: bool) -> int:
@@ -106,7 +107,7 @@ def _usage(error: Any, wants_json: bool) -> int:
     if wants_json:
         context = getattr(error, "ctx", None)
         where = context.command_path if context is not None else "command line"
-        _document(code, "UsageError", error.format_message(), where, f"see {where} --help")
+        _document(_Fault(code, "UsageError", error.format_message(), where, f"see {where} --help"))
     return code
 
 
@@ -120,29 +121,22 @@ def _in_our_words(error: Any) -> None:
         error.message = "; ".join(not_one_of(given[1], re.findall(r"'(.*?)'", given[2])))
 
 
-def _report(code: int, kind: str, what: str, where: str = "", hint: str = "", *, wants_json: bool) -> int:
-    what, where, hint = (one_line(part) for part in (what, where, hint))
+def _report(fault: _Fault, wants_json: bool) -> int:
+    what, where, hint = (one_line(part) for part in (fault.what, fault.where, fault.hint))
     line = f"{where}: {what}" if where else what
     with contextlib.suppress(OSError):
         sys.stderr.write(f"error: {line}; {hint}\n" if hint else f"error: {line}\n")
         sys.stderr.flush()
     if wants_json:
-        _document(code, kind, what, where, hint)
+        _document(replace(fault, what=what, where=where, hint=hint))
     _discard_output()
-    return code
+    return fault.code
 
 
-def _document(code: int, kind: str, what: str, where: str, hint: str) -> None:
-    content = {"code": code, "kind": kind, "what": what, "where": where, "hint": hint}
+def _document(fault: _Fault) -> None:
     with contextlib.suppress(OSError):
-        sys.stdout.write(json.dumps({"error": content}, allow_nan=False) + "\n")
+        sys.stdout.write(json.dumps({"error": asdict(fault)}, allow_nan=False) + "\n")
         sys.stdout.flush()
-
-
-def _closed_pipe() -> int:
-    """Return the exit code without a message when the reader has closed the pipe (``| head``)."""
-    _discard_output()
-    return 1
 
 
 def _discard_output() -> None:
