@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from impact_posture.path.posture_path import PosturePath
 
 
+@dataclass(frozen=True, eq=False)
 class PostureResult:
     """An optimized posture with its certificate, which can be saved, drawn and exported.
 
@@ -47,22 +49,12 @@ class PostureResult:
         global_search: Finding of the search ``global``; ``None`` without it.
     """
 
-    def __init__(
-        self,
-        problem: PostureProblem,
-        solution: PostureSolution,
-        robustness: Robustness | None = None,
-        tradeoff: TradeOff | None = None,
-        motion: PosturePath | None = None,
-        global_search: GlobalSearch | None = None,
-    ) -> None:
-        self.problem, self.solution, self.robustness = problem, solution, robustness
-        self.tradeoff, self.motion, self.global_search = tradeoff, motion, global_search
-
-    def _with(self, **found: Any) -> PostureResult:
-        """The same result with more found about it."""
-        kept = {key: getattr(self, key) for key in ("tradeoff", "motion", "global_search")}
-        return PostureResult(self.problem, self.solution, self.robustness, **kept | found)
+    problem: PostureProblem
+    solution: PostureSolution
+    robustness: Robustness | None = None
+    tradeoff: TradeOff | None = None
+    motion: PosturePath | None = None
+    global_search: GlobalSearch | None = None
 
     @property
     def q(self) -> Array:
@@ -137,7 +129,7 @@ class PostureResult:
                 )
             force = impact.contact_stiffness, impact.speed
         curve = pareto_front(self.solution, points, force=force, compile=compile, progress=progress)
-        return self._with(tradeoff=curve)
+        return replace(self, tradeoff=curve)
 
     def path(self, *, seed: int = 0) -> PostureResult:
         """Return the same result with a path from the start to the optimum, timed within the robot's limits.
@@ -153,7 +145,7 @@ class PostureResult:
         """
         from impact_posture.path.posture_path import posture_path
 
-        return self._with(motion=posture_path(self.solution, seed=seed))
+        return replace(self, motion=posture_path(self.solution, seed=seed))
 
     def save(
         self,
