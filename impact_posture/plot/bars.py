@@ -32,14 +32,14 @@ class Bar:
         scenario: Name of the scenario. Rows of the same scenario share a panel.
         controller: Name of the controller.
         mean: ``∫‖ν‖dt`` over the impact windows, mean over the runs; NaN where no run completed.
-        half_width: Half of the 95 % interval; NaN or 0 for a single run.
+        half_width: Half of the 95 % interval; 0 for a single run.
         paper: Number of the paper for the same controller, if there is one.
     """
 
     scenario: str
     controller: str
     mean: float
-    half_width: float = float("nan")
+    half_width: float = 0.0
     paper: float | None = None
 
 
@@ -71,7 +71,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
 
 
 def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
-    ours = max((row.mean + _wide(row) for row in group if np.isfinite(row.mean)), default=0.0)
+    ours = max((row.mean + row.half_width for row in group if np.isfinite(row.mean)), default=0.0)
     papers = [row.paper for row in group if row.paper is not None]
     # The robot of the paper differs. Its numbers must not shorten the bars.
     near = [paper for paper in papers if paper <= _FAR * ours or ours == 0]
@@ -79,8 +79,8 @@ def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
     for place, row in enumerate(group):
         if np.isfinite(row.mean):
             axes.barh(place, row.mean, height=0.6, **(BEFORE_BAR if row.controller == "nominal" else AFTER_BAR))
-            if _wide(row) > 0:
-                axes.errorbar(row.mean, place, xerr=_wide(row), color=INK, linewidth=1.0, capsize=2.5, zorder=4)
+            if row.half_width:
+                axes.errorbar(row.mean, place, xerr=row.half_width, color=INK, linewidth=1.0, capsize=2.5, zorder=4)
         if row.paper is not None:
             axes.plot(min(row.paper, 0.975 * end), place, **(_PAPER if row.paper in near else _BEYOND))
         # The numbers stand right of the panel, clear of the bars.
@@ -103,20 +103,15 @@ _PAPER: dict[str, Any] = {
 _BEYOND = _PAPER | {"marker": ">", "markersize": 6}
 
 
-def _wide(row: Bar) -> float:
-    """Return half of the interval, 0 without an interval."""
-    return row.half_width if np.isfinite(row.half_width) else 0.0
-
-
 def _words(row: Bar) -> str:
     """Format mean and interval with the digits that the interval supports, and the number of the paper."""
     paper = f"\npaper {number(row.paper)}" if row.paper is not None else ""
     if not np.isfinite(row.mean):
         return "no run ended" + paper
-    if not _wide(row) > 0:
+    if not row.half_width:
         return number(row.mean) + paper
-    digits = max(1 - int(np.floor(np.log10(_wide(row)))), 0)
-    return f"{row.mean:.{digits}f} ± {_wide(row):.{digits}f}{paper}"
+    digits = max(1 - int(np.floor(np.log10(row.half_width))), 0)
+    return f"{row.mean:.{digits}f} ± {row.half_width:.{digits}f}{paper}"
 
 
 def _handles(rows: Sequence[Bar]) -> list[Any]:

@@ -26,8 +26,6 @@ def has_cone(view: ResultView) -> bool:
 
 def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) -> None:
     """Draw the shadow of the cone (two cones where n turned) and the worst normals before and after."""
-    if not has_cone(view):
-        return
     for n in _axes_of_cones(view):
         outline = cone_shadow(n, view.objective.normal_cone_deg, REACH * limit, plane.axes)
         axes.fill(*outline, facecolor=PALE, edgecolor="none", alpha=0.55, zorder=0.5)
@@ -41,8 +39,6 @@ def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) ->
 
 def draw_uncertainty_3d(axes: Any, view: ResultView, limit: float) -> None:
     """Draw the surface and rim of the cone, and the worst normals."""
-    if not has_cone(view):
-        return
     for n in _axes_of_cones(view):
         rim = cone_rim(n, view.objective.normal_cone_deg, limit, 49)
         sheet = [row[None] * [[0.0], [1.0]] for row in rim]
@@ -68,7 +64,9 @@ def uncertainty_handles(view: ResultView) -> list[Any]:
 
 
 def _axes_of_cones(view: ResultView) -> list[Array]:
-    """Return the world axis of the cone, or both axes where it turned with the contact frame."""
+    """Return the world axis of the cone, or both axes where it turned with the contact frame; none without a cone."""
+    if not has_cone(view):
+        return []
     before, after = view.before.normal, view.after.normal
     return [after] if abs(before - after).max() < 1e-3 else [before, after]
 

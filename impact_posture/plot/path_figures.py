@@ -51,7 +51,7 @@ def path_figure(view: ResultView) -> Figure:
         InputError: The view has no path, or its arrays do not fit together.
     """
     path = _checked(view.path)
-    with framed(*header_lines(view), 3.1, [share_notes("along the path", undrawn(path))]) as (figure, body):
+    with framed(*header_lines(view), 3.1, [share_notes("along the path", path)]) as (figure, body):
         axes = body.subplots()
         drawn = draw_shares(axes, path.s, path)
         _mark(axes, path)
@@ -63,15 +63,12 @@ def path_figure(view: ResultView) -> Figure:
 
 def draw_shares(axes: Any, x: Array, data: NullSpacePath | TradeOffData) -> bool:
     """Draw H, G, V and S over ``x``, each divided by its value at the start; return whether any was drawn."""
-    curves = {name: normalized(data, name) for name in QUANTITIES}
-    drawn = {name: curve for name, curve in curves.items() if curve is not None}
-    values = np.concatenate([curve[np.isfinite(curve)] for curve in drawn.values()]) if drawn else np.ones(1)
-    log = spreads(values)
-    for name, curve in drawn.items():
-        shown = np.where(curve > 0, curve, np.nan) if log else curve
-        at_start = number(float(getattr(data, name)[_first(data, name)]))
-        every = max(len(x) // 10, 1)
-        axes.plot(x, shown, label=f"{name} / {at_start}", markevery=every, markersize=3.5, **QUANTITIES[name])
+    drawn = {name: found for name in QUANTITIES if (found := normalized(data, name)) is not None}
+    values = np.concatenate([curve[np.isfinite(curve)] for curve, _ in drawn.values()]) if drawn else np.ones(1)
+    log, every = spreads(values), max(len(x) // 10, 1)
+    for name, (curve, at_start) in drawn.items():
+        shown, label = np.where(curve > 0, curve, np.nan) if log else curve, f"{name} / {number(at_start)}"
+        axes.plot(x, shown, label=label, markevery=every, markersize=3.5, **QUANTITIES[name])
     axes.axhline(1.0, color=GRAY, linewidth=0.6, zorder=0)
     if log:
         log_axis(axes)
@@ -95,24 +92,14 @@ def log_axis(axes: Any) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def undrawn(data: NullSpacePath | TradeOffData) -> list[str]:
-    """Return the quantities without a curve, because they are undefined or zero at the start."""
-    return [name for name in QUANTITIES if normalized(data, name) is None]
+def normalized(data: NullSpacePath | TradeOffData, name: str) -> tuple[Array, float] | None:
+    """Return a quantity divided by its value at the start, or by its nearest value, and that value.
 
-
-def normalized(path: NullSpacePath | TradeOffData, name: str) -> Array | None:
-    """Divide a quantity by its value at the start, or by its nearest value; ``None`` where that is 0."""
-    values = np.asarray(getattr(path, name), dtype=float)
-    first = _first(path, name)
-    if first is None or not values[first] > 0:
-        return None
-    return np.asarray(values / values[first])
-
-
-def _first(path: NullSpacePath | TradeOffData, name: str) -> int | None:
-    values = np.asarray(getattr(path, name), dtype=float)
-    finite = np.flatnonzero(np.isfinite(values))
-    return int(finite[0]) if finite.size else None
+    ``None`` where it is undefined or zero there.
+    """
+    values = np.asarray(getattr(data, name), dtype=float)
+    first = next(iter(values[np.isfinite(values)]), 0.0)
+    return (values / first, float(first)) if first > 0 else None
 
 
 def _checked(path: NullSpacePath | None) -> NullSpacePath:
@@ -139,13 +126,14 @@ def _mark(axes: Any, path: NullSpacePath) -> None:
         )  # fmt: skip
 
 
-def share_notes(where: str, missing: list[str]) -> str:
+def share_notes(where: str, data: NullSpacePath | TradeOffData) -> str:
     """Return the note on the curves of :func:`draw_shares`."""
     notes = "Each curve is divided by its value at the start; for H, V and S less is better. G is 1/effective mass."
+    missing = [name for name in QUANTITIES if normalized(data, name) is None]
     if "S" in missing:
         notes += f" S is undefined {where}."
-    others = [name for name in missing if name != "S"]
-    return notes + (f" {', '.join(others)} start at zero and cannot be divided by it." if others else "")
+        missing.remove("S")
+    return notes + (f" {', '.join(missing)} start at zero and cannot be divided by it." if missing else "")
 
 
 _BOUNDS = {
@@ -167,7 +155,7 @@ def tradeoff_figure(view: ResultView) -> Figure:
             "there is no trade-off to draw", where="figure tradeoff", hint="run optimize again with `tradeoff`"
         )
     knee = [_KNEE.format(_EXTRA[data.against])] if data.knee is not None else []
-    notes = [NOTES[data.against] + _LINES, *knee, share_notes("at these postures", undrawn(data))]
+    notes = [NOTES[data.against] + _LINES, *knee, share_notes("at these postures", data)]
     with framed(*header_lines(view), 5.6, notes) as (figure, body):
         upper, lower = body.subplots(2, 1, sharex=True, height_ratios=[1.25, 1])
         _objective(upper, data, view)

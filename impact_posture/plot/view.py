@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
-from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import MetricError
 from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.contact import point_on
@@ -134,14 +133,11 @@ class ResultView:
         except MetricError:
             return None
 
-    @cached_property
-    def contact_point(self) -> PointOnLink:
-        """Contact point on its link."""
-        return point_on(self.robot, self.objective.contact.frame, self.objective.contact.offset)
-
     def jacobian(self, q: Array) -> Array:
         """Return ``J(q)``, shape (3, nv), of the world velocity of the contact point without supports."""
-        return np.array(self.objective.oracle.numeric.at(q).jacobian(self.contact_point)[:3])
+        contact = self.objective.contact
+        point = point_on(self.robot, contact.frame, contact.offset)
+        return np.array(self.objective.oracle.numeric.at(q).jacobian(point)[:3])
 
 
 def jump_unit(view: ResultView) -> str:

@@ -432,9 +432,9 @@ def test_path_curves(tilthex: ResultView) -> None:
     path = tilthex.path
     assert path is not None
     assert path.s[0] == 0 and (np.diff(path.s) > 0).all()
-    curve = normalized(path, "H")
-    assert curve is not None
-    np.testing.assert_allclose(curve, path.H / tilthex.before.H)
+    found = normalized(path, "H")
+    assert found is not None and found[1] == path.H[0]
+    np.testing.assert_allclose(found[0], path.H / tilthex.before.H)
     assert path.H[-1] == pytest.approx(tilthex.after.H)
 
 

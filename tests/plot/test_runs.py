@@ -299,7 +299,7 @@ ROWS = (
     Bar("vertical", "nominal", 1.42, 0.05, 10.4),
     Bar("vertical", "robust", 0.4, 0.02, 5.1),
     Bar("humanoid", "nominal", 0.284, 0.01, 0.305),
-    Bar("humanoid", "robust", 0.136, float("nan"), 0.166),
+    Bar("humanoid", "robust", 0.136, 0.0, 0.166),
     Bar("humanoid", "stiff", float("nan")),
 )
 
