@@ -46,13 +46,9 @@ def license_of(mesh: Path) -> MeshLicense | None:
 @cache
 def _read(folder: Path) -> MeshLicense:
     """Read the README of a package, which states ``license:`` and ``upstream:``, and its LICENSE."""
-    texts = {name: folder / name for name in ("README.md", "LICENSE")}
-    found = {
-        name: path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-        for name, path in texts.items()
-    }
-    stated = {
-        key: re.search(rf"^{key}:\s*(\S.*)$", found["README.md"], re.I | re.M) for key in ("license", "upstream")
-    }
-    values = {key: "" if match is None else match[1].strip() for key, match in stated.items()}
-    return MeshLicense(folder.name, values["license"], values["upstream"], found["LICENSE"])
+    readme, text = (
+        path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+        for path in (folder / "README.md", folder / "LICENSE")
+    )
+    stated = (re.search(rf"^{key}:\s*(\S.*)$", readme, re.I | re.M) for key in ("license", "upstream"))
+    return MeshLicense(folder.name, *("" if found is None else found[1].strip() for found in stated), text)

@@ -22,8 +22,7 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.impact.oracle import ImpactQuantities
 from impact_posture.impact.quantity_table import quantities
 from impact_posture.plot.shapes import root
-from impact_posture.report.shapes import DrawnRobot, hull_of
-from impact_posture.report.solid import Solid
+from impact_posture.report.shapes import DrawnRobot, Solid, hull_of
 from impact_posture.robot.robot import Robot
 
 _TYPES = {"uint16": "u2", "uint32": "u4", "float32": "f4"}

@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import coal
 import numpy as np
 import pinocchio as pin
+from pydantic import PlainSerializer, PlainValidator
 
 from impact_posture.arrays import Array
 from impact_posture.collision.geometry import geometry_key, load_geometry
@@ -17,9 +19,8 @@ from impact_posture.collision.shape_points import shape_points, surface_of
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.libraries import source_key
 from impact_posture.report.mesh_license import MeshLicense, license_of
-from impact_posture.report.solid import PlacedSolids, Solid
 from impact_posture.robot.robot import Robot
-from impact_posture.stored_text import read_stored, write_stored
+from impact_posture.stored_text import StoredArray, read_stored, write_stored
 
 # Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
 _MOST_TRIANGLES = 150_000
@@ -37,6 +38,48 @@ _BOX_FACES = np.array(
 _HEAD = 200_000
 
 Color = tuple[float, ...]
+_Placement = Annotated[
+    pin.SE3,
+    PlainValidator(lambda rows: pin.SE3(np.array(rows))),
+    PlainSerializer(lambda at: at.homogeneous.tolist()),
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A triangle mesh with whole coordinates.
+
+    Attributes:
+        corners: Corners as multiples of ``step`` from ``low``, shape (k, 3).
+        faces: Triangles as indices, shape (n, 3).
+        low: Least coordinates, m, shape (3,).
+        step: Length of a unit, m.
+    """
+
+    corners: StoredArray
+    faces: StoredArray
+    low: StoredArray
+    step: float
+
+    @property
+    def points(self) -> Array:
+        """Corners, m, shape (k, 3)."""
+        return self.low + self.step * self.corners
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedSolids:
+    """Meshes, and where they are.
+
+    Attributes:
+        solids: The meshes.
+        places: Name of a shape, joint, index of its mesh, and placement in the axes of the joint.
+        warnings: Shapes that are left out, one line each.
+    """
+
+    solids: tuple[Solid, ...]
+    places: tuple[tuple[str, int, int, _Placement], ...]
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
