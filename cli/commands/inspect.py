@@ -127,22 +127,11 @@ def _joints(page: Page, summary: dict[str, Any]) -> None:
 
     page.gap()
     page.title(f"Joints ({len(summary['joints'])})", "SI units: rad, rad/s, N·m, kg·m²; prismatic: m, m/s, N, kg")
-    page.table(
-        ("joint", "type", "limits", "velocity", "effort", "armature"),
-        [
-            (
-                j["name"],
-                j["type"],
-                limits(j),
-                number(j["velocity"], missing="none"),
-                number(j["effort"], missing="none"),
-                number(j["armature"]),
-            )
-            for j in summary["joints"]
-        ],
-        right=(2, 3, 4, 5),
-        fold=0,
-    )
+    rows = []
+    for joint in summary["joints"]:
+        numbers = (number(joint[key], missing="none") for key in ("velocity", "effort", "armature"))
+        rows.append((joint["name"], joint["type"], limits(joint), *numbers))
+    page.table(("joint", "type", "limits", "velocity", "effort", "armature"), rows, right=(2, 3, 4, 5), fold=0)
 
 
 def _frames(page: Page, summary: dict[str, Any]) -> None:
@@ -178,16 +167,9 @@ def _actuation(page: Page, actuation: dict[str, Any]) -> None:
     rows = []
     for at in actuation["postures"]:
         sides = at["lateral_force"] or dict.fromkeys(("forward", "backward", "left", "right"))
-        rows.append(
-            (
-                at["posture"],
-                "yes" if at["feasible"] else "no",
-                f"{min(at['thrusts']):.3g} … {max(at['thrusts']):.3g}",
-                *(number(value, missing="–") for value in sides.values()),
-                "; ".join(at["violations"]),
-            )
-        )
-    page.table(
-        ("posture", "hovers", "thrusts, N", "forward", "backward", "left", "right", ""), rows, right=(2, 3, 4, 5, 6)
-    )
+        hovers, forces = "yes" if at["feasible"] else "no", (number(v, missing="–") for v in sides.values())
+        thrusts = f"{min(at['thrusts']):.3g} … {max(at['thrusts']):.3g}"
+        rows.append((at["posture"], hovers, thrusts, *forces, "; ".join(at["violations"])))
+    head = ("posture", "hovers", "thrusts, N", "forward", "backward", "left", "right", "")
+    page.table(head, rows, right=(2, 3, 4, 5, 6))
     page.line("  forward … right: largest net horizontal force at zero tilt, N", style="dim")

@@ -67,8 +67,7 @@ def optimize(
             prepared = prepare(settings)
         folder = Path(out) if out else default_out(prepared)
         check_output(folder, force=force, kind="result")
-        if not json:
-            _announce(page, prepared)
+        _announce(page, prepared)
         with progress("solving", "starts", shown=shown, first="building the expressions") as advance:
             result = solve(
                 PostureProblem.of(prepared),

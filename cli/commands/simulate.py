@@ -141,18 +141,15 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
     rows = [("status", document["status"])]
     if document["metrics"] is not None:
         rows += _numbers(document["metrics"], document["prediction"])
-    relaxed, held, ticks, made, asked = (
-        sum(values)
-        for values in zip(
-            *[[part["metrics"]["relaxed_ticks"], part["metrics"]["failed_ticks"], part["ticks"],
-               part["metrics"]["contacts"], part["metrics"]["contacts_asked"]] for part in runs],
-            strict=True,
-        )
-    )  # fmt: skip
-    rows.append(("relaxed", f"{relaxed} of {ticks} ticks, in which limits made a task give way"))
-    rows.append(("held", f"{held} ticks, in which no command was found and the last one was kept"))
+    counted = ("relaxed_ticks", "failed_ticks", "contacts", "contacts_asked")
+    count = {key: sum(part["metrics"][key] for part in runs) for key in counted}
+    ticks = sum(part["ticks"] for part in runs)
+    given_way = f"{count['relaxed_ticks']} of {ticks} ticks, in which limits made a task give way"
+    rows.append(("relaxed", given_way))
+    held = f"{count['failed_ticks']} ticks, in which no command was found and the last one was kept"
+    rows.append(("held", held))
     if any(window["kind"] == "dwell" for window in document["windows"]):
-        rows.append(("contacts", f"{made} of {asked}"))
+        rows.append(("contacts", f"{count['contacts']} of {count['contacts_asked']}"))
     page.pairs(rows)
     if len(runs) > 1 and document["metrics"] is not None:
         page.gap()

@@ -65,12 +65,8 @@ def verify(
     else:
         page = Page(quiet=quiet)
         _asked(page.title, impact, report)
-        page.table(
-            ("way", "", "largest error", "allowed", "", "where"),
-            [_cells(row) for row in report.rows],
-            right=(2, 3),
-            fold=5,
-        )
+        head = ("way", "", "largest error", "allowed", "", "where")
+        page.table(head, [_cells(row) for row in report.rows], right=(2, 3), fold=5)
         page.warnings(impact.warnings)
         others = [contact.frame for contact in impact.objective.others]
         page.warnings([f"{impact.contact.frame} alone is compared, not {', '.join(others)}"] if others else [])
