@@ -138,7 +138,6 @@ def run_batch(
     *,
     processes: int = 1,
     store: Store | None = None,
-    keep_series: Callable[[Job], bool] = lambda job: False,
     progress: Progress | None = None,
 ) -> list[Document]:
     """Run the jobs that are not stored yet, and return all documents in the order of the jobs.
@@ -149,8 +148,7 @@ def run_batch(
     Args:
         jobs: The jobs.
         processes: Number of processes.
-        store: Folder where finished jobs are kept and found.
-        keep_series: Whether the store keeps the time series of a job, too.
+        store: Folder where finished jobs are kept and found, with the time series of those that are shown.
         progress: Callback with (done, all).
 
     Raises:
@@ -166,7 +164,7 @@ def run_batch(
             factory.driver(job.controller)
         elif store is not None:
             found = store.find(job)
-        if found is not None and store is not None and (not keep_series(job) or store.has_series(job, found)):
+        if found is not None and store is not None and (not job.shown or store.has_series(job, found)):
             done[k] = found
     waiting = [k for k in range(len(jobs)) if k not in done]
     if progress:
@@ -174,7 +172,7 @@ def run_batch(
 
     def work(index: int) -> Document:
         job = jobs[waiting[index]]
-        return _run(job, store if keep_series(job) else None)
+        return _run(job, store if job.shown else None)
 
     with one_blas_thread(), fork_map(work, len(waiting), processes) as results:
         for index, document in results:

@@ -58,6 +58,11 @@ class Job:
         return self.controller + (":held" if self.mode == "held" else "") + (":free" if self.free else "")
 
     @property
+    def shown(self) -> bool:
+        """Whether figures and reports show it, for which its time series are kept: of several seeds the first."""
+        return self.seed == 0
+
+    @property
     def name(self) -> str:
         """Name of its files."""
         return f"{file_name(self.scenario)}-{file_name(self.label.replace(':', '-'))}-{self.seed}"

@@ -109,8 +109,8 @@ class Reproduction:
 
     @property
     def shown(self) -> list[Job]:
-        """The jobs with the first seed, whose time series are kept."""
-        return [job for job in self.jobs if job.seed == 0]
+        """The jobs whose time series are kept."""
+        return [job for job in self.jobs if job.shown]
 
     @property
     def scenarios(self) -> tuple[str, ...]:
@@ -174,13 +174,7 @@ def reproduce(
             store cannot be written.
     """
     jobs = jobs_of(plan, seeds, compile)
-    documents = run_batch(
-        jobs,
-        processes=processes,
-        store=store,
-        keep_series=lambda job: store is not None and job.seed == 0,
-        progress=progress,
-    )
+    documents = run_batch(jobs, processes=processes, store=store, progress=progress)
     rows: list[Row] = []
     for scenario, labels in plan.items():
         count = len(labels) * seeds
