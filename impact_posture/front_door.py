@@ -16,7 +16,7 @@ from impact_posture.front_door_problem import PostureProblem
 from impact_posture.output_folder import whole_folder, write_json
 from impact_posture.posture.certificate import Certificate
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.global_search import GlobalSearch, SelfMotionMap, check_searchable, search_globally
+from impact_posture.posture.global_search import GlobalSearch, check_searchable, search_globally
 from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.pareto import pareto_front
 from impact_posture.posture.problem_settings import Prepared, dump_settings, resolved_settings
@@ -26,7 +26,7 @@ from impact_posture.posture.search import Progress
 from impact_posture.posture.solve import PostureSolution
 from impact_posture.posture.tradeoff import TradeOff
 from impact_posture.result_folder import FORMATS, Finish, FinishRequest, Written, finish_result
-from impact_posture.result_view import result_view
+from impact_posture.result_view import FoundPostures, result_view
 from impact_posture.robot.postures import write_posture
 from impact_posture.settings import Against, Search
 
@@ -87,9 +87,11 @@ class PostureResult:
         extras = self.robustness, self.tradeoff, path, self.global_search
         return result_document(self._prepared, self.solution, *extras)
 
-    @property
-    def _mapped(self) -> SelfMotionMap | None:
-        return None if self.global_search is None else self.global_search.map
+    @cached_property
+    def _found(self) -> FoundPostures:
+        solution, mapped = self.solution, None if self.global_search is None else self.global_search.map
+        path = null_space_path(solution.problem, solution.initial, solution.q)
+        return FoundPostures(solution.initial, solution.q, path, self.document, mapped)
 
     @property
     def _prepared(self) -> Prepared:
@@ -179,23 +181,20 @@ class PostureResult:
         Raises:
             OutputError: The folder exists without ``force``, or cannot be written.
         """
-        prepared, found, mapped = self._prepared, self.solution, self._mapped
-        path = null_space_path(found.problem, found.initial, found.q)
+        prepared, found = self._prepared, self._found
         export: Export | None = None
         compiler_error = report_error = ""
         with whole_folder(Path(out), force=force, kind="result") as folder:
             write_json(folder / "result.json", self.document)
-            arrays = result_arrays(found, path, self.tradeoff, mapped)
+            arrays = result_arrays(self.solution, found.path, self.tradeoff, found.mapped)
             np.savez_compressed(folder / "result.npz", **arrays)  # type: ignore[arg-type]
-            write_json(folder / "posture.json", write_posture(prepared.impact.robot, found.q))
+            write_json(folder / "posture.json", write_posture(prepared.impact.robot, found.optimal))
             (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
             if self.motion is not None:
                 from impact_posture.path.files import write_path
 
                 write_path(folder, prepared.impact.robot, self.motion)
-            request = FinishRequest(
-                folder, found.initial, found.q, path, mapped, self.document, codegen, formats, report, meshes, jobs
-            )
+            request = FinishRequest(folder, found, codegen, formats, report, meshes, jobs)
             for done, count, result in (finish or partial(finish_result, prepared))(request):
                 if isinstance(result, str):
                     report_error = result
@@ -211,10 +210,7 @@ class PostureResult:
         """Draw the figures into a folder; return their paths."""
         from impact_posture.plot import draw_all
 
-        found = self.solution
-        path = null_space_path(found.problem, found.initial, found.q)
-        view = result_view(self._prepared, found.initial, found.q, path, self.document, self.motion, self._mapped)
-        return draw_all(view, Path(out), formats, only)
+        return draw_all(result_view(self._prepared, self._found, self.motion), Path(out), formats, only)
 
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
         """Write the C code as :meth:`ImpactObjective.export` does, with the optimal posture as a constant."""

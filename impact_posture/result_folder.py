@@ -9,15 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from impact_posture.arrays import Array
 from impact_posture.errors import CompilerError, one_line
 from impact_posture.escape import file_name
 from impact_posture.output_folder import write_record
-from impact_posture.posture.global_search import SelfMotionMap
-from impact_posture.posture.null_space_path import NullSpacePath
 from impact_posture.posture.problem_settings import Prepared
 from impact_posture.processes import fork_map
-from impact_posture.result_view import motion_of, result_view
+from impact_posture.result_view import FoundPostures, motion_of, result_view
 
 # Matplotlib and the C export are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
@@ -34,11 +31,7 @@ class FinishRequest:
 
     Attributes:
         folder: The folder, with the files of the path to the optimum, if it was searched.
-        initial: Posture before, shape (nq,).
-        optimal: Posture after, shape (nq,).
-        path: The null-space path between them.
-        mapped: The self-motion map, if it was computed.
-        document: The content of ``result.json``.
+        found: The solution.
         codegen: Whether to export, build and check the C code.
         formats: Formats of the figures.
         report: Whether to write ``report.html``.
@@ -47,11 +40,7 @@ class FinishRequest:
     """
 
     folder: Path
-    initial: Array
-    optimal: Array
-    path: NullSpacePath
-    mapped: SelfMotionMap | None
-    document: dict[str, Any]
+    found: FoundPostures
     codegen: bool
     formats: Sequence[str]
     report: bool
@@ -94,10 +83,8 @@ def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finish
     """
     # The C code comes first, because it takes longest.
     exports = [partial(_export, prepared, request)] if request.codegen else []
-    motion = motion_of(request.folder, request.document, prepared.impact.robot)
-    view = result_view(
-        prepared, request.initial, request.optimal, request.path, request.document, motion, request.mapped
-    )
+    motion = motion_of(request.folder, request.found.document, prepared.impact.robot)
+    view = result_view(prepared, request.found, motion)
     tasks: list[Callable[[], Any]] = [*exports, *_drawings(view, request.folder, request.formats, request.report)]
     count = len(tasks) + request.report
     scene: Scene | None = None
@@ -139,7 +126,13 @@ def _report(
         from impact_posture.report.result_report import write_result_report
 
         write_result_report(
-            request.folder, prepared, view, request.document, meshes=request.meshes, scene=scene, pictures=pictures
+            request.folder,
+            prepared,
+            view,
+            request.found.document,
+            meshes=request.meshes,
+            scene=scene,
+            pictures=pictures,
         )
     except Exception as error:
         return one_line(f"{type(error).__name__}: {error}")
@@ -152,7 +145,7 @@ def _export(prepared: Prepared, request: FinishRequest) -> tuple[Export, str]:
     from impact_posture.codegen.naming import products
     from impact_posture.impact.contact_compression import compression
 
-    folder, optimal, failure, impact = request.folder / "c", request.optimal, "", prepared.impact
+    folder, optimal, failure, impact = request.folder / "c", request.found.optimal, "", prepared.impact
     folder.mkdir()
     squeezed = compression(impact.objective, optimal, impact.speed, impact.contact_stiffness)
     try:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
 
+from impact_posture.arrays import Array
 from impact_posture.errors import SpecError, shown
 from impact_posture.posture.global_search import SelfMotionMap
 from impact_posture.posture.null_space_path import NullSpacePath
@@ -27,6 +28,25 @@ if TYPE_CHECKING:
 
 # Exceptions from reading a changed or incomplete result.
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, EOFError, BadZipFile, RecursionError)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPostures:
+    """What a result folder holds of a solved problem.  It can be sent to a process.
+
+    Attributes:
+        initial: Posture before, shape (nq,).
+        optimal: Posture after, shape (nq,).
+        path: The null-space path between them.
+        document: The content of ``result.json``.
+        mapped: The self-motion map, if it was computed.
+    """
+
+    initial: Array
+    optimal: Array
+    path: NullSpacePath
+    document: dict[str, Any]
+    mapped: SelfMotionMap | None
 
 
 def load_view(folder: Path) -> ResultView:
@@ -86,9 +106,8 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
             for key in ("initial", "optimal")
         )
-        motion = motion_of(folder, document, robot)
-        view = result_view(prepared, initial, optimal, path, document, motion, mapped)
-        return prepared, view, document
+        found = FoundPostures(initial, optimal, path, document, mapped)
+        return prepared, result_view(prepared, found, motion_of(folder, document, robot)), document
     except _BROKEN as error:
         raise _broken(folder, error) from None
 
@@ -111,45 +130,33 @@ def motion_of(folder: Path, document: dict[str, Any], robot: Robot) -> PosturePa
     return read_path(folder, document["path"], robot)
 
 
-def result_view(
-    prepared: Prepared,
-    initial: np.ndarray,
-    optimal: np.ndarray,
-    path: NullSpacePath,
-    document: dict[str, Any],
-    motion: PosturePath | None,
-    mapped: SelfMotionMap | None,
-) -> ResultView:
+def result_view(prepared: Prepared, found: FoundPostures, motion: PosturePath | None) -> ResultView:
     """Return the view of a result, from which its figures and its report are drawn.
 
     Args:
         prepared: The problem.
-        initial: Posture before, shape (nq,).
-        optimal: Posture after, shape (nq,).
-        path: The path between them.
-        document: The content of ``result.json``.
+        found: Its solution.
         motion: The path to the optimum, if it was searched.
-        mapped: The self-motion map, if it was computed.
     """
     from impact_posture.plot import ResultView
 
-    impact, around = prepared.impact, prepared.problem.surroundings
+    impact, around, document = prepared.impact, prepared.problem.surroundings, found.document
     return ResultView(
         objective=impact.objective,
-        q_initial=initial,
-        q_optimal=optimal,
+        q_initial=found.initial,
+        q_optimal=found.optimal,
         speed=impact.speed,
         restitution=impact.restitution,
-        path=path,
+        path=found.path,
         tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
-        collisions=_collisions(prepared, initial, optimal),
+        collisions=_collisions(prepared, found.initial, found.optimal),
         depths=() if around is None else tuple(around.depth(c) for c in impact.objective.contacts),
         motion=motion,
-        self_motion=mapped,
+        self_motion=found.mapped,
     )
 
 
-def _collisions(prepared: Prepared, *postures: np.ndarray) -> Any:
+def _collisions(prepared: Prepared, *postures: Array) -> Any:
     """Shapes that touch at each of two postures, for an optimization that does not keep them apart."""
     if prepared.problem.surroundings is not None:
         return (), ()

@@ -50,5 +50,6 @@ def _read(folder: Path) -> MeshLicense:
         path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
         for path in (folder / "README.md", folder / "LICENSE")
     )
-    stated = (re.search(rf"^{key}:\s*(\S.*)$", readme, re.I | re.M) for key in ("license", "upstream"))
-    return MeshLicense(folder.name, *("" if found is None else found[1].strip() for found in stated), text)
+    found = (re.search(rf"^{key}:\s*(\S.*)$", readme, re.I | re.M) for key in ("license", "upstream"))
+    license, upstream = ("" if match is None else match[1].strip() for match in found)
+    return MeshLicense(folder.name, license, upstream, text)
