@@ -135,7 +135,7 @@ def text_width(text: str, size: float) -> float:
     return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0])
 
 
-def shared_legend(body: Any, handles: Sequence[Any], place: str, **look: Any) -> None:
+def shared_legend(body: Any, handles: Sequence[Any], place: str) -> None:
     """Put the legend of a figure above (``upper``) or below (``lower``) its panels, as wide as the page."""
     size, handle, gap, room = float(_RC["legend.fontsize"]), 2.2, 1.4, 72 * WIDTH * 0.96
     widths = [text_width(str(h.get_label()).replace("$", ""), size) + size * (handle + 0.8 + gap) for h in handles]
@@ -148,7 +148,7 @@ def shared_legend(body: Any, handles: Sequence[Any], place: str, **look: Any) ->
     columns = next((n for n in range(len(handles), 1, -1) if width(n) <= room), 1)
     # Rows of equal length, as few as possible.
     columns = -(-len(handles) // -(-len(handles) // columns))
-    look = {"ncols": columns, "handlelength": handle, "columnspacing": gap} | look
+    look = {"ncols": columns, "handlelength": handle, "columnspacing": gap}
     body.legend(handles=list(handles), loc=f"outside {place} center", **look)
 
 
