@@ -1,14 +1,17 @@
-"""``impact-posture codegen ROBOT --frame F --normal X Y Z`` or ``impact-posture codegen RESULT_DIR``."""
+"""``impact-posture codegen ROBOT --frame F --normal X Y Z`` or ``impact-posture codegen RESULT_DIR``.
+
+With ``--controller KIND`` it writes the whole online controller.
+"""
 
 from __future__ import annotations
 
 import os
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from impact_posture.settings import ImpactSettings
+from impact_posture.settings import ImpactSettings, LoadOptions, RobotSettings
 from impact_posture_cli import options
-from impact_posture_cli.controller_code import controller_parts
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, print_json
 from impact_posture_cli.progress_line import progress
@@ -17,9 +20,12 @@ from impact_posture_cli.settings_options import Given, with_settings
 if TYPE_CHECKING:
     from impact_posture.arrays import Array
     from impact_posture.codegen.export import Export
+    from impact_posture.controller_export.builtin import ControllerKind
     from impact_posture.controller_export.export import ControllerExport
     from impact_posture.impact.contact_compression import Compression
     from impact_posture.impact.objective import ImpactObjective
+    from impact_posture.robot.robot import Robot
+    from impact_posture.tsid.task_formulation import TaskFormulation
 
 _IMPACT = {"speed", "restitution", "posture"}
 
@@ -56,7 +62,7 @@ def codegen(
     if controller is not None:
         from impact_posture.controller_export.export import export_controller
 
-        made, formulation, objective = controller_parts(given, robot, controller, flow, scenario)
+        made, formulation, objective = _controller_parts(given, robot, controller, flow, scenario)
         written = export_controller(
             made, formulation, place, objective=objective, prefix=prefix, daqp=Path(daqp) if daqp else None,
             build=compile, force=force,
@@ -119,3 +125,43 @@ def _objectives(
     impacts = [resolve(given.fill(ImpactSettings, robot=robot, frame=frame)) for frame in frames]
     known = (compression(one.objective, one.q, one.speed, one.contact_stiffness) for one in impacts)
     return [one.objective for one in impacts], None, next(filter(None, known), None), impacts[-1].warnings
+
+
+def _controller_parts(
+    given: Given, robot: str, kind: ControllerKind, flow: bool, scenario: str | None
+) -> tuple[Robot, TaskFormulation, ImpactObjective | None]:
+    """Return the robot, its tasks, and the objective that the posture task follows."""
+    if scenario is not None:
+        from impact_posture.simulation.controller_factory import ControllerFactory
+        from impact_posture.simulation.scenario import set_up
+        from impact_posture.simulation.scenario_file import read_scenario
+        from impact_posture.simulation.scenario_objective import interpreted
+
+        if given.values:
+            raise UsageError(f"--{next(iter(given.values))} contradicts --scenario, which has robot and impact.")
+        setup = set_up(read_scenario(scenario))
+        if setup.robot.name != robot:
+            raise UsageError(f"The scenario {scenario} is of {setup.robot.name}, not of {robot}.")
+        factory = ControllerFactory(setup, gradient_of=interpreted)
+        driver = factory.driver("robust-flow" if flow else "robust")
+        return setup.robot, driver.controller.formulation, factory.objective()
+    from impact_posture.controller_export.builtin import default_formulation
+
+    if "normal" in given.values:
+        from impact_posture.impact.resolved_impact import resolve
+
+        frames = given.values.get("frame", (None,))
+        if len(frames) > 1:
+            raise UsageError("--controller follows the gradient of one impact: give one --frame.")
+        objective = resolve(given.fill(ImpactSettings, robot=robot, frame=frames[0])).objective
+        return objective.robot, default_formulation(objective.robot, kind, objective, flow=flow), objective
+    from impact_posture.robot.robot_loader import load_robot
+
+    if flow:
+        raise UsageError("--flow lowers impacts: give --normal X Y Z, or --scenario.")
+    known = {field.name for field in fields(LoadOptions)}
+    for name in given.values:
+        if name not in known:
+            raise UsageError(f"--{name.replace('_', '-')} belongs to an impact: give --normal X Y Z too.")
+    loaded = load_robot(robot, given.fill(RobotSettings, robot=robot))
+    return loaded, default_formulation(loaded, kind), None
