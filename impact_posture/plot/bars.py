@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from impact_posture.errors import InputError
 from impact_posture.escape import plot_label
 from impact_posture.plot.style import AFTER_BAR, BEFORE_BAR, INK, VERMILLION, framed, shared_legend
-from impact_posture.plot.view import number
+from impact_posture.plot.view import SEPARATOR, number
 
 NOTES = (
     "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper prints "
@@ -60,7 +60,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
     heights = [0.55 + 0.3 * max(len(group) for group in line) for line in lines]
     lead = "Motion during impacts, ∫‖ν‖dt over the impact windows"
     facts = ["less is better", "the same windows for every controller", "bars: ours, mean and 95 % interval"]
-    with framed(lead, ["  ·  ".join(facts)], sum(heights) + 0.4, NOTES) as (figure, body):
+    with framed(lead, [SEPARATOR.join(facts)], sum(heights) + 0.4, NOTES) as (figure, body):
         panels = body.subplots(len(lines), columns, squeeze=False, height_ratios=heights)
         for axes in panels.flat[len(groups) :]:
             axes.set_visible(False)

@@ -14,7 +14,7 @@ from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support
 from impact_posture.impact.velocity_jump import tangent_units
-from impact_posture.plot.view import number
+from impact_posture.plot.view import SEPARATOR, number
 from impact_posture.robot.robot import Robot
 
 # Imported for its name alone, because the figures need no simulation.
@@ -178,7 +178,7 @@ def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
         facts += [f"contact {one.contact.frame}", f"n = ({n})", f"contacts {counts} of {len(one.impacts)}"]
     facts.append(f"on {', '.join(s.frame for s in one.supports)}" if one.supports else "no supports")
     shared = [fact for fact in one.facts if all(fact in view.facts for view in views)]
-    return f"{one.scenario}: {names}", ["  ·  ".join([*facts, *shared])]
+    return f"{one.scenario}: {names}", [SEPARATOR.join([*facts, *shared])]
 
 
 def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:

@@ -174,17 +174,18 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
 
     H never stands alone: G, V, S and E stand beside it.
     """
-    contact, robot = view.objective.contact, view.robot
+    contact, metric, robot = view.objective.contact, view.objective.metric, view.robot
     named = zip(view.objective.contacts, contact_letters(view), strict=True)
     frames = ", ".join(f"{one.frame}{letter and f' ({letter.strip()})'}" for one, letter in named)
     normal = ", ".join(number(v) for v in contact.normal)
     axes = "world" if contact.normal_frame == "world" else "contact frame"
     facts = [f"offset ({', '.join(number(v) for v in contact.offset)}) m"] if any(contact.offset) else []
     cone = view.objective.normal_cone_deg
+    source = f" ({_short(metric.source)})" if metric.kind == "weighted" and metric.source else ""
     facts += [
         f"n = ({normal}) in {axes}" + (f", worst within {cone:g}°" if cone else ""),
         f"objective {view.objective.name}" + _worst_values(view),
-        f"metric {view.objective.metric.kind}" + (f" ({_short(view.objective.metric.source)})" * _sourced(view)),
+        f"metric {metric.kind}{source}",
         f"armature {_armature(robot)}",
     ]
     if view.objective.others:
@@ -219,10 +220,6 @@ def number(value: float | None) -> str:
     text = f"{rounded:g}" if abs(rounded) < 1e5 else f"{rounded:.3g}"
     mantissa, _, exponent = text.partition("e")
     return (f"{mantissa}e{int(exponent)}" if exponent else mantissa).replace("-", "−")
-
-
-def _sourced(view: ResultView) -> bool:
-    return view.objective.metric.kind == "weighted" and bool(view.objective.metric.source)
 
 
 def _short(source: str) -> str:
