@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,8 @@ from impact_posture.progress import tell
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Series, Window
 
-_COLUMNS = (
-    "t", "q", "v", "torque", "rotor_command", "rotor_speed", "force", "peak", "objective", "level", "at_stop",
-)  # fmt: skip
+# Columns of the time series that figures show.
+_COLUMNS = {field.name for field in fields(RunView)} & {field.name for field in fields(Series)}
 
 
 def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:
