@@ -167,7 +167,8 @@ def _actuation(page: Page, actuation: dict[str, Any]) -> None:
     rows = []
     for at in actuation["postures"]:
         sides = at["lateral_force"] or dict.fromkeys(("forward", "backward", "left", "right"))
-        hovers, forces = "yes" if at["feasible"] else "no", (number(v, missing="–") for v in sides.values())
+        hovers = "yes" if at["feasible"] else "no"
+        forces = (number(value, missing="–") for value in sides.values())
         thrusts = f"{min(at['thrusts']):.3g} … {max(at['thrusts']):.3g}"
         rows.append((at["posture"], hovers, thrusts, *forces, "; ".join(at["violations"])))
     head = ("posture", "hovers", "thrusts, N", "forward", "backward", "left", "right", "")

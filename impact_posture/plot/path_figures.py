@@ -65,9 +65,11 @@ def draw_shares(axes: Any, x: Array, data: NullSpacePath | TradeOffData) -> bool
     """Draw H, G, V and S over ``x``, each divided by its value at the start; return whether any was drawn."""
     drawn = {name: found for name in QUANTITIES if (found := normalized(data, name)) is not None}
     values = np.concatenate([curve[np.isfinite(curve)] for curve, _ in drawn.values()]) if drawn else np.ones(1)
-    log, every = spreads(values), max(len(x) // 10, 1)
+    log = spreads(values)
+    every = max(len(x) // 10, 1)
     for name, (curve, at_start) in drawn.items():
-        shown, label = np.where(curve > 0, curve, np.nan) if log else curve, f"{name} / {number(at_start)}"
+        shown = np.where(curve > 0, curve, np.nan) if log else curve
+        label = f"{name} / {number(at_start)}"
         axes.plot(x, shown, label=label, markevery=every, markersize=3.5, **QUANTITIES[name])
     axes.axhline(1.0, color=GRAY, linewidth=0.6, zorder=0)
     if log:
