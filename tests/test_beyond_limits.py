@@ -20,6 +20,7 @@ from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.resolved_impact import resolve
 from impact_posture.posture.problem_settings import read_settings
+from impact_posture.posture.result import SCHEMA
 from impact_posture.result_view import load_view
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.spec import read_spec
@@ -121,7 +122,9 @@ def test_a_result_with_a_posture_of_another_length(tmp_path: Path, size: int) ->
     robot = load_robot("tilthex_arm")
     q = {"initial": {"q": robot.posture().tolist()}, "optimal": {"q": [0.0] * size}}
     (tmp_path / "problem.toml").write_text('robot = "tilthex_arm"\nnormal = [0, 0, 1]\n')
-    (tmp_path / "result.json").write_text(json.dumps({"robot": {"model_sha256": robot.model_sha256}, **q}))
+    (tmp_path / "result.json").write_text(
+        json.dumps({"schema": SCHEMA, "robot": {"model_sha256": robot.model_sha256}, **q})
+    )
     path = {f"path_{key}": np.zeros(1) for key in ("q", "s", "H", "G", "V", "S", "objective")}
     np.savez(tmp_path / "result.npz", **path)
     with pytest.raises(PostureError, match=rf"optimal\.q: a posture of tilthex_arm has .* numbers, this one {size}"):

@@ -15,7 +15,6 @@ from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.reader import check_library, check_robot, frame_block, read_manifest
 from impact_posture.errors import InputError, ManifestMismatch, MetricError, PostureError, SpecError
 from impact_posture.libraries import build_library, library_path, load_library
-from impact_posture.robot.joint_model import with_joint_model
 
 if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot
@@ -121,6 +120,9 @@ class ImpactGradient:
         Raises:
             ManifestMismatch: Names the first difference.
         """
+        # This needs Pinocchio, and the rest of the module does not.
+        from impact_posture.robot.joint_model import with_joint_model
+
         joints = self.manifest["joint_model"]
         check_robot(self.manifest, robot if joints == robot.joint_model else with_joint_model(robot, joints))
 
