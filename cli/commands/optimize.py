@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -207,8 +208,12 @@ def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, docume
     if "collision" in document:
         at = document["collision"]["optimal"]
         page.line(f"no collision; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
-    optima = ", ".join(f"{number(o.objective)} ({o.hits}×)" for o in solution.optima[:5])
-    more = f" and {len(solution.optima) - 5} more" if len(solution.optima) > 5 else ""
+    # Mirrored postures are optima of one value.
+    hits = Counter[str]()
+    for optimum in solution.optima:
+        hits[number(optimum.objective)] += optimum.hits
+    optima = ", ".join(f"{value} ({count}×)" for value, count in list(hits.items())[:5])
+    more = f" and {len(hits) - 5} more" if len(hits) > 5 else ""
     left = solution.dominated_starts
     page.line(
         f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
