@@ -25,7 +25,7 @@ from impact_posture.tsid.relaxation import Relaxed
 _STATUSES = tuple(Status)
 _FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
 # Numbers of a target: set, position, rotation, velocity, acceleration.
-_TARGET = 25
+TARGET = 25
 
 
 class CompiledController:
@@ -34,6 +34,7 @@ class CompiledController:
     Attributes:
         manifest: The content of ``<prefix>.json``.
         parameters: Name → values, shape (size,), which the next :meth:`reset` reads.
+        targets: Name of a task → numbers of its target as C has them, shape (25,).
     """
 
     def __init__(self, library: ctypes.CDLL, document: Mapping[str, Any], manifest: Manifest) -> None:
@@ -59,10 +60,10 @@ class CompiledController:
         self._context = ctypes.create_string_buffer(bytes_)
         tasks = len(manifest.tasks)
         memory = memoryview(self._context)
-        targets = np.frombuffer(memory, dtype=float, count=_TARGET * tasks).reshape(tasks, _TARGET)
+        targets = np.frombuffer(memory, dtype=float, count=TARGET * tasks).reshape(tasks, TARGET)
         # The level stands behind the targets; C has no arrays of length zero.
-        self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * _TARGET * max(1, tasks))
-        self._targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
+        self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * TARGET * max(1, tasks))
+        self.targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
         self._pointers = [x.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for x in (self._q, self._v, self._force)]
         names = (*_FUNCTIONS, *(["brace_before"] if sizes.get("FLOW") else []))
@@ -107,7 +108,7 @@ class CompiledController:
             MetricError: The gradient that the posture task follows does not exist there, or vanishes.
             ContactError: A sole stands on its edge.
         """
-        targets = {name: row.copy() for name, row in self._targets.items()}
+        targets = {name: row.copy() for name, row in self.targets.items()}
         self._ready = False
         refused = self._call("init", ctypes.byref(self._given))
         if refused < 0:
@@ -117,7 +118,7 @@ class CompiledController:
             values = ", ".join(f"{x:g}" for x in self.parameters[name][:8])
             raise InputError(f"is out of range ({values})", where=f"parameter {name}", hint="see the header")
         for name, row in targets.items():
-            self._targets[name][:] = row
+            self.targets[name][:] = row
         self._q[:], self._v[:] = q, v
         code = self._call("reset", *self._pointers[:2], ctypes.byref(self._command))
         if code == 1:
@@ -149,6 +150,22 @@ class CompiledController:
         pushed = None if force is None else force_at
         self._call("tick", ctypes.c_double(t), q_at, v_at, pushed, ctypes.byref(self._command))
         return self._commanded()
+
+    @property
+    def measured(self) -> tuple[Array, Array]:
+        """The state ``(q, ν)`` of the last tick."""
+        return self._q.copy(), self._v.copy()
+
+    def addresses(self) -> dict[str, int]:
+        """Return the number of targets, and where C finds what a loop of ticks in C needs."""
+        arrays = {"q": self._q, "v": self._v, "force": self._force, "level": self._level}
+        arrays |= {"u": self._out["u"], "rotor_speed": self._out["rotor_speed"]}
+        found = {name: int(array.ctypes.data) for name, array in arrays.items()}
+        found["tick"] = ctypes.cast(self._functions["tick"], ctypes.c_void_p).value or 0
+        found["context"] = found["target"] = ctypes.addressof(self._context)
+        found["command"] = ctypes.addressof(self._command)
+        found["status"] = found["command"] + type(self._command).status.offset
+        return found | {"targets": len(self.targets)}
 
     def report(self) -> Report:
         """Return the diagnosis of the last tick."""
@@ -275,10 +292,10 @@ class CompiledController:
             raise InputError(words, where="controller", hint="give phases in the order of their times, or reset it")
 
     def _target(self, task: str) -> Array:
-        if task not in self._targets:
-            known = ", ".join(self._targets) or "none"
+        if task not in self.targets:
+            known = ", ".join(self.targets) or "none"
             raise InputError(f"there is no task '{task}'", where="controller", hint=f"one of: {known}")
-        return self._targets[task]
+        return self.targets[task]
 
     def _call(self, name: str, *arguments: Any) -> int:
         return int(self._functions[name](self._context, *arguments))

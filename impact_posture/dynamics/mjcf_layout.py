@@ -77,6 +77,20 @@ class MjcfLayout:
         self._moved = [slot for slot in self.slots if slot.moved]
         self._turning = [slot for slot in self.slots if slot.joint.kind.family in ("free-flyer", "planar")]
 
+    @property
+    def places(self) -> tuple[Array, Array] | None:
+        """Return the places of ``q`` in ``qpos`` and of ``v`` in ``qvel`` where these are all that there is to know.
+
+        That is so for hinges and slides, and a floating base in front of them.  Its quaternion is normalized and its
+        linear velocity is turned.  It is ``None`` for a model with other joints.
+        """
+        base = len(self._turning)
+        others = self.slots[base:]
+        plain = not self._moved and base <= 1 and len(self._quaternions) == base and not self._angle.size
+        if not plain or any(slot.joint.kind.nv != 1 for slot in others) or self.slots[:base] != self._turning:
+            return None
+        return self._qpos[np.argsort(self._q)], self._rates
+
     def qpos(self, q: Array) -> Array:
         """Return ``qpos``, shape (nqpos,), of a configuration, shape (nq,)."""
         for slot in self._moved:

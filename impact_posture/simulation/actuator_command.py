@@ -57,6 +57,12 @@ class ActivePushes:
         self._model, self._apply = model, import_mujoco().mj_applyFT
         self.active: list[tuple[int, Array, Array, int]] = []
 
+    def in_c(self) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of these pushes."""
+        bodies, points, forces, ends = zip(*self.active, strict=True) if self.active else ((), (), (), ())
+        return {"pushes": len(bodies), "push_body": bodies, "push_end": ends,
+                "push": [[*point, *force] for point, force in zip(points, forces, strict=True)]}  # fmt: skip
+
     def apply(self, data: Any, step: int) -> None:
         """Add the forces to a step, and forget the pushes that have ended."""
         data.qfrc_applied[:] = 0.0

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from impact_posture.arrays import Array
-from impact_posture.controller_export.compiled_controller import CompiledController
+from impact_posture.controller_export.compiled_controller import TARGET, CompiledController
 from impact_posture.controller_export.daqp_sources import VERSION
 from impact_posture.controller_export.export import export_controller
 from impact_posture.controller_export.parameters import parameters
@@ -35,7 +38,6 @@ class CompiledTick:
         self.library, self._controller, self._structure = library, controller, structure
         self._tasks = [t for t in controller.formulation.tasks if isinstance(t, TargetTask)]
         self._sent: dict[str, tuple[object, bytes, bytes]] = {}
-        self._last: Reading | None = None
 
     def reset(self, q: Array, v: Array) -> Command:
         """Start at a state at which the controller in Python has just been reset, with its gains and targets."""
@@ -50,16 +52,34 @@ class CompiledTick:
 
     def tick(self, reading: Reading) -> Command:
         """Return the command at a reading, with the targets that have been moved."""
-        self._last = reading
         self._lead()
         return self.library.tick(reading.t, reading.q, reading.v, reading.force)
 
+    def plan(self, times: Sequence[float], lead: Callable[[float], None]) -> tuple[Array, Array]:
+        """Return which targets a function moves before the ticks at n times, and where to.
+
+        Returns:
+            Whether a target is moved, shape (n, targets), and its numbers, shape (n, targets, 25).
+        """
+        targets = self.library.targets
+        before = {name: row.copy() for name, row in targets.items()}
+        led, leads = np.zeros((len(times), len(targets))), np.zeros((len(times), len(targets), TARGET))
+        places = {name: k for k, name in enumerate(targets)}
+        for tick, t in enumerate(times):
+            lead(t)
+            for name in self._lead():
+                led[tick, places[name]], leads[tick, places[name]] = 1, targets[name]
+        for name, row in before.items():
+            targets[name][:] = row
+        return led, leads
+
     def catch_up(self) -> None:
         """Bring the state of the controller in Python to that of the last tick."""
-        if self._last is not None:
-            self._controller.state.update(self._last.q, self._last.v)
+        self._controller.state.update(*self.library.measured)
 
-    def _lead(self) -> None:
+    def _lead(self) -> list[str]:
+        """Send the targets that have been moved, and return the names of their tasks."""
+        moved = []
         for task in self._tasks:
             # A target is replaced as a whole.  What C moves by itself stays as it is.
             rates = task.target_velocity, task.target_acceleration
@@ -68,6 +88,8 @@ class CompiledTick:
             if sent is None or sent[0] is not now[0] or sent[1:] != now[1:]:
                 self.library.set_target(task.name, task.required_target(), *rates)
                 self._sent[task.name] = now
+                moved.append(task.name)
+        return moved
 
 
 def compiled_tick(controller: Controller, structure: Structure, objective: ImpactObjective | None) -> CompiledTick:

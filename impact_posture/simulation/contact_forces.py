@@ -86,6 +86,12 @@ class ContactLog:
         self._force, self._normal, self._impulse = np.zeros((count, 3)), np.zeros(count), np.zeros((count, 3))
         self._peak, self._began = np.zeros(count), np.full(count, np.inf)
 
+    def in_c(self) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of these contacts, which have just been reset."""
+        one, three = np.zeros(self._count), np.zeros((self._count, 3))
+        return {"shapes": self._count, "shape_of": self._shape_of, "now": three, "normal": one, "impulse": three,
+                "peak": one, "began": one}  # fmt: skip
+
     def step(self, data: Any, number: int) -> None:
         """Write down the contacts of a step, which ends at ``data.time`` and has some."""
         contact = data.contact

@@ -63,12 +63,16 @@ class Driver:
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
         """Return the command, where ``reference`` is the target of the end effector along its way in."""
-        if reference != self._followed and reference is not None:
-            self._follow(reference)
-            self._followed = reference
+        self.lead(reading.t, reference)
         if self.compiled is not None:
             return self.compiled.tick(reading)
         return self.controller.tick(reading.t, reading.q, reading.v, reading.force)
+
+    def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
+        """Move the targets of the tasks for a tick at a time, s."""
+        if reference != self._followed and reference is not None:
+            self._follow(reference)
+            self._followed = reference
 
     def brace(self) -> None:
         """Prepare for impacts from now on.  The nominal controller does nothing."""
@@ -123,10 +127,10 @@ class FlowDriver(Driver):
     posture: ReferenceFlowPosture
     _now = 0.0
 
-    def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command, and keep the time."""
-        self._now = reading.t
-        return super().tick(reading, reference)
+    def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
+        """Keep the time."""
+        self._now = t
+        super().lead(t, reference)
 
     def brace(self) -> None:
         """Let the posture flow."""
@@ -171,8 +175,8 @@ class PostureDriver(Driver):
             self._moves.append((task, task.target, end))
         self._since = 0.0
 
-    def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command while the references move."""
+    def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
+        """Move the targets of the body tasks."""
         if self._since is not None and self._since < MOVE:
             self._since = min(MOVE, self._since + self.controller.period)
             for task, begin, end in self._moves:
@@ -180,7 +184,7 @@ class PostureDriver(Driver):
                     task.target = begin + self.level * (end - begin)
                 else:
                     task.target = begin @ pin.exp3(self.level * pin.log3(begin.T @ end))
-        return super().tick(reading, reference)
+        super().lead(t, reference)
 
     @property
     def level(self) -> float:

@@ -47,6 +47,8 @@ class Recorder:
         feet = feet_of(setup)
         self._feet = [k for k, frame in enumerate(shapes) if frame in feet]
         self._rows: list[tuple[Array, float, int, float]] = []
+        # Rotor commands, levels, numbers of status, distances; and true states.
+        self._columns: list[tuple[Array, ...]] = []
         self._traces: list[Trace] = []
         self._push = (np.zeros(3), np.inf, -np.inf)
         propulsion = robot.spec.propulsion
@@ -59,14 +61,19 @@ class Recorder:
     @property
     def ticks(self) -> int:
         """Number of recorded ticks."""
-        return len(self._rows)
+        return len(self._rows) + sum(trace.t.size for trace in self._traces)
 
     def take(self, command: Command, level: float, distance: float) -> None:
         """Record a tick and the state of the world after it."""
         self._rows.append((command.rotor_speed, level, _NUMBERS[command.status], distance))
         self._world.mark()
-        if not len(self._rows) % _BLOCK:
-            self._traces.append(self._world.trace())
+        if len(self._rows) == _BLOCK:
+            self._trace()
+
+    def take_all(self, trace: Trace, *columns: Array) -> None:
+        """Record ticks: the states after them, rotor commands, levels, numbers of status, and distances."""
+        self._traces.append(trace)
+        self._columns.append(columns)
 
     def first_touch(self, begin: float, end: float) -> float | None:
         """Return when the shape that hits first began to touch within ``[begin, end)``, s."""
@@ -81,7 +88,7 @@ class Recorder:
     def series(self) -> Series:
         """Return the time series, with what follows from the recorded states and commands."""
         trace = self._trace()
-        command, level, status, distance = (np.array(column) for column in zip(*self._rows, strict=True))
+        command, level, status, distance = (np.concatenate(parts) for parts in zip(*self._columns, strict=True))
         t, q, (pushed, begin, end) = trace.t, trace.q, self._push
         if self._shape is not None:
             force, peak, slip = (x[:, self._shape] for x in (trace.force, trace.peak, trace.slip))
@@ -101,8 +108,9 @@ class Recorder:
 
     def _trace(self) -> Trace:
         """Return the true states of all ticks."""
-        if len(self._rows) > sum(trace.t.size for trace in self._traces):
-            self._traces.append(self._world.trace())
+        if self._rows:
+            self.take_all(self._world.trace(), *map(np.array, zip(*self._rows, strict=True)))
+            self._rows = []
         self._traces = [Trace(*map(np.concatenate, zip(*self._traces, strict=True)))]
         return self._traces[0]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
@@ -54,14 +56,29 @@ class Rotors:
 
     def steps(self, command: Array, count: int) -> Array:
         """Take time steps under one command within the limits.  Return the speeds, shape (count, rotors)."""
+        away = command - self.speeds
+        # A speed never passes its command, so its time constant does not change in between.
+        speeds = self.speeds - np.where(away > 0, *self._ways(count)) * away
+        self.speeds = speeds[-1]
+        return np.asarray(speeds)
+
+    def _ways(self, count: int) -> tuple[Array, Array]:
         if count not in self._gone:
             passed = np.arange(1.0, count + 1)[:, None]
             self._gone[count] = np.expm1(self._up * passed), np.expm1(self._down * passed)
-        away = command - self.speeds
-        # A speed never passes its command, so its time constant does not change in between.
-        speeds = self.speeds - np.where(away > 0, *self._gone[count]) * away
-        self.speeds = speeds[-1]
-        return np.asarray(speeds)
+        return self._gone[count]
+
+    def in_c(self, count: int) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of these rotors, for a number of steps in a tick."""
+        up, down = self._ways(count)
+        limits = {"lowest": self._lowest, "highest": self._highest, "thrust": self._coefficient}
+        return {
+            "rotors": self.speeds.size,
+            "speeds": self.speeds,
+            "phases": 0 * self.speeds,
+            "up": up,
+            "down": down,
+        } | limits
 
     def thrusts(self, speeds: Array) -> Array:
         """Return thrusts ``c_f ω²``, N, in the shape of the speeds."""
@@ -107,6 +124,10 @@ class Vibration:
         phases = self.phases + 2 * np.pi * timestep * speeds.cumsum(axis=0)
         self.phases = phases[-1]
         return np.asarray(phases)
+
+    def in_c(self) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of this vibration."""
+        return {"vibrates": 1, "phases": self.phases, "along": self._x, "across": self._y, "inverse": self._inverse}
 
     def twist(self, speeds: Array, phases: Array) -> Array:
         """Return the error of the measured base twist, base axes, shape (6,)."""

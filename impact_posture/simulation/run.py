@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -9,9 +10,11 @@ from functools import partial
 
 import numpy as np
 
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.processes import fork_call
 from impact_posture.progress import tell
+from impact_posture.simulation.compiled_world import compiled_world
 from impact_posture.simulation.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.driver import Driver
 from impact_posture.simulation.recorder import Recorder
@@ -24,6 +27,8 @@ from impact_posture.simulation.throw import FLIGHT, Throw
 BRACE = 0.1
 # Ticks from one message about the progress to the next.
 _TELL = 100
+# Times that differ by less are equal, because sums of periods are not exact, s.
+_SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +86,7 @@ def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mod
 
 
 class _Loop:
-    """Controller and world, tick by tick."""
+    """Controller and world, in C where both are there."""
 
     def __init__(self, factory: ControllerFactory, driver: Driver, seed: int) -> None:
         setup = factory.setup
@@ -96,6 +101,7 @@ class _Loop:
             )
         command = driver.reset(setup.q)
         self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
+        self.compiled = compiled_world(self.world, driver.compiled, self.count)
         self.recorder = Recorder(setup, factory.metric)
         self.away: float | None = None
 
@@ -103,23 +109,57 @@ class _Loop:
     def t(self) -> float:
         return self.world.time
 
-    def tick(self, reference: Reference | None = None) -> bool:
-        """Take a tick.  Return whether the state did not run away."""
-        point = None if reference is None else reference.at(self.t)
-        command = self.driver.tick(self.world.read(), point)
-        try:
-            self.world.step(command, self.count)
-        except SimulationDiverged as error:
-            # A figure needs two ticks.
-            if self.recorder.ticks < 2:
-                raise
-            self.away = error.time
-            return False
-        distance = 0.0 if point is None else point.distance
-        self.recorder.take(command, self.driver.level, distance)
-        if not self.recorder.ticks % _TELL:
+    def ticks(self, n: int, reference: Reference | None = None) -> Array:
+        """Take ticks, fewer if the state runs away (:attr:`away`).  Return ``‖ν‖`` after each."""
+        take = self._in_python if self.compiled is None else self._in_c
+        speeds = np.zeros(0)
+        while speeds.size < n:
+            asked = min(_TELL, n - speeds.size)
+            found = take(asked, reference)
+            speeds = np.concatenate([speeds, found])
+            if found.size < asked:
+                # A figure needs two ticks.
+                if self.recorder.ticks < 2:
+                    raise SimulationDiverged(self.t, where=self.setup.robot.name)
+                self.away = self.t
+                break
             tell(f"simulating, t = {self.t:.1f} s", None if reference is None else self.t / reference.total)
-        return True
+        return speeds
+
+    def until(self, t: float) -> int:
+        """Return the number of ticks, at least one, until a time has come, s."""
+        return max(1, math.ceil((t - _SAME - self.t) / self.period))
+
+    def _in_python(self, n: int, reference: Reference | None) -> Array:
+        speeds = []
+        for _ in range(n):
+            point = None if reference is None else reference.at(self.t)
+            command = self.driver.tick(self.world.read(), point)
+            try:
+                self.world.step(command, self.count)
+            except SimulationDiverged:
+                break
+            self.recorder.take(command, self.driver.level, 0.0 if point is None else point.distance)
+            speeds.append(self.world.speed)
+        return np.array(speeds)
+
+    def _in_c(self, n: int, reference: Reference | None) -> Array:
+        assert self.compiled is not None  # noqa: S101 (the caller has asked)
+        distances: list[float] = []
+        levels: list[float] = []
+
+        def lead(t: float) -> None:
+            point = None if reference is None else reference.at(t)
+            self.driver.lead(t, point)
+            distances.append(0.0 if point is None else point.distance)
+            levels.append(self.driver.level)
+
+        found = self.compiled.take(n, lead)
+        done = found.level.size
+        # A driver with a level of its own knows it before the tick.
+        level = found.level if type(self.driver).level is Driver.level else np.array(levels[:done])
+        self.recorder.take_all(found.trace, found.rotor_speed, level, found.status, np.array(distances[:done]))
+        return np.asarray(np.linalg.norm(found.trace.v, axis=1))
 
 
 def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
@@ -133,11 +173,13 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     # From the begin of the way in, the next impact is the expected one.
     events += [(start, partial(driver.expect, start + crossing)) for start in starts]
     events.sort(key=lambda event: event[0])
-    for _ in range(round(reference.total / loop.period)):
-        while events and loop.t >= events[0][0] - 1e-9:
+    left = round(reference.total / loop.period)
+    while left and loop.away is None:
+        while events and loop.t >= events[0][0] - _SAME:
             events.pop(0)[1]()
-        if not loop.tick(reference):
-            break
+        n = min(left, loop.until(events[0][0])) if events else left
+        loop.ticks(n, reference)
+        left -= n
     windows = []
     for k, start in enumerate(starts):
         end = start + reference.cycle
@@ -176,9 +218,7 @@ def _push(loop: _Loop, task: SinglePush | Throw, sign: int, rested: bool) -> Run
         loop.world.push(push)
         loop.recorder.pushed(np.array(push.force), begin, begin + length)
     loop.driver.expect(expected)
-    for _ in range(round((expected - begin + length + task.after) / loop.period)):
-        if not loop.tick():
-            break
+    loop.ticks(round((expected - begin + length + task.after) / loop.period))
     touch = loop.recorder.first_touch(begin, np.inf) if isinstance(task, Throw) else begin
     hit = expected if touch is None else touch
     ends = {"impact": length, "recovery": min(RECOVERY, length + task.after)}
@@ -189,11 +229,13 @@ def _push(loop: _Loop, task: SinglePush | Throw, sign: int, rested: bool) -> Run
 def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Callable[[], None]]) -> bool:
     """Go on until ``least`` and until the robot has been quiet for long enough.  Return whether it has."""
     still, end = 0.0, max(least, loop.t) + task.patience
-    while loop.t < least - 1e-9 or still < task.still - 1e-9:
+    while loop.t < least - _SAME or still < task.still - _SAME:
         if loop.t > end or loop.away is not None:
             return False
-        if brace and loop.t >= BRACE - 1e-9:
+        if brace and loop.t >= BRACE - _SAME:
             brace.pop()()
-        loop.tick()
-        still = still + loop.period if loop.world.speed < task.quiet else 0.0
+        # It is not at rest before so many ticks.
+        waits = [max(least, loop.t + task.still - still), end, *([BRACE] if brace else [])]
+        for speed in loop.ticks(min(map(loop.until, waits))):
+            still = still + loop.period if speed < task.quiet else 0.0
     return True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -51,6 +51,10 @@ class ForceFilter:
 
     def __init__(self, turns: float) -> None:
         self._share, self.force = -math.expm1(-2 * math.pi * turns), NO_FORCE
+
+    def in_c(self) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of this filter."""
+        return {"share": self._share, "filtered": self.force}
 
     def feel(self, force: list[float]) -> None:
         """Take the force of a step."""
@@ -106,13 +110,22 @@ class SensorNoise:
         """Draw all noise from a generator from now on, which nobody else may use."""
         self._generator, self._drawn = generator, iter(np.zeros((0, 0)))
 
+    def draw(self, n: int) -> Array:
+        """Return the noise of the next n readings, the numbers that single draws would give, shape (n, numbers)."""
+        return np.asarray(self._scales * self._generator.standard_normal((n, self._ends[-1])))
+
+    def in_c(self) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of these sensors."""
+        first, second, third = self._ends
+        return {"noises": third, "noisy_q": int(first > 0), "noisy_v": int(second > first),
+                "noisy_force": int(third > second), "resolution": self._sensors.joint_resolution}  # fmt: skip
+
     def read(self, t: float, q: Array, v: Array, force: Array | None) -> Reading:
         """Add noise to the true state.  The given arrays are not changed."""
         sensors, (first, second, third) = self._sensors, self._ends
         drawn = next(self._drawn, None)
         if drawn is None:
-            # The numbers are those that single draws would give.
-            self._drawn = iter(self._scales * self._generator.standard_normal((_DRAWS, third)))
+            self._drawn = iter(self.draw(_DRAWS))
             drawn = next(self._drawn)
         q = pin.integrate(self._model, q, drawn[:first]) if first else q.copy()
         if sensors.joint_resolution:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,12 +28,24 @@ from impact_posture.tsid.controller import Command
 from impact_posture.tsid.state import checked_velocity
 
 # No robot is so far away or so fast, m, m/s, rad/s, and no torque so large, N·m.
-_RUNAWAY = 1e6
+RUNAWAY = 1e6
 _NOTHING = np.zeros(0)
 
 
 def _ignore(message: str) -> None:
     """Take a warning and do nothing."""
+
+
+@contextmanager
+def unwarned() -> Iterator[None]:
+    """Keep MuJoCo from writing warnings to a log file in the working directory.  The state shows the problem."""
+    mujoco = import_mujoco()
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_ignore)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 class World:
@@ -172,17 +187,12 @@ class World:
         self._data.ctrl[self._count :] = self._torques
         if not count:
             return
-        # MuJoCo itself would write a warning to a log file in the working directory.  The state shows the problem.
-        before = self._mujoco.get_mju_user_warning()
-        self._mujoco.set_mju_user_warning(_ignore)
-        try:
+        with unwarned():
             self._advance(speed, count)
-        finally:
-            self._mujoco.set_mju_user_warning(before)
         state = self._data.qpos, self._data.qvel
         # The largest number is computed only where the sum of squares does not settle it.
-        usual = state[0].dot(state[0]) + state[1].dot(state[1]) < _RUNAWAY**2
-        if not usual and not all(np.abs(part).max() < _RUNAWAY for part in state):
+        usual = state[0].dot(state[0]) + state[1].dot(state[1]) < RUNAWAY**2
+        if not usual and not all(np.abs(part).max() < RUNAWAY for part in state):
             raise SimulationDiverged(self.time, where=self.robot.name)
 
     def _advance(self, command: Array, count: int) -> None:
@@ -247,10 +257,14 @@ class World:
         times, samples, torques, speeds = zip(*self._marks, strict=True)
         self._marks = []
         q, v = zip(*(sample.state for sample in samples), strict=True)
-        values = np.array([sample.qpos for sample in samples])[:, self._limited]
-        stopped = (values <= self._low) | (values >= self._high)
+        stopped = self.stopped(np.array([sample.qpos for sample in samples]))
         parts = [np.array(column) for column in (times, q, v, speeds, torques)]
         return Trace._make([*parts, stopped, *self._log.look()])
+
+    def stopped(self, qpos: Array) -> Array:
+        """Return the joints with limits that are at one, shape (n, joints), for ``qpos`` of shape (n, numbers)."""
+        values = qpos[:, self._limited]
+        return np.asarray((values <= self._low) | (values >= self._high))
 
     def truth(self) -> Truth:
         """Return the true state.  The peak force and the first touch of each shape begin again, as do all marks."""
@@ -264,17 +278,47 @@ class World:
         stops = tuple(name for name, there in zip(self.limited, stopped, strict=True) if there)
         return Truth(float(t), q, v, speeds, thrusts, torques, shapes, stops)
 
+    def in_c(self, count: int) -> dict[str, Any] | None:
+        """Return the members of ``c/world_ticks.c`` that are of this world, for a number of steps in a tick.
+
+        It is ``None`` where C has no such world: for delayed readings, and for joints other than a floating base,
+        hinges and slides.
+        """
+        self._check_ready()
+        places, sample, floating = self._layout.places, self._past[-1], self.robot.floating
+        if places is None or self._past.maxlen != 1:
+            return None
+        q, v = sample.state
+        found = {"model": self._model._address, "data": self._data._address, "runaway": RUNAWAY**2,
+                 "nq": q.size, "nv": v.size, "nqpos": self._data.qpos.size, "floating": int(floating),
+                 "q_at": places[0], "v_at": places[1], "true_q": q, "true_v": v, "joints": self._effort.size,
+                 "effort": self._effort, "torque": self._torques, "steps": self._steps, "count": count,
+                 "timestep": self.timestep, "rotors": 0, "vibrates": 0,
+                 "felt": -1 if self._felt is None else self._felt}  # fmt: skip
+        parts = [self._filter.in_c(), self._noise.in_c(), self._log.in_c()]
+        parts += [] if self._rotors is None else [self._rotors.in_c(count)]
+        parts += [] if self._vibration is None else [self._vibration.in_c()]
+        return {key: value for part in (found, *parts) for key, value in part.items()}
+
+    def next_in_c(self, n: int) -> dict[str, Any]:
+        """Return the members that change from call to call: the noise of n readings, and the pushes."""
+        return {"noise": self._noise.draw(n), **self._pushes.in_c()}
+
+    def go_to(self, steps: int) -> None:
+        """Take note that C has gone to a number of steps since the reset."""
+        self._steps = steps
+
     def _checked(self, command: Command | ActuatorCommand) -> tuple[Array, Array]:
         speed, torque = np.asarray(command.rotor_speed, dtype=float), np.asarray(command.torque, dtype=float)
         if speed.shape != (self._count,) or torque.shape != self._effort.shape:
             sizes = f"give {self._count} and {self._effort.size}"
             raise InputError(f"{speed.size} rotor speeds and {torque.size} torques", where="command", hint=sizes)
         # A sum of squares that is not absurd settles it.
-        usual = speed.dot(speed) + torque.dot(torque) < _RUNAWAY**2
+        usual = speed.dot(speed) + torque.dot(torque) < RUNAWAY**2
         if not usual and not (np.isfinite(speed).all() and np.isfinite(torque).all()):
             raise InputError("is not finite", where="command", hint="hold the last one instead")
         torque = np.minimum(np.maximum(torque, -self._effort), self._effort)
-        if not usual and not np.abs(torque).max(initial=0.0) < _RUNAWAY:
+        if not usual and not np.abs(torque).max(initial=0.0) < RUNAWAY:
             raise InputError("has an endless torque", where="command", hint="give the joints effort limits")
         return speed if self._rotors is None else self._rotors.within(speed), torque
 

@@ -1,0 +1,152 @@
+"""Many ticks of a world under a controller in C, in a loop in C that calls MuJoCo and the controller."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Callable
+from functools import cache
+from importlib import metadata, resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from impact_posture.arrays import Array
+from impact_posture.dynamics.mjcf import import_mujoco
+from impact_posture.errors import CompilerError
+from impact_posture.libraries import build_library, cache_folder, is_cached, library_path, load_library, source_key
+from impact_posture.simulation.actuator_command import Trace
+from impact_posture.simulation.compiled_tick import CompiledTick
+from impact_posture.simulation.scenario_objective import locked
+from impact_posture.simulation.world import World, unwarned
+
+_NAME = "world_ticks"
+# Most propellers, as in C.
+_ROTORS = 64
+
+
+class Ticks(NamedTuple):
+    """Record of n ticks.
+
+    Attributes:
+        trace: True states after the ticks.
+        rotor_speed: Commanded rotor speeds, shape (n, rotors).
+        level: Level of the impact-robust term, shape (n,).
+        status: Number of the status, shape (n,).
+    """
+
+    trace: Trace
+    rotor_speed: Array
+    level: Array
+    status: Array
+
+
+class CompiledWorld:
+    """A world that has been reset, and the controller in C that acts in it.
+
+    The loop does what :class:`World` and :class:`CompiledTick` do, but for the order of some sums.  Pushes and throws
+    still go to the world, which knows the time; nothing else of it may be used before the next reset.
+    """
+
+    def __init__(self, world: World, tick: CompiledTick, contents: dict[str, Any], library: ctypes.CDLL) -> None:
+        """Take over a world; use :func:`compiled_world`."""
+        self._world, self._tick, self._run = world, tick, library.world_ticks
+        self._members, self._arrays = _members(), dict[str, Array]()
+        kinds = {"int": ctypes.c_int, "double": ctypes.c_double}
+        fields = [(name, kinds.get(kind, ctypes.c_void_p)) for name, kind in self._members.items()]
+        self._struct = type("World", (ctypes.Structure,), {"_fields_": fields})()
+        self._give(**_functions(), **tick.library.addresses(), **contents)
+
+    def _give(self, **values: Any) -> None:
+        for name, value in values.items():
+            if isinstance(value, int | float):
+                setattr(self._struct, name, value)
+            else:
+                kind = np.intc if self._members[name] == "int *" else np.double
+                self._arrays[name] = np.array(value, dtype=kind, order="C")
+                setattr(self._struct, name, self._arrays[name].ctypes.data)
+
+    def take(self, n: int, lead: Callable[[float], None]) -> Ticks:
+        """Take n ticks, or fewer if the state runs away.
+
+        Args:
+            n: Number of ticks.
+            lead: Moves the targets of the controller before a tick at a time, s.
+        """
+        world, own = self._world, self._struct
+        led, leads = self._tick.plan([(own.steps + k * own.count) * own.timestep for k in range(n)], lead)
+        self._give(led=led, lead=leads, **world.next_in_c(n))
+        each, rotors = (own.shapes,), (own.rotors,)
+        shapes = {"t": (), "q": (own.nq,), "v": (own.nv,), "rotor_speeds": rotors, "torques": (own.joints,),
+                  "qpos": (own.nqpos,), "touching": each, "force": (*each, 3), "impulse": (*each, 3), "peak": each,
+                  "began": each, "slip": each, "command": rotors, "level": (), "status": ()}  # fmt: skip
+        self._give(**{f"row_{name}": np.zeros((n, *shape)) for name, shape in shapes.items()})
+        with unwarned():
+            done = int(self._run(ctypes.byref(own), n))
+        world.go_to(own.steps)
+        row: dict[str, Any] = {name: self._arrays[f"row_{name}"][:done] for name in shapes}
+        row["stopped"], row["touching"] = world.stopped(row["qpos"]), row["touching"] > 0
+        row["began"] = np.where(np.isinf(row["began"]), np.nan, row["began"])
+        return Ticks(Trace(*(row[name] for name in Trace._fields)), row["command"], row["level"], row["status"])
+
+
+def compiled_world(world: World, tick: CompiledTick | None, count: int) -> CompiledWorld | None:
+    """Return the loop for a world that has been reset, or ``None`` where Python has to take the ticks.
+
+    That is so without a controller in C, without the headers of MuJoCo, and for some worlds (:meth:`World.in_c`).
+
+    Args:
+        world: The world.
+        tick: The controller.
+        count: Physics steps in a tick.
+    """
+    contents = None if tick is None else world.in_c(count)
+    if tick is None or contents is None or contents["rotors"] > _ROTORS:
+        return None
+    try:
+        library = _library()
+    except CompilerError:
+        return None
+    return None if library is None else CompiledWorld(world, tick, contents, library)
+
+
+@cache
+def _members() -> dict[str, str]:
+    """Return the members of the struct in C with their types, in order."""
+    struct = re.sub(r"/\*.*?\*/", "", _source(), flags=re.DOTALL).partition("typedef struct {")[2].partition("}")[0]
+    found = {}
+    for declaration in filter(None, map(str.strip, struct.split(";"))):
+        if function := re.search(r"\(\*(\w+)\)\(", declaration):
+            found[function[1]] = "function"
+            continue
+        kind, names = declaration.removeprefix("const ").split(maxsplit=1)
+        for name in map(str.strip, names.split(",")):
+            found[name.lstrip("*")] = f"{kind} *" if name.startswith("*") else kind
+    return found
+
+
+def _source() -> str:
+    return (resources.files(__package__) / "c" / f"{_NAME}.c").read_text(encoding="utf-8")
+
+
+@cache
+def _functions() -> dict[str, int]:
+    """Return the addresses of the functions of MuJoCo, by the names of the members."""
+    library = ctypes.CDLL(str(next(Path(import_mujoco().__file__).parent.glob("libmujoco.*"))))
+    names = {"step1": library.mj_step1, "step2": library.mj_step2, "apply": library.mj_applyFT}
+    return {name: ctypes.cast(function, ctypes.c_void_p).value or 0 for name, function in names.items()}
+
+
+def _library() -> ctypes.CDLL | None:
+    """Return the loop, which is built once and cached, or ``None`` where MuJoCo has no headers."""
+    headers = Path(import_mujoco().__file__).parent / "include"
+    if not (headers / "mujoco" / "mujoco.h").is_file():
+        return None
+    folder = cache_folder("worlds", source_key([metadata.version("mujoco"), _source()]))
+    library = library_path(folder, _NAME)
+    with locked(folder.with_suffix(".lock")):
+        if not is_cached(library):
+            (folder / f"{_NAME}.c").write_text(_source(), encoding="utf-8")
+            build_library(folder, _NAME, flags=["-isystem", str(headers)])
+    return load_library(library)
