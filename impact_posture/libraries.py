@@ -13,13 +13,13 @@ import os
 import stat
 import struct
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from impact_posture.errors import OutputError, SpecError
 from impact_posture.scratch_folder import scratch_folder
-from impact_posture.toolchain import find_compiler, no_compiler, run_compiler, words_of
+from impact_posture.toolchain import find_compiler, no_compiler, run_compiler, run_compilers, words_of
 from impact_posture.version import __version__
 
 _REBUILD = "delete it: it is built again"
@@ -31,7 +31,7 @@ _SEGMENT = {1: "IIIII", 2: "IIQQQQ"}
 # ---- building -----------------------------------------------------------------------------------------------------
 
 # Strict C forbids fused multiply-adds by default.
-_FLAGS = ("-std=c99", "-O2", "-ffp-contract=fast", "-fPIC", "-shared")
+_FLAGS = ("-std=c99", "-O2", "-ffp-contract=fast", "-fPIC")
 
 
 def library_path(folder: Path, prefix: str) -> Path:
@@ -58,7 +58,47 @@ def build_library(folder: Path, prefix: str, library: Path | None = None, flags:
     library = (library_path(folder, prefix) if library is None else library).absolute()
     with building(library) as scratch:
         built = str(scratch / library.name)
-        run_compiler([*compiler, *_FLAGS, *words_of("CFLAGS"), *flags, f"{prefix}.c", "-o", built, "-lm"], folder)
+        run_compiler(
+            [*compiler, *_FLAGS, "-shared", *words_of("CFLAGS"), *flags, f"{prefix}.c", "-o", built, "-lm"], folder
+        )
+    return library
+
+
+def build_parts(folder: Path, library: Path, parts: Mapping[str, Sequence[str]]) -> Path:
+    """Compile sources at once into a sealed shared library, and return where it is.
+
+    What other libraries have in common with this one, their preprocessed text and flags, is compiled once.
+
+    Args:
+        folder: The folder of the sources.
+        library: The library to write.
+        parts: Source → flags of the compiler after those of strict C and of ``$CFLAGS``.
+
+    Raises:
+        CompilerError: There is no compiler, or it failed; with its first error line and the command.
+        OutputError: The library or the cache cannot be written.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise no_compiler("codegen")
+    library = library.absolute()
+    cached = cache_folder("objects")
+    with building(library) as scratch:
+        commands = [[*compiler, *_FLAGS, *words_of("CFLAGS"), *flags, name] for name, flags in parts.items()]
+        texts = [scratch / f"{name}.i" for name in parts]
+        run_compilers([[*c, "-E", "-P", "-o", str(text)] for c, text in zip(commands, texts, strict=True)], folder)
+        objects = [
+            cached / f"{source_key([repr(command), text.read_text(encoding='utf-8')])}.o"
+            for command, text in zip(commands, texts, strict=True)
+        ]
+        with ExitStack() as finished:
+            missing = []
+            for command, part in zip(commands, objects, strict=True):
+                if not is_cached(part):
+                    beside = finished.enter_context(building(part)) / part.name
+                    missing.append([*command, "-c", "-o", str(beside)])
+            run_compilers(missing, folder)
+        run_compiler([*compiler, "-shared", *map(str, objects), "-o", str(scratch / library.name), "-lm"], folder)
     return library
 
 

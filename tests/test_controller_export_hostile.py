@@ -37,7 +37,7 @@ def compile_c(folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
 def abuse_with(sanitizers: str, folder: Path, program: Path, *more: str) -> None:
     """Build the abuse with the sources of a controller and sanitizers, or skip."""
     flags = [f"-fsanitize={sanitizers}", "-fno-sanitize-recover=all", "-O0", "-g0", f"-I{folder}", str(ABUSE)]
-    sources = ["ctl.c", "ctl_relaxation.c", "ctl_daqp.c", *more]
+    sources = ["ctl.c", "ctl_defaults.c", "ctl_dynamics.c", "ctl_relaxation.c", "ctl_daqp.c", *more]
     built = compile_c(folder, *flags, *sources, "-o", str(program), "-lm", "-lpthread")
     if (built.returncode and "sanit" in built.stderr + built.stdout) or "cannot find -l" in built.stderr:
         pytest.skip(f"the compiler has no -fsanitize={sanitizers}")
@@ -82,7 +82,9 @@ def test_no_tick_reads_what_was_not_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["tilthex_arm", "talos", "solo8"])
 def test_the_code_has_no_warnings(name: str) -> None:
     folder = exported(name)
-    found = compile_c(folder, *STRICT, "-fsyntax-only", "ctl.c", "ctl_relaxation.c")
+    found = compile_c(
+        folder, *STRICT, "-fsyntax-only", "ctl.c", "ctl_defaults.c", "ctl_dynamics.c", "ctl_relaxation.c"
+    )
     assert found.returncode == 0, found.stderr
 
 

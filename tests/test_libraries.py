@@ -23,7 +23,7 @@ from impact_posture.codegen.reader import read_manifest
 from impact_posture.errors import CompilerError, OutputError, SpecError
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.libraries import build_library
+from impact_posture.libraries import build_library, build_parts
 from impact_posture.robot.robot_loader import load_robot
 from tests.plot.views import PENDULUM
 from tests.tools import need, need_compiler
@@ -304,3 +304,34 @@ def test_what_is_damaged_goes(kept: Path) -> None:
     kept.write_bytes(b"code")
     libraries.seal_path(kept).unlink()
     assert not libraries.is_cached(kept), "without a seal it may be anything"
+
+
+def test_parts_that_libraries_have_in_common_are_compiled_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    need_compiler()
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "two.h").write_text("#define TWO 2\n")
+    (tmp_path / "one.c").write_text('#include "two.h"\nint other(void);\nint one(void) { return other() + TWO; }\n')
+
+    def built(name: str, other: int) -> int:
+        (tmp_path / "other.c").write_text(f"/* {name} */\nint other(void) {{ return {other}; }}\n")
+        library = build_parts(tmp_path, tmp_path / name, {"one.c": (), "other.c": ("-O0",)})
+        return int(libraries.load_library(library).one())
+
+    def objects() -> int:
+        return len(list((tmp_path / "cache" / "objects").glob("*.o")))
+
+    assert (built("a.so", 1), objects()) == (3, 2)
+    assert (built("b.so", 5), objects()) == (7, 3)
+    # Comments make no difference, what is included does.
+    assert (built("c.so", 5), objects()) == (7, 3)
+    (tmp_path / "two.h").write_text("#define TWO 20\n")
+    assert (built("d.so", 5), objects()) == (25, 4)
+    # A damaged object is compiled again.
+    for path in (tmp_path / "cache" / "objects").glob("*.o"):
+        path.write_bytes(b"")
+    assert (built("e.so", 5), objects()) == (25, 4)
+    (tmp_path / "one.c").write_text("int one(void) { return }\n")
+    with pytest.raises(CompilerError, match=r"one\.c"):
+        built("f.so", 5)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import casadi as ca
@@ -74,6 +75,7 @@ def export_controller(
     daqp: Path | None = None,
     build: bool = False,
     force: bool = False,
+    generated: Sequence[str] = (),
 ) -> ControllerExport:
     """Write the controller of a formulation as C99 into a folder, whole or not at all.
 
@@ -90,6 +92,7 @@ def export_controller(
         daqp: Folder of the sources of DAQP, where they cannot be downloaded.
         build: Leave ``lib<prefix>.so`` in the folder.
         force: Replace an earlier export.
+        generated: Further flags of the compiler for what is generated from the model.
 
     Raises:
         InputError: A task or joint has no C code, the gradient is missing, or there are no sources of DAQP.
@@ -106,10 +109,14 @@ def export_controller(
     fields = tuple(parameters(structure, period))
     manifest = _manifest(structure, fields, prefix)
     metric = f"{prefix}_metric" if objective is not None else None
-    own = [f"{prefix}_relaxation.c", *([] if metric is None else [f"{metric}.c"])]
+    own = [
+        *(f"{prefix}_{name}.c" for name in ("defaults", "dynamics", "relaxation")),
+        *([] if metric is None else [f"{metric}.c"]),
+    ]
     manifest["sources"] = [*own, f"{prefix}_daqp.c"]
     texts = render(structure, fields, prefix, identity(manifest), metric) | renamed(sources, prefix)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
+    texts |= {} if objective is None or metric is None else _metric(objective, metric)
     texts["Makefile"], texts["CMakeLists.txt"] = _makefile(manifest), _cmake(manifest)
     out = Path(f"{prefix}-c") if out is None else out
     library = library_path(out, prefix)
@@ -120,23 +127,20 @@ def export_controller(
         (folder / "daqp").mkdir()
         for name in FILES:
             (folder / "daqp" / name).write_bytes(sources[name])
-        if objective is not None and metric is not None:
-            _write_metric(objective, folder, metric)
         if build and find_compiler() is not None:
-            build_controller(folder, manifest)
+            build_controller(folder, manifest, generated)
         names = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     built = library if library.is_file() else None
     return ControllerExport(out, robot, tuple(out / name for name in names), manifest, built)
 
 
-def _write_metric(objective: ImpactObjective, folder: Path, prefix: str) -> None:
-    """Write the gradient beside the controller, without the examples that a gradient alone has."""
-    beside = folder / "metric"
-    beside.mkdir()
-    export_gradient(objective, beside, prefix=prefix, check=False)
-    for name in (f"{prefix}.c", f"{prefix}.h", f"{prefix}.json"):
-        (beside / name).replace(folder / name)
-    shutil.rmtree(beside)
+@lru_cache(maxsize=2)
+def _metric(objective: ImpactObjective, prefix: str) -> dict[str, str]:
+    """Return file name → text of the gradient, without the examples that a gradient alone has."""
+    with TemporaryDirectory() as folder:
+        export_gradient(objective, Path(folder), prefix=prefix, check=False)
+        names = [f"{prefix}.{ending}" for ending in ("c", "h", "json")]
+        return {name: (Path(folder) / name).read_text(encoding="utf-8") for name in names}
 
 
 def _manifest(s: Structure, fields: Sequence[Field], prefix: str) -> dict[str, Any]:

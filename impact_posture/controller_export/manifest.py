@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from impact_posture.codegen.reader import Loose, read_checked
-from impact_posture.libraries import build_library
+from impact_posture.libraries import build_parts, library_path
 
 SCHEMA = "impact-posture/controller/1"
 # Most numbers of one kind.  A larger size is no robot, and would only ask for memory.
@@ -57,11 +58,19 @@ def read_controller(path: Path) -> tuple[dict[str, Any], Manifest, Path]:
     return document, checked, file.parent
 
 
-def build_controller(folder: Path, manifest: dict[str, Any]) -> Path:
+def build_controller(folder: Path, manifest: dict[str, Any], generated: Sequence[str] = ()) -> Path:
     """Build ``lib<prefix>.so`` in the folder of an exported controller.
+
+    Args:
+        folder: The folder.
+        manifest: The content of its manifest.
+        generated: Further flags of the compiler for what is generated from the model, in long sources without loops.
 
     Raises:
         CompilerError: There is no compiler, or it failed.
-        OutputError: The library cannot be written.
+        OutputError: The library or the cache cannot be written.
     """
-    return build_library(folder, str(manifest["prefix"]), flags=["-isystem", "daqp", *manifest["sources"]])
+    prefix, shared = str(manifest["prefix"]), ["-isystem", "daqp"]
+    own = {f"{prefix}_dynamics.c", f"{prefix}_metric.c"}
+    parts = {name: [*shared, *generated] if name in own else shared for name in (f"{prefix}.c", *manifest["sources"])}
+    return build_parts(folder, library_path(folder, prefix), parts)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import resources
 from typing import Any
 
@@ -23,6 +24,8 @@ from impact_posture.controller_export.rigid_body import MovingTree
 from impact_posture.controller_export.structure import Structure
 from impact_posture.escape import c_comment
 from impact_posture.impact.contact import point_on
+from impact_posture.robot.robot import Robot
+from impact_posture.settings import Vector3
 from impact_posture.version import __version__
 
 # Files in c/, in the order in which one source has them.
@@ -64,15 +67,16 @@ class DynamicsCode:
     stack_bytes: int
 
 
-def dynamics_code(s: Structure) -> DynamicsCode:
-    """Generate the dynamics that a structure needs."""
-    q, v = ca.SX.sym("q", s.robot.nq), ca.SX.sym("v", s.robot.nv)
-    tree = MovingTree(s.robot.model, q, v)
+@lru_cache(maxsize=2)
+def dynamics_code(robot: Robot, points: tuple[tuple[str, Vector3, bool], ...]) -> DynamicsCode:
+    """Generate the dynamics of points of a robot: frame, offset, and whether a rotation is needed."""
+    q, v = ca.SX.sym("q", robot.nq), ca.SX.sym("v", robot.nv)
+    tree = MovingTree(robot.model, q, v)
     found: dict[str, ca.SX] = {"M": tree.mass_matrix(), "h": tree.bias()}
-    if s.robot.floating:
+    if robot.floating:
         found["base"] = tree.rotations[1]
-    for k, point in enumerate(s.points):
-        on, rows = point_on(s.robot, point.frame, point.offset), 6 if point in s.turning else 3
+    for k, (frame, offset, turns) in enumerate(points):
+        on, rows = point_on(robot, frame, offset), 6 if turns else 3
         spatial, velocity = tree.spatial_drift(on), tree.velocity(on)
         drift = spatial + ca.vertcat(ca.cross(velocity[3:], velocity[:3]), ca.SX(3, 1))
         found[f"position[{k}]"] = tree.position(on)
@@ -111,7 +115,7 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
         identity: Words of the library about its manifest.
         metric: Prefix of the export of the gradient, if the controller has one.
     """
-    code, robot = dynamics_code(s), s.robot
+    code, robot = dynamics_code(s.robot, tuple((p.frame, p.offset, p in s.turning) for p in s.points)), s.robot
     sizes = s.sizes
     bounds = sizes["SIMPLE"] + sizes["GENERAL"]
     nv, equations = sizes["NV"], sizes["EQUATIONS"]
@@ -145,7 +149,13 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
     templates = environment("impact_posture.controller_export", c_comment)
     texts = {
         name: templates.get_template(template).render(context)
-        for name, template in ((f"{prefix}.h", "controller.h.jinja"), (f"{prefix}.c", "controller.c.jinja"))
+        for name, template in (
+            (f"{prefix}.h", "controller.h.jinja"),
+            (f"{prefix}.c", "controller.c.jinja"),
+            (f"{prefix}_defaults.c", "defaults.c.jinja"),
+            (f"{prefix}_dynamics.h", "dynamics.h.jinja"),
+            (f"{prefix}_dynamics.c", "dynamics.c.jinja"),
+        )
     }
     return {name: named(text, prefix) for name, text in texts.items()} | _relaxation(prefix)
 

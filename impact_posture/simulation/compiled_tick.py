@@ -24,6 +24,8 @@ from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.task import TargetTask
 
 _PREFIX = "controller"
+# Of a tick, what is generated from the model takes little, but compilers take long to optimize it.
+_QUICK = ("-O0",)
 
 
 class CompiledTick:
@@ -112,6 +114,7 @@ def compiled_tick(controller: Controller, structure: Structure, objective: Impac
                 raise no_compiler("controller")
             tell("compiling the controller")
             given: dict[str, Any] = {"objective": objective, "prefix": _PREFIX, "build": True, "force": True}
+            given["generated"] = _QUICK
             if export_controller(robot, controller.formulation, folder, **given).library is None:
                 raise CompilerError("left no library", where=str(folder), hint="set CC to another compiler")
     return CompiledTick(controller, structure, CompiledController.load(folder, robot=robot))
@@ -123,6 +126,7 @@ def _key(structure: Structure, objective: ImpactObjective | None) -> str:
     frames = [robot.model.frames[robot.frame_id(point.frame)] for point in structure.points]
     content = [
         VERSION,
+        repr(_QUICK),
         robot.model_sha256,
         repr(structure.sizes),
         repr({name: table.tolist() for name, table in structure.tables.items()}),

@@ -1,11 +1,6 @@
-/* Parameters: their defaults, and what init refuses. */
+/* Parameters: what init refuses. */
 
 const unsigned long ip_context_bytes = (unsigned long)sizeof(ip_context);
-
-void ip_default_params(ip_params *params)
-{
-  *params = ip_defaults;
-}
 
 /* Whether a number, which may never be NaN, fulfills a rule of ip_rules. */
 static int ip_holds(int rule, double x)
