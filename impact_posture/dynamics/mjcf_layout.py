@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart, JointSlot
@@ -78,18 +79,18 @@ class MjcfLayout:
         self._turning = [slot for slot in self.slots if slot.joint.kind.family in ("free-flyer", "planar")]
 
     @property
-    def places(self) -> tuple[Array, Array] | None:
+    def places(self) -> tuple[NDArray[np.int_], NDArray[np.int_]] | None:
         """Return the places of ``q`` in ``qpos`` and of ``v`` in ``qvel`` where these are all that there is to know.
 
         That is so for hinges and slides, and a floating base in front of them.  Its quaternion is normalized and its
         linear velocity is turned.  It is ``None`` for a model with other joints.
         """
         base = len(self._turning)
-        others = self.slots[base:]
-        plain = not self._moved and base <= 1 and len(self._quaternions) == base and not self._angle.size
-        if not plain or any(slot.joint.kind.nv != 1 for slot in others) or self.slots[:base] != self._turning:
+        # Chart coordinates are those of q but for cosines and sines.
+        plain = not self._moved and base <= 1 and self.nq == self.nqpos and self.slots[:base] == self._turning
+        if not plain or any(slot.joint.kind.nv != 1 for slot in self.slots[base:]):
             return None
-        return self._qpos[np.argsort(self._q)], self._rates
+        return np.argsort(self._places), self._rates
 
     def qpos(self, q: Array) -> Array:
         """Return ``qpos``, shape (nqpos,), of a configuration, shape (nq,)."""
