@@ -20,7 +20,7 @@ help:
 	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
 	@echo "make study-elastic  which inertia arms with elastic joints meet a contact with, against MuJoCo"
 	@echo "make study-global   how complete the search global is, and basin hopping beside multi-start"
-	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about half an hour)"
+	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about ten minutes)"
 	@echo "make study-feasible  what it costs to be clear of collisions, held by the motors and reached at speed"
 	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts (ten minutes)"
 	@echo "make study-real-impacts  balls, strikes, taps: what the rigid model predicts, and what MuJoCo finds (some minutes)"
