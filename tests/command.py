@@ -174,7 +174,7 @@ def _command(
     if not pictures:
         # Of a run the snapshots stay, as blank.
         figures = impact_posture.experiment.figures
-        figures.run_figures = figures.comparison_figures = lambda views: {"snapshots": blank(views)}
+        figures.figures_of_run = figures.figures_of_comparison = lambda views: {"snapshots": blank(views)}
         if words[0] != "report":
             # A page without figures is made where it is what a test is about.
             impact_posture.report.result_report.write_result_report = lambda *arguments, **options: None

@@ -12,7 +12,7 @@ from impact_posture.experiment.batch import Document, Store
 from impact_posture.experiment.jobs import Job, controller_factory
 from impact_posture.experiment.paper import PAPER
 from impact_posture.experiment.reproduction import Reproduction
-from impact_posture.plot import Bar, RunView, bars_figure, comparison_figures, run_figures, save, save_all
+from impact_posture.plot import Bar, RunView, bars_figure, figures_of_comparison, figures_of_run, save, save_all
 from impact_posture.progress import tell
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Series, Window
@@ -27,7 +27,7 @@ def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, f
         into = folder if one is runs[0] else folder / "minus"
         tell("drawing")
         view = run_view(job, one.series, one.windows, one.sign, part["status"])
-        save_all(run_figures(view), into, formats)
+        save_all(figures_of_run(view), into, formats)
 
 
 def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]) -> None:
@@ -35,7 +35,7 @@ def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: 
     tell("drawing")
     views = [view for job in jobs if (view := _stored_view(job, store)) is not None]
     if views:
-        save_all(comparison_figures(views), folder, formats)
+        save_all(figures_of_comparison(views), folder, formats)
 
 
 def draw_reproduction(found: Reproduction, store: Store, folder: Path, formats: Sequence[str]) -> None:

@@ -1,6 +1,6 @@
 """Figures of a result: :func:`draw_all` writes them, the ``*_figure`` functions return matplotlib figures.
 
-Figures of simulated runs: :func:`run_figures`, :func:`comparison_figures` and :func:`bars_figure`.
+Figures of simulated runs: :func:`figures_of_run`, :func:`figures_of_comparison` and :func:`bars_figure`.
 
 The package does not change the global state of pyplot and shows no window.
 """
@@ -23,7 +23,7 @@ from impact_posture.plot import (
 )
 from impact_posture.plot.bars import Bar, bars_figure
 from impact_posture.plot.robot_drawing import postures_figure
-from impact_posture.plot.run_figures import comparison_figures, run_figures
+from impact_posture.plot.run_figures import figures_of_comparison, figures_of_run
 from impact_posture.plot.run_view import RunView
 from impact_posture.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save, save_all
 from impact_posture.plot.view import ResultView, TradeOffData
@@ -37,10 +37,10 @@ __all__ = [
     "RunView",
     "TradeOffData",
     "bars_figure",
-    "comparison_figures",
     "draw_all",
     "drawable",
-    "run_figures",
+    "figures_of_comparison",
+    "figures_of_run",
     "save",
     "save_all",
 ]

@@ -31,7 +31,7 @@ COLUMNS = 3
 _WIDTHS = (1.7, 1.0)
 
 
-def run_figures(view: RunView) -> dict[str, Figure]:
+def figures_of_run(view: RunView) -> dict[str, Figure]:
     """Return the figures of a run by name: ``metric``, ``controls``, ``joints`` and ``snapshots``.
 
     A robot without actuators has no ``controls``, a robot without joints has no ``joints``.
@@ -44,7 +44,7 @@ def run_figures(view: RunView) -> dict[str, Figure]:
     return figures | {"snapshots": snapshots_figure([view])}
 
 
-def comparison_figures(views: Sequence[RunView]) -> dict[str, Figure]:
+def figures_of_comparison(views: Sequence[RunView]) -> dict[str, Figure]:
     """Return the figures of several controllers in a scenario by name.
 
     They are ``comparison-metric``, ``comparison-controls``, ``comparison-joints`` and ``snapshots``.

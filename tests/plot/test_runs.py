@@ -15,7 +15,16 @@ from matplotlib.figure import Figure
 
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact
-from impact_posture.plot import FORMATS, Bar, RunView, bars_figure, comparison_figures, run_figures, save, save_all
+from impact_posture.plot import (
+    FORMATS,
+    Bar,
+    RunView,
+    bars_figure,
+    figures_of_comparison,
+    figures_of_run,
+    save,
+    save_all,
+)
 from impact_posture.plot.run_axes import AT_LIMIT, LIMIT, SHADES, STOP
 from impact_posture.plot.run_figures import (
     comparison_figure,
@@ -350,8 +359,8 @@ def test_nothing_overlaps(name: str, figure: Any, request: pytest.FixtureRequest
 
 def test_files_in_all_formats_and_the_same_each_time(flying: RunView, fixed: RunView, tmp_path: Path) -> None:
     short = dataclasses.replace(fixed, windows=())
-    paths = save_all(run_figures(short), tmp_path, ("svg",))
-    paths += save_all(comparison_figures([short, short]), tmp_path, ("pdf",))
+    paths = save_all(figures_of_run(short), tmp_path, ("svg",))
+    paths += save_all(figures_of_comparison([short, short]), tmp_path, ("pdf",))
     paths += save(bars_figure(ROWS), tmp_path, "bars", FORMATS)
     assert [path.name for path in paths] == [
         "metric.svg", "controls.svg", "joints.svg", "snapshots.svg",
@@ -388,7 +397,7 @@ def test_bad_input(flying: RunView, pushed: RunView, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no course of time"):
         dataclasses.replace(flying, t=flying.t[::-1])
     with pytest.raises(InputError, match="there is no run to draw"):
-        comparison_figures([])
+        figures_of_comparison([])
     with pytest.raises(InputError, match=r"robot of nominal is solo8, of nominal tilthex_arm.*same scenario"):
         snapshots_figure([flying, pushed])
     with pytest.raises(InputError, match="no format 'gif'"):
