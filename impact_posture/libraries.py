@@ -15,6 +15,7 @@ import struct
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 from impact_posture.errors import OutputError, SpecError
@@ -251,12 +252,18 @@ def source_key(content: Iterable[str], *packages: str) -> str:
         content: What the code depends on.
         packages: Packages of this library whose formulas write the code; a changed formula gives another key.
     """
-    digest = hashlib.sha256("\n".join([__version__, *content]).encode())
-    for package in packages:
-        for path in sorted((Path(__file__).parent / package).glob("**/*")):
-            if path.suffix in (".py", ".jinja", ".c", ".h"):
-                digest.update(path.read_bytes())
-    return digest.hexdigest()[:32]
+    text = "\n".join([__version__, *content, *map(_formulas, packages)])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+@cache
+def _formulas(package: str) -> str:
+    """Return a hash of the source code of a package, as it was when this process first asked."""
+    digest = hashlib.sha256()
+    for path in sorted((Path(__file__).parent / package).glob("**/*")):
+        if path.suffix in (".py", ".jinja", ".c", ".h"):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def check_private(path: Path) -> None:

@@ -55,7 +55,8 @@ def test_it_ends_where_a_cold_run_does_with_fewer_iterations(solved: Solved) -> 
         warm = there.solve(home.q, scale=factor * scale, warm=home.end)
         assert cold.converged and warm.converged
         assert warm.iterations < 0.8 * cold.iterations
-        assert warm.minimized == pytest.approx(cold.minimized, rel=1e-6)
+        # A cold run moves off the bounds first, and may come back to a neighboring, worse optimum.
+        assert (1 - 1e-3) * cold.minimized < warm.minimized < (1 + 1e-6) * cold.minimized
         assert certify(there.problem, warm.q, factor * scale, warm.auxiliaries).holds()
 
 

@@ -92,7 +92,7 @@ class Kinematics:
                 i, "inertia", lambda j: model.inertias[j].matrix() + self._extra.get(j, 0.0)
             )
         armature, locked = finite_armature(model)
-        self._armature = self.by_joint("armature", armature)
+        self.armature = self.by_joint("armature", armature)
         self.locked = tuple(int(k) for k in np.flatnonzero(locked))
 
     def _constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:

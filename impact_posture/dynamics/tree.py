@@ -103,7 +103,7 @@ class Tree(Kinematics):
         velocities = self.velocities(v) if velocities is None else velocities
         inertia = self._inertia if extra else self._own_inertia
         momenta = self._accumulate({i: inertia[i] @ velocity for i, velocity in velocities.items()})
-        return self._project(momenta) + self._armature * v
+        return self._project(momenta) + self.armature * v
 
     def _project(self, forces: ByJoint) -> ca.SX:
         return ca.densify(ca.vertcat(*[transposed_times(S, forces[i]) for i, S in self._S.items()]))
@@ -127,10 +127,13 @@ class Tree(Kinematics):
 
     def point_velocity(self, point: PointOnLink, velocities: ByJoint) -> ca.SX:
         """Return the world linear and angular velocity of a point, ``J v`` in LOCAL_WORLD_ALIGNED, shape (6,)."""
-        motion = velocities[point.joint]
-        linear = motion[:3] + cross(motion[3:], ca.SX(point.position))
-        R = self.rotations[point.joint]
-        return ca.vertcat(R @ linear, R @ motion[3:])
+        own, R = self.own_velocity(point, velocities), self.rotation(point)
+        return ca.vertcat(R @ own[:3], R @ own[3:])
+
+    def own_velocity(self, point: PointOnLink, velocities: ByJoint) -> ca.SX:
+        """Return the linear and angular velocity of a point in its own axes, shape (6,)."""
+        motion, axes = velocities[point.joint], constant(point.rotation).T
+        return ca.vertcat(axes @ (motion[:3] + cross(motion[3:], ca.SX(point.position))), axes @ motion[3:])
 
     # ---- articulated body -------------------------------------------------------------------------------------
 
@@ -150,7 +153,7 @@ class Tree(Kinematics):
         articulated = dict(self._inertia)
         found: dict[int, tuple[ca.SX, ...]] = {}
         for slot, i, parent in reversed(self._joints):
-            D = step.pivot(articulated[i], self._S[i], self._armature[slot.v])
+            D = step.pivot(articulated[i], self._S[i], self.armature[slot.v])
             # Not in a template, so that a constant becomes a factor and not a divisor.
             pivot = ca.SX(0) if slot.v.start in self.locked else 1 / D if slot.kind.nv == 1 else D
             found[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)

@@ -91,7 +91,7 @@ class ImpactKind(ABC):
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
         """Return the value with the linear solve left to the program, at ``tree.q`` and the normal ``parameters``."""
         jump = self.unknowns(tree, parameters)
-        return Lifted(jump.variables, jump.residual, self.lifted_value(jump))
+        return Lifted.of([jump], self.lifted_value(jump))
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """Return the unknowns of :meth:`lift` that solve its equations at ``q``."""

@@ -187,13 +187,12 @@ class ImpulseBox:
         case = self.oracle.case
         jumps = [unknown_jump(case, tree, impact, f"{i}_") for i, impact in enumerate(self._impacts(parameters))]
         K = _gram(len(jumps), lambda i, j: weighed(case.metric, jumps[i], jumps[j]))
-        parts = [Lifted(jump.variables, jump.residual, ca.SX(0)) for jump in jumps]
+        parts = [Lifted.of([jump], ca.SX(0)) for jump in jumps]
         return worst_of(parts, [_form(K, ca.DM(corner)) for corner in self.corners], scale)
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """See :class:`~impact_posture.impact.worst_case.WorstCase`."""
-        found = [oracle.quantities(q) for oracle in self.oracles]
-        parts = [Guess.unbounded(np.concatenate([one.jump, one.support_impulse])) for one in found]
+        parts = [Guess.unbounded(one.with_support_impulses(one.quantities(q).jump)) for one in self.oracles]
         return worst_of_guesses(parts, self.value(q) / scale, attempt)
 
     def _impacts(self, n: ca.SX) -> list[Wrench]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from impact_posture.arrays import Array
+from impact_posture.dynamics.jump_derivatives import Foot, JumpDerivatives
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.impact_case import ImpactCase
@@ -27,12 +29,38 @@ class Lifted:
         residual: Equations that fix them, ``= 0``, shape (r, 1).
         value: The objective in terms of configuration and auxiliaries.
         inequalities: Rows ``≤ 0`` that bound it from below, shape (i, 1).
+        jumps: Unknown jumps whose derivatives are known.
     """
 
     variables: ca.SX
     residual: ca.SX
     value: ca.SX
     inequalities: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
+    jumps: tuple[PlacedJump, ...] = ()
+
+    @staticmethod
+    def of(
+        jumps: Sequence[UnknownJump], value: ca.SX, *, others: ca.SX | None = None, equations: ca.SX | None = None
+    ) -> Lifted:
+        """Return a form with unknown jumps, ``others`` beside their unknowns and ``equations`` beside theirs."""
+        row, column, placed = 0, 0, list[PlacedJump]()
+        for jump in jumps:
+            placed += [PlacedJump(jump, row, column)] if jump.derivatives.exist else []
+            row, column = row + jump.residual.numel(), column + jump.variables.numel()
+        return Lifted(
+            ca.vertcat(*[jump.variables for jump in jumps], *([] if others is None else [others])),
+            ca.vertcat(*[jump.residual for jump in jumps], *([] if equations is None else [equations])),
+            value,
+            jumps=tuple(placed),
+        )
+
+    @property
+    def rest(self) -> ca.SX:
+        """The residual less the parts whose derivatives are known, shape (r, 1)."""
+        found = ca.SX(self.residual)
+        for jump, row, _ in self.jumps:
+            found[row : row + jump.rest.numel()] = jump.rest
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,45 +100,77 @@ class UnknownJump:
 
     Attributes:
         a: Unknown jump, shape (nv,).
+        f: Support impulses, in the axes of the feet.
         variables: ``a``, the support impulses, and an unknown impulse of the impact if there is one.
         residual: ``M a − J_sᵀf − (the impact)`` and ``J_s a + εf``, and equations that fix the unknown impulse.
+        rest: What :attr:`derivatives` leave of the residual: the impact, and the rows of locked joints.
+        derivatives: Derivatives of the equations.
+        compliance: ε, 1/kg.
+        locked: Velocity entries of locked joints, whose equation is ``a_k = 0``.
         mass_a: ``M a``.
         contact_velocity: ``J a``, world, shape (3,).
     """
 
     a: ca.SX
+    f: ca.SX
     variables: ca.SX
     residual: ca.SX
+    rest: ca.SX
+    derivatives: JumpDerivatives
+    compliance: float
+    locked: tuple[int, ...]
     mass_a: ca.SX
     contact_velocity: ca.SX
 
     def with_impulse(self, impulse: ca.SX, fixing: ca.SX) -> UnknownJump:
         """Return the same jump with the impulse of the impact as an unknown, and the equations that fix it."""
-        return replace(
-            self, variables=ca.vertcat(self.variables, impulse), residual=ca.vertcat(self.residual, fixing)
-        )
+        residual, rest = (ca.vertcat(rows, fixing) for rows in (self.residual, self.rest))
+        return replace(self, variables=ca.vertcat(self.variables, impulse), residual=residual, rest=rest)
+
+    def known_derivatives(self, multipliers: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return Jacobian and Hessian of the residual less :attr:`rest`, over chart coordinates, ``a`` and ``f``."""
+        count = self.a.numel()
+        moving = ca.SX.ones(count)
+        moving[list(self.locked)] = 0
+        b, of_feet = moving * multipliers[:count], multipliers[count : count + self.f.numel()]
+        jacobian, hessian = self.derivatives.of(self.a, self.f, b, of_feet, self.compliance)
+        jacobian[list(self.locked), :] = 0
+        return ca.sparsify(jacobian), hessian
+
+
+class PlacedJump(NamedTuple):
+    """An unknown jump, and where its rows and its unknowns begin in a lifted form."""
+
+    jump: UnknownJump
+    row: int
+    column: int
 
 
 def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") -> UnknownJump:
     """Return unknowns and equations of the velocity jump under one impulse."""
     a = ca.SX.sym(f"a{label}", tree.nv)
     velocities = tree.velocities(a)
-    wrenches, held, f = [impact], [], ca.SX(0, 1)
-    for k, support in enumerate(case.supports):
-        foot = point_on(case.robot, support.frame, support.offset)
-        f_k = ca.SX.sym(f"f{label}_{k}", support.rows)
-        full = ca.vertcat(f_k, ca.SX.zeros(6 - support.rows))
-        wrenches.append(Wrench(foot, full[:3], full[3:]))
-        held.append(tree.point_velocity(foot, velocities)[: support.rows] + case.compliance * f_k)
+    feet = [Foot(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
+    wrenches, held, f = list[Wrench](), list[ca.SX](), ca.SX(0, 1)
+    for k, foot in enumerate(feet):
+        f_k = ca.SX.sym(f"f{label}_{k}", foot.rows)
+        full = ca.vertcat(f_k, ca.SX.zeros(6 - foot.rows))
+        wrenches.append(Wrench(foot.point, full[:3], full[3:], in_frame=True))
+        held.append(tree.own_velocity(foot.point, velocities)[: foot.rows] + case.compliance * f_k)
         f = ca.vertcat(f, f_k)
-    mass_a = tree.mass_times(a)
-    momentum = mass_a - tree.generalized_force(wrenches)
+    mass_a, pushed = tree.mass_times(a), -tree.generalized_force([impact])
+    momentum = mass_a + pushed - tree.generalized_force(wrenches)
     for k in tree.locked:
-        momentum[k] = a[k]
+        momentum[k] = pushed[k] = a[k]
     return UnknownJump(
         a=a,
+        f=f,
         variables=ca.vertcat(a, f),
         residual=ca.vertcat(momentum, *held),
+        rest=ca.vertcat(pushed, ca.SX(f.numel(), 1)),
+        derivatives=JumpDerivatives(tree, feet),
+        compliance=case.compliance,
+        locked=tree.locked,
         mass_a=mass_a,
         contact_velocity=tree.point_velocity(impact.point, velocities)[:3],
     )
@@ -137,11 +197,16 @@ def weighed(metric: Metric, one: UnknownJump, other: UnknownJump) -> ca.SX:
 def worst_of(parts: Sequence[Lifted], values: Sequence[ca.SX], scale: ca.SX) -> Lifted:
     """Return ``t`` with ``values[k] ≤ t · scale``, over the unknowns and equations of all parts."""
     t = ca.SX.sym("t")
+    row, column, jumps = 0, 0, list[PlacedJump]()
+    for part in parts:
+        jumps += [PlacedJump(jump, row + below, column + right) for jump, below, right in part.jumps]
+        row, column = row + part.residual.numel(), column + part.variables.numel()
     return Lifted(
         variables=ca.vertcat(*[p.variables for p in parts], t),
         residual=ca.vertcat(*[p.residual for p in parts]),
         value=t * scale,
         inequalities=ca.vertcat(*[p.inequalities for p in parts], *[v / scale - t for v in values]),
+        jumps=tuple(jumps),
     )
 
 

@@ -147,10 +147,11 @@ class NormalCone:
         for k, (i, j) in enumerate(_UPPER):
             L[i, j] = L[j, i] = root[k]
         gap = ca.blockcat([[tau - rho, -form[0, 1:]], [-form[1:, 0], block]]) - L @ L
-        return Lifted(
-            variables=ca.vertcat(*[jump.variables for jump in jumps], tau, rho, root),
-            residual=ca.vertcat(*[jump.residual for jump in jumps], *[gap[i, j] for i, j in _UPPER]),
-            value=kind.of_form_expression(unit * t),
+        return Lifted.of(
+            jumps,
+            kind.of_form_expression(unit * t),
+            others=ca.vertcat(tau, rho, root),
+            equations=ca.vertcat(*[gap[i, j] for i, j in _UPPER]),
         )
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:

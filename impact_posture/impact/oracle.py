@@ -177,8 +177,14 @@ class ImpactOracle:
         return known.quantities
 
     def with_support_impulses(self, a: Array) -> Array:
-        """Return ``a`` and its support impulses ``−J_s a/ε`` at the last posture, as one vector."""
-        return np.concatenate([a, -self.Js @ a / self.compliance])
+        """Return ``a`` and its support impulses ``−J_s a/ε``, in the axes of the feet at the last posture."""
+        f = -self.Js @ a / self.compliance
+        parts, start = [a], 0
+        for foot, rows in self.feet:
+            R = np.array(self.numeric.placement(foot).rotation)
+            parts += [R.T @ f[k : k + 3] for k in range(start, start + rows, 3)]
+            start += rows
+        return np.concatenate(parts)
 
     # ---- gradients --------------------------------------------------------------------------------------------
 

@@ -45,10 +45,10 @@ class Program:
         self.chart, self.numeric = rows.chart, Numeric(problem.robot.model)
         own = ca.SX.sym("own", len(problem.objective.parameters))
         scale, weight, self._price = ca.SX.sym("scale"), ca.SX.sym("weight"), ca.SX.sym("price")
-        self._lifted = lifted = problem.objective.lift(rows.tree, own, scale)
+        self.lifted = lifted = problem.objective.lift(rows.tree, own, scale)
         self.bounded = int(lifted.inequalities.numel())
-        self._value = lifted.value / scale + weight * rows.away
-        self._p = ca.vertcat(own, scale, weight, self._price, rows.reference, *rows.parameters)
+        self.value = lifted.value / scale + weight * rows.away
+        self.parameters = ca.vertcat(own, scale, weight, self._price, rows.reference, *rows.parameters)
 
     def branch(self) -> Program:
         """Return a program that grows on its own from here."""
@@ -61,25 +61,32 @@ class Program:
 
         The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.
         """
-        rows, objective = self.rows.lift(problem), self._lifted
+        rows, objective = self.rows.lift(problem), self.lifted
         x = ca.vertcat(self.rows.x, objective.variables, rows.variables)
         g = ca.vertcat(self.rows.norms, rows.rows, objective.residual, objective.inequalities)
-        symbols = {"x": x, "p": self._p, "f": self._value + self._price * rows.slack, "g": g}
+        symbols = {"x": x, "p": self.parameters, "f": self.value + self._price * rows.slack, "g": g}
         if not problem.grows:
             return symbols, {}
-        found = joined(self._own, self.rows.derivatives(rows), self.chart.nx)
+        found = joined(self.own, self.rows.derivatives(rows), self.chart.nx)
         # Own rows are the value, the norms and the rows of the objective, with the constraints between the latter.
-        norms, count, own = self.rows.norms.numel(), rows.rows.numel(), self._own.multipliers.numel()
+        norms, count, own = self.rows.norms.numel(), rows.rows.numel(), self.own.multipliers.numel()
         order = [*range(1, 1 + norms), *range(own, own + count), *range(1 + norms, own)]
         placed = Derivatives(found.multipliers[order], found.jacobian[order, :], found.hessian)
-        return symbols, placed.options(x, self._p, found.multipliers[0], g)
+        return symbols, placed.options(x, self.parameters, found.multipliers[0], g)
 
     @cached_property
-    def _own(self) -> Derivatives:
+    def own(self) -> Derivatives:
         """Derivatives of the value and of all rows but those of constraints."""
-        objective = self._lifted
-        rows = ca.vertcat(self._value, self.rows.norms, objective.residual, objective.inequalities)
-        return Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))
+        objective, nx, norms = self.lifted, self.chart.nx, self.rows.norms
+        rows = ca.vertcat(self.value, norms, objective.rest, objective.inequalities)
+        found = Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))
+        for jump, row, column in objective.jumps:
+            first = 1 + norms.numel() + row
+            jacobian, hessian = jump.known_derivatives(found.multipliers[first:])
+            own, size = [*range(nx), *range(nx + column, column + jacobian.shape[1])], jacobian.shape[0]
+            found.jacobian[first : first + size, own] += jacobian
+            found.hessian[own, own] += hessian
+        return found
 
 
 def parameters(problem: PostureProblem, chart: Chart, scale: float, price: float) -> Array:

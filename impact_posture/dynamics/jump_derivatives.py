@@ -1,0 +1,246 @@
+"""First and second derivatives of the equations of a velocity jump, in closed form.
+
+For a jump ``a`` and impulses ``f`` of feet, in the axes of the feet, the equations are ``M a − J_sᵀf`` and
+``J_s a + εf``.  With multipliers ``b`` and ``l`` their sum is ``φ = bᵀM a − bᵀJ_sᵀf + lᵀJ_s a + ε lᵀf``.  All vectors
+here are in the axes of a root link, so that the inertias of a subtree just add up.  Moving a joint j turns all that
+lies beyond it by ``S_j ×``.  Relative to these links, the velocities under ``a`` change by
+``U_j(a) = −S_j × V_p(a)``, where p is the parent.  So ::
+
+    ∂φ/∂q_j       = U_j(b)ᵀF_j(a) + U_j(a)ᵀF_j(b)
+    ∂²φ/∂q_j∂q_k  = U_j(b)ᵀA_k(a) + U_j(a)ᵀA_k(b),   A_k = S_k ×* F_k + I_k U_k,   for k = j or beyond j
+
+``I_k`` is the inertia of the subtree of k, ``F_k(a)`` its momentum under a less the impulses ``f`` of its feet, and
+``F_k(b)`` its momentum under b plus ``l``.  Automatic differentiation takes three times as many operations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.arrays import Array
+from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
+from impact_posture.dynamics.spatial import constant, cross, motion_cross_force, skew, symmetric, template
+
+# Families of joints with one degree of freedom, whose coordinate in the chart changes at their velocity.
+_ONE_AXIS = ("revolute", "continuous", "prismatic")
+
+
+@dataclass(frozen=True, eq=False)
+class Foot:
+    """A point of a link that stays where it is.
+
+    Attributes:
+        point: The point, in whose axes its velocity and its impulse are.
+        rows: Number of entries that are held: 3 of the velocity, or 6 with the angular velocity.
+    """
+
+    point: PointOnLink
+    rows: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """What one velocity of the robot gives for every joint beyond a root.
+
+    Attributes:
+        turned: ``U_j``, shape (6, joints).
+        changed: ``A_j``, shape (6, joints).
+    """
+
+    turned: ca.SX
+    changed: ca.SX
+
+
+class JumpDerivatives:
+    """Derivatives of the equations of jumps at one symbolic configuration.
+
+    Args:
+        tree: The tree at the configuration, without extra inertias.
+        feet: The feet.
+    """
+
+    def __init__(self, tree: Kinematics, feet: Sequence[Foot]) -> None:
+        self._tree, self._feet = tree, tuple(feet)
+        self._parents = [int(parent) for parent in tree.model.parents]
+        slots = tree.chart.slots
+        self._beyond = [slot for slot in slots if self._parents[slot.index]]
+        # Joints of the degrees of freedom and of the columns of a motion.
+        self._of_v = [slot.index for slot in slots for _ in range(slot.kind.nv)]
+        self._of_u = [slot.index for slot in self._beyond]
+
+    @property
+    def exist(self) -> bool:
+        """Whether all joints but those of root links have one degree of freedom."""
+        return all(slot.kind.family in _ONE_AXIS for slot in self._beyond)
+
+    def of(self, a: ca.SX, f: ca.SX, b: ca.SX, multipliers: ca.SX, compliance: float) -> tuple[ca.SX, ca.SX]:
+        """Return the Jacobian of the equations and the Hessian of ``φ`` over chart coordinates, ``a`` and ``f``.
+
+        Args:
+            a: Jump, shape (nv,).
+            f: Impulses of the feet, one after the other, in their axes.
+            b: Multipliers of ``M a − J_sᵀf``, shape (nv,).
+            multipliers: Those of ``J_s a + εf``, shape of ``f``.
+            compliance: ε, 1/kg.
+        """
+        one, other = self._motion(a, -f), self._motion(b, multipliers)
+        nx, others = self._tree.chart.nx, a.numel() + f.numel()
+        in_x = [slot.x.start for slot in self._beyond]
+        J, held = self._at_feet(self._subspaces, self._of_v), compliance * ca.SX.eye(f.numel())
+        by_x, mixed = ca.SX(others, nx), ca.SX(others, nx)
+        by_x[:, in_x] = ca.vertcat(self._of_momentum(one), self._at_feet(one.turned, self._of_u))
+        mixed[:, in_x] = ca.vertcat(self._of_momentum(other), -self._at_feet(other.turned, self._of_u))
+        products = one.changed.T @ other.turned + other.changed.T @ one.turned
+        curvature = ca.SX(nx, nx)
+        curvature[in_x, in_x] = ca.tril2symm(_kept(products, self._lies_on(self._of_u, self._of_u)))
+        return (
+            ca.horzcat(by_x, ca.blockcat([[self._mass, -J.T], [J, held]])),
+            ca.blockcat([[curvature, mixed.T], [mixed, ca.SX(others, others)]]),
+        )
+
+    # ---- blocks -----------------------------------------------------------------------------------------------
+
+    def _lies_on(self, ends: Sequence[int], joints: Sequence[int], *, itself: bool = True) -> Array:
+        """Return whether each of the ``joints`` (columns) is on the path from a root to each of the ends (rows)."""
+        paths = {end: {int(i) for i in self._tree.model.supports[end]} - (set() if itself else {end}) for end in ends}
+        return np.array([[joint in paths[end] for joint in joints] for end in ends], dtype=bool)
+
+    @cached_property
+    def _mass(self) -> ca.SX:
+        """``M``, shape (nv, nv)."""
+        products = self._momenta.T @ self._subspaces
+        below = _kept(products, self._lies_on(self._of_v, self._of_v) & np.tri(len(self._of_v), dtype=bool))
+        return ca.tril2symm(below) + ca.diag(self._tree.armature)
+
+    def _of_momentum(self, motion: _Motion) -> ca.SX:
+        """Return the derivative of ``M x`` and of the impulses of the feet, shape (nv, joints)."""
+        below = _kept(self._momenta.T @ motion.turned, self._lies_on(self._of_v, self._of_u))
+        above = _kept(motion.changed.T @ self._subspaces, self._lies_on(self._of_u, self._of_v, itself=False))
+        return below + above.T
+
+    def _at_feet(self, motions: ca.SX, joints: Sequence[int]) -> ca.SX:
+        """Return the held entries of the feet under motions of all that lies beyond joints, shape (rows, joints)."""
+        rows = [ca.SX(0, len(joints))]
+        for foot, X in zip(self._feet, self._foot_motions, strict=True):
+            rows.append(_kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))
+        return ca.vertcat(*rows)
+
+    # ---- the tree in the axes of its roots --------------------------------------------------------------------
+
+    @cached_property
+    def _places(self) -> dict[int, tuple[ca.SX, ca.SX]]:
+        """Rotation and origin of every link."""
+        root = {i: int(list(self._tree.model.supports[i])[1]) for i in set(self._of_v)}
+        return {i: self._tree.relative(root[i], i) for i in root}
+
+    @cached_property
+    def _subspaces(self) -> ca.SX:
+        """Motion subspaces of all joints, shape (6, nv)."""
+        columns = []
+        for slot in self._tree.chart.slots:
+            place, S = self._places[slot.index], constant(slot.kind.subspace)
+            columns += [_motion_of_link(*place, S[:, k]) for k in range(slot.kind.nv)]
+        return ca.horzcat(*columns)
+
+    @cached_property
+    def _inertias(self) -> ByJoint:
+        """Mass, first moment and rotational inertia about the root of every link, in one matrix of shape (4, 4)."""
+        found: ByJoint = {}
+        for i, (R, p) in self._places.items():
+            body = self._tree.model.inertias[i]
+            numbers = (np.array(body.mass), body.lever, body.inertia)
+            found[i] = _inertia_of_link(R, p, *[ca.SX(np.array(part)) for part in numbers])
+        return found
+
+    @cached_property
+    def _subtrees(self) -> ByJoint:
+        """The same of the subtree of every joint."""
+        return self._gathered(self._inertias)
+
+    def _gathered(self, of_links: ByJoint) -> ByJoint:
+        """Return sums over the subtrees of all joints."""
+        found = dict(of_links)
+        for i in sorted(found, reverse=True):
+            if parent := self._parents[i]:
+                found[parent] = found[parent] + found[i]
+        return found
+
+    @cached_property
+    def _momenta(self) -> ca.SX:
+        """``I_k S_k``, shape (6, nv)."""
+        return ca.horzcat(*[_momentum(self._subtrees[i], self._subspaces[:, k]) for k, i in enumerate(self._of_v)])
+
+    @cached_property
+    def _foot_motions(self) -> list[ca.SX]:
+        """What takes the motion of its link to the held entries of every foot, shape (rows, 6)."""
+        found = []
+        for foot in self._feet:
+            R, p = self._places[foot.point.joint]
+            axes, position = R @ constant(foot.point.rotation), p + R @ constant(foot.point.position)
+            X = ca.blockcat([[axes.T, -axes.T @ skew(position)], [ca.SX(3, 3), axes.T]])
+            found.append(X[: foot.rows, :])
+        return found
+
+    def _motion(self, x: ca.SX, impulses: ca.SX) -> _Motion:
+        """Return the motion of the velocity ``x``, with impulses of the feet beside the momentum."""
+        velocities: ByJoint = {}
+        forces: ByJoint = {}
+        turned: ByJoint = {}
+        for slot in self._tree.chart.slots:
+            i, S = slot.index, self._subspaces[:, slot.v]
+            own = S @ x[slot.v]
+            if parent := self._parents[i]:
+                turned[i] = -_motion_cross(S, velocities[parent])
+                own = own + velocities[parent]
+            velocities[i], forces[i] = own, _momentum(self._inertias[i], own)
+        start = 0
+        for foot, X in zip(self._feet, self._foot_motions, strict=True):
+            forces[foot.point.joint] += X.T @ impulses[start : start + foot.rows]
+            start += foot.rows
+        forces = self._gathered(forces)
+        changed = [
+            motion_cross_force(self._subspaces[:, slot.v], forces[i]) + _momentum(self._subtrees[i], turned[i])
+            for slot in self._beyond
+            for i in [slot.index]
+        ]
+        return _Motion(ca.horzcat(ca.SX(6, 0), *turned.values()), ca.horzcat(ca.SX(6, 0), *changed))
+
+
+def _kept(matrix: ca.SX, pattern: Array) -> ca.SX:
+    """Return a matrix without the entries outside a pattern."""
+    return matrix * ca.sparsify(ca.SX(pattern.astype(float)))
+
+
+@template
+def _motion_of_link(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
+    """Express the motion of a link in the axes of its root."""
+    angular = R @ motion[3:]
+    return ca.vertcat(R @ motion[:3] + cross(p, angular), angular)
+
+
+@template
+def _inertia_of_link(R: ca.SX, p: ca.SX, mass: ca.SX, lever: ca.SX, inertia: ca.SX) -> ca.SX:
+    """Return ``[I h; hᵀ m]`` with ``h = m c`` and ``I`` about the root, from the inertia about the center of mass."""
+    c = p + R @ lever
+    h = mass * c
+    about_root = symmetric(R @ symmetric(inertia) @ R.T + ca.dot(h, c) * ca.SX.eye(3) - h @ c.T)
+    return ca.blockcat([[about_root, h], [h.T, mass]])
+
+
+@template
+def _momentum(inertia: ca.SX, motion: ca.SX) -> ca.SX:
+    """Return the momentum about the root, ``[m v − h × w; h × v + I w]``."""
+    h, v, w = inertia[:3, 3], motion[:3], motion[3:]
+    return ca.vertcat(inertia[3, 3] * v - cross(h, w), cross(h, v) + inertia[:3, :3] @ w)
+
+
+@template
+def _motion_cross(one: ca.SX, other: ca.SX) -> ca.SX:
+    """Return the cross product of two motions, ``[w₁ × v₂ + v₁ × w₂; w₁ × w₂]``."""
+    v, w = one[:3], one[3:]
+    return ca.vertcat(cross(w, other[:3]) + cross(v, other[3:]), cross(w, other[3:]))
