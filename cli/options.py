@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
@@ -27,7 +28,9 @@ def option(*names: str, panel: str, help: str, **more: Any) -> Any:
 
 def out_option(help: str, default: str = "") -> Any:
     """Return the option of the folder to write."""
-    return option("--out", metavar="DIR", panel=OUTPUT, show_default=default or True, help=help)
+    # A shell leaves the ~ of --out=~/result to the program.
+    home = {"callback": lambda folder: folder and os.path.expanduser(folder)}
+    return option("--out", metavar="DIR", panel=OUTPUT, show_default=default or True, help=help, **home)
 
 
 RobotName = Annotated[

@@ -103,6 +103,14 @@ def test_files_that_are_no_robot(
     assert (out, err) == ("", "")
 
 
+def test_swapped_limits(load: Load) -> None:
+    swapped = joint("a", "b").replace('lower="-1" upper="1"', 'lower="1" upper="-1"')
+    elements = (link("a", GOOD), link("b", OFF_AXIS), swapped)
+    with pytest.raises(UrdfError, match="lower position limit of 'a_b' is above the upper one"):
+        load(*elements)
+    load(*elements, toml="[limits.position]\na_b = [-1, 1]")
+
+
 def test_binary_missing_and_folder(tmp_path: Path) -> None:
     binary = tmp_path / "binary.urdf"
     binary.write_bytes(bytes(range(256)))

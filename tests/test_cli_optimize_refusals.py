@@ -151,6 +151,22 @@ def test_existing_output_is_kept(tmp_path: Path) -> None:
     untouched(tmp_path, "out")
 
 
+def test_a_result_folder_in_place_of_its_problem(tmp_path: Path) -> None:
+    (tmp_path / "result").mkdir()
+    (tmp_path / "result/problem.toml").write_text("")
+    done = run("optimize", "result", cwd=tmp_path)
+    assert done.returncode == 2 and "result/problem.toml" in done.stderr
+
+
+def test_the_home_folder_in_the_output(tmp_path: Path) -> None:
+    """A shell does not replace the tilde of ``--out=~/taken``."""
+    (tmp_path / "home/taken").mkdir(parents=True)
+    (tmp_path / "home/taken/note").touch()
+    done = run(*BASE, "--out=~/taken", cwd=tmp_path, env={"HOME": str(tmp_path / "home")})
+    refused(done, 1, f"{tmp_path}/home/taken", "exists")
+    untouched(tmp_path, "home")
+
+
 def test_output_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     refused(run(*BASE, "--out", "file", cwd=tmp_path), 1, "file")

@@ -117,6 +117,8 @@ def optimize(
 
 def _settings(robot: str, given: Given) -> ProblemSettings:
     from_file = robot.endswith(".toml")
+    if not from_file and (problem := Path(robot) / "problem.toml").is_file():
+        raise typer.BadParameter(f"a result folder is no robot; its problem is {problem}", param_hint="'ROBOT'")
     if not from_file or "contact" in given.values:
         given.check_contact()
     if not from_file:

@@ -62,6 +62,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     _remount(model, options.mounting, name)
     srdf = srdf_path(spec, options, base)
     _override_limits(model, spec, name)
+    _check_limits(model, source)
     postures, default = named_postures(model, srdf, spec, root, name)
     armature_source = set_armature(model, spec, srdf, options.armature, name)
     locked = _named(model, (*spec.model.lock, *options.lock), f"{name} lock")
@@ -220,6 +221,19 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
             low[k], high[k] = -value, value
         setattr(model, f"lower{kind}Limit", low)
         setattr(model, f"upper{kind}Limit", high)
+
+
+def _check_limits(model: pin.Model, source: str) -> None:
+    for k in np.flatnonzero(model.lowerPositionLimit > model.upperPositionLimit):
+        joint = next(
+            name for i, name in enumerate(model.names) if model.idx_qs[i] <= k < model.idx_qs[i] + model.nqs[i]
+        )
+        limits = f"{model.lowerPositionLimit[k]:g}, {model.upperPositionLimit[k]:g}"
+        raise UrdfError(
+            f"the lower position limit of '{joint}' is above the upper one ({limits})",
+            where=source,
+            hint="swap them there, or give robot.toml [limits.position]",
+        )
 
 
 def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, ...]:
