@@ -46,7 +46,7 @@ class MovingTree(Tree):
             while j:
                 above = self.chart.slots[j - 1]
                 block = ca.horzcat(*[transposed_times(self._S[j], column) for column in columns])
-                M[above.v, slot.v] = block + (ca.diag(self._armature[slot.v]) if j == i else 0)
+                M[above.v, slot.v] = block + (ca.diag(self.armature[slot.v]) if j == i else 0)
                 columns = [force_to_parent(self._R[j], self._p[j], column) for column in columns]
                 j = self._parents[j]
         return ca.triu2symm(ca.triu(M))
