@@ -54,4 +54,4 @@ def composite_mass_matrix(tree: Tree) -> ca.SX:
             M[slot.v, other.v] = M[other.v, slot.v].T
         if parent:
             composite[parent] = composite[parent] + tree._inertia_to_parent(i, composite[i])
-    return M + ca.diag(tree._armature)
+    return M + ca.diag(tree.armature)
