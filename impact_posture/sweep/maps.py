@@ -100,7 +100,7 @@ def draw_maps(folder: Path, out: Path, axes: Sequence[str] | None = None, format
         table = _Slice(data, plane + number * grid.size, problem)
         switches += len(table.switches)
         best += _best(data, grid, number, case["values"])
-        files += _draw(table, grid, (across, upwards), case["values"], number, out, formats)
+        files += _draw(table, grid, (across, upwards), case["values"], problem, out / f"map-{number}", formats)
     return Shown(points, counts, switches, best, files)
 
 
@@ -204,14 +204,16 @@ def _draw(
     grid: Grid,
     axes: tuple[int, int | None],
     values: dict[str, Any],
-    number: int,
-    out: Path,
+    problem: PostureProblem,
+    path: Path,
     formats: Sequence[str],
 ) -> list[Path]:
     across, upwards = axes
     rows, columns = table.value.shape
     others = [f"{a.name} {a.values[len(a.values) // 2]}" for k, a in enumerate(grid.axes) if k not in axes]
-    facts = " · ".join([f"{key} {value}" for key, value in values.items()] + others)
+    contacts = ", ".join(contact.frame for contact in problem.objective.contacts)
+    what = [f"{problem.robot.name} at {contacts}", f"objective in {problem.objective.units}"]
+    facts = " · ".join(what + [f"{key} {value}" for key, value in values.items()] + others)
     notes = [f"{len(table.switches)} steps between neighbors switch to another optimum."]
     missing = int((table.status == "").sum())
     if missing:
@@ -249,7 +251,7 @@ def _draw(
             _label(panel.yaxis, grid.axes[upwards])
         if handles:
             shared_legend(body, handles, "lower")
-        return save(figure, out, f"map-{number}", formats)
+        return save(figure, path.parent, path.name, formats)
 
 
 def _edge(one: tuple[int, int], other: tuple[int, int]) -> list[tuple[float, float]]:
