@@ -46,8 +46,8 @@ def main() -> None:
     for arguments, figures in PICTURES:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "result"
-            more = ["--no-codegen", "--quiet", "--format", "png", "--out", str(out)]
-            subprocess.run([str(program), "optimize", *arguments.split(), *more], check=True)
+            more = ["--no-codegen", "--quiet", "--format", "png", "--out", out.name]
+            subprocess.run([str(program), "optimize", *arguments.split(), *more], cwd=folder, check=True)
             if figures is PICTURES[0][1]:
                 picture_report(out / "report.html")
             for figure, name in figures.items():
