@@ -140,6 +140,14 @@ def test_it_does_not_climb_where_it_turns() -> None:
     assert found.values[-1] < 0.3
 
 
+def test_it_does_not_climb_where_it_brakes_to_rest() -> None:
+    """It rests in the bend, where straight on is up: without looking ahead it climbs by 1e-1."""
+    r = robot("talos")
+    found = course(flow_of(r, valley(r, 4), epsilon=0.05), r.posture(), 3.0)
+    assert (found.values - np.minimum.accumulate(found.values)).max() < 1e-5
+    assert found.rested < 2.5
+
+
 @pytest.mark.parametrize("name", ["solo8", "talos"])
 def test_the_base_tilts_no_further_than_it_may(name: str) -> None:
     """An objective that falls as the base tilts, about an axis that is neither roll nor pitch."""

@@ -220,6 +220,9 @@ class ReferenceFlow:
         self._wanted[:] = self.direction.newton(self._space, self._slope, self.value / self.start, offset, self.error)
         gain, least = self.direction.gain, self.options.epsilon
         self.resting = gain < (4 * least if self.resting else least)
+        if self.resting:
+            # It brakes as it turns, downhill.
+            self._wanted[:] = 0.0
 
     def _govern(self) -> None:
         """Limit speed and acceleration, and return to contacts and tasks."""
@@ -232,7 +235,7 @@ class ReferenceFlow:
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         fastest = min(fastest, options.acceleration * max(self._deadline - self._clock, 0.0))
         wanted = self._wanted * (options.acceleration / options.speed)
-        if not self.on or self.resting:
+        if not self.on:
             fastest = 0.0
         rate = self.error / _RETURN
         for task, rows in zip(self._held, self._places, strict=True):

@@ -172,4 +172,8 @@ static void ip_flow_direct(ip_context *c)
 #endif
   ip_flow_newton(c);
   f->resting = f->gain < (f->resting ? 4.0 : 1.0) * c->p.flow_epsilon[0];
+  if (f->resting) {
+    /* It brakes as it turns, downhill. */
+    memset(f->wanted, 0, sizeof f->wanted);
+  }
 }

@@ -119,7 +119,7 @@ static void ip_flow_govern(ip_context *c)
   ip_difference(c->q, f->q, e);
   fastest = p->flow_speed[0] * fmax(1.0 - ip_largest(e, IP_BASE) / p->flow_tracking[0], 0.0);
   fastest = fmin(fastest, p->flow_acceleration[0] * fmax(f->deadline - f->clock, 0.0));
-  fastest = !f->on || f->resting ? 0.0 : fastest;
+  fastest = f->on ? fastest : 0.0;
   ip_flow_back(c, back);
   ip_flow_project(f, f->flow);
   ip_flow_change(f, p, period, fastest, step);
