@@ -34,7 +34,7 @@ class FlowOptions:
 
     Attributes:
         speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
-        acceleration: Largest acceleration ``a``, rad/s² (m/s²); ``v/a`` is the time constant of the flow.
+        acceleration: Largest acceleration ``a``, rad/s² (m/s²); half of it stops the flow on its step.
         rho: ρ, pull of the joints towards the start per rad², relative to ``H₀``.
         mu: μ, least curvature per rad², relative to ``H₀``.
         epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.

@@ -234,7 +234,9 @@ class ReferenceFlow:
         error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         fastest = min(fastest, options.acceleration * max(self._deadline - self._clock, 0.0))
-        wanted = self._wanted * (options.acceleration / options.speed)
+        # Half of the acceleration stops a flow of speed √(a δ) on its step δ.  Below v/2, the speed is 2 a/v δ.
+        least = options.speed**2 / (4 * options.acceleration)
+        wanted = self._wanted * math.sqrt(options.acceleration / max(np.abs(self._wanted).max(), least))
         if not self.on:
             fastest = 0.0
         rate = self.error / _RETURN

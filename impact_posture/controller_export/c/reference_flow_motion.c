@@ -76,10 +76,13 @@ static void ip_flow_change(const ip_flow *f, const ip_params *p, double period, 
 {
   enum { N = IP_NV, FAST = 0, BRAKE = 2 };
   const double a = p->flow_acceleration[0], most = a * period, time = ip_largest(f->flow, 0) / a;
+  /* Half of the acceleration stops a flow of speed sqrt(a d) on its step d.  Below v/2, the speed is 2 a/v d. */
+  const double least = p->flow_speed[0] * p->flow_speed[0] / (4.0 * a);
+  const double pace = sqrt(a / fmax(ip_largest(f->wanted, 0), least));
   double wanted[N], stop[N];
   int i, k;
   for (i = 0; i < N; ++i) {
-    wanted[i] = f->wanted[i] * a / p->flow_speed[0];
+    wanted[i] = pace * f->wanted[i];
     /* Twice the way on which it stops, because the curvature may grow on it. */
     stop[i] = time * f->flow[i];
   }
