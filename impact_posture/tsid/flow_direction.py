@@ -48,7 +48,7 @@ class FlowOptions:
 
     speed: float = 1.0
     acceleration: float = 2.0
-    rho: float = 0.01
+    rho: float = 0.001
     mu: float = 0.05
     epsilon: float = 3e-4
     joint_margin: float = 0.1
