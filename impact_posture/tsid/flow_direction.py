@@ -24,6 +24,8 @@ _LEAST = 1e-8
 _LEVEL = 1e-6
 # What a limit may be missed by where the flow brakes, rad (m), or as a share.
 _NEAR = 1e-3
+# What of that the flow takes where a limit is missed by so much already: along it, the flow would creep across.
+_SPENT = 9e-4
 # Stiffness of those springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
 _STIFFNESS = 3e4
 
@@ -180,8 +182,8 @@ class FlowDirection:
         upper[count:] = 1.0 - shares
         lower[count:] = -1.0 - shares
         ahead = self._rows @ coasting
-        np.maximum(upper, 0.0, out=self._room[0])
-        np.minimum(lower, 0.0, out=self._room[1])
+        np.maximum(upper, -_SPENT, out=self._room[0])
+        np.minimum(lower, _SPENT, out=self._room[1])
         np.maximum(upper - np.maximum(ahead, 0.0), 0.0, out=upper)
         np.minimum(lower - np.minimum(ahead, 0.0), 0.0, out=lower)
 

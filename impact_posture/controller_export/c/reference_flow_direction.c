@@ -3,6 +3,8 @@
 
 /* Least H/H0 whose root counts. */
 #define IP_LEAST_VALUE 1e-8
+/* What of IP_NEAR the flow takes where a limit is missed by so much already: along it, the flow would creep across. */
+#define IP_SPENT 9e-4
 /* Sine of an angle of the base below which the tilt has no slope. */
 #define IP_LEVEL 1e-6
 
@@ -72,8 +74,8 @@ static void ip_flow_limits(ip_context *c)
         ahead = ip_dot(f->T[k], coasting, IP_NV);
       }
     }
-    f->room[0][r] = fmax(high, 0.0);
-    f->room[1][r] = fmin(low, 0.0);
+    f->room[0][r] = fmax(high, -IP_SPENT);
+    f->room[1][r] = fmin(low, IP_SPENT);
     f->high[r] = fmax(high - fmax(ahead, 0.0), 0.0);
     f->low[r] = fmin(low - fmin(ahead, 0.0), 0.0);
   }
